@@ -1,0 +1,181 @@
+"""The knob tree of a run. Imports no torch: help and parsing stay fast."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from .checks import at_least, between, positive
+from .datamanagers.config import DataManagerConfig, RayBatchesConfig
+from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
+from .fields.layouts import LayoutConfig, SingleConfig
+from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig
+from .plugins.encoders.config import DinoConfig, EncoderConfig, Vgg19Config
+from .plugins.executors.config import ExecutorConfig, SerialConfig
+from .plugins.samplers.config import ProposalConfig, SamplerConfig
+
+__all__ = [
+    "ContentConfig",
+    "LossConfig",
+    "OptimizerConfig",
+    "RenderConfig",
+    "SemanticConfig",
+    "StatisticsConfig",
+    "TrainConfig",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContentConfig:
+    """The content field: what it learns, and what turns that into colour."""
+
+    encoder: EncoderConfig = Vgg19Config()
+    """Encoder whose features carry content and style."""
+    field: ContentFieldConfig = PlanesConfig()
+    """Representation of density and content."""
+    decoder: DecoderConfig = MlpDecoderConfig()
+    """Frozen decoder from content features to colour."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SemanticConfig:
+    """The semantic field: what finds the fitting reference."""
+
+    encoder: EncoderConfig | None = DinoConfig()
+    """Encoder whose features the semantic field learns; none = no semantics, global styles alone."""
+    field: SemanticFieldConfig = SemanticPlanesConfig()
+    """Representation of the semantics."""
+    dim: int = 64
+    """Principal components of the encoder's features that are kept (all, if the encoder has fewer)."""
+    samples: int = 48
+    """Heaviest samples of a ray that carry semantics in training."""
+
+    def __post_init__(self) -> None:
+        at_least("semantic.dim", self.dim, 1)
+        at_least("semantic.samples", self.samples, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossConfig:
+    """Weights of the training terms (means over the batch); a term of weight 0 is never computed."""
+
+    rgb: float = 1.0
+    """Squared error of the colour."""
+    content: float = 0.01
+    """Squared error of the rendered content features, in units of their variance."""
+    semantic: float = 0.1
+    """Absolute error of the rendered semantic features, in units of their standard deviation."""
+    variation: float = 1e-4
+    """Total variation of the content planes."""
+    proposal_variation: float = 1e-4
+    """Total variation of the proposal planes."""
+    interlevel: float = 1.0
+    """Proposals must bound the field's weights from above."""
+    distortion: float = 1e-3
+    """Weights should gather at one place along a ray."""
+
+    def __post_init__(self) -> None:
+        for name in ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion"):
+            at_least(f"loss.{name}", getattr(self, name), 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimizerConfig:
+    """Adam with linear warm-up and cosine decay."""
+
+    rate: float = 1e-2
+    """Learning rate at its height."""
+    final: float = 0.01
+    """Share of the rate that is left at the end."""
+    warm_up: int = 512
+    """Steps of linear warm-up."""
+    beta2: float = 0.99
+    """Decay of the squared-gradient average."""
+    eps: float = 1e-12
+    """Keeps the step finite where the gradient vanishes."""
+
+    def __post_init__(self) -> None:
+        positive("optimizer.rate", self.rate)
+        between("optimizer.final", self.final, 0.0, 1.0)
+        between("optimizer.beta2", self.beta2, 0.0, 1.0)
+        positive("optimizer.eps", self.eps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """How samples become pixels, and what may be skipped."""
+
+    budget: float = 1 / 512
+    """Largest weight per ray that may be dropped when rendering; bounds the colour error (0 = exact)."""
+    train_budget: float = 1 / 512
+    """The same bound while training."""
+    chunk: int = 8192
+    """Rays rendered at a time."""
+    background: tuple[float, float, float] | None = None
+    """Colour behind everything; none = white where images have transparency, else nothing is assumed."""
+
+    def __post_init__(self) -> None:
+        between("render.budget", self.budget, 0.0, 0.5)
+        between("render.train_budget", self.train_budget, 0.0, 0.5)
+        at_least("render.chunk", self.chunk, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatisticsConfig:
+    """The exact pass over the trained scene that styles build on."""
+
+    rays: int = 65536
+    """Rays, spread evenly over the training views."""
+    regions: int = 8
+    """Scene codes: clusters of the scene's own semantics."""
+
+    def __post_init__(self) -> None:
+        at_least("statistics.rays", self.rays, 64)
+        at_least("statistics.regions", self.regions, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Everything that decides a run."""
+
+    data: Path = Path("town")
+    """Scene folder; `town` is the embedded one."""
+    output: Path | None = None
+    """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
+    downscale: int = 1
+    """Images are reduced by this factor."""
+    steps: int = 30_000
+    """Optimiser steps."""
+    minutes: float | None = None
+    """Wall-clock limit, features included; the schedule ends with whichever comes first, steps or minutes."""
+    seed: int = 0
+    """Every draw is a function of it."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+    checkpoint_minutes: float = 5.0
+    """Time between checkpoints."""
+    datamanager: DataManagerConfig = RayBatchesConfig()
+    """Feeds training."""
+    sampler: SamplerConfig = ProposalConfig()
+    """Places samples along rays."""
+    content: ContentConfig = ContentConfig()
+    """Geometry and appearance."""
+    semantic: SemanticConfig = SemanticConfig()
+    """Semantics."""
+    blocks: LayoutConfig = SingleConfig()
+    """How the scene is cut into blocks."""
+    executor: ExecutorConfig = SerialConfig()
+    """Where blocks are trained."""
+    loss: LossConfig = LossConfig()
+    """Weights of the training terms."""
+    optimizer: OptimizerConfig = OptimizerConfig()
+    """How parameters move."""
+    render: RenderConfig = RenderConfig()
+    """Rendering and skipping."""
+    statistics: StatisticsConfig = StatisticsConfig()
+    """Scene statistics for styling."""
+
+    def __post_init__(self) -> None:
+        at_least("downscale", self.downscale, 1)
+        at_least("steps", self.steps, 0)
+        if self.minutes is not None:
+            positive("minutes", self.minutes)
+        positive("checkpoint_minutes", self.checkpoint_minutes)

@@ -1,0 +1,1 @@
+"""Scenes, images, features and batches."""

@@ -1,0 +1,75 @@
+"""Data manager configs. `build` imports the implementation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from ..checks import at_least, between
+from ..plugins.config import PluginConfig
+from .parsers.config import DataParserConfig
+
+if TYPE_CHECKING:
+    from ..interfaces import DataManager, Encoder
+    from .scene import Scene
+
+__all__ = ["DataManagerConfig", "GuidedConfig", "RayBatchesConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuidedConfig:
+    """Guided upsampling of feature maps: F(p) = A(p) I(p) + b(p), with A and b kept at a stride."""
+
+    radius: float = 0.08
+    """Window radius as a share of the image's shorter side (0.08 of 378 pixels is the paper's code's 30)."""
+    eps: float = 1e-3
+    """Regularisation in squared colour units, colours in [0, 1]; at least 1e-6."""
+    stride: int = 8
+    """Pixels between stored coefficients."""
+
+    def __post_init__(self) -> None:
+        between("guided.radius", self.radius, 0.0, 1.0)
+        at_least("guided.eps", self.eps, 1e-6)
+        at_least("guided.stride", self.stride, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataManagerConfig(PluginConfig):
+    """Feeds training with pixels and their feature targets."""
+
+    group: ClassVar[str] = "fprf.datamanagers"
+
+    parser: DataParserConfig | None = None
+    """Format of the scene folder; none = recognised from what lies in it."""
+
+    def build(
+        self, *, scene: Scene, content: Encoder | None, semantic: Encoder | None, dim: int, cache: Path, seed: int
+    ) -> DataManager:
+        """The data manager; features are computed into `cache` unless they lie there already. `dim` is the number of
+        principal semantic components that the field learns."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RayBatchesConfig(DataManagerConfig):
+    """Random pixels of all training views."""
+
+    rays: int = 4096
+    """Rays per step."""
+    semantic_share: float = 1.0
+    """Share of the rays that also carry a semantic target."""
+    guided: GuidedConfig = GuidedConfig()
+    """Edge-aware upsampling of the targets."""
+
+    def __post_init__(self) -> None:
+        at_least("datamanager.rays", self.rays, 1)
+        between("datamanager.semantic_share", self.semantic_share, 0.0, 1.0)
+
+    def build(
+        self, *, scene: Scene, content: Encoder | None, semantic: Encoder | None, dim: int, cache: Path, seed: int
+    ) -> DataManager:
+        """The data manager."""
+        from .batches import RayBatches
+
+        return RayBatches(self, scene=scene, content=content, semantic=semantic, dim=dim, cache=cache, seed=seed)

@@ -1,0 +1,31 @@
+"""A parsed scene: where its images lie, how they were taken, what is for training. No image is decoded yet."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from torch import Tensor
+
+from ..rendering.cameras import Cameras
+
+__all__ = ["Scene"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """V views of one place. Cameras are at the size that images are used at (after `downscale`)."""
+
+    name: str
+    paths: tuple[Path, ...]
+    """One image a view, as delivered; loading resizes it to the camera's size."""
+    cameras: Cameras
+    train: Annotated[Tensor, "T"]
+    """int64 indices of the training views."""
+    test: Annotated[Tensor, "U"]
+    """int64 indices of the held-out views (every 8th by name, unless the capture says)."""
+    points: Annotated[Tensor, "P 3"] | None = None
+    """Sparse points of the reconstruction, float64 world, for bounds."""
+    depths: Annotated[Tensor, "V 2"] | None = None
+    """Nearest and farthest depth along each view's axis, where the capture says."""
+    alpha: bool = False
+    """Images carry transparency."""

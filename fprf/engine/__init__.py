@@ -1,0 +1,1 @@
+"""Model, losses, training and checkpoints."""

@@ -1,0 +1,56 @@
+"""Every error that a user can cause, or that names somebody else's code.
+
+    FprfError                 one clear line: where, what was found, what is allowed, what to do
+      UsageError              a flag or an argument
+      ConfigError             a saved config or a config field
+      PluginError             a plug-in that is missing, ambiguous, broken or of the wrong type
+      DataError               a scene folder, an image, a reference photograph
+      WeightsError            encoder or decoder weights: absent, of another encoder, damaged
+      CheckpointError         a run folder or a checkpoint
+      NumericsError           a value that is not finite where it must be
+
+The command line turns each into one line on standard error and exit code 2.
+"""
+
+__all__ = [
+    "CheckpointError",
+    "ConfigError",
+    "DataError",
+    "FprfError",
+    "NumericsError",
+    "PluginError",
+    "UsageError",
+    "WeightsError",
+]
+
+
+class FprfError(Exception):
+    """The root: its text is complete and meant for the user."""
+
+
+class UsageError(FprfError):
+    """A flag or an argument that the command line does not take."""
+
+
+class ConfigError(FprfError):
+    """A config value out of its range, or a saved config that the code cannot read."""
+
+
+class PluginError(FprfError):
+    """A plug-in that is missing, ambiguous, broken or of the wrong type."""
+
+
+class DataError(FprfError):
+    """A scene, an image or a reference that cannot be used as it is."""
+
+
+class WeightsError(FprfError):
+    """Weights that are absent, damaged, or belong to something else."""
+
+
+class CheckpointError(FprfError):
+    """A run folder or checkpoint that cannot be read."""
+
+
+class NumericsError(FprfError):
+    """A value that is not finite where the computation needs one."""

@@ -1,0 +1,88 @@
+"""Field configs. `build` imports the implementation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from ..checks import at_least
+from ..plugins.config import PluginConfig
+
+if TYPE_CHECKING:
+    from ..interfaces import ContentField, SemanticField
+
+__all__ = ["ContentFieldConfig", "PlanesConfig", "SemanticFieldConfig", "SemanticPlanesConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContentFieldConfig(PluginConfig):
+    """Density and content features of a scene."""
+
+    group: ClassVar[str] = "fprf.fields"
+
+    def build(self, *, channels: int, seed: int) -> ContentField:
+        """The field with so many content channels, its parameters drawn from the seed."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SemanticFieldConfig(PluginConfig):
+    """Semantic features of a scene, without direction."""
+
+    group: ClassVar[str] = "fprf.fields"
+
+    def build(self, *, channels: int, seed: int) -> SemanticField:
+        """The field with so many semantic channels, its parameters drawn from the seed."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanesConfig(ContentFieldConfig):
+    """K-Planes: the product of three planes at several scales, then a small network (paper, content field)."""
+
+    resolutions: tuple[int, ...] = (64, 128, 256, 512)
+    """Nodes along each side of the planes, coarse to fine."""
+    channels: int = 32
+    """Channels of each plane."""
+    hidden: int = 256
+    """Width of the content network."""
+    layers: int = 2
+    """Hidden layers of the content network."""
+    degree: int = 4
+    """Spherical-harmonics degree of the viewing direction (1 = none)."""
+
+    def __post_init__(self) -> None:
+        for r in self.resolutions:
+            at_least("content.field.resolutions", r, 2)
+        at_least("content.field.channels", self.channels, 1)
+
+    def build(self, *, channels: int, seed: int) -> ContentField:
+        """The field."""
+        from .content import PlanesField
+
+        return PlanesField(self, channels=channels, seed=seed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SemanticPlanesConfig(SemanticFieldConfig):
+    """K-Planes for semantics: coarser, no direction (paper, semantic field)."""
+
+    resolutions: tuple[int, ...] = (64, 128, 256, 512)
+    """Nodes along each side of the planes, coarse to fine."""
+    channels: int = 32
+    """Channels of each plane."""
+    hidden: int = 384
+    """Width of the semantic network."""
+    layers: int = 2
+    """Hidden layers of the semantic network."""
+
+    def __post_init__(self) -> None:
+        for r in self.resolutions:
+            at_least("semantic.field.resolutions", r, 2)
+        at_least("semantic.field.channels", self.channels, 1)
+
+    def build(self, *, channels: int, seed: int) -> SemanticField:
+        """The field."""
+        from .semantic import SemanticPlanes
+
+        return SemanticPlanes(self, channels=channels, seed=seed)

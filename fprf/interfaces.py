@@ -1,0 +1,170 @@
+"""The abstract base of every plug-in kind, with shapes: the one file that a plug-in author reads.
+
+Each is built by its config's `build(...)`; the configs live in the `config.py` next to the built-ins and import no torch.
+Shapes use the letters of `fprf.types`.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from .types import Batch, FieldSample, Rays, Sampled, Want
+
+if TYPE_CHECKING:
+    from .datamanagers.scene import Scene
+
+__all__ = [
+    "BlockLayout",
+    "ContentField",
+    "DataManager",
+    "DataParser",
+    "Decoder",
+    "Encoder",
+    "Executor",
+    "Sampler",
+    "SemanticField",
+    "Stylizer",
+]
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+class Encoder(nn.Module, ABC):
+    """Images to features. Frozen; deterministic; normalises its input itself."""
+
+    @property
+    @abstractmethod
+    def identity(self) -> str:
+        """What makes two encoders the same: name, layer, settings and a hash of the weights. Keys caches and decoders."""
+
+    @property
+    @abstractmethod
+    def channels(self) -> int:
+        """Channels of the features."""
+
+    @abstractmethod
+    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
+        """Features of sRGB images in [0, 1], aligned to the whole image: cell (i, j) covers its h-th and w-th part."""
+
+
+class ContentField(nn.Module, ABC):
+    """Points to density and content features (paper, scene content field). Stateless between calls."""
+
+    @abstractmethod
+    def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
+        """Density per space unit and a latent for `content`, at points of the unit cube [-1, 1]^3."""
+
+    @abstractmethod
+    def content(
+        self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]
+    ) -> Annotated[Tensor, "M C"]:
+        """Content features of some of the points, by their latents and unit viewing directions."""
+
+    @abstractmethod
+    def penalties(self) -> dict[str, Tensor]:
+        """Regularisers by loss name, each a scalar (for example 'variation')."""
+
+
+class SemanticField(nn.Module, ABC):
+    """Points to semantic features, without direction (paper, scene semantic field). Never moves density."""
+
+    @abstractmethod
+    def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
+        """Semantic features at points of the unit cube."""
+
+    @abstractmethod
+    def penalties(self) -> dict[str, Tensor]:
+        """Regularisers by loss name."""
+
+
+class Sampler(nn.Module, ABC):
+    """Rays to sample edges. May own proposal fields; `locate` maps space points [N 3] to the unit cube."""
+
+    @abstractmethod
+    def forward(
+        self,
+        rays: Rays,
+        *,
+        locate: Callable[[Tensor], Tensor],
+        distance: Callable[[Tensor, Tensor, Tensor], Tensor],
+        step: int | None,
+        generator: torch.Generator | None,
+    ) -> Sampled:
+        """Edges along each ray. `distance(s, near, far)` is the spacing of the space; generator None = deterministic."""
+
+    @abstractmethod
+    def penalties(self) -> dict[str, Tensor]:
+        """Regularisers by loss name."""
+
+
+class Decoder(nn.Module, ABC):
+    """Content features to colour, point by point, scene-agnostic and frozen while a scene trains (paper, D_VGG)."""
+
+    @abstractmethod
+    def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
+        """sRGB in [0, 1]."""
+
+
+class Stylizer(nn.Module, ABC):
+    """Content features to stylised content features, point by point. Knows nothing of rays."""
+
+    @property
+    @abstractmethod
+    def needs(self) -> Want:
+        """`Want.CONTENT`, with `Want.SEMANTIC` if it reads semantic features."""
+
+    @abstractmethod
+    def forward(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> Annotated[Tensor, "N C"]:
+        """The features in the new style, at full strength."""
+
+    @abstractmethod
+    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
+        """Attention of each point to each style code; rows sum to 1."""
+
+
+class BlockLayout(ABC):
+    """How a scene is cut into blocks: geometry only, no parameters."""
+
+    @property
+    @abstractmethod
+    def boxes(self) -> Annotated[Tensor, "K 2 3"]:
+        """Lowest and highest corner of every block in unit-cube coordinates, margins included."""
+
+    @abstractmethod
+    def blend(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N K"]:
+        """Weight of every block at every point; rows sum to 1."""
+
+
+class DataParser(ABC):
+    """A scene folder to a `Scene`. Decodes no image."""
+
+    @abstractmethod
+    def parse(self, data: Path, downscale: int) -> "Scene":
+        """The scene at 1/downscale of the delivered size. Raises DataError with file, finding and remedy."""
+
+
+class DataManager(ABC):
+    """Training batches and views of one scene."""
+
+    @abstractmethod
+    def batch(self, step: int) -> Batch:
+        """The pixels of a step: a pure function of (seed, step), so that a resumed run sees the same ones."""
+
+    @abstractmethod
+    def image(self, view: int) -> Annotated[Tensor, "H W 3"]:
+        """One view as a float image in [0, 1]."""
+
+
+class Executor(ABC):
+    """Runs independent tasks (blocks, frames), here or on many machines."""
+
+    @abstractmethod
+    def map(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
+        """Results in the order of the tasks."""

@@ -1,0 +1,48 @@
+"""Methods: functions that return a complete config. Each says only how it differs from the one it starts from."""
+
+from dataclasses import replace
+
+from .config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, TrainConfig
+from .datamanagers.config import RayBatchesConfig
+from .fields.config import PlanesConfig, SemanticPlanesConfig
+from .plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
+from .plugins.samplers.config import ProposalConfig
+
+__all__ = ["fprf", "fprf_fast", "fprf_lite"]
+
+
+def fprf() -> TrainConfig:
+    """The paper's sizes: VGG-19 relu2_1 content, DINO semantics, tri-planes 64 to 512, 256 + 128 + 48 samples."""
+    return TrainConfig(render=RenderConfig(train_budget=0.0))
+
+
+def fprf_fast() -> TrainConfig:
+    """The paper's encoders on leaner fields: fewer samples and channels, semantics on coarse planes and a few rays."""
+    return replace(
+        fprf(),
+        steps=15_000,
+        sampler=_LEAN_SAMPLER,
+        content=ContentConfig(field=PlanesConfig(channels=16, hidden=128)),
+        semantic=replace(SemanticConfig(), field=_LEAN_SEMANTICS, samples=2),
+        datamanager=RayBatchesConfig(semantic_share=0.25),
+        optimizer=_QUICK,
+        render=RenderConfig(),
+    )
+
+
+def fprf_lite() -> TrainConfig:
+    """Bundled encoders, no download, made for a CPU: `fprf demo` trains it."""
+    return replace(
+        fprf_fast(),
+        steps=6_000,
+        content=ContentConfig(
+            encoder=BundledContentConfig(), field=PlanesConfig(resolutions=(32, 64, 128, 256), channels=16, hidden=64)
+        ),
+        semantic=SemanticConfig(encoder=BundledSemanticConfig(), field=_LEAN_SEMANTICS, dim=32, samples=2),
+        loss=LossConfig(),
+    )
+
+
+_LEAN_SAMPLER = ProposalConfig(samples=(48,), final=16, resolutions=(128,), anneal_steps=500)
+_LEAN_SEMANTICS = SemanticPlanesConfig(resolutions=(32, 128), channels=16, hidden=64, layers=1)
+_QUICK = OptimizerConfig(rate=2e-2, final=0.05, warm_up=100)

@@ -1,0 +1,1 @@
+"""Hot kernels: a plain torch reference, and faster back ends beside it."""

@@ -1,0 +1,1 @@
+"""Cameras, spaces, step functions and compositing."""

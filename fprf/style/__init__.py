@@ -1,0 +1,1 @@
+"""Dictionaries, clusters and statistics: the mathematics of a style."""

@@ -1,0 +1,87 @@
+"""What flows between the parts. Letters, used in every signature:
+
+R rays · S samples of a ray · E = S+1 edges · N points · C content channels · D semantic channels of the field ·
+L latent channels · T style codes · K scene regions · V views · H W pixels · B images.
+
+Images are [H W 3] sRGB in [0, 1] float32, channels last; encoders alone take [B 3 H W]. Camera axes are OpenGL's
+(x right, y up, the camera looks along -z); pixel centres lie at +0.5.
+"""
+
+from collections.abc import Mapping
+from enum import Flag, auto
+from typing import Annotated, NamedTuple
+
+from torch import Tensor
+
+__all__ = ["Batch", "FieldSample", "Level", "Rays", "Rendered", "Sampled", "Want"]
+
+
+class Want(Flag):
+    """What is asked of a field or a render: nothing else is computed."""
+
+    DENSITY = auto()
+    COLOUR = auto()
+    CONTENT = auto()
+    SEMANTIC = auto()
+
+
+class Rays(NamedTuple):
+    """Rays in the scene's own space (see `rendering.space`), ready to be marched."""
+
+    origin: Annotated[Tensor, "R 3"]
+    direction: Annotated[Tensor, "R 3"]
+    """March direction in space units; of any length in NDC."""
+    view: Annotated[Tensor, "R 3"]
+    """Unit viewing direction in world axes, for view-dependent features."""
+    near: Annotated[Tensor, "R"]
+    far: Annotated[Tensor, "R"]
+
+
+class Level(NamedTuple):
+    """One proposal level, kept for the interlevel loss."""
+
+    s: Annotated[Tensor, "R E"]
+    weights: Annotated[Tensor, "R S"]
+
+
+class Sampled(NamedTuple):
+    """Sorted sample edges: `s` in [0, 1] as the sampler spaces them, `t` along the ray in space units."""
+
+    s: Annotated[Tensor, "R E"]
+    t: Annotated[Tensor, "R E"]
+    levels: tuple[Level, ...] = ()
+
+
+class FieldSample(NamedTuple):
+    """A content field at points: density per space unit, and what `content` needs to go on from there."""
+
+    density: Annotated[Tensor, "N"]
+    latent: Annotated[Tensor, "N L"]
+
+
+class Batch(NamedTuple):
+    """Training pixels, a pure function of (seed, step). Targets that nobody wants are None."""
+
+    view: Annotated[Tensor, "R"]
+    """int64 index of the view in the scene."""
+    pixel: Annotated[Tensor, "R 2"]
+    """x, y in pixels, centres at +0.5."""
+    rgb: Annotated[Tensor, "R 3"]
+    content: Annotated[Tensor, "R C"] | None = None
+    semantic: Annotated[Tensor, "Q D"] | None = None
+    """Semantic targets of the first Q rays of the batch (Q <= R)."""
+
+
+class Rendered(NamedTuple):
+    """A render of R rays. What was not wanted is None."""
+
+    depth: Annotated[Tensor, "R"]
+    """Expected distance in space units along the ray parameter."""
+    opacity: Annotated[Tensor, "R"]
+    rgb: Annotated[Tensor, "R 3"] | None = None
+    content: Annotated[Tensor, "R C"] | None = None
+    semantic: Annotated[Tensor, "R D"] | None = None
+    weights: Annotated[Tensor, "R S"] | None = None
+    sampled: Sampled | None = None
+    counts: Mapping[str, int] = {}
+    """How many samples were placed, kept, decoded: what was skipped can be read off."""
