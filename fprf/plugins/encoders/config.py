@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from ...checks import at_least
+from ...errors import ConfigError
 from ..config import PluginConfig
 
 if TYPE_CHECKING:
     from ...interfaces import Encoder
 
-__all__ = ["EncoderConfig"]
+__all__ = [
+    "BundledContentConfig",
+    "BundledSemanticConfig",
+    "DinoConfig",
+    "Dinov2Config",
+    "EncoderConfig",
+    "RandomConfig",
+    "Vgg19Config",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,3 +34,124 @@ class EncoderConfig(PluginConfig):
     def build(self) -> Encoder:
         """The frozen encoder. Raises WeightsError where weights are missing."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundledContentConfig(EncoderConfig):
+    """Ships with the package: a small network that imitates the principal components of VGG-19 relu2_1, stride 2."""
+
+    weights: Path | None = None
+    """A file made by `fprf pretrain content`. By default the one that ships."""
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where the file is absent or no content encoder."""
+        from .bundled import load_content_encoder
+
+        return load_content_encoder(self.weights)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundledSemanticConfig(EncoderConfig):
+    """Ships with the package: a small network distilled from MobileNet-class features, stride 8; day and night agree."""
+
+    weights: Path | None = None
+    """A file made by `fprf pretrain semantic`. By default the one that ships."""
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where the file is absent or no semantic encoder."""
+        from .bundled import load_semantic_encoder
+
+        return load_semantic_encoder(self.weights)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vgg19Config(EncoderConfig):
+    """VGG-19 trained on ImageNet, the paper's content encoder. torchvision's weights are downloaded once, unless named."""
+
+    layer: str = "relu2_1"
+    """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
+    weights: Path | None = None
+    """torchvision's vgg19-dcbb9e9d.pth, or a safetensors file with torchvision's keys. By default the download cache."""
+    normalise: bool = True
+    """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-4])", self.layer):
+            raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-19; allowed are conv1_1, relu1_1 ... relu5_4")
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where weights are missing or end before the layer."""
+        from .vgg import build_vgg19
+
+        return build_vgg19(self.layer, weights=self.weights, normalise=self.normalise)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DinoConfig(EncoderConfig):
+    """DINO, the paper's semantic encoder: a self-supervised vision transformer. Needs the extra `encoders`."""
+
+    model: str = "facebook/dino-vits8"
+    """A model of the Hugging Face hub, or a folder that holds one."""
+    layer: int = -1
+    """Block whose tokens are taken, from 1; negative counts from the last."""
+    stride: int = 8
+    """Pixels of the image per feature: the image is resized until one patch covers that many."""
+
+    def __post_init__(self) -> None:
+        _check_transformer(self.layer, self.stride)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where transformers or the model is absent."""
+        from .vit import build_vit
+
+        return build_vit("dino", self.model, layer=self.layer, stride=self.stride)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dinov2Config(EncoderConfig):
+    """DINOv2: the successor, with steadier semantics. Needs the extra `encoders`."""
+
+    model: str = "facebook/dinov2-small"
+    """A model of the Hugging Face hub, or a folder that holds one."""
+    layer: int = -1
+    """Block whose tokens are taken, from 1; negative counts from the last."""
+    stride: int = 8
+    """Pixels of the image per feature: the image is resized until one patch covers that many."""
+
+    def __post_init__(self) -> None:
+        _check_transformer(self.layer, self.stride)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where transformers or the model is absent."""
+        from .vit import build_vit
+
+        return build_vit("dinov2", self.model, layer=self.layer, stride=self.stride)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomConfig(EncoderConfig):
+    """Untrained convolutions drawn from a seed: for tests, and as the floor in ablations."""
+
+    channels: int = 16
+    """Channels of the features."""
+    stride: int = 4
+    """Pixels per feature."""
+    seed: int = 0
+    """Another seed, other filters."""
+
+    def __post_init__(self) -> None:
+        at_least("channels", self.channels, 1)
+        at_least("stride", self.stride, 1)
+        at_least("seed", self.seed, 0)
+
+    def build(self) -> Encoder:
+        """The encoder."""
+        from .random import RandomEncoder
+
+        return RandomEncoder(channels=self.channels, stride=self.stride, seed=self.seed)
+
+
+def _check_transformer(layer: int, stride: int) -> None:
+    if layer == 0:
+        raise ConfigError("layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last")
+    at_least("stride", stride, 1)
