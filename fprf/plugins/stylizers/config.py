@@ -1,10 +1,15 @@
-"""Stylizer configs. `build` imports the implementation."""
+"""Stylizer configs. `build` imports the implementation.
+
+Temperatures are relative: 1 is the spread of the matching scores between this scene and these references, so that one
+default serves every encoder. Small = each point takes one style code, large = all codes mix.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
+from ...checks import at_least, between, positive
 from ..config import PluginConfig
 
 if TYPE_CHECKING:
@@ -12,7 +17,14 @@ if TYPE_CHECKING:
     from ...style.dictionary import StyleDictionary
     from ...style.scene import SceneStyle
 
-__all__ = ["StylizerConfig"]
+__all__ = [
+    "AdainConfig",
+    "IdentityConfig",
+    "LocalAdainConfig",
+    "RegionAdainConfig",
+    "RegionOtConfig",
+    "StylizerConfig",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,3 +36,85 @@ class StylizerConfig(PluginConfig):
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The stylizer of these references on this scene."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class IdentityConfig(StylizerConfig):
+    """Leaves the scene as it is: shows what the decoder alone does."""
+
+    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        from .identity import IdentityStylizer
+
+        return IdentityStylizer(dictionary)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdainConfig(StylizerConfig):
+    """Global AdaIN (paper, single reference): all references together are one mean and deviation. Needs no semantics."""
+
+    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        from .adain import AdainStylizer
+
+        return AdainStylizer(dictionary, scene)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalAdainConfig(StylizerConfig):
+    """Local AdaIN (paper, Eq. 5 and 6): every point mixes the style codes that its semantics resemble."""
+
+    temperature: float = 0.2
+    """Softness of the match, relative to the spread of the scores; above 0."""
+    similarity: Literal["cosine", "dot"] = "cosine"
+    """Score of a match: cosine of centred features, or the paper's dot product."""
+
+    def __post_init__(self) -> None:
+        positive("stylizer.temperature", self.temperature)
+
+    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        from .local import LocalAdainStylizer
+
+        return LocalAdainStylizer(dictionary, scene, temperature=self.temperature, similarity=self.similarity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionAdainConfig(StylizerConfig):
+    """Two-sided AdaIN: points belong to scene regions, regions match style codes, channel by channel."""
+
+    temperature: float = 0.2
+    """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
+    blend: float = 0.3
+    """Share of the whole scene's statistics in each region's, in [0, 1]; the dictionary's own blend matches it."""
+    gain: float = 8.0
+    """Largest amplification of any channel, at least 1, so that the noise of flat regions stays small."""
+
+    def __post_init__(self) -> None:
+        positive("stylizer.temperature", self.temperature)
+        between("stylizer.blend", self.blend, 0.0, 1.0)
+        at_least("stylizer.gain", self.gain, 1.0)
+
+    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        from .region import RegionAdainStylizer
+
+        return RegionAdainStylizer(dictionary, scene, temperature=self.temperature, blend=self.blend, gain=self.gain)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionOtConfig(StylizerConfig):
+    """Two-sided optimal transport (recommended): regions match style codes, all channels move together."""
+
+    temperature: float = 0.2
+    """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
+    blend: float = 0.3
+    """Share of the whole scene's statistics in each region's, in [0, 1]; the dictionary's own blend matches it."""
+    gain: float = 8.0
+    """Largest amplification in any direction, at least 1, so that the noise of flat regions stays small."""
+
+    def __post_init__(self) -> None:
+        positive("stylizer.temperature", self.temperature)
+        between("stylizer.blend", self.blend, 0.0, 1.0)
+        at_least("stylizer.gain", self.gain, 1.0)
+
+    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        from .region import RegionOtStylizer
+
+        return RegionOtStylizer(dictionary, scene, temperature=self.temperature, blend=self.blend, gain=self.gain)
