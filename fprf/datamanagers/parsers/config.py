@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
+from ...checks import at_least
 from ...plugins.config import PluginConfig
 
 if TYPE_CHECKING:
     from ...interfaces import DataParser
 
-__all__ = ["DataParserConfig"]
+__all__ = ["ColmapConfig", "DataParserConfig", "LlffConfig", "TownConfig", "TransformsConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,3 +23,73 @@ class DataParserConfig(PluginConfig):
     def build(self) -> DataParser:
         """The parser."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class LlffConfig(DataParserConfig):
+    """LLFF: `poses_bounds.npy` beside a folder of images, one row an image in the order of their names."""
+
+    images: str = ""
+    """Image folder; empty = `images`, else the `images_N` that is reduced least."""
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .llff import LlffParser
+
+        return LlffParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransformsConfig(DataParserConfig):
+    """Nerfstudio and instant-ngp `transforms.json`, or Blender's `transforms_train.json` and `transforms_test.json`."""
+
+    file: str = ""
+    """One JSON file of the folder, for example transforms_4.json; empty = transforms.json, else Blender's pair."""
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .transforms import TransformsParser
+
+        return TransformsParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapConfig(DataParserConfig):
+    """A COLMAP sparse model, binary or text, in `sparse/0`, `sparse` or the folder itself."""
+
+    images: str = "images"
+    """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their size."""
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .colmap import ColmapParser
+
+        return ColmapParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TownConfig(DataParserConfig):
+    """The embedded scene: a small procedural town, rendered when it is asked for."""
+
+    seed: int = 0
+    """Decides where houses, trees and cars stand."""
+    palette: str = "day"
+    """Light and colours."""
+    views: int = 40
+    """Number of images."""
+    width: int = 160
+    """Pixels across an image."""
+    height: int = 120
+    """Pixels down an image."""
+
+    def __post_init__(self) -> None:
+        at_least("parser.seed", self.seed, 0)
+        at_least("parser.views", self.views, 2)
+        at_least("parser.width", self.width, 8)
+        at_least("parser.height", self.height, 8)
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .town import TownParser
+
+        return TownParser(self)

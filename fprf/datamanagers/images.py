@@ -1,0 +1,141 @@
+"""Image files to 8-bit arrays [H W 3], sRGB, at the size that a scene's cameras have.
+
+Pixels are taken as stored: EXIF orientation is ignored, as COLMAP does, because the cameras were calibrated so.
+Transparency is straight (not premultiplied) and composited before any reduction, which averages areas.
+"""
+
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from .image_header import ImageHeader, header_of, read_header
+from .scene import Scene
+
+__all__ = ["MAX_PIXELS", "Image", "load_image", "load_images"]
+
+MAX_PIXELS = 100_000_000
+"""Files that claim more are refused before they are decoded."""
+
+Image: TypeAlias = NDArray[np.uint8]
+_WHITE = (1.0, 1.0, 1.0)
+
+
+def load_image(path: Path, size: tuple[int, int] | None = None, background: Sequence[float] | None = None) -> Image:
+    """An image [H W 3] in sRGB, 0 to 255, resized to `size` (width, height), or as delivered without one.
+
+    16-bit files are rounded to 8 bits, grey ones repeated. Transparent pixels show `background` (RGB in [0, 1]; white
+    by default). Raises DataError where the file is absent, truncated, damaged, of no known format or of over 1e8 pixels.
+    """
+    header = read_header(path)
+    if header.width * header.height > MAX_PIXELS:
+        raise DataError(
+            f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the image"
+        )
+    pixels = _to_rgb(path, _decode(path, header), _WHITE if background is None else background)
+    if size is None or size == (pixels.shape[1], pixels.shape[0]):
+        return pixels
+    smaller = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
+    resized = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    return np.asarray(resized, dtype=np.uint8)
+
+
+def load_images(scene: Scene, background: Sequence[float] | None = None) -> list[Image]:
+    """Every view of a scene at its camera's size, in the scene's order; sizes may differ.
+
+    Raises DataError as `load_image` does, and where a file's shape has changed since the scene was parsed.
+    """
+    sizes = [(int(width), int(height)) for width, height in scene.cameras.size.tolist()]
+
+    def load(view: int) -> Image:
+        path, (width, height) = scene.paths[view], sizes[view]
+        header = read_header(path)
+        # Both sides were rounded to whole pixels: a larger deviation is another shape, not another scale.
+        if abs(width * header.height - height * header.width) > 0.5 * (header.width + header.height) + 1e-6:
+            raise DataError(
+                f"{path}: {header.width}x{header.height} pixels do not fit its camera's {width}x{height}; "
+                "restore the image (was it rotated or cropped?) or run the reconstruction again"
+            )
+        return load_image(path, (width, height), background)
+
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(load, range(len(sizes))))
+
+
+def _decode(path: Path, header: ImageHeader) -> NDArray[np.generic]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    damage = _damage(data, header)
+    if damage:
+        raise DataError(f"{path}: {damage}; copy or export the image again")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise DataError(f"{path}: the {header.kind} data cannot be decoded; copy or export the image again") from error
+    if pixels is None:
+        raise DataError(f"{path}: the {header.kind} data cannot be decoded; copy or export the image again")
+    return np.asarray(pixels)
+
+
+def _damage(data: bytes, header: ImageHeader) -> str:
+    """What is wrong with the file, as far as its structure tells; decoders fill what is missing with grey, silently."""
+    if header_of(data) != header:
+        return "the file changed while it was read"
+    if header.kind == "jpeg":
+        scan = _first_scan(data)
+        return "" if data.rfind(b"\xff\xd9", scan) >= 0 else "the JPEG is truncated (no end-of-image marker)"
+    if header.kind == "png":
+        return _png_damage(data)
+    return ""
+
+
+def _first_scan(data: bytes) -> int:
+    """Where the first scan starts: an end marker before it belongs to a thumbnail."""
+    at = 2
+    while at + 4 <= len(data) and data[at + 1] != 0xDA:
+        stuffed = data[at + 1] == 0xFF
+        bare = data[at + 1] == 0x01 or 0xD0 <= data[at + 1] <= 0xD8
+        at += 1 if stuffed else 2 if bare else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return at
+
+
+def _png_damage(data: bytes) -> str:
+    at = 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(memoryview(data)[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return f"the PNG is damaged (checksum of the chunk at byte {at})"
+        if data[at + 4 : at + 8] == b"IEND":
+            return ""
+        at = end + 4
+    return "the PNG is truncated (no end chunk)"
+
+
+def _to_rgb(path: Path, pixels: NDArray[np.generic], background: Sequence[float]) -> Image:
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise DataError(f"{path}: pixels of type {pixels.dtype}; 8 or 16 bits a channel are read: convert the image")
+    if pixels.ndim == 2:
+        pixels = pixels[:, :, None]
+    channels = pixels.shape[2]
+    if channels not in (1, 2, 3, 4):
+        raise DataError(f"{path}: {channels} channels; grey, RGB and either with alpha are read: convert the image")
+    colour = pixels[:, :, :1] if channels < 3 else pixels[:, :, 2::-1]
+    top = np.float32(255 if pixels.dtype == np.uint8 else 65535)
+    if channels in (2, 4):
+        alpha = pixels[:, :, -1:].astype(np.float32) / top
+        behind = np.asarray(background, dtype=np.float32) * 255
+        blended = colour.astype(np.float32) * (255 / top) * alpha + behind * (1 - alpha)
+        return np.asarray(np.clip(np.rint(blended), 0, 255), dtype=np.uint8)
+    eight = colour if pixels.dtype == np.uint8 else np.rint(colour.astype(np.float32) * (255 / top))
+    return np.ascontiguousarray(np.broadcast_to(eight, (*pixels.shape[:2], 3)), dtype=np.uint8)
