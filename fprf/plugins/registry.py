@@ -1,0 +1,161 @@
+"""Names to objects through entry points. Listing reads metadata only; loading imports the one plug-in that is named.
+
+A broken, ambiguous or missing plug-in is an error only for whoever names it.
+"""
+
+import difflib
+import re
+import sys
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import Distribution, EntryPoint, distributions
+from types import MappingProxyType
+from typing import NamedTuple, TypeVar
+
+from ..errors import PluginError
+
+__all__ = ["Entry", "entry", "forget", "installed", "load", "load_object", "name_of", "nearest", "unreadable"]
+
+T = TypeVar("T")
+
+
+class Entry(NamedTuple):
+    """One registered plug-in, not imported."""
+
+    point: EntryPoint
+    package: str
+    """Distribution and version, for example `acme-clip 0.3`."""
+
+    @property
+    def origin(self) -> str:
+        """Object and package, for messages."""
+        return f"{self.point.value} from {self.package}"
+
+
+class _Scan(NamedTuple):
+    groups: Mapping[str, Mapping[str, tuple[Entry, ...]]]
+    unreadable: tuple[str, ...]
+
+
+def installed(group: str) -> Mapping[str, tuple[Entry, ...]]:
+    """Entries of a group by name, sorted. A name that several packages claim has several entries."""
+    return _scan().groups.get(group, MappingProxyType({}))
+
+
+def unreadable() -> tuple[str, ...]:
+    """Packages whose entry points cannot be read, each with the reason. They register nothing and hurt nobody else."""
+    return _scan().unreadable
+
+
+def forget() -> None:
+    """Read the metadata anew at the next question, for example after a package was installed in this process."""
+    _scan.cache_clear()
+
+
+def entry(group: str, name: str) -> Entry:
+    """The one entry of that name. Raises PluginError where there is none or more than one."""
+    entries = installed(group).get(name, ())
+    if not entries:
+        raise PluginError(
+            f"{group}: no plug-in {name!r} is installed{nearest(name, installed(group))} "
+            f"(installed: {', '.join(installed(group)) or 'none'}); "
+            "after adding an entry point to a package, install that package again"
+        )
+    if len(entries) > 1:
+        claims = ", ".join(each.origin for each in entries)
+        raise PluginError(f"{group}: several packages provide {name!r}: {claims}; uninstall all but one")
+    return entries[0]
+
+
+def load_object(group: str, name: str) -> object:
+    """Import the one plug-in of that name. Raises PluginError where it is missing, ambiguous or fails to import."""
+    found = entry(group, name)
+    try:
+        loaded: object = found.point.load()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a stranger's module may even call sys.exit while it is imported
+        raise PluginError(
+            f"{group}: {name!r} ({found.origin}) failed to import: {type(error).__name__}: {error}; "
+            "mend or uninstall that package, or choose another plug-in"
+        ) from error
+    return loaded
+
+
+def load(group: str, name: str, kind: type[T]) -> type[T]:
+    """Import the one plug-in of that name, a subclass of `kind`. Raises PluginError."""
+    loaded = load_object(group, name)
+    if isinstance(loaded, type) and issubclass(loaded, kind):
+        return loaded
+    shown = loaded.__name__ if isinstance(loaded, type) else repr(loaded)
+    raise PluginError(
+        f"{group}: {name!r} ({entry(group, name).origin}) is {shown}, not a {kind.__name__}; "
+        "choose a plug-in of that kind, or correct its entry point"
+    )
+
+
+def name_of(group: str, cls: type) -> str:
+    """The name that a plug-in is saved under: the inverse of `load`. Imports nothing."""
+    value = f"{cls.__module__}:{cls.__qualname__}"
+    for name, entries in installed(group).items():
+        if any(each.point.value == value or _imported(each.point) is cls for each in entries):
+            return name
+    raise PluginError(
+        f"{value} has no entry point in {group}, so it has no name to be saved under; "
+        f'add `NAME = "{value}"` to [project.entry-points."{group}"] of its package and install that again'
+    )
+
+
+def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
+    """`; did you mean 'x'?` where something allowed is close, else nothing."""
+    close = difflib.get_close_matches(name, list(allowed), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _imported(point: EntryPoint) -> object | None:
+    """What the entry point names, if its module happens to be imported already: a class may be re-exported."""
+    module, _, attributes = point.value.partition(":")
+    found: object | None = sys.modules.get(module.strip())
+    for attribute in attributes.strip().split("."):
+        found = getattr(found, attribute, None)
+    return found
+
+
+@cache
+def _scan() -> _Scan:
+    found: dict[str, dict[str, list[Entry]]] = {}
+    bad: list[str] = []
+    seen: set[str] = set()
+    for distribution in distributions():
+        try:
+            package, points = f"{distribution.name} {distribution.version}", list(distribution.entry_points)
+        except Exception as error:  # whatever a damaged file makes the reader raise
+            bad.extend(_complaint(distribution, error))
+            continue
+        name = re.sub(r"[-_.]+", "-", package.partition(" ")[0]).lower()
+        if name in seen:  # an older copy further down sys.path
+            continue
+        seen.add(name)
+        for point in points:
+            if point.group.startswith(_PREFIX):
+                found.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
+    groups = {
+        group: MappingProxyType({name: tuple(names[name]) for name in sorted(names)}) for group, names in found.items()
+    }
+    return _Scan(MappingProxyType(groups), tuple(bad))
+
+
+def _complaint(distribution: Distribution, error: Exception) -> list[str]:
+    """What is wrong with a package whose metadata cannot be read, if it has plug-ins of ours at all."""
+    try:
+        text = distribution.read_text("entry_points.txt") or ""
+    except Exception:  # the file itself is the damaged one: it may be about us
+        text = f"[{_PREFIX}"
+    if f"[{_PREFIX}" not in text:
+        return []
+    return [
+        f"{distribution.locate_file('')}: a package's entry points cannot be read ({type(error).__name__}: {error})"
+    ]
+
+
+_PREFIX = "fprf."

@@ -1,0 +1,124 @@
+"""Slots of a config tree: where they are, and how `--path NAME` fills them.
+
+A slot is a field annotated with an abstract `PluginConfig` (one that sets `group`), or with that or None.
+"""
+
+import dataclasses
+import types
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from ..errors import PluginError, UsageError
+from . import registry
+from .config import PluginConfig
+
+__all__ = ["Slot", "hints_of", "is_slot", "members", "replace", "resolve", "slots", "take_flag"]
+
+C = TypeVar("C")
+
+
+class Slot(NamedTuple):
+    """A place in a config tree that a plug-in fills."""
+
+    path: str
+    """Dotted, for example `semantic.encoder`."""
+    kind: type[PluginConfig]
+    """The abstract config that whatever fills it derives from."""
+    value: Any
+    """The config that fills it now, or None."""
+    optional: bool
+    """None is allowed."""
+
+
+def members(hint: Any) -> tuple[Any, ...]:
+    """The alternatives of a union; the hint itself otherwise."""
+    return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+
+
+def is_slot(hint: Any) -> bool:
+    """Whether a type is an abstract plug-in config: one that sets `group` itself."""
+    return isinstance(hint, type) and issubclass(hint, PluginConfig) and "group" in hint.__dict__
+
+
+def hints_of(cls: type) -> dict[str, Any]:
+    """Types of a dataclass's fields. Raises PluginError where an annotation cannot be resolved."""
+    try:
+        return get_type_hints(cls)
+    except Exception as error:  # names in a stranger's annotations are evaluated here
+        raise PluginError(
+            f"{cls.__module__}:{cls.__qualname__}: its field types cannot be resolved ({error}); "
+            "types of config fields must be importable at run time"
+        ) from error
+
+
+def slots(config: Any, prefix: str = "") -> Iterator[Slot]:
+    """Every slot of a config tree, outer before inner, in the order of declaration."""
+    hints = hints_of(type(config))
+    for field in dataclasses.fields(config):
+        value, path = getattr(config, field.name), f"{prefix}{field.name}"
+        choices = members(hints[field.name])
+        for kind in filter(is_slot, choices):
+            yield Slot(path, kind, value, type(None) in choices)
+        if dataclasses.is_dataclass(value):
+            yield from slots(value, f"{path}.")
+
+
+def replace(config: C, path: str, value: object) -> C:
+    """`dataclasses.replace` along a dotted path."""
+    head, _, rest = path.partition(".")
+    inner = replace(getattr(config, head), rest, value) if rest else value
+    changed: C = dataclasses.replace(config, **{head: inner})  # type: ignore[type-var]  # C is a dataclass by contract
+    return changed
+
+
+def take_flag(args: Sequence[str], flag: str) -> tuple[str | None, list[str]]:
+    """Value of `--flag V` or `--flag=V` (the last one wins), and the other arguments. '-' and '_' are one letter."""
+    value: str | None = None
+    rest: list[str] = []
+    waiting = iter(args)
+    for arg in waiting:
+        key, equals, inline = arg.partition("=")
+        if not key.startswith("--") or key[2:].replace("_", "-") != flag.replace("_", "-"):
+            rest.append(arg)
+            continue
+        value = inline if equals else next(waiting, "")
+        if not value or value.startswith("-"):
+            raise UsageError(f"--{flag}: needs the name of a plug-in; `fprf plugins` lists them")
+    return value, rest
+
+
+def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
+    """Apply the slot flags among the arguments, outermost first, so that a chosen plug-in may bring slots of its own.
+
+    Naming the plug-in that is there keeps the values it has; another one starts from its own defaults.
+    """
+    rest, seen = list(args), set[str]()
+    while todo := [slot for slot in slots(config) if slot.path not in seen]:
+        slot = todo[0]
+        seen.add(slot.path)
+        name, rest = take_flag(rest, slot.path)
+        if name is not None:
+            config = _fill(config, slot, name)
+    return config, rest
+
+
+def _fill(config: C, slot: Slot, name: str) -> C:
+    if name == "none":
+        if not slot.optional:
+            allowed = ", ".join(registry.installed(slot.kind.group))
+            raise UsageError(f"--{slot.path}: cannot be none; allowed are {allowed}")
+        return replace(config, slot.path, None)
+    try:
+        chosen = registry.load(slot.kind.group, name, slot.kind)
+        if type(slot.value) is chosen:
+            return config
+        value = chosen()
+    except PluginError as error:
+        raise PluginError(f"--{slot.path}: {error}") from error
+    except TypeError as error:
+        origin = registry.entry(slot.kind.group, name).origin
+        raise PluginError(
+            f"--{slot.path}: {name!r} ({origin}) has no defaults to start from ({error}); "
+            "every field of a plug-in's config needs one"
+        ) from error
+    return replace(config, slot.path, value)

@@ -1,0 +1,222 @@
+"""Configs to plain JSON and back, driven by the type hints.
+
+Nothing in a file is ever imported: a plug-in is named, and the name is looked up among the installed entry points. One
+that is not installed is kept as data (`Missing`) and fails only when it is built.
+"""
+
+import dataclasses
+import enum
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin
+
+from ..errors import ConfigError, PluginError
+from . import registry
+from .config import PluginConfig
+from .slots import hints_of, is_slot, members
+
+__all__ = ["Missing", "from_json", "to_json"]
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Missing(PluginConfig):
+    """Stands where a plug-in was that cannot be loaded here; keeps its data, and fails when it is built."""
+
+    slot: str
+    """Dotted path of the slot."""
+    kind: str
+    """Entry-point group."""
+    name: str
+    """Name of the plug-in."""
+    data: str
+    """Its fields, as JSON text."""
+    package: str
+    """The package that provided it when the file was written, as the file says; may be empty."""
+    reason: str
+    """Why it cannot be loaded."""
+
+    def build(self, *args: object, **kwargs: object) -> NoReturn:
+        """Raise PluginError: takes what any kind's `build` takes."""
+        raise PluginError(
+            f"{self.slot}: {self.reason}; install {self.package or 'the package that provides it'}, "
+            f"or choose another with --{self.slot} NAME"
+        )
+
+
+def to_json(config: object) -> Any:
+    """A config as dicts, lists, strings and numbers; a plug-in carries its name as `type`."""
+    return _encode(config, type(config), "config")
+
+
+def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None) -> T:
+    """The config of that type. Raises ConfigError naming the field by its dotted path.
+
+    A key that is absent takes the code's default; an unknown one is refused. `packages` says by dotted path which
+    package each plug-in came from, for the message about a missing one.
+    """
+    value: T = _Reader(packages or {}).read(data, kind, "config")
+    return value
+
+
+def _encode(value: Any, hint: Any, path: str) -> Any:
+    if isinstance(value, Missing):
+        return {"type": value.name, **json.loads(value.data)}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        kind = next(filter(is_slot, members(hint)), None)
+        tag = {"type": registry.name_of(kind.group, type(value))} if kind else {}
+        hints = hints_of(type(value))
+        return tag | {
+            f.name: _encode(getattr(value, f.name), hints[f.name], f"{path}.{f.name}")
+            for f in dataclasses.fields(value)
+        }
+    if isinstance(value, enum.Enum):
+        return value.value
+    if isinstance(value, Path):
+        return value.as_posix()
+    if isinstance(value, tuple | list):
+        hint = next((h for h in members(hint) if get_origin(h) in (tuple, list)), tuple[Any, ...])
+        return [
+            _encode(v, h, f"{path}.{i}") for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True))
+        ]
+    if isinstance(value, Mapping):
+        hint = next((h for h in members(hint) if get_origin(h) is dict), dict[str, Any])
+        return {str(k): _encode(v, get_args(hint)[1], f"{path}.{k}") for k, v in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{path}: {value} is not a finite number and cannot be saved")
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise ConfigError(f"{path}: {type(value).__name__} cannot be saved; use numbers, text, paths, tuples")
+
+
+class _Reader:
+    """JSON to configs by type hint."""
+
+    def __init__(self, packages: Mapping[str, str]) -> None:
+        self.packages = packages
+
+    def read(self, data: Any, hint: Any, path: str) -> Any:
+        if hint is Any:
+            return data
+        choices = [h for h in members(hint) if h is not type(None)]
+        if data is None and len(choices) < len(members(hint)):
+            return None
+        if len(choices) > 1:
+            return self._union(data, choices, path)
+        hint = choices[0]
+        if is_slot(hint):
+            return self._plugin(data, hint, path)
+        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+            return self._dataclass(_expect(data, dict, path), hint, path)
+        return self._container(data, hint, path)
+
+    def _container(self, data: Any, hint: Any, path: str) -> Any:
+        origin, args = get_origin(hint), get_args(hint)
+        if origin is Literal:
+            for allowed in args:
+                if type(allowed) is type(data) and allowed == data:  # True == 1
+                    return allowed
+            raise ConfigError(f"{path}: {data!r} is not one of {', '.join(map(repr, args))}")
+        if origin in (tuple, list):
+            items = _expect(data, list, path)
+            hints = _items(hint, len(items))
+            if len(items) != len(hints):
+                raise ConfigError(f"{path}: expected {len(hints)} values, found {len(items)}")
+            return origin(self.read(v, h, f"{path}.{i}") for i, (v, h) in enumerate(zip(items, hints, strict=True)))
+        if origin is dict:
+            return {k: self.read(v, args[1], f"{path}.{k}") for k, v in _expect(data, dict, path).items()}
+        return _scalar(data, hint, path)
+
+    def _union(self, data: Any, choices: list[Any], path: str) -> Any:
+        faults = []
+        for choice in choices:
+            try:
+                return self.read(data, choice, path)
+            except ConfigError as fault:
+                faults.append(str(fault).removeprefix(f"{path}: "))
+        raise ConfigError(f"{path}: {', nor '.join(faults)}")
+
+    def _plugin(self, data: Any, kind: type[PluginConfig], path: str) -> Any:
+        fields = dict(_expect(data, dict, path))
+        name = fields.pop("type", None)
+        if not isinstance(name, str):
+            raise ConfigError(f'{path}: expected the plug-in\'s name as "type", found {name!r}')
+        try:
+            chosen = registry.load(kind.group, name, kind)
+        except PluginError as reason:
+            slot = path.partition(".")[2]
+            text, package = json.dumps(fields, allow_nan=False), self.packages.get(slot, "")
+            package = package.removeprefix(f"{name} ")
+            return Missing(slot=slot, kind=kind.group, name=name, data=text, package=package, reason=str(reason))
+        return self._dataclass(fields, chosen, path)
+
+    def _dataclass(self, data: dict[str, Any], cls: type, path: str) -> Any:
+        hints = hints_of(cls)
+        names = [f.name for f in dataclasses.fields(cls) if f.init]
+        for key in data:
+            if key not in names:
+                raise ConfigError(
+                    f"{path}: {cls.__name__} has no field {key!r}{registry.nearest(key, names)} "
+                    f"(its fields: {', '.join(names) or 'none'})"
+                )
+        values = {key: self.read(value, hints[key], f"{path}.{key}") for key, value in data.items()}
+        try:
+            return cls(**values)
+        except ConfigError as fault:
+            raise ConfigError(f"{path}: {fault}") from fault
+        except TypeError as fault:  # a field without a default is absent
+            raise ConfigError(f"{path}: {fault}") from fault
+
+
+def _scalar(data: Any, hint: Any, path: str) -> Any:
+    if hint is Path:
+        return Path(_expect(data, str, path))
+    if isinstance(hint, type) and issubclass(hint, enum.Enum):
+        for member in hint:
+            if type(member.value) is type(data) and member.value == data:
+                return member
+        raise ConfigError(f"{path}: {data!r} is not one of {', '.join(repr(m.value) for m in hint)}")
+    if hint is float:
+        number = _expect(data, (float, int), path)
+        try:
+            value = float(number)
+        except OverflowError:
+            value = math.inf
+        if not math.isfinite(value):
+            raise ConfigError(f"{path}: expected a finite number, found one beyond the range of float64")
+        return value
+    if hint in (bool, int, str):
+        return _expect(data, hint, path)
+    raise ConfigError(f"{path}: a field of type {hint} cannot be read from a file")
+
+
+def _items(hint: Any, count: int) -> tuple[Any, ...]:
+    """Types of the items of `tuple[A, B]`, `tuple[A, ...]` or `list[A]`."""
+    args = get_args(hint)
+    return (args[0],) * count if get_origin(hint) is list or args[-1] is Ellipsis else args
+
+
+def _expect(data: Any, kind: type | tuple[type, ...], path: str) -> Any:
+    """The datum itself if it is exactly of that type: a bool is no int, 1.0 is no int, "5" is no number."""
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if type(data) not in kinds:
+        raise ConfigError(f"{path}: expected {_NAMES[kinds[0]]}, found {_shown(data)}")
+    return data
+
+
+def _shown(data: Any) -> str:
+    text = json.dumps(data)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+_NAMES = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    dict: "an object",
+    list: "a list",
+}
