@@ -19,10 +19,13 @@ _jit_sum = numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract
 
 @numba.njit(inline="always", cache=True)
 def _cell(x, size):
-    """Node at or below a coordinate in [-1, 1], and the share of the next one; outside counts as the border."""
+    """Node at or below a coordinate in [-1, 1], and the share of the next one; outside counts as the border.
+
+    The comparison is written so that NaN falls on the lower border: an index must never leave the table.
+    """
     last = np.float32(size - 1)
     at = (x + np.float32(1)) * (np.float32(0.5) * last)
-    at = min(max(at, np.float32(0)), last)
+    at = min(at, last) if at > np.float32(0) else np.float32(0)
     low = min(int(at), size - 2)
     return low, at - np.float32(low)
 

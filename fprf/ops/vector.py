@@ -25,9 +25,7 @@ _FUSE = ("contract",)
 
 def _splat(build, value):
     one = build.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(_INDEX, 0))
-    return build.shuffle_vector(
-        one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_INDEX, LANES), [0] * LANES)
-    )
+    return build.shuffle_vector(one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_INDEX, LANES), [0] * LANES))
 
 
 def _pointer(context, build, kind, array, offset):

@@ -1,0 +1,31 @@
+"""Small networks without biases, and their deterministic start."""
+
+import math
+
+import torch
+from torch import nn
+
+__all__ = ["linear", "mlp"]
+
+
+def linear(inputs: int, outputs: int, *, generator: torch.Generator) -> nn.Linear:
+    """A linear map without bias, uniform in +-sqrt(3 / inputs): unit variance out for unit variance in."""
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=False)
+    bound = math.sqrt(3 / inputs)
+    with torch.no_grad():
+        layer.weight.uniform_(-bound, bound, generator=generator)
+    assert isinstance(layer, nn.Linear)
+    return layer
+
+
+def mlp(inputs: int, hidden: int, layers: int, outputs: int, *, generator: torch.Generator) -> nn.Sequential:
+    """`layers` hidden ReLU layers of width `hidden`, then a linear one; hidden weights keep the variance through ReLU."""
+    parts: list[nn.Module] = []
+    for _ in range(layers):
+        layer = linear(inputs, hidden, generator=generator)
+        with torch.no_grad():
+            layer.weight.mul_(math.sqrt(2))
+        parts += [layer, nn.ReLU(inplace=True)]
+        inputs = hidden
+    parts.append(linear(inputs, outputs, generator=generator))
+    return nn.Sequential(*parts)

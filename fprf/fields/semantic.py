@@ -1,0 +1,32 @@
+"""The scene semantic field (paper): tri-planes and a network, no view direction, so that semantics agree across views."""
+
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..interfaces import SemanticField
+from .config import SemanticPlanesConfig
+from .networks import mlp
+from .planes import Planes
+
+__all__ = ["SemanticPlanes"]
+
+
+class SemanticPlanes(SemanticField):
+    """K-Planes semantic field."""
+
+    def __init__(self, config: SemanticPlanesConfig, *, channels: int, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.planes = Planes(config.resolutions, config.channels, generator=generator)
+        self.network = mlp(self.planes.out, config.hidden, config.layers, channels, generator=generator)
+
+    def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
+        """Semantic features."""
+        result: Tensor = self.network(self.planes(points))
+        return result
+
+    def penalties(self) -> dict[str, Tensor]:
+        """None: semantics need no smoothing beyond the planes' own resolution."""
+        return {}

@@ -1,0 +1,70 @@
+"""Proposal sampling (mip-NeRF 360): each level's density says where the next level, and at last the field, looks."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from ...fields.proposal import ProposalField
+from ...interfaces import Sampler
+from ...rendering.stepfun import midpoints, resample, transmittance_weights
+from ...types import Level, Rays, Sampled
+from .config import ProposalConfig
+from .uniform import even_edges
+
+__all__ = ["ProposalSampler"]
+
+
+class ProposalSampler(Sampler):
+    """Coarse to fine. Proposals learn from the interlevel loss alone, ever more rarely after the warm-up."""
+
+    def __init__(self, config: ProposalConfig, *, seed: int) -> None:
+        super().__init__()
+        self.config = config
+        self.levels = nn.ModuleList(ProposalField(r, config.channels, seed=seed + i) for i, r in enumerate(config.resolutions))
+
+    def forward(
+        self,
+        rays: Rays,
+        *,
+        locate: Callable[[Tensor], Tensor],
+        distance: Callable[[Tensor, Tensor, Tensor], Tensor],
+        step: int | None,
+        generator: torch.Generator | None,
+    ) -> Sampled:
+        """Edges for the content field, and the levels that proposed them where they learn in this step."""
+        learns = step is not None and self.learns(step)
+        sharpness = 1.0 if step is None else self.sharpness(step)
+        counts = (*self.config.samples[1:], self.config.final)
+        s = even_edges(rays, self.config.samples[0], generator)
+        levels = []
+        for field, count in zip(self.levels, counts, strict=True):
+            t = distance(s, rays.near, rays.far)
+            points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
+            with torch.set_grad_enabled(learns):
+                density = field(locate(points.view(-1, 3))).view(len(s), -1)
+                w = transmittance_weights(density, t)
+            if learns:
+                levels.append(Level(s, w))
+            trusted = w.detach() if sharpness == 1 else w.detach().clamp_min(1e-7) ** sharpness
+            s = resample(s, trusted, count, padding=self.config.padding, generator=generator)
+        return Sampled(s, distance(s, rays.near, rays.far), tuple(levels))
+
+    def penalties(self) -> dict[str, Tensor]:
+        """'proposal_variation' of all levels' planes."""
+        total = torch.zeros(())
+        for field in self.levels:
+            assert isinstance(field, ProposalField)
+            total = total + field.planes.variation()
+        return {"proposal_variation": total}
+
+    def learns(self, step: int) -> bool:
+        """Every step at first, every `update_every` steps after the warm-up, evenly rarer between."""
+        every = 1 + (self.config.update_every - 1) * min(1.0, step / max(1, self.config.warm_up))
+        return step % round(every) == 0
+
+    def sharpness(self, step: int) -> float:
+        """Exponent of the weights: rises from 0 to 1 over the annealing, so that no early error is locked in."""
+        x = min(1.0, (step + 1) / max(1, self.config.anneal_steps))
+        slope = self.config.anneal_slope
+        return slope * x / ((slope - 1) * x + 1)

@@ -1,0 +1,182 @@
+"""From a scene's cameras and points to its space: kind, centre, scale, near and far are found, never asked for.
+
+forward-facing (all cameras look one way, and stand close together against the depth of what they see)   -> ndc
+images with transparency (a bounded object)                                                              -> box
+anything else                                                                                            -> contraction
+"""
+
+import math
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..datamanagers.scene import Scene
+from ..errors import DataError
+from .cameras import Cameras, rays_through
+from .space import Kind, Space
+
+__all__ = ["find_kind", "find_space", "focus"]
+
+FORWARD_ANGLE = math.radians(35)
+"""Cameras that all look within this angle of their mean direction may be forward-facing."""
+FORWARD_SPREAD = 0.5
+"""... if they also stand within this share of the median depth of what they see."""
+BOX_SHARE = 0.45
+"""Half the side of an object's box, as a share of the cameras' distance to its centre."""
+FAR = 1e3
+"""Farthest distance in the contraction, in units of the scene's inner radius: beyond it disparity is below 1e-3."""
+NEAR = 0.05
+"""Nearest distance in the contraction where nothing is known of depths, in units of the inner radius."""
+MARGIN = 1.02
+"""Bounds are this much wider than what the training rays span, so that no training point lies on a border."""
+
+
+def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
+    """The point nearest to all optical axes, and how well it is determined: smallest over largest eigenvalue."""
+    origin, axis = cameras.pose[:, :, 3], -cameras.pose[:, :, 2]
+    axis = axis / axis.norm(dim=-1, keepdim=True)
+    across = torch.eye(3, dtype=axis.dtype) - axis[:, :, None] * axis[:, None, :]
+    matrix = across.sum(0)
+    values = torch.linalg.eigvalsh(matrix)
+    # A least-squares ridge of 1e-9 keeps parallel axes solvable: the answer is then the cameras' own centre.
+    ridge = 1e-9 * values[-1].clamp_min(1e-12) * torch.eye(3, dtype=axis.dtype)
+    target = (across @ origin[:, :, None]).sum(0) + ridge @ origin.mean(0)[:, None]
+    return torch.linalg.solve(matrix + ridge, target)[:, 0], float(values[0] / values[-1].clamp_min(1e-12))
+
+
+def find_space(scene: Scene) -> Space:
+    """The space of a scene. Raises DataError where cameras leave it undefined (all of them in one place, no points)."""
+    kind = find_kind(scene)
+    if kind == "ndc":
+        return _ndc(scene)
+    return _box(scene) if kind == "box" else _contraction(scene)
+
+
+def find_kind(scene: Scene) -> Kind:
+    """Which of the three fits."""
+    if scene.alpha:
+        return "box"
+    cameras = scene.cameras
+    axis = -cameras.pose[:, :, 2]
+    mean = axis.mean(0)
+    if len(cameras) < 3 or mean.norm() < math.cos(FORWARD_ANGLE):
+        return "contraction"
+    mean = mean / mean.norm()
+    if (axis @ mean).amin() < math.cos(FORWARD_ANGLE):
+        return "contraction"
+    depth = _depths(scene)
+    if depth is None:
+        return "contraction"
+    offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
+    return "ndc" if offset.norm(dim=-1).amax() < FORWARD_SPREAD * depth.median() else "contraction"
+
+
+def _depths(scene: Scene) -> Tensor | None:
+    """Depths that the capture knows: of its sparse points in every camera, or the middle of its near and far."""
+    if scene.points is not None and len(scene.points) >= 8:
+        pose = scene.cameras.pose
+        z = -((scene.points[None] - pose[:, None, :, 3]) * pose[:, None, :, 2]).sum(-1)
+        z = z[z > 0]
+        return z if len(z) else None
+    if scene.depths is not None:
+        return scene.depths.prod(-1).sqrt()
+    return None
+
+
+def _axes(cameras: Cameras) -> Tensor:
+    """Rows: the direction along which the cameras spread, third axis, mean up. Planes then follow streets and walls."""
+    up = cameras.pose[:, :, 1].mean(0)
+    if up.norm() < 0.3:  # a full turn about the optical axis, or nadir views from all sides: any axis is as good
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=up.dtype)
+    up = up / up.norm()
+    offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
+    flat = offset - (offset @ up)[:, None] * up
+    along = torch.linalg.svd(flat, full_matrices=False).Vh[0] if len(flat) > 1 else cameras.pose[0, :, 0]
+    along = along - (along @ up) * up
+    if along.norm() < 1e-6:
+        along = torch.linalg.svd(up[None], full_matrices=True).Vh[1]
+    along = along / along.norm()
+    return torch.stack([along, torch.linalg.cross(up, along), up])
+
+
+def _contraction(scene: Scene) -> Space:
+    cameras = scene.cameras
+    position = cameras.pose[:, :, 3]
+    rotation = _axes(cameras)
+    point, certain = focus(cameras)
+    ahead = ((point - position) * -cameras.pose[:, :, 2]).sum(-1) > 0
+    inward = certain > 0.02 and ahead.double().mean() > 0.9
+    centre = point if inward else position.mean(0)
+    local = (position - centre) @ rotation.T
+    radius = float(local.abs().amax(-1).quantile(0.9))
+    if scene.points is not None and len(scene.points) >= 8:
+        spread = float(((scene.points - centre) @ rotation.T).abs().amax(-1).quantile(0.5))
+        radius = max(radius, min(spread, 3 * radius if radius > 0 else spread))
+    if radius <= 0:
+        raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
+    depth = _depths(scene)
+    near = NEAR if depth is None else min(NEAR, 0.5 * float(depth.quantile(_share(depth, 0.001))) / radius)
+    return Space("contraction", _three(centre), _rows(rotation), 1 / radius, max(near, 1e-3), FAR)
+
+
+def _share(values: Tensor, share: float) -> float:
+    """quantile() takes up to 16 million values; fewer points than 1/share give their smallest."""
+    return share if len(values) * share >= 1 else 0.0
+
+
+def _box(scene: Scene) -> Space:
+    position = scene.cameras.pose[:, :, 3]
+    centre, certain = focus(scene.cameras)
+    if certain < 1e-4:
+        centre = position.mean(0)
+    distance = float((position - centre).norm(dim=-1).median())
+    if distance <= 0:
+        raise DataError(f"{scene.name}: all cameras stand in one place; capture from several places")
+    return Space("box", _three(centre), _rows(torch.eye(3)), 1 / (BOX_SHARE * distance), 0.0, FAR)
+
+
+def _ndc(scene: Scene) -> Space:
+    cameras = scene.cameras
+    pose = cameras.pose
+    back = pose[:, :, 2].mean(0)
+    back = back / back.norm()
+    right = torch.linalg.cross(pose[:, :, 1].mean(0), back)
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(back, right), back])
+    centre = pose[:, :, 3].mean(0)
+    depth = _depths(scene)
+    assert depth is not None  # find_kind asked
+    nearest = depth.quantile(_share(depth, 0.001)) if scene.depths is None else scene.depths[:, 0].amin()
+    size = cameras.size.double().mean(0)
+    focal = 2 * cameras.focal.mean(0) / size
+    first = Space(
+        "ndc", _three(centre), _rows(rotation), 1.0, 0.9 * float(nearest), 1.0, focal=(float(focal[0]), float(focal[1]))
+    )
+    low, high = _span(first, cameras)
+    return Space(
+        "ndc", first.centre, first.rotation, 1.0, first.near, 1.0, (low[0], low[1], -1.0), (high[0], high[1], 1.0), first.focal
+    )
+
+
+def _span(space: Space, cameras: Cameras) -> tuple[list[float], list[float]]:
+    """What all image corners span in NDC x and y, from the near plane to infinity, a little widened."""
+    ends = []
+    for view in range(len(cameras)):
+        w, h = (float(v) for v in cameras.size[view])
+        corner = torch.tensor([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]], dtype=torch.float64)
+        rays = space.rays(*rays_through(cameras, torch.full((4,), view), corner))
+        ends += [rays.origin, rays.origin + rays.direction]
+    spread = torch.cat(ends).double()
+    low, high = spread.amin(0), spread.amax(0)
+    middle, half = (low + high) / 2, (high - low) / 2 * MARGIN
+    return [float(v) for v in middle - half], [float(v) for v in middle + half]
+
+
+def _three(x: Tensor) -> tuple[float, float, float]:
+    a, b, c = (float(v) for v in x)
+    return a, b, c
+
+
+def _rows(matrix: Tensor) -> tuple[tuple[float, float, float], ...]:
+    return tuple(_three(row) for row in matrix)

@@ -1,0 +1,134 @@
+"""The space that a scene's fields live in: from world metres to the unit cube [-1, 1]^3.
+
+Three kinds, chosen from the cameras and points by `bounds.find_space`, never asked for:
+
+    box          a bounded object: an affine map; rays are cut at the box
+    contraction  anything unbounded: recentred and scaled so that the part that matters lies in [-1, 1]^3, then
+                 x -> (2 - 1/m) x / m where m = max |x_i| > 1, and halved; distances are spaced evenly near, in disparity far
+    ndc          forward-facing captures: normalised device coordinates of the mean camera (NeRF, appendix C)
+
+World coordinates are recentred in float64 before anything is float32: at 4.5e6 m float32 steps are 0.5 m.
+Spacing maps s in [0, 1] to the ray parameter t. In the contraction g(t) = t/2 up to 1 and 1 - 1/(2t) beyond is linear in s;
+the far half works with the complement 1/(2t), which keeps its relative accuracy at any distance.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import torch
+from torch import Tensor
+
+from ..types import Rays
+
+__all__ = ["Kind", "Space", "contract", "uncontract"]
+
+Kind = Literal["box", "contraction", "ndc"]
+
+
+def contract(x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+    """R^3 to [-1, 1]^3 by the largest coordinate; the identity, halved, inside [-1, 1]^3. Finite for any finite x."""
+    m = x.abs().amax(-1, keepdim=True).clamp_min(1)
+    # x / m first: the product (2 - 1/m) x would overflow where x is near the largest float.
+    return (1 - 0.5 / m) * (x / m)
+
+
+def uncontract(y: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+    """The inverse of `contract` for max |y_i| < 1."""
+    m = y.abs().amax(-1, keepdim=True)
+    outside = 0.5 / (1 - m)
+    return torch.where(m > 0.5, y / m.clamp_min(0.5) * outside, 2 * y)
+
+
+@dataclass(frozen=True)
+class Space:
+    """One scene's map to the unit cube; plain numbers, saved with the run."""
+
+    kind: Kind
+    centre: tuple[float, float, float]
+    """World point that becomes the origin."""
+    rotation: tuple[tuple[float, float, float], ...]
+    """World to space axes, rows orthonormal."""
+    scale: float
+    """World units to space units (box, contraction)."""
+    near: float
+    """Nearest distance that is looked at: space units, or in NDC the world depth of the near plane."""
+    far: float
+    """Farthest distance, space units (unused in NDC)."""
+    low: tuple[float, float, float] = (-1.0, -1.0, -1.0)
+    """Corner of space coordinates that becomes (-1, -1, -1) (box, ndc)."""
+    high: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Corner that becomes (1, 1, 1)."""
+    focal: tuple[float, float] = (1.0, 1.0)
+    """2 fx / W and 2 fy / H of the mean camera (ndc)."""
+
+    def rays(self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"]) -> Rays:
+        """World rays (float64, unit directions) as float32 rays of this space."""
+        turn = torch.tensor(self.rotation, dtype=origin.dtype, device=origin.device)
+        o = (origin - torch.tensor(self.centre, dtype=origin.dtype, device=origin.device)) @ turn.T
+        d = direction @ turn.T
+        view = direction.float()
+        if self.kind == "ndc":
+            o, d = self._device_coordinates(o, d)
+            near, far = torch.zeros_like(o[:, 0]), torch.ones_like(o[:, 0])
+            return Rays(o.float(), d.float(), view, near.float(), far.float())
+        o = o * self.scale
+        if self.kind == "box":
+            near, far = self._slab(o, d)
+        else:
+            near, far = torch.full_like(o[:, 0], self.near), torch.full_like(o[:, 0], self.far)
+        return Rays(o.float(), d.float(), view, near.float(), far.float())
+
+    def locate(self, x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+        """Points of the space to the unit cube."""
+        if self.kind == "contraction":
+            return contract(x)
+        low, high = x.new_tensor(self.low), x.new_tensor(self.high)
+        return (x - low) * (2 / (high - low)) - 1
+
+    def distance(
+        self, s: Annotated[Tensor, "R E"], near: Annotated[Tensor, "R"], far: Annotated[Tensor, "R"]
+    ) -> Annotated[Tensor, "R E"]:
+        """Ray parameters t of edges s in [0, 1]; increasing, with the ends on near and far."""
+        n, f = near[:, None], far[:, None]
+        if self.kind != "contraction":
+            return n + (f - n) * s
+        g_near, g_far = torch.where(n < 1, n / 2, 1 - 0.5 / n), torch.where(f < 1, f / 2, 1 - 0.5 / f)
+        c_near, c_far = torch.where(n < 1, 1 - n / 2, 0.5 / n), torch.where(f < 1, 1 - f / 2, 0.5 / f)
+        g, c = g_near + (g_far - g_near) * s, c_near + (c_far - c_near) * s
+        return torch.where(g < 0.5, 2 * g, 0.5 / c)
+
+    def metric(
+        self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]
+    ) -> Annotated[Tensor, "R"]:
+        """World distance along unit world rays of the ray parameter t; infinite at NDC's far plane."""
+        if self.kind != "ndc":
+            return t / self.scale
+        turn = torch.tensor(self.rotation, dtype=origin.dtype, device=origin.device)
+        o = (origin - torch.tensor(self.centre, dtype=origin.dtype, device=origin.device)) @ turn.T
+        d = direction @ turn.T
+        to_near = -(self.near + o[:, 2]) / d[:, 2]
+        start = o[:, 2] + to_near * d[:, 2]
+        # NDC z = 1 + 2 near / z rises from -1; t is the share of the way to the far plane, so z = z0 / (1 - t).
+        z = start / (1 - t.to(o.dtype)).clamp_min(1e-9)
+        return (to_near + (z - start) / d[:, 2]).to(t.dtype)
+
+    def _device_coordinates(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays from the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one."""
+        dz = d[:, 2].clamp(max=-1e-6)
+        d = torch.cat([d[:, :2], dz[:, None]], -1)
+        start = o + (-(self.near + o[:, 2]) / dz)[:, None] * d
+        fx, fy = self.focal
+        x, y, z = start.unbind(-1)
+        first = torch.stack([-fx * x / z, -fy * y / z, 1 + 2 * self.near / z], -1)
+        dx, dy, dz = d.unbind(-1)
+        way = torch.stack([-fx * (dx / dz - x / z), -fy * (dy / dz - y / z), -2 * self.near / z], -1)
+        return first, way
+
+    def _slab(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+        """Where rays enter and leave the box; a ray that misses it gets an empty interval."""
+        low, high = o.new_tensor(self.low), o.new_tensor(self.high)
+        safe = torch.where(d.abs() < 1e-12, torch.full_like(d, 1e-12), d)
+        a, b = (low - o) / safe, (high - o) / safe
+        near = torch.minimum(a, b).amax(-1).clamp_min(self.near)
+        far = torch.maximum(a, b).amin(-1)
+        return near, torch.maximum(far, near)
