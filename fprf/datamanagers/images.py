@@ -31,13 +31,11 @@ def load_image(path: Path, size: tuple[int, int] | None = None, background: Sequ
     """An image [H W 3] in sRGB, 0 to 255, resized to `size` (width, height), or as delivered without one.
 
     16-bit files are rounded to 8 bits, grey ones repeated. Transparent pixels show `background` (RGB in [0, 1]; white
-    by default). Raises DataError where the file is absent, truncated, damaged, of no known format or of over 1e8 pixels.
+    by default). Raises DataError where the file is absent, truncated, damaged, of no known format or over 1e8 pixels.
     """
     header = read_header(path)
     if header.width * header.height > MAX_PIXELS:
-        raise DataError(
-            f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the image"
-        )
+        raise DataError(f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the image")
     pixels = _to_rgb(path, _decode(path, header), _WHITE if background is None else background)
     if size is None or size == (pixels.shape[1], pixels.shape[0]):
         return pixels

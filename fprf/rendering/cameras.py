@@ -98,8 +98,8 @@ def sees(cameras: Cameras, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor
     local = unbend(distortion, lens, reach, plane)
     # A direction at the very reach must not fall beyond it by rounding.
     back = bend(distortion, lens, reach * (1 + 1e-9), local)
-    miss = torch.linalg.vector_norm((back - plane) * cameras.focal[view], dim=-1)
-    return miss <= 1e-6
+    miss: Tensor = torch.linalg.vector_norm((back - plane) * cameras.focal[view], dim=-1)
+    return torch.le(miss, 1e-6)
 
 
 def project(

@@ -1,0 +1,144 @@
+"""Untrusted files of a scene folder: strict JSON, paths that stay inside, NumPy arrays without pickle.
+
+Whatever the bytes, the outcome is a value or a DataError of one line; nothing is allocated on a file's word alone.
+Links inside the folder are followed: only what a file *says* must stay inside.
+"""
+
+import ast
+import json
+import math
+import os
+import re
+import zipfile
+import zlib
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import DataError
+from ..image_header import IMAGE_SUFFIXES
+
+__all__ = ["Json", "image_names", "inside", "name_of", "read_bytes", "read_json", "read_npy", "read_npz"]
+
+Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
+
+_NPY_HEADER = re.compile(
+    r"\s*\{\s*'descr':\s*'([<>|=][fiu][1248])',\s*'fortran_order':\s*(True|False),"
+    r"\s*'shape':\s*(\([0-9, ]*\)),?\s*\}\s*"
+)
+_MAX_ARRAY = 1 << 32
+"""Bytes that an array inside an archive may unpack to."""
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file; DataError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
+
+
+def read_json(path: Path) -> Json:
+    """A JSON value without NaN, Infinity, numbers beyond float64, or repeated keys."""
+
+    def refuse(text: str) -> float:
+        raise ValueError(f"{text} is not a JSON number")
+
+    def real(text: str) -> float:
+        value = float(text)
+        return value if math.isfinite(value) else refuse(text)
+
+    def integer(text: str) -> int:
+        if len(text) > 300:
+            raise ValueError(f"{text[:12]}... is too large")
+        return int(text)
+
+    def once(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
+        found: dict[str, Json] = {}
+        for key, value in pairs:
+            if key in found:
+                raise ValueError(f"the key {key!r} occurs twice in one object")
+            found[key] = value
+        return found
+
+    data = read_bytes(path)
+    try:
+        value: Json = json.loads(
+            data.decode("utf-8-sig"),
+            parse_constant=refuse,
+            parse_float=real,
+            parse_int=integer,
+            object_pairs_hook=once,
+        )
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: no valid JSON ({error}); write it again with the tool it came from") from error
+    return value
+
+
+def inside(root: Path, where: str, text: str) -> tuple[str, Path]:
+    """A path that a file gives relative to `root`: its normal form with slashes, and the whole path.
+
+    Raises DataError for absolute paths, drive letters, `..`, empty and unprintable ones. `where` opens the message.
+    """
+    name = text.replace("\\", "/")
+    parts = PurePosixPath(name).parts
+    outside = PurePosixPath(name).is_absolute() or PureWindowsPath(text).drive or ".." in parts
+    if outside or not parts or not name.isprintable():
+        raise DataError(f"{where}: the path {text!r} leaves {root} or is none; give paths inside, like images/0001.png")
+    return "/".join(parts), root.joinpath(*parts)
+
+
+def name_of(data: Path) -> str:
+    """A scene's name: its folder's."""
+    return data.resolve().name or "scene"
+
+
+def image_names(folder: Path) -> list[str]:
+    """Sorted names of the images directly in a folder, hidden files left out; DataError where there is none."""
+    try:
+        entries = os.listdir(folder)
+    except OSError as error:
+        raise DataError(f"{folder}: no such image folder ({error.strerror}); name it or put the images there") from error
+    names = sorted(n for n in entries if Path(n).suffix.lower() in IMAGE_SUFFIXES and not n.startswith("."))
+    if not names:
+        raise DataError(f"{folder}: no image among {len(entries)} files; put PNG, JPEG, WebP, BMP or TIFF images there")
+    return names
+
+
+def read_npy(where: str, data: bytes) -> NDArray[np.float64]:
+    """The numbers of a .npy file as float64; DataError, opened by `where`, for anything but a whole numeric array."""
+    length = {1: 2, 2: 4, 3: 4}.get(data[6] if len(data) > 8 else 0, 0)
+    if not data.startswith(b"\x93NUMPY") or not length:
+        raise DataError(f"{where}: no NumPy array; write it again with numpy.save")
+    start = 8 + length + int.from_bytes(data[8 : 8 + length], "little")
+    header = _NPY_HEADER.fullmatch(data[8 + length : min(start, 8 + length + 4096)].decode("latin-1"))
+    if header is None or header[2] == "True":
+        raise DataError(f"{where}: the array's header is not that of a plain numeric array; write it with numpy.save")
+    dtype = np.dtype(header[1])
+    axes = ast.literal_eval(header[3]) if re.fullmatch(r"\((\d{1,18}, ?)*(\d{1,18})?\)", header[3]) else None
+    shape: tuple[int, ...] = axes if isinstance(axes, tuple) else (-1,)
+    count = math.prod(shape)
+    if count < 0 or count * dtype.itemsize != len(data) - start:
+        raise DataError(
+            f"{where}: the header says {header[3]} of {header[1]}, but {max(len(data) - start, 0)} bytes follow; "
+            "copy the file again, it is damaged"
+        )
+    return np.frombuffer(data, dtype=dtype, offset=start, count=count).reshape(shape).astype(np.float64)
+
+
+def read_npz(path: Path, key: str) -> NDArray[np.float64]:
+    """One array of a .npz archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entry = archive.getinfo(f"{key}.npy")
+            if entry.file_size > _MAX_ARRAY:
+                raise DataError(f"{path}: {key} claims {entry.file_size} bytes; at most {_MAX_ARRAY} are read: thin it out")
+            data = archive.read(entry)
+    except KeyError as error:
+        raise DataError(f"{path}: no array {key!r} in it; write it with numpy.savez(..., {key}=...)") from error
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, OverflowError) as error:
+        raise DataError(f"{path}: no readable .npz archive ({error}); write it again with numpy.savez") from error
+    return read_npy(f"{path}: {key}", data)

@@ -1,0 +1,75 @@
+"""LLFF captures: `poses_bounds.npy`, one row an image in the order of their names.
+
+A row is a 3x5 matrix [R | t | (height, width, focal)] and the nearest and farthest depth. Columns of R are the camera's
+down, right and back axes in the world; ours are right, up and back. The world frame is kept.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DataError
+from ...interfaces import DataParser
+from ..scene import Scene
+from .config import LlffConfig
+from .files import image_names, inside, read_bytes, read_npy
+from .views import View, assemble, rigid
+
+__all__ = ["LlffParser"]
+
+
+class LlffParser(DataParser):
+    """`poses_bounds.npy` beside a folder of images."""
+
+    def __init__(self, config: LlffConfig) -> None:
+        self.config = config
+
+    def parse(self, data: Path, downscale: int) -> Scene:
+        """The scene at 1/downscale of the images in the chosen folder, whatever size the poses were estimated at."""
+        file = data / "poses_bounds.npy"
+        rows = read_npy(str(file), read_bytes(file))
+        if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+            raise DataError(f"{file}: an array of shape {rows.shape}; LLFF has one row of 17 numbers an image")
+        if not np.isfinite(rows).all():
+            bad = int(np.flatnonzero(~np.isfinite(rows).all(1))[0])
+            raise DataError(f"{file}: row {bad} is not finite; run the reconstruction again")
+        folder = _folder(data, self.config.images)
+        names = image_names(folder)
+        if len(names) != len(rows):
+            raise DataError(f"{folder}: {len(names)} images but {len(rows)} poses; remove the extra or re-run COLMAP")
+        views = []
+        for number, (name, row) in enumerate(zip(names, rows, strict=True)):
+            height, width, focal = row[:15].reshape(3, 5)[:, 4]
+            matrix = row[:15].reshape(3, 5)[:, :4]
+            turned = np.stack([matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]], 1)
+            if not (1 <= width <= 1e6 and 1 <= height <= 1e6):
+                raise DataError(f"{file}: row {number} says {width:g}x{height:g} pixels; run the reconstruction again")
+            size = (round(float(width)), round(float(height)))
+            views.append(
+                View(
+                    name=name,
+                    path=folder / name,
+                    pose=rigid(f"{file}: row {number} ({name})", turned),
+                    size=size,
+                    focal=(float(focal), float(focal)),
+                    centre=(size[0] / 2, size[1] / 2),
+                    depths=(float(row[15]), float(row[16])),
+                )
+            )
+        return assemble(data, views, downscale=downscale, reduced=True)
+
+
+def _folder(data: Path, wanted: str) -> Path:
+    if wanted:
+        return inside(data, "parser.images", wanted)[1]
+    if (data / "images").is_dir():
+        return data / "images"
+    reduced = {}
+    for path in data.glob("images_*"):
+        factor = re.fullmatch(r"images_([0-9]{1,4})", path.name)
+        if factor and path.is_dir():
+            reduced[int(factor[1])] = path
+    if not reduced:
+        raise DataError(f"{data}: poses_bounds.npy, but no folder images or images_N; put the images there")
+    return reduced[min(reduced)]

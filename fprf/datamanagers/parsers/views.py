@@ -1,0 +1,138 @@
+"""From what a capture says of each view to a `Scene`: poses made exact, sizes and images checked against the files."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...errors import DataError
+from ...rendering.cameras import Cameras
+from ..image_header import read_header
+from ..scene import Scene
+from .files import name_of
+from .split import every_eighth
+
+__all__ = ["View", "assemble", "found", "rigid"]
+
+_LOOSE = 1e-3
+"""Largest deviation of RᵀR from 1 that counts as rounding and is repaired."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One image and its camera, as the capture gives them."""
+
+    name: str
+    """Path inside the image folder, with slashes: what views are sorted by."""
+    path: Path
+    pose: NDArray[np.float64]
+    """Camera to world [3 4], OpenGL axes."""
+    size: tuple[int, int]
+    """Width and height that the intrinsics belong to."""
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    lens: int = 0
+    depths: tuple[float, float] | None = None
+
+
+def found(root: Path, paths: Sequence[Path]) -> None:
+    """Raise DataError unless every image is there, naming the first and how many are missing."""
+    missing = [path for path in paths if not os.path.isfile(path)]
+    if missing:
+        raise DataError(
+            f"{root}: {len(missing)} of {len(paths)} images are missing, the first is {missing[0]}; "
+            "copy them there or remove their entries"
+        )
+
+
+def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A camera-to-world pose [3 4] from [3 4] or [4 4], its rotation made orthonormal to rounding.
+
+    Raises DataError, opened by `where`, for anything that is not a rotation and a finite position within 1e-3.
+    """
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise DataError(f"{where}: the pose is no finite 3x4 or 4x4 matrix; run the reconstruction again")
+    if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise DataError(f"{where}: the pose's last row is {matrix[3].tolist()}, not 0 0 0 1; run the reconstruction again")
+    rotation = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if not deviation <= _LOOSE or np.linalg.det(rotation) < 0:
+        kind = f"off by {deviation:.2g}, at most {_LOOSE} is repaired" if not deviation <= _LOOSE else "a reflection"
+        raise DataError(f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses")
+    left, _, right = np.linalg.svd(rotation)
+    return np.concatenate([left @ right, matrix[:3, 3:]], 1)
+
+
+def assemble(
+    data: Path,
+    views: Sequence[View],
+    *,
+    downscale: int,
+    split: tuple[Tensor, Tensor] | None = None,
+    points: NDArray[np.float64] | None = None,
+    reduced: bool = False,
+) -> Scene:
+    """The scene of at least one view, in the given order; without a split every 8th view is held out.
+
+    The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder holds
+    smaller copies of the same shape, which the cameras are then scaled to.
+    """
+    found(data, [view.path for view in views])
+    alpha = False
+    sizes = []
+    for view in views:
+        header = read_header(view.path)
+        _check_lens(view)
+        _check_size(view, (header.width, header.height), reduced)
+        alpha |= header.alpha
+        sizes.append((header.width, header.height))
+    delivered = Cameras(
+        pose=torch.from_numpy(np.stack([view.pose for view in views])),
+        focal=torch.tensor([view.focal for view in views], dtype=torch.float64),
+        centre=torch.tensor([view.centre for view in views], dtype=torch.float64),
+        size=torch.tensor([view.size for view in views], dtype=torch.int64),
+        distortion=torch.tensor([view.distortion for view in views], dtype=torch.float64),
+        lens=torch.tensor([view.lens for view in views], dtype=torch.int64),
+    ).resized(torch.tensor(sizes))
+    depths = [view.depths for view in views if view.depths is not None]
+    train, test = split or every_eighth(len(views))
+    return Scene(
+        name=name_of(data),
+        paths=tuple(view.path for view in views),
+        cameras=delivered.scaled(downscale) if downscale != 1 else delivered,
+        train=train,
+        test=test,
+        points=None if points is None or not len(points) else torch.from_numpy(points),
+        depths=torch.tensor(depths, dtype=torch.float64) if len(depths) == len(views) else None,
+        alpha=alpha,
+    )
+
+
+def _check_size(view: View, file: tuple[int, int], reduced: bool) -> None:
+    # Reducing rounds each side to a whole pixel.
+    same_shape = abs(view.size[0] * file[1] - view.size[1] * file[0]) <= sum(view.size)
+    if not (view.size == file or (reduced and same_shape)):
+        raise DataError(
+            f"{view.path}: {file[0]}x{file[1]} pixels, but its camera has {view.size[0]}x{view.size[1]}; "
+            "restore the image (was it resized, rotated or cropped?) or calibrate again"
+        )
+
+
+def _check_lens(view: View) -> None:
+    numbers = (*view.focal, *view.centre, *view.distortion)
+    if not np.isfinite(numbers).all() or max(map(abs, numbers)) > 1e9:
+        raise DataError(f"{view.path}: the camera's numbers {numbers} are not all finite and sane; calibrate again")
+    if min(view.focal) <= 0:
+        raise DataError(f"{view.path}: the focal length is {min(view.focal)}, it must be above 0; calibrate again")
+    if view.depths is not None and not 0 < view.depths[0] < view.depths[1] < np.inf:
+        raise DataError(
+            f"{view.path}: nearest and farthest depth are {view.depths[0]} and {view.depths[1]}, "
+            "0 < near < far is needed; remove or correct them"
+        )
