@@ -1,0 +1,145 @@
+"""A town from a seed: which solids stand where.
+
+The street runs along x from -8 to 42 m and ends in a square before a church; houses, front gardens, trees and lamps line
+it on both sides (y < 0 and y > 0); a wood all around hides the horizon, so that every ray ends within about 80 m.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .buildings import Lot, church, house
+from .shapes import Face, Finish, Material, Shape
+from .street import LANTERN, bush, car, forest, hedge, lamp, tree
+
+__all__ = ["CROSSING", "END", "KERB", "ROAD_HALF", "SQUARE_HALF", "START", "WALK_HALF", "FaceTable", "Town", "build_town"]
+
+ROAD_HALF, WALK_HALF, KERB = 3.4, 5.4, 0.22
+"""Half widths of the road and of road plus sidewalks, and the width of the kerb, in metres."""
+START, END, SQUARE_HALF = -8.0, 41.0, 9.0
+"""Where the houses begin, where the road meets the square, and half the square's width."""
+CROSSING = 13.0
+"""Where the zebra crossing begins."""
+
+
+class FaceTable(NamedTuple):
+    """The F faces of a town as arrays; face 0 is the ground."""
+
+    material: NDArray[np.int64]
+    style: NDArray[np.int64]
+    tint: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    storeys: NDArray[np.int64]
+    door: NDArray[np.int64]
+    shutters: NDArray[np.int64]
+    origin: NDArray[np.float64]
+    u: NDArray[np.float64]
+    v: NDArray[np.float64]
+    extent: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    curve: NDArray[np.float64]
+
+
+class Town(NamedTuple):
+    """Solids, the index of each one's first face, the table of faces, and what lighting needs to know."""
+
+    seed: int
+    shapes: tuple[Shape, ...]
+    first: tuple[int, ...]
+    faces: FaceTable
+    footprints: NDArray[np.float64]
+    """[K 5] low x, low y, high x, high y, height of what stands on the ground, for ambient occlusion."""
+    lamps: NDArray[np.float64]
+    """[L 3] positions of the lights."""
+
+
+def _row(side: int, rng: np.random.Generator) -> list[Shape]:
+    """Houses, gardens and driveways of one side of the street."""
+    shapes: list[Shape] = []
+    x = START + float(rng.uniform(-1.0, 1.0))
+    while x < END - 7.0:
+        width = float(rng.uniform(6.5, 9.5))
+        front = WALK_HALF + float(rng.uniform(2.2, 4.0))
+        lot = Lot(x, x + width, front, float(rng.uniform(7.0, 9.0)), side)
+        shapes += house(lot, rng)
+        door = x + (width / max(1, round(width / 2.7))) * (max(1, round(width / 2.7)) // 2 + 0.5)
+        for _ in range(int(rng.integers(1, 4))):
+            at = float(rng.uniform(x + 0.6, x + width - 0.6))
+            if abs(at - door) > 1.6:
+                shapes += bush(at, side * (front - 0.7), float(rng.uniform(0.45, 0.8)), rng)
+        gap = float(rng.uniform(2.0, 4.2))
+        shapes += _gap(x + width, gap, front, side, rng)
+        x += width + gap
+    return shapes
+
+
+def _gap(x: float, gap: float, front: float, side: int, rng: np.random.Generator) -> list[Shape]:
+    """What fills the space between two houses: a tree behind a hedge, or a car on a driveway before one."""
+    middle = x + gap / 2
+    parked = gap > 2.6 and rng.random() < 0.6
+    at = front + (5.4 if parked else 1.0)
+    low, high = sorted((side * at, side * (at + 0.9)))
+    shapes: list[Shape] = [hedge((x - 0.1, low), (x + gap + 0.1, high), float(rng.uniform(1.9, 2.5)))]
+    shapes += tree(middle, side * (at + 2.6), float(rng.uniform(1.7, 2.3)), rng)
+    if parked:
+        shapes += car(middle, side * (front + 1.6), 1, rng)
+    return shapes
+
+
+def _avenue(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float, float, float]]]:
+    """Trees and lamps along both sidewalks, and cars at the far end of the street."""
+    shapes: list[Shape] = []
+    lights = []
+    for side in (-1, 1):
+        shift = float(rng.uniform(0.0, 3.0))
+        for k in range(6):
+            x = -5.0 + shift + 8.2 * k
+            if x < END and rng.random() < 0.85:
+                shapes += tree(x, side * (WALK_HALF + 0.9), float(rng.uniform(1.15, 1.6)), rng)
+        for k in range(5):
+            x = -2.0 + 11.0 * k + (5.5 if side > 0 else 0.0)
+            shapes += lamp(x, side * (ROAD_HALF + 0.55))
+            lights.append((x, side * (ROAD_HALF + 0.55), LANTERN))
+        shapes += car(float(rng.uniform(34.0, 38.0)), side * (ROAD_HALF - 1.05), 0, rng)
+    return shapes, lights
+
+
+def _wood(rng: np.random.Generator) -> list[Shape]:
+    """Overlapping crowns on a rectangle around the town."""
+    low, high = np.array([-17.0, -27.0]), np.array([70.0, 27.0])
+    shapes: list[Shape] = []
+    for x in np.arange(low[0], high[0], 4.0):
+        for y in (low[1], high[1]):
+            shapes.append(forest(float(x), float(y) + float(rng.uniform(-1, 1)), float(rng.uniform(3.4, 4.6)), rng))
+    for y in np.arange(low[1], high[1], 4.0):
+        for x in (low[0], high[0]):
+            shapes.append(forest(float(x) + float(rng.uniform(-1, 1)), float(y), float(rng.uniform(3.4, 4.6)), rng))
+    return shapes
+
+
+def _table(faces: list[Face]) -> FaceTable:
+    numbers = np.array([face.finish for face in faces], dtype=np.int64)
+    frames = [np.stack(rows) for rows in zip(*(face[1:] for face in faces), strict=True)]
+    return FaceTable(*numbers.T, *frames)
+
+
+def build_town(seed: int) -> Town:
+    """The town of a seed: same seed, same town."""
+    rng = np.random.default_rng([0x70574E, seed])
+    shapes = church(END + 7.0, rng)
+    avenue, lights = _avenue(rng)
+    shapes += _row(-1, rng) + _row(1, rng) + avenue + _wood(rng)
+    for side in (-1, 1):
+        shapes += tree(END + 4.0, side * 7.2, 2.0, rng) + tree(END + 12.0, side * 10.5, 2.4, rng)
+        low, high = sorted((side * 9.4, side * 10.2))
+        shapes.append(hedge((END + 0.5, low), (END + 9.0, high), 1.2))
+    x, y, z = np.eye(3)
+    faces = [Face(Finish(Material.GROUND), 0 * z, x, y, np.zeros(2))]
+    first = []
+    for shape in shapes:
+        first.append(len(faces))
+        faces += shape.faces
+    solid = [s for s in shapes if s.low[2] < 0.4 and abs(s.low[1] + s.high[1]) < 40.0 and s.low[0] > -12.0]
+    prints = np.array([[*s.low[:2], *s.high[:2], s.high[2]] for s in solid])
+    return Town(seed, tuple(shapes), tuple(first), _table(faces), prints, np.array(lights))
