@@ -1,10 +1,51 @@
 """The style dictionary (paper, section on semantic matching): local semantic codes and the styles that go with them."""
 
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from torch import Tensor
 
-__all__ = ["StyleDictionary"]
+from ..checks import at_least, between
+from ..errors import CheckpointError, DataError
+from .clusters import kmeans
+from .statistics import covariance, double, group_moments, mix, moments
+
+__all__ = [
+    "BLEND",
+    "Reference",
+    "StyleDictionary",
+    "blend_codes",
+    "build_dictionary",
+    "code_odds",
+    "load_dictionary",
+    "save_dictionary",
+    "whole_style",
+]
+
+BLEND = 0.3
+"""Share of the whole image's (or scene's) statistics in each local code (released code; the paper has no such term)."""
+
+_FORMAT = "fprf-style-1"
+_TENSORS = ("keys", "mean", "covariance", "share", "reference", "weight")
+
+
+class Reference(NamedTuple):
+    """One reference photograph as pixel samples."""
+
+    name: str
+    content: Annotated[Tensor, "N C"]
+    semantic: Annotated[Tensor, "N D"]
+    """In the scene's semantic basis; D = 0 where the scene has no semantics."""
+    weight: float = 1.0
+    """How much it counts beside the others; above 0."""
 
 
 class StyleDictionary(NamedTuple):
@@ -23,3 +64,192 @@ class StyleDictionary(NamedTuple):
     """User weight of its reference; above 0."""
     names: tuple[str, ...]
     """Names of the references, in dictionary order."""
+    blend: float = 0.0
+    """Share of the whole reference's statistics that is in each code; `whole_style` takes it out again."""
+
+
+def build_dictionary(
+    references: Sequence[Reference],
+    *,
+    clusters: int = 10,
+    blend: float = BLEND,
+    seed: int = 0,
+    min_members: int = 32,
+) -> StyleDictionary:
+    """Cluster each reference by its semantics; a code is the mean and covariance of the content inside, float32.
+
+    A code takes `blend` of its whole image's statistics, and more the further its members fall short of `min_members`. The
+    order of the references plays no part: they are sorted by what they hold. Raises DataError for no references, one
+    without pixels, sizes that differ, or values that are not finite.
+    """
+    at_least("clusters", clusters, 1)
+    between("blend", blend, 0.0, 1.0)
+    at_least("min_members", min_members, 1)
+    _check(references)
+    ordered = sorted(references, key=lambda r: (_content_hash(r), r.name, r.weight))
+    parts = [_codes(r, clusters, blend, seed, min_members) for r in ordered]
+    keys, mean, covariances, share = (torch.cat(part) for part in zip(*parts, strict=True))
+    count = torch.tensor([len(p[0]) for p in parts])
+    return StyleDictionary(
+        keys=keys,
+        mean=mean,
+        covariance=covariances,
+        share=share,
+        reference=torch.arange(len(parts)).repeat_interleave(count),
+        weight=torch.tensor([float(r.weight) for r in ordered]).repeat_interleave(count),
+        names=tuple(r.name for r in ordered),
+        blend=float(blend),
+    )
+
+
+def blend_codes(
+    mean: Annotated[Tensor, "T C"],
+    covariances: Annotated[Tensor, "T C C"],
+    whole_mean: Annotated[Tensor, "C"],
+    whole_covariance: Annotated[Tensor, "C C"],
+    blend: Annotated[Tensor, "T"],
+) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
+    """Local statistics x (1 - blend) + whole x blend, code by code (released code, `blending_ratio`)."""
+    at = blend[:, None]
+    return (1 - at) * mean + at * whole_mean, (1 - at[..., None]) * covariances + at[..., None] * whole_covariance
+
+
+def whole_style(d: StyleDictionary) -> tuple[Annotated[Tensor, "C"], Annotated[Tensor, "C C"]]:
+    """Mean and covariance of all pixels of all references by user weight, float64: what global AdaIN aims at.
+
+    Blending draws the codes' means together and thereby takes b (1 - b) of the scatter between them out of the total
+    covariance, for blend b; it is given back, reference by reference, so that clusters and blend don't matter here.
+    """
+    means, covariances, weights = [], [], []
+    for i in range(len(d.names)):
+        own = d.reference == i
+        mean, total = mix(d.mean[own], d.covariance[own], d.share[own])
+        if d.blend < 1:
+            share = double(d.share[own])
+            apart = (double(d.mean[own]) - mean) * (share / share.sum()).sqrt()[:, None]
+            total = total + d.blend / (1 - d.blend) * apart.T @ apart
+        means.append(mean)
+        covariances.append(total)
+        weights.append(double(d.weight[own])[0])
+    return mix(torch.stack(means), torch.stack(covariances), torch.stack(weights))
+
+
+def code_odds(d: StyleDictionary) -> Annotated[Tensor, "T"]:
+    """Share of each code when nothing is matched: its pixels, by user weight; float64, sums to 1."""
+    odds = double(d.share) * double(d.weight)
+    return odds / odds.sum()
+
+
+def save_dictionary(path: Path, d: StyleDictionary) -> None:
+    """Write the dictionary to `path`; a crash leaves the old file or the new one, never a part."""
+    tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in _TENSORS}
+    meta = {"format": _FORMAT, "names": json.dumps(d.names), "blend": repr(d.blend), "sha256": _digest(tensors)}
+    data = save(tensors, metadata=meta)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load_dictionary(path: Path) -> StyleDictionary:
+    """Read a dictionary. Raises CheckpointError where it is absent, damaged, or no dictionary."""
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no style dictionary there; stylize with --references first")
+    try:
+        with safe_open(path, framework="pt") as file:
+            meta = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path}: not readable as safetensors ({error}); build the style again") from error
+    if meta.get("format") != _FORMAT or set(tensors) != set(_TENSORS):
+        raise CheckpointError(f"{path}: not a style dictionary of format {_FORMAT}; build the style again")
+    if meta.get("sha256") != _digest(tensors):
+        raise CheckpointError(f"{path}: checksum does not match, the file is damaged; build the style again")
+    try:
+        names = tuple(str(name) for name in json.loads(meta["names"]))
+        blend = float(meta["blend"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise CheckpointError(f"{path}: its names or blend are unreadable; build the style again") from error
+    d = StyleDictionary(**tensors, names=names, blend=blend)
+    _check_stored(path, d)
+    return d
+
+
+def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> tuple[Tensor, ...]:
+    """Keys, means, covariances and shares of one reference."""
+    label, centres = _cluster(r.semantic, clusters, seed)
+    whole = moments(r.content, torch.ones(len(r.content)))
+    member = torch.nn.functional.one_hot(label, len(centres)).double()
+    mean, covariances, share = group_moments(r.content, member)
+    trust = (share * len(label) / min_members).clamp_max(1.0)
+    mean, covariances = blend_codes(mean, covariances, whole.mean, covariance(whole), 1 - (1 - blend) * trust)
+    return centres.float(), mean.float(), covariances.float(), share.float()
+
+
+def _cluster(semantic: Tensor, clusters: int, seed: int) -> tuple[Tensor, Tensor]:
+    if semantic.shape[1] == 0:
+        return torch.zeros(len(semantic), dtype=torch.int64), semantic[:1].float()
+    found = kmeans(semantic.cpu(), clusters, seed=seed)
+    return found.label, found.centres
+
+
+def _content_hash(r: Reference) -> str:
+    digest = hashlib.sha256()
+    for part in (r.content, r.semantic):
+        digest.update(str(tuple(part.shape)).encode())
+        digest.update(part.detach().float().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _check(references: Sequence[Reference]) -> None:
+    if not references:
+        raise DataError("references: none given; name at least one photograph")
+    first = references[0]
+    for r in references:
+        if len(r.content) == 0 or len(r.content) != len(r.semantic):
+            raise DataError(
+                f"{r.name}: {len(r.content)} content and {len(r.semantic)} semantic samples; both need the same number, "
+                "at least 1"
+            )
+        if r.content.shape[1] != first.content.shape[1] or r.semantic.shape[1] != first.semantic.shape[1]:
+            raise DataError(
+                f"{r.name}: {r.content.shape[1]} content and {r.semantic.shape[1]} semantic channels, but {first.name} "
+                f"has {first.content.shape[1]} and {first.semantic.shape[1]}; encode all with the scene's encoders"
+            )
+        if not bool(r.content.isfinite().all() & r.semantic.isfinite().all()):
+            raise DataError(f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged")
+        if not 0 < r.weight < float("inf"):
+            raise DataError(f"{r.name}: weight {r.weight}; a reference's weight must be above 0 and finite")
+
+
+def _check_stored(path: Path, d: StyleDictionary) -> None:
+    """The checksum says the file is whole; this says it is a dictionary, whoever wrote it."""
+    t = len(d.keys) if d.keys.ndim == 2 else 0
+    c = d.mean.shape[-1] if d.mean.ndim == 2 else 0
+    shapes = {"mean": (t, c), "covariance": (t, c, c), "share": (t,), "reference": (t,), "weight": (t,)}
+    wrong = [name for name, shape in shapes.items() if tuple(getattr(d, name).shape) != shape]
+    if t == 0 or c == 0 or wrong:
+        raise CheckpointError(f"{path}: {', '.join(wrong) or 'keys'} of the wrong shape; build the style again")
+    if not all(bool(getattr(d, name).isfinite().all()) for name in _TENSORS):
+        raise CheckpointError(f"{path}: a value is not finite; build the style again")
+    used = torch.arange(len(d.names))
+    if d.reference.dtype != torch.int64 or not torch.equal(torch.unique(d.reference), used):
+        raise CheckpointError(f"{path}: codes and {len(d.names)} reference names don't fit; build the style again")
+    if not bool((d.share > 0).all() & (d.weight > 0).all()) or not 0 <= d.blend <= 1:
+        raise CheckpointError(f"{path}: shares and weights must be above 0, blend in [0, 1]; build the style again")
+
+
+def _digest(tensors: dict[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        t = tensors[name]
+        digest.update(f"{name} {t.dtype} {tuple(t.shape)} ".encode())
+        digest.update(t.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

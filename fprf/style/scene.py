@@ -1,10 +1,29 @@
 """What a trained scene knows of its own style: one set of content statistics and its semantic regions."""
 
+from collections.abc import Mapping
 from typing import Annotated, NamedTuple
 
+import torch
 from torch import Tensor
 
-__all__ = ["SceneStyle"]
+from ..errors import CheckpointError, DataError
+from .clusters import kmeans
+from .dictionary import BLEND, StyleDictionary, blend_codes
+from .matching import attention, score_spread, unit
+from .statistics import Moments, covariance, double, group_moments
+from .statistics import moments as moments_of
+
+__all__ = ["SceneStyle", "check_fit", "from_tensors", "membership", "own_style", "region_units", "scene_style", "to_tensors"]
+
+_SOFTNESS = 0.2
+"""Temperature of points belonging to regions, relative to the spread of the scores: fixed with the scene, since the
+regions' statistics are taken with it."""
+
+_FAINT = 1e-3
+"""Memberships below this are dropped: a point then belongs to one or two regions and the others cost nothing."""
+
+_CLUSTERED = 32768
+"""Rows that k-means sees at most: more do not move the centroids, and clustering stays below half a second."""
 
 
 class SceneStyle(NamedTuple):
@@ -24,3 +43,122 @@ class SceneStyle(NamedTuple):
     """Share of the scene's weight in each region; sums to 1."""
     semantic_mean: Annotated[Tensor, "D"]
     """Mean semantic feature of the scene: the centre for cosine matching."""
+
+
+def scene_style(
+    content: Annotated[Tensor, "N C"],
+    semantic: Annotated[Tensor, "N D"] | None,
+    weights: Annotated[Tensor, "N"],
+    moments: Moments | None,
+    regions: int,
+    seed: int,
+) -> SceneStyle:
+    """The scene's style from weighted points, float32.
+
+    Regions are k-means clusters of the semantics; their statistics are taken over the same soft `membership` by which the
+    region stylizers assign points. `moments` are those of the whole scene, where a longer pass has them already. Raises
+    DataError for no weight, NumericsError for values that are not finite.
+    """
+    if not bool(weights.any()):
+        raise DataError("scene statistics: no point has weight; the scene renders empty, train it for longer")
+    whole = moments_of(content, weights) if moments is None else moments
+    keep = weights > 0
+    content, weights = content[keep], weights[keep]
+    semantic = content.new_zeros(len(content), 0) if semantic is None else semantic[keep]
+    keys = semantic.new_zeros(1, 0)
+    if semantic.shape[1] > 0:
+        every = -(-len(semantic) // _CLUSTERED)
+        keys = kmeans(semantic[::every], regions, seed=seed, weights=weights[::every]).centres
+    middle = (double(weights) @ double(semantic) / double(weights).sum()).to(semantic)
+    alive, belongs = _regions(semantic, keys, middle)
+    keys, belongs = keys[alive], belongs * double(weights)[:, None]
+    mean, covariances, share = group_moments(content, belongs)
+    return SceneStyle(
+        mean=whole.mean.float(),
+        covariance=covariance(whole).float(),
+        keys=keys.float(),
+        region_mean=mean.float(),
+        region_covariance=covariances.float(),
+        share=share.float(),
+        semantic_mean=middle.float(),
+    )
+
+
+def region_units(keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"]) -> tuple[Annotated[Tensor, "K D"], float]:
+    """Directions of the regions' keys, and the (absolute) temperature at which points belong to them."""
+    units = unit(keys, centre)
+    return units, _SOFTNESS * score_spread(units, units)
+
+
+def membership(
+    semantic: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"], units: Annotated[Tensor, "K D"], temperature: float
+) -> Annotated[Tensor, "N K"]:
+    """How much each point belongs to each region: attention without the faintest shares; rows sum to 1."""
+    if len(units) == 1:
+        return semantic.new_ones(len(semantic), 1)
+    share = attention(unit(semantic, centre), units, temperature)
+    share = torch.where(share < _FAINT * share.amax(1, keepdim=True), 0.0, share)
+    return share / share.sum(1, keepdim=True)
+
+
+def own_style(scene: SceneStyle, blend: float = BLEND) -> StyleDictionary:
+    """The scene as its own only reference, blended as references are: the dictionary that changes nothing."""
+    at = scene.share.new_full((len(scene.share),), blend)
+    mean, covariances = blend_codes(scene.region_mean, scene.region_covariance, scene.mean, scene.covariance, at)
+    return StyleDictionary(
+        keys=scene.keys,
+        mean=mean,
+        covariance=covariances,
+        share=scene.share,
+        reference=torch.zeros(len(scene.share), dtype=torch.int64, device=scene.share.device),
+        weight=torch.ones_like(scene.share),
+        names=("scene",),
+        blend=blend,
+    )
+
+
+def check_fit(dictionary: StyleDictionary, scene: SceneStyle) -> None:
+    """Raise DataError unless references and scene were encoded alike."""
+    style = (dictionary.mean.shape[1], dictionary.keys.shape[1])
+    here = (scene.mean.shape[0], scene.keys.shape[1])
+    if style != here:
+        raise DataError(
+            f"style dictionary: {style[0]} content and {style[1]} semantic channels, but the scene has {here[0]} and "
+            f"{here[1]}; build it with the scene's own encoders"
+        )
+
+
+def to_tensors(scene: SceneStyle) -> dict[str, Tensor]:
+    """The fields by name, for a checkpoint."""
+    return {name: t.detach().contiguous() for name, t in scene._asdict().items()}
+
+
+def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:
+    """A scene's style out of a checkpoint. Raises CheckpointError for missing or misshapen fields."""
+    missing = [name for name in SceneStyle._fields if name not in tensors]
+    if missing:
+        raise CheckpointError(f"scene statistics: {', '.join(missing)} missing; compute the statistics again")
+    scene = SceneStyle(**{name: tensors[name] for name in SceneStyle._fields})
+    c, k, d = scene.mean.numel(), scene.share.numel(), scene.semantic_mean.numel()
+    shapes = ((c,), (c, c), (k, d), (k, c), (k, c, c), (k,), (d,))
+    for name, t, shape in zip(SceneStyle._fields, scene, shapes, strict=True):
+        if tuple(t.shape) != shape:
+            raise CheckpointError(f"scene statistics: {name} is {tuple(t.shape)}, expected {shape}; compute them again")
+        if not bool(t.isfinite().all()):
+            raise CheckpointError(f"scene statistics: {name} is not finite; compute the statistics again")
+    return scene
+
+
+def _regions(semantic: Tensor, keys: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+    """Which keys some point belongs to, and memberships among those alone: no region has statistics of nothing.
+
+    K-means compares distances and membership compares directions, so a cluster may win no point. Memberships are taken
+    again without it, as the stylizers will.
+    """
+    alive = torch.arange(len(keys), device=keys.device)
+    while True:
+        belongs = membership(semantic, centre, *region_units(keys[alive], centre))
+        used = belongs.sum(0) > 0
+        if bool(used.all()):
+            return alive, double(belongs)
+        alive = alive[used]

@@ -1,1 +1,135 @@
-"""Weighted moments that merge exactly: float64, centred (Chan), any order and partition gives the same within 1e-12."""
+"""Weighted moments that merge exactly: float64, centred (Chan), any order and partition gives the same within 1e-12.
+
+Scatter is the weighted sum of outer products about the mean; covariance = scatter / weight (not Bessel-corrected:
+weights are rendering weights, not counts).
+"""
+
+from collections.abc import Iterator
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import NumericsError
+
+__all__ = ["Moments", "covariance", "deviation", "double", "empty", "group_moments", "merge", "mix", "moments"]
+
+_CHUNK = 16384
+"""Rows centred at a time: bounds the float64 copies of large inputs."""
+
+_FLOOR = 0.01
+"""A channel deviates by at least this share of the median channel: noise of dead channels must not become style."""
+
+_RESOLUTION = 1e-6
+"""A deviation below this share of the mean is float32 rounding."""
+
+
+class Moments(NamedTuple):
+    """Weight, mean and scatter of weighted rows, all float64."""
+
+    weight: Annotated[Tensor, ""]
+    mean: Annotated[Tensor, "C"]
+    scatter: Annotated[Tensor, "C C"]
+
+
+def empty(channels: int, *, device: torch.device | None = None) -> Moments:
+    """The moments of nothing: the neutral element of `merge`."""
+    zero = torch.zeros(channels, dtype=torch.float64, device=device)
+    return Moments(zero.new_zeros(()), zero, zero.new_zeros(channels, channels))
+
+
+def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"]) -> Moments:
+    """Moments of rows with weights >= 0; rows of weight 0 count for nothing, whatever they hold.
+
+    Raises NumericsError where a row that counts, or a weight, is not finite.
+    """
+    total = empty(features.shape[1], device=_wide_device(features))
+    for rows, mass in _chunks(features, weights):
+        weight = mass.sum()
+        mean = mass @ rows / weight
+        rows = rows - mean
+        # The mean's own rounding error is carried to second order only: the centred rows are corrected once.
+        correction = mass @ rows / weight
+        rows = (rows - correction) * mass.sqrt()[:, None]
+        total = merge(total, Moments(weight, mean + correction, rows.T @ rows))
+    return total
+
+
+def merge(a: Moments, b: Moments) -> Moments:
+    """Moments of both inputs together (Chan, Golub, LeVeque 1979). Commutative and associative within 1e-12."""
+    weight = a.weight + b.weight
+    share = b.weight / torch.where(weight > 0, weight, 1.0)
+    shift = b.mean - a.mean
+    scatter = a.scatter + b.scatter + torch.outer(shift, shift) * (a.weight * share)
+    mean = torch.where(weight > 0, (1 - share) * a.mean + share * b.mean, a.mean)
+    return Moments(weight, mean, scatter)
+
+
+def covariance(m: Moments) -> Annotated[Tensor, "C C"]:
+    """Covariance, symmetric bit for bit; zero where there is no weight."""
+    c = m.scatter / torch.where(m.weight > 0, m.weight, 1.0)
+    return (c + c.T) / 2
+
+
+def group_moments(
+    features: Annotated[Tensor, "N C"], membership: Annotated[Tensor, "N K"]
+) -> tuple[Annotated[Tensor, "K C"], Annotated[Tensor, "K C C"], Annotated[Tensor, "K"]]:
+    """Mean, covariance and share of the weight of each (soft) group, float64.
+
+    Membership is the weight >= 0 of each row in each group; only rows that belong to a group are visited for it, so
+    sharp memberships cost one group. An empty group has the mean and covariance of nothing: zero.
+    """
+    groups = [
+        moments(features[inside], membership[inside, k])
+        for k, inside in enumerate((column > 0).nonzero().squeeze(1) for column in membership.T)
+    ]
+    weight = torch.stack([g.weight for g in groups])
+    mean = torch.stack([g.mean for g in groups])
+    return mean, torch.stack([covariance(g) for g in groups]), weight / weight.sum().clamp_min(torch.finfo().tiny)
+
+
+def mix(
+    mean: Annotated[Tensor, "T C"], covariances: Annotated[Tensor, "T C C"], share: Annotated[Tensor, "T"]
+) -> tuple[Annotated[Tensor, "C"], Annotated[Tensor, "C C"]]:
+    """Mean and covariance of groups taken together, by the law of total covariance. Shares need not sum to 1."""
+    mean, covariances, share = double(mean), double(covariances), double(share)
+    share = share / share.sum()
+    whole = share @ mean
+    apart = (mean - whole) * share.sqrt()[:, None]
+    return whole, torch.einsum("t,tij->ij", share, covariances) + apart.T @ apart
+
+
+def deviation(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "... C"]) -> Annotated[Tensor, "... C"]:
+    """Standard deviation per channel, never below 1 % of the median channel's nor below float32 rounding of the means.
+
+    The floor is relative, so it biases no live channel, whatever the encoder's scale; always above 0.
+    """
+    sigma = variance.clamp_min(0.0).sqrt()
+    floor = _FLOOR * sigma.median(dim=-1, keepdim=True).values
+    rounding = _RESOLUTION * mean.abs().amax(dim=-1, keepdim=True)
+    return sigma.maximum(floor).maximum(rounding).clamp_min(1e-12)
+
+
+def double(x: Tensor) -> Tensor:
+    """The tensor in float64; on a device that has none (MPS), on the CPU."""
+    return x.to(device=_wide_device(x), dtype=torch.float64)
+
+
+def _wide_device(x: Tensor) -> torch.device:
+    return torch.device("cpu") if x.device.type == "mps" else x.device
+
+
+def _chunks(features: Tensor, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    for start in range(0, len(features), _CHUNK):
+        rows, mass = features[start : start + _CHUNK], double(weights[start : start + _CHUNK])
+        if not bool((mass >= 0).all() & mass.isfinite().all()):
+            raise NumericsError("statistics: a weight is negative or not finite; weights must be finite and at least 0")
+        keep = mass > 0
+        if not bool(keep.any()):
+            continue
+        if not bool(keep.all()):
+            rows, mass = rows[keep.to(rows.device)], mass[keep]
+        rows = double(rows)
+        if not bool(rows.isfinite().all()):
+            raise NumericsError("statistics: a content feature is not finite; check the field or encoder that made it")
+        yield rows, mass

@@ -43,6 +43,7 @@ class IdentityConfig(StylizerConfig):
     """Leaves the scene as it is: shows what the decoder alone does."""
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        """The stylizer that changes nothing."""
         from .identity import IdentityStylizer
 
         return IdentityStylizer(dictionary)
@@ -50,9 +51,10 @@ class IdentityConfig(StylizerConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class AdainConfig(StylizerConfig):
-    """Global AdaIN (paper, single reference): all references together are one mean and deviation. Needs no semantics."""
+    """Global AdaIN (paper, single reference): one mean and deviation of all references. Needs no semantics."""
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        """Global AdaIN towards these references."""
         from .adain import AdainStylizer
 
         return AdainStylizer(dictionary, scene)
@@ -71,6 +73,7 @@ class LocalAdainConfig(StylizerConfig):
         positive("stylizer.temperature", self.temperature)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        """Local AdaIN towards these references."""
         from .local import LocalAdainStylizer
 
         return LocalAdainStylizer(dictionary, scene, temperature=self.temperature, similarity=self.similarity)
@@ -93,6 +96,7 @@ class RegionAdainConfig(StylizerConfig):
         at_least("stylizer.gain", self.gain, 1.0)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        """Two-sided AdaIN towards these references."""
         from .region import RegionAdainStylizer
 
         return RegionAdainStylizer(dictionary, scene, temperature=self.temperature, blend=self.blend, gain=self.gain)
@@ -115,6 +119,7 @@ class RegionOtConfig(StylizerConfig):
         at_least("stylizer.gain", self.gain, 1.0)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        """Two-sided transport towards these references."""
         from .region import RegionOtStylizer
 
         return RegionOtStylizer(dictionary, scene, temperature=self.temperature, blend=self.blend, gain=self.gain)

@@ -1,0 +1,79 @@
+"""Local AdaIN (paper, Eq. 5 and 6): each point mixes the style codes that its semantics resemble.
+
+M_w = R^S M and Sigma_w = R^S Sigma over the codes' means and deviations, then Sigma_w (F - mu_c) / sigma_c + M_w with the
+statistics of the whole scene.
+"""
+
+from typing import Annotated
+
+from torch import Tensor
+
+from ...interfaces import Stylizer
+from ...style.dictionary import StyleDictionary, code_odds, whole_style
+from ...style.matching import Similarity, attention, full_precision, score_spread, share_mean, unit
+from ...style.scene import SceneStyle, check_fit
+from ...style.statistics import deviation, double
+from ...types import Want
+
+__all__ = ["LocalAdainStylizer"]
+
+
+class LocalAdainStylizer(Stylizer):
+    """AdaIN towards a per-point mixture. With one code, or without semantics, the mixture is the same everywhere."""
+
+    content_mean: Annotated[Tensor, "C"]
+    semantic_mean: Annotated[Tensor, "D"]
+    keys: Annotated[Tensor, "T D"]
+    prior: Annotated[Tensor, "T"]
+    odds: Annotated[Tensor, "T"]
+    style_mean: Annotated[Tensor, "T C"]
+    gain: Annotated[Tensor, "T C"]
+
+    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, *, temperature: float, similarity: Similarity) -> None:
+        super().__init__()
+        check_fit(dictionary, scene)
+        self.similarity = similarity
+        self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
+        centre = share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
+        if similarity == "cosine":
+            keys, queries = unit(dictionary.keys, centre), unit(scene.keys, scene.semantic_mean)
+        else:
+            # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
+            keys, queries = dictionary.keys - centre, scene.keys
+        # The only region of an undivided scene lies at its mean, where it says nothing about scores.
+        self.temperature = temperature * score_spread(queries if len(queries) > 1 else keys, keys)
+        mean, covariance = double(dictionary.mean), double(dictionary.covariance)
+        if not self.matched:
+            mean, covariance = (part[None] for part in whole_style(dictionary))
+        scene_sigma = deviation(double(scene.mean), double(scene.covariance).diagonal())
+        gain = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)) / scene_sigma
+        self.register_buffer("content_mean", scene.mean.float())
+        self.register_buffer("semantic_mean", scene.semantic_mean.float())
+        self.register_buffer("keys", keys.float())
+        self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
+        self.register_buffer("odds", code_odds(dictionary).to(keys.device).float())
+        self.register_buffer("style_mean", mean.to(keys.device).float())
+        self.register_buffer("gain", gain.to(keys.device).float())
+
+    @property
+    def needs(self) -> Want:
+        """Semantics only where there is something to choose."""
+        return Want.CONTENT | Want.SEMANTIC if self.matched else Want.CONTENT
+
+    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
+        """AdaIN towards each point's own mixture; the mean is subtracted first."""
+        with full_precision(content):
+            mean, gain = self.style_mean, self.gain
+            if self.matched:
+                assert semantic is not None, "Want.SEMANTIC was asked for"
+                share = self.match(semantic)
+                mean, gain = share @ mean, share @ gain
+            return ((content.to(self.gain) - self.content_mean) * gain + mean).to(content)
+
+    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
+        """R^S: softmax of the scores."""
+        if not self.matched:
+            return self.odds.expand(len(semantic), -1)
+        query = semantic.to(self.keys)
+        query = unit(query, self.semantic_mean) if self.similarity == "cosine" else query
+        return attention(query, self.keys, self.temperature, self.prior)
