@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 
 from ..errors import PluginError
 
-__all__ = ["Entry", "entry", "forget", "installed", "load", "load_object", "name_of", "nearest", "unreadable"]
+__all__ = ["Entry", "entry", "forget", "installed", "load", "load_object", "name_of", "nearest", "peek", "unreadable"]
 
 T = TypeVar("T")
 
@@ -106,6 +106,12 @@ def name_of(group: str, cls: type) -> str:
     )
 
 
+def peek(group: str, name: str) -> object | None:
+    """What the name stands for if its module happens to be imported already, else None. Imports nothing."""
+    entries = installed(group).get(name, ())
+    return _imported(entries[0].point) if len(entries) == 1 else None
+
+
 def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
     """`; did you mean 'x'?` where something allowed is close, else nothing."""
     close = difflib.get_close_matches(name, list(allowed), n=1)
@@ -113,7 +119,7 @@ def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
 
 
 def _imported(point: EntryPoint) -> object | None:
-    """What the entry point names, if its module happens to be imported already: a class may be re-exported."""
+    """The object of an entry point, from the modules that are imported already: a class may be re-exported."""
     module, _, attributes = point.value.partition(":")
     found: object | None = sys.modules.get(module.strip())
     for attribute in attributes.strip().split("."):
@@ -139,9 +145,7 @@ def _scan() -> _Scan:
         for point in points:
             if point.group.startswith(_PREFIX):
                 found.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
-    groups = {
-        group: MappingProxyType({name: tuple(names[name]) for name in sorted(names)}) for group, names in found.items()
-    }
+    groups = {group: MappingProxyType({name: tuple(names[name]) for name in sorted(names)}) for group, names in found.items()}
     return _Scan(MappingProxyType(groups), tuple(bad))
 
 
@@ -153,9 +157,7 @@ def _complaint(distribution: Distribution, error: Exception) -> list[str]:
         text = f"[{_PREFIX}"
     if f"[{_PREFIX}" not in text:
         return []
-    return [
-        f"{distribution.locate_file('')}: a package's entry points cannot be read ({type(error).__name__}: {error})"
-    ]
+    return [f"{distribution.locate_file('')}: a package's entry points cannot be read ({type(error).__name__}: {error})"]
 
 
 _PREFIX = "fprf."
