@@ -1,0 +1,74 @@
+"""How far a render is from a photograph. Pure functions of images [H W 3] in [0, 1]; the result is a float.
+
+PSNR = -10 log10(mean squared error), in decibels. SSIM after Wang et al. 2004: Gaussian window of 11 pixels (σ 1.5),
+K = (0.01, 0.03), dynamic range 1, mean over channels and over the windows that lie wholly inside.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated
+
+import torch
+from kornia.metrics import ssim as _ssim_map
+from torch import Tensor
+
+from ..errors import DataError, NumericsError
+
+__all__ = ["PSNR_CAP", "image_metrics", "mean_metrics", "psnr", "ssim"]
+
+PSNR_CAP = 99.0
+"""PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of 1.3e-10."""
+
+_WINDOW = 11
+
+
+def _pair(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Both images as they are compared: on one device, in float32 at least. Raises DataError for unlike shapes."""
+    if a.shape != b.shape or a.ndim != 3 or a.shape[-1] != 3 or a.numel() == 0:
+        raise DataError(
+            f"images of shape {tuple(a.shape)} and {tuple(b.shape)} cannot be compared; both must be [H W 3] of one size"
+        )
+    kind = torch.promote_types(torch.promote_types(a.dtype, b.dtype), torch.float32)
+    return a.detach().to(kind), b.detach().to(a.device, kind)
+
+
+def _finite(name: str, value: float) -> float:
+    if not math.isfinite(value):
+        raise NumericsError(f"{name} is {value}: an image holds values that are not finite; nothing can be judged by it")
+    return value
+
+
+def psnr(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
+    """Peak signal-to-noise ratio in dB, at most `PSNR_CAP`; symmetric. Raises NumericsError for NaN and infinities."""
+    first, second = _pair(a, b)
+    error = _finite("psnr", float((first - second).square().mean()))
+    return min(PSNR_CAP, -10 * math.log10(error)) if error > 0 else PSNR_CAP
+
+
+def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
+    """Structural similarity in [-1, 1], 1 for identical images; symmetric.
+
+    An image with a side below 11 pixels is judged with the largest odd window that fits. Raises as `psnr`.
+    """
+    first, second = _pair(a, b)
+    shortest = min(first.shape[:2])
+    window = min(_WINDOW, shortest - 1 + shortest % 2)
+    windows = _ssim_map(first.permute(2, 0, 1)[None], second.permute(2, 0, 1)[None], window, padding="valid")
+    # Rounding can carry an identical pair past 1.
+    return max(-1.0, min(1.0, _finite("ssim", float(windows.mean()))))
+
+
+def image_metrics(render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H W 3"]) -> dict[str, float]:
+    """Every metric of one view, by name."""
+    return {"psnr": psnr(render, truth), "ssim": ssim(render, truth)}
+
+
+def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Mean of every metric over views, each view counting once (the mean of PSNRs, not the PSNR of the mean error).
+
+    Raises DataError where there is no view; KeyError where the views carry different metrics.
+    """
+    rows: Sequence[Mapping[str, float]] = list(views)
+    if not rows:
+        raise DataError("no views to average metrics over; the split is empty")
+    return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}

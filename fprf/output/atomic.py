@@ -1,0 +1,69 @@
+"""Files that are whole or absent: written beside their final name, flushed to disk, then renamed over it."""
+
+import json
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..errors import DataError, NumericsError
+
+__all__ = ["atomic_path", "write_bytes", "write_json", "write_text"]
+
+
+def _flush(path: Path, mode: int) -> None:
+    handle = os.open(path, mode)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def atomic_path(final: Path) -> Iterator[Path]:
+    """A hidden name beside `final` to write to; it becomes `final` when the block ends, and is removed if it fails.
+
+    Keeps the ending of the name, which encoders choose their format by. Creates the folder. A reader sees the old file
+    or the new one, whenever the process dies. Raises DataError where `final` is a folder or its folder is a file.
+    """
+    if final.is_dir():
+        raise DataError(f"{final}: a folder is in the place of a file to be written; remove it or choose another name")
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise DataError(f"{final}: {error.filename} is a file, not a folder; choose another output") from error
+    # The stem is cut so that a name of the longest length allowed (255 bytes) still has a temporary one.
+    temporary = final.with_name(f".{final.stem[:40]}.{secrets.token_hex(4)}{final.suffix}")
+    try:
+        yield temporary
+        _flush(temporary, os.O_RDWR)
+        os.replace(temporary, final)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    if os.name == "posix":  # elsewhere a folder cannot be opened; the rename is then as durable as the system makes it
+        _flush(final.parent, os.O_RDONLY)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write `data` to `path`, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text with the line ends it has, whole or not at all."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path, value: object) -> None:
+    """Write strict JSON, keys in the order given, and a newline at the end.
+
+    Raises NumericsError for NaN and infinities, which JSON does not have; TypeError for what is no JSON type.
+    """
+    try:
+        text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False)
+    except ValueError as error:
+        raise NumericsError(f"{path}: {error}; every figure must be finite, or null where there is none") from error
+    write_text(path, text + "\n")

@@ -1,0 +1,76 @@
+"""Pictures to bytes and files. A picture is a uint8 array [H W 3] in RGB; floats are sRGB in [0, 1]."""
+
+import base64
+from pathlib import Path
+from typing import Annotated, Literal, TypeAlias
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..errors import DataError, NumericsError
+from .atomic import write_bytes
+
+__all__ = ["Format", "Picture", "checked", "data_uri", "encode", "shrink", "to_uint8", "write_image"]
+
+Picture: TypeAlias = NDArray[np.uint8]
+Format: TypeAlias = Literal["png", "jpg", "webp"]
+
+_OPTIONS: dict[Format, list[int]] = {
+    "png": [cv2.IMWRITE_PNG_COMPRESSION, 4],
+    "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92],
+    "webp": [cv2.IMWRITE_WEBP_QUALITY, 84],
+}
+_MEDIA: dict[Format, str] = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
+_ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".webp": "webp"}
+
+
+def to_uint8(image: Annotated[Tensor, "H W 3"]) -> Picture:
+    """A float image as a picture: clipped to [0, 1] and rounded. Raises NumericsError where a value is not finite."""
+    pixels = image.detach().to("cpu", torch.float32)
+    if not bool(torch.isfinite(pixels).all()):
+        share = float((~torch.isfinite(pixels)).float().mean())
+        raise NumericsError(f"an image of shape {tuple(image.shape)} has {share:.2%} values that are not finite")
+    # Half to even would move 0.5/255 steps unevenly; +0.5 and floor is what every image library does.
+    pictured: Picture = (pixels.clamp(0, 1) * 255 + 0.5).to(torch.uint8).contiguous().numpy()
+    return pictured
+
+
+def checked(picture: Picture) -> Picture:
+    """The picture itself, if it is one. Raises DataError."""
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or 0 in picture.shape:
+        raise DataError(f"a picture must be uint8 of shape [H W 3]; found {picture.dtype} of shape {picture.shape}")
+    return picture
+
+
+def encode(picture: Picture, form: Format) -> bytes:
+    """The file of a picture. PNG is exact; JPEG (92) and WebP (84) are for the eye."""
+    done, data = cv2.imencode(f".{form}", cv2.cvtColor(checked(picture), cv2.COLOR_RGB2BGR), _OPTIONS[form])
+    if not done:
+        raise DataError(f"{form} cannot hold a picture of {picture.shape[1]}x{picture.shape[0]} pixels; use png")
+    return bytes(data.tobytes())
+
+
+def data_uri(picture: Picture, form: Format = "webp") -> str:
+    """A picture as text that a page can hold."""
+    return f"data:{_MEDIA[form]};base64,{base64.b64encode(encode(picture, form)).decode('ascii')}"
+
+
+def shrink(picture: Picture, side: int) -> Picture:
+    """The picture with its longer side at most `side` pixels, area-averaged; never enlarged."""
+    height, width = checked(picture).shape[:2]
+    scale = side / max(height, width)
+    if scale >= 1:
+        return picture
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def write_image(path: Path, picture: Picture) -> None:
+    """Write a picture, whole or not at all, in the format that the name ends with: .png .jpg .jpeg .webp."""
+    form = _ENDINGS.get(path.suffix.lower())
+    if form is None:
+        raise DataError(f"{path}: '{path.suffix}' is no picture format; allowed are {' '.join(_ENDINGS)}")
+    write_bytes(path, encode(picture, form))

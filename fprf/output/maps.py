@@ -1,0 +1,152 @@
+"""Depth and matching as pictures: what the geometry is, and which reference each place took its style from."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import DataError
+from .images import Picture, to_uint8
+
+__all__ = ["depth_image", "depth_limits", "match_image", "match_summary", "palette"]
+
+_EMPTY = (0.50, 0.51, 0.53)
+"""Where nothing was hit: a grey that neither map uses."""
+
+_COLOURS = (
+    (0.902, 0.624, 0.000),  # orange
+    (0.337, 0.706, 0.914),  # sky blue
+    (0.835, 0.369, 0.000),  # vermilion
+    (0.000, 0.620, 0.451),  # bluish green
+    (0.800, 0.475, 0.655),  # reddish purple
+    (0.000, 0.447, 0.698),  # blue
+    (0.941, 0.894, 0.259),  # yellow
+)
+"""Okabe and Ito's colours, told apart with any of the usual colour blindnesses; ordered for contrast between neighbours."""
+
+
+def palette(count: int) -> Annotated[Tensor, "T 3"]:
+    """sRGB colours in [0, 1] of `count` references. From the eighth on the hues repeat, a third darker or lighter."""
+    rows = []
+    for index in range(count):
+        colour, turn = torch.tensor(_COLOURS[index % len(_COLOURS)]), index // len(_COLOURS)
+        # 1st repeat darker, 2nd lighter, 3rd darker still: lightness then is all that is left to tell them apart.
+        strength = 1 - 0.65 ** ((turn + 1) // 2)
+        rows.append(torch.lerp(colour, torch.full((3,), float(turn % 2 == 0)), strength))
+    return torch.stack(rows) if rows else torch.zeros(0, 3)
+
+
+def depth_limits(
+    depths: Sequence[Annotated[Tensor, "H W"]], opacities: Sequence[Annotated[Tensor, "H W"]]
+) -> tuple[float, float]:
+    """Disparity (1 / depth) range of several views, so that they share one scale: 1st and 99th percentile where solid.
+
+    (0, 1) where nothing is solid in any view.
+    """
+    seen = [(1 / depth[_solid(depth, opacity)]).cpu().numpy() for depth, opacity in zip(depths, opacities, strict=True)]
+    disparity = np.concatenate([np.zeros(0, np.float32), *seen])
+    if not len(disparity):
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(disparity, (1, 99)))
+    return low, high
+
+
+def depth_image(
+    depth: Annotated[Tensor, "H W"], opacity: Annotated[Tensor, "H W"], limits: tuple[float, float] | None = None
+) -> Picture:
+    """Depth (any unit, > 0) as colour: near is bright, far is dark, nothing is grey. `limits` as from `depth_limits`.
+
+    The colour is even in disparity, which is how much a place moves between views. Inferno: perceptually even, legible
+    in greyscale and to the colour-blind.
+    """
+    low, high = depth_limits([depth], [opacity]) if limits is None else limits
+    solid = _solid(depth, opacity, 0.0)
+    disparity = torch.where(solid, 1 / torch.where(solid, depth, torch.ones_like(depth)), torch.zeros_like(depth))
+    # A plane square to the view has one disparity: shown as halfway, not as noise.
+    even = (disparity - low) / (high - low) if high > low else torch.full_like(disparity, 0.5)
+    # Inferno's first steps are black: stay off them, so that far places keep some hue.
+    steps = (even.clamp(0, 1) * 235 + 20).to(torch.uint8).cpu().numpy()
+    coloured = cv2.cvtColor(cv2.applyColorMap(steps, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    cover = torch.where(solid, opacity, torch.zeros_like(opacity)).clamp(0, 1).cpu().float()
+    return _over_empty(torch.from_numpy(coloured).float() / 255, cover)
+
+
+def match_image(
+    attention: Annotated[Tensor, "H W T"],
+    reference: Annotated[Tensor, "T"],
+    names: Sequence[str],
+    opacity: Annotated[Tensor, "H W"] | None = None,
+) -> Picture:
+    """Which reference each pixel took its style from: its hue (`palette`), the code of it as a shade, doubt as darkness.
+
+    `attention` as `Stylizer.match` gives it (rows sum to 1); `reference` is the dictionary's. Raises DataError for
+    numbers that do not fit together.
+    """
+    _fitting(attention, reference, names)
+    colours = _code_colours(reference.cpu(), len(names))
+    weights = attention.detach().cpu().float()
+    # Doubt never hides the hue: the darkest is 45 %.
+    light = 0.45 + 0.55 * (1 - _entropy(weights) / math.log(max(2, weights.shape[-1])))
+    picture = colours[weights.argmax(dim=-1)] * light.clamp(0, 1)[..., None]
+    cover = torch.ones(weights.shape[:2]) if opacity is None else opacity.detach().cpu().float().clamp(0, 1)
+    return _over_empty(picture, cover)
+
+
+def match_summary(
+    attention: Annotated[Tensor, "H W T"],
+    reference: Annotated[Tensor, "T"],
+    names: Sequence[str],
+    opacity: Annotated[Tensor, "H W"] | None = None,
+) -> dict[str, object]:
+    """How the references were used: their `share` of the attention (sums to 1), the mean of the best code's attention
+    (`mean_score`, 1 = certain) and the mean `entropy` in bits (0 = certain). Pixels count by their opacity.
+    """
+    _fitting(attention, reference, names)
+    weights = attention.detach().cpu().double()
+    cover = torch.ones(weights.shape[:2]) if opacity is None else opacity.detach().cpu()
+    each = cover.double().clamp(min=0)
+    # An empty view has no shares to speak of; dividing by 1 leaves them at 0.
+    total = float(each.sum()) or 1.0
+    codes = (weights * each[..., None]).sum(dim=(0, 1)) / total
+    shares = torch.zeros(len(names), dtype=torch.float64).index_add_(0, reference.cpu(), codes)
+    return {
+        "references": [{"name": name, "share": float(share)} for name, share in zip(names, shares, strict=True)],
+        "mean_score": float((weights.amax(dim=-1) * each).sum()) / total,
+        "entropy_bits": float((_entropy(weights) * each).sum()) / total / math.log(2),
+    }
+
+
+def _solid(depth: Tensor, opacity: Tensor, least: float = 0.5) -> Tensor:
+    return torch.isfinite(depth) & (depth > 0) & (opacity > least)
+
+
+def _over_empty(picture: Annotated[Tensor, "H W 3"], cover: Annotated[Tensor, "H W"]) -> Picture:
+    return to_uint8(torch.lerp(torch.tensor(_EMPTY).expand_as(picture), picture, cover[..., None]))
+
+
+def _entropy(weights: Annotated[Tensor, "H W T"]) -> Annotated[Tensor, "H W"]:
+    """In nats; 0 log 0 = 0."""
+    return torch.special.entr(weights.clamp(min=0)).sum(dim=-1)
+
+
+def _code_colours(reference: Annotated[Tensor, "T"], count: int) -> Annotated[Tensor, "T 3"]:
+    """The colour of every code: its reference's, from a quarter darker to a quarter lighter in the order of the codes."""
+    hues = palette(count)
+    colours = torch.empty(len(reference), 3)
+    for index in range(count):
+        codes = (reference == index).nonzero()[:, 0]
+        for place, code in enumerate(codes.tolist()):
+            shade = 0.0 if len(codes) == 1 else 0.5 * place / (len(codes) - 1) - 0.25
+            colours[code] = torch.lerp(hues[index], torch.full((3,), float(shade > 0)), abs(shade))
+    return colours
+
+
+def _fitting(attention: Tensor, reference: Tensor, names: Sequence[str]) -> None:
+    if attention.ndim != 3 or attention.shape[-1] != len(reference) or not len(reference):
+        raise DataError(f"attention {tuple(attention.shape)} does not fit {len(reference)} style codes; it must be [H W T]")
+    if int(reference.min()) < 0 or int(reference.max()) >= len(names):
+        raise DataError(f"style codes name reference {int(reference.max())}, but there are {len(names)} references")

@@ -1,0 +1,119 @@
+"""Frames to a film or to numbered pictures, one frame in memory at a time."""
+
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+
+from ..errors import DataError, UsageError
+from .atomic import atomic_path
+from .images import Picture, checked, write_image
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+__all__ = ["write_frames", "write_video"]
+
+Codec = Literal["h264", "mp4v"]
+
+
+def _even(frame: Picture) -> Picture:
+    """4:2:0 colour needs even sizes: repeat the last row and column."""
+    bottom, right = frame.shape[0] % 2, frame.shape[1] % 2
+    if not bottom and not right:
+        return frame
+    return np.pad(frame, ((0, bottom), (0, right), (0, 0)), mode="edge")
+
+
+def _alike(frames: Iterable[Picture], path: Path) -> Iterator[Picture]:
+    """The frames, even-sized; DataError at the first whose size differs from that of the first of all."""
+    shape: tuple[int, ...] | None = None
+    for index, frame in enumerate(frames):
+        if shape is None:
+            shape = checked(frame).shape
+        if frame.shape != shape:
+            raise DataError(
+                f"{path}: frame {index} is {frame.shape[1]}x{frame.shape[0]}, the first was {shape[1]}x{shape[0]}; "
+                "render all views of a film at one size, or write a folder of pictures"
+            )
+        yield _even(checked(frame))
+
+
+def _with_av(av: "ModuleType", path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction) -> None:
+    with av.open(str(path), "w", options={"movflags": "+faststart"}) as container:
+        stream = container.add_stream("libx264", rate=fps, options={"crf": "17", "preset": "medium"})
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p"
+        # Players take untagged films of more than 576 lines for BT.709 and smaller ones for BT.601: say which it is.
+        context = stream.codec_context
+        context.color_range, context.colorspace, context.color_primaries, context.color_trc = 1, 1, 1, 1
+        for frame in frames:
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace="ITU709")))
+        container.mux(stream.encode(None))
+
+
+def _with_cv2(path: Path, frames: Iterator[Picture], size: tuple[int, int], fps: Fraction) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), float(fps), size)
+    if not writer.isOpened():
+        raise DataError(f"{path}: no video encoder here; install one with pip install 'fprf[video]', or write a folder")
+    try:
+        for frame in frames:
+            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    finally:
+        writer.release()
+
+
+def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool = True) -> Codec:
+    """Write an .mp4, whole or not at all: H.264 where PyAV is installed (extra `video`), MPEG-4 part 2 elsewhere.
+
+    Odd sizes gain a repeated row or column. Returns the codec that was used; browsers play "h264" alone. `h264=False`
+    asks for the fallback. Raises UsageError for another ending, DataError for no frames or frames of several sizes.
+    """
+    if path.suffix.lower() != ".mp4":
+        raise UsageError(f"{path}: films end in .mp4; give such a name, or a folder for single pictures")
+    if not 0 < fps <= 1000:
+        raise UsageError(f"{path}: {fps} frames a second; must lie in (0, 1000]")
+    rate = Fraction(fps).limit_denominator(1001)
+    even = _alike(frames, path)
+    first = next(even, None)
+    if first is None:
+        raise DataError(f"{path}: no frames to write; the camera path is empty")
+    size = (first.shape[1], first.shape[0])
+    av = _av() if h264 else None
+    with atomic_path(path) as temporary:
+        if av is None:
+            _with_cv2(temporary, chain([first], even), size, rate)
+            return "mp4v"
+        _with_av(av, temporary, chain([first], even), size, rate)
+        return "h264"
+
+
+def _av() -> "ModuleType | None":
+    try:
+        import av
+    except ImportError:
+        return None
+    # Some distributions build it without x264.
+    return av if "libx264" in av.codecs_available else None
+
+
+def write_frames(folder: Path, names: Iterable[str], frames: Iterable[Picture]) -> list[Path]:
+    """Write each frame to FOLDER/NAME.png, whole or not at all each; names are stems such as "0001".
+
+    Raises DataError for a name that leaves the folder or comes twice; ValueError where names and frames differ in number.
+    """
+    written: list[Path] = []
+    for name, frame in zip(names, frames, strict=True):
+        path = folder / f"{name}.png"
+        if path.parent != folder or name in (".", "..", ""):
+            raise DataError(f"{folder}: '{name}' is no plain file name; frames carry names without a folder")
+        if path in written:
+            raise DataError(f"{folder}: two frames are named '{name}'; give every view its own name")
+        write_image(path, frame)
+        written.append(path)
+    return written

@@ -1,0 +1,226 @@
+"""Camera paths through a captured scene, as `Cameras` without distortion.
+
+World units and OpenGL axes as in `rendering.cameras`; float64. Every path stays where the training cameras were: a
+radiance field knows nothing of places that no camera has seen.
+"""
+
+import math
+from dataclasses import replace
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..errors import UsageError
+from .cameras import Cameras
+from .lens import PINHOLE
+from .splines import catmull_rom, quaternions, rotations, slerp
+
+__all__ = ["dataset", "interpolate", "look_at", "orbit", "spiral", "tour"]
+
+
+def dataset(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Cameras:
+    """The captured views of `indices`, in that order, with their own lenses: renders lie over the photographs."""
+    return cameras.select(indices)
+
+
+def look_at(
+    position: Annotated[Tensor, "M 3"], target: Annotated[Tensor, "M 3"], up: Annotated[Tensor, "3"]
+) -> Annotated[Tensor, "M 3 4"]:
+    """Poses at `position` that look at `target`, x level with respect to `up`. Rotations orthonormal to 1e-12.
+
+    Where the line of sight runs along `up`, which then says nothing, another axis takes its place.
+    """
+    back = _unit(position - target)
+    spare = torch.eye(3, dtype=back.dtype, device=back.device)[up.abs().argmin()]
+    right = torch.linalg.cross(up.expand_as(back), back)
+    vague = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm()
+    right = _unit(torch.where(vague, torch.linalg.cross(spare.expand_as(back), back), right))
+    return torch.stack([right, torch.linalg.cross(back, right), back, position], dim=-1)
+
+
+def spiral(
+    cameras: Cameras,
+    frames: int,
+    *,
+    points: Annotated[Tensor, "P 3"] | None = None,
+    depths: Annotated[Tensor, "V 2"] | None = None,
+    turns: int = 2,
+) -> Cameras:
+    """A closed spiral about the most central captured camera, looking at what that camera sees.
+
+    What it looks at lies at the median depth of the `points` in view, else at LLFF's blend of `depths` (near, far), else
+    where the optical axes meet. The radii are the spread of the cameras along the central camera's axes, shrunk until
+    no frame is farther from a captured camera than captured cameras are from each other. Raises UsageError.
+    """
+    _at_least("frames", frames, 1)
+    _at_least("turns", turns, 1)
+    centres = cameras.pose[:, :, 3]
+    apart = torch.cdist(centres, centres)
+    middle = int(apart.sum(-1).argmin())
+    rotation, start = cameras.pose[middle, :, :3], centres[middle]
+    depth = _focus_depth(cameras, middle, points, depths)
+    spread = ((centres - start) @ rotation).abs().quantile(0.9, dim=0)
+    # Beyond a third of the depth the view would swing by more than 18 degrees, or pass what it looks at.
+    radii = spread.clamp(max=depth / 3)
+    angle = torch.arange(frames, dtype=centres.dtype, device=centres.device) * (2 * math.pi * turns / frames)
+    loop = (torch.stack([angle.cos(), angle.sin(), (angle / turns).sin()], dim=-1) * radii) @ rotation.T
+    reach = 1.0 if len(cameras) == 1 else _spacing(apart)
+    for step in range(_SHRINKS):
+        position = start + loop * (1 - step / _SHRINKS)
+        if float(torch.cdist(position, centres).amin(dim=-1).amax()) <= reach:
+            break
+    target = (start - rotation[:, 2] * depth).expand_as(position)
+    return _pinhole(look_at(position, target, rotation[:, 1]), cameras, middle)
+
+
+def orbit(cameras: Cameras, frames: int, *, points: Annotated[Tensor, "P 3"] | None = None) -> Cameras:
+    """Around the place that the cameras look at, in the distance and elevation that they have at each azimuth.
+
+    A full circle where the cameras surround the place, else to and fro within the arc that they cover; closed in both
+    cases. The axis is the cameras' mean up, or for cameras that look straight down, against their view. Raises UsageError.
+    """
+    _at_least("frames", frames, 1)
+    pose = cameras.pose
+    centres, up = pose[:, :, 3], pose[:, :, 1].mean(dim=0)
+    if float(up.norm()) < 0.3:
+        up = pose[:, :, 2].mean(dim=0)
+    if float(up.norm()) < 1e-6:
+        raise UsageError("orbit: the cameras have no common up; choose the path 'interpolate' or 'dataset'")
+    up = _unit(up)
+    middle = int(torch.cdist(centres, centres).sum(-1).argmin())
+    target = _meeting(pose)
+    if target is None:
+        target = centres[middle] - pose[middle, :, 2] * _focus_depth(cameras, middle, points, None)
+    east = _unit(_across(up))
+    north = torch.linalg.cross(up, east)
+    offset = centres - target
+    distance = offset.norm(dim=-1)
+    azimuth = torch.atan2(offset @ north, offset @ east)
+    elevation = torch.asin(((offset @ up) / distance.clamp(min=1e-12)).clamp(-1, 1))
+    angle = _sweep(azimuth, frames)
+    # Von Mises kernel, about 15 degrees wide; the maximum is taken out so that an empty azimuth takes the nearest camera.
+    closeness = 15 * torch.cos(angle[:, None] - azimuth)
+    share = torch.softmax(closeness, dim=-1)
+    high, far = share @ elevation, share @ distance
+    level = angle.cos()[:, None] * east + angle.sin()[:, None] * north
+    position = target + far[:, None] * (high.cos()[:, None] * level + high.sin()[:, None] * up)
+    return _pinhole(look_at(position, target.expand_as(position), up), cameras, middle)
+
+
+def interpolate(cameras: Cameras, order: Annotated[Tensor, "M"], frames_between: int) -> Cameras:
+    """Through the views of `order`, with `frames_between` new ones in each gap: (M - 1) (frames_between + 1) + 1 frames.
+
+    Positions follow a centripetal Catmull-Rom spline, which neither loops nor overshoots; rotations and intrinsics move
+    evenly (SLERP, linear). Every frame has the size of the first view. Raises UsageError.
+    """
+    _at_least("frames_between", frames_between, 0)
+    _at_least("the number of views", len(order), 1)
+    keys = cameras.select(order)
+    keys = keys.resized(keys.size[:1].expand(len(keys), 2))
+    frame = torch.arange((len(keys) - 1) * (frames_between + 1) + 1, device=keys.pose.device)
+    gap, u = frame // (frames_between + 1), (frame % (frames_between + 1)) / keys.pose.new_tensor(frames_between + 1)
+    after = (gap + 1).clamp(max=len(keys) - 1)
+    turn = quaternions(keys.pose[:, :, :3])
+    rotation = rotations(slerp(turn[gap], turn[after], u))
+    position = catmull_rom(keys.pose[:, :, 3], gap, u)
+    return Cameras(
+        pose=torch.cat([rotation, position[:, :, None]], dim=-1),
+        focal=torch.lerp(keys.focal[gap], keys.focal[after], u[:, None]),
+        centre=torch.lerp(keys.centre[gap], keys.centre[after], u[:, None]),
+        size=keys.size[gap],
+        distortion=torch.zeros_like(keys.distortion[gap]),
+        lens=torch.full_like(keys.lens[gap], PINHOLE),
+    )
+
+
+def tour(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Annotated[Tensor, "M"]:
+    """`indices` in an order fit for `interpolate`: from an outermost view always to the nearest one not yet visited."""
+    centres = cameras.pose[indices, :, 3]
+    apart = torch.cdist(centres, centres)
+    here = int(apart.sum(-1).argmax()) if len(indices) else 0
+    order: list[int] = []
+    for _ in range(len(indices)):
+        order.append(here)
+        apart[:, here] = torch.inf
+        here = int(apart[here].argmin())
+    return indices[torch.tensor(order, dtype=torch.int64, device=indices.device)]
+
+
+_SHRINKS = 64
+
+
+def _pinhole(pose: Annotated[Tensor, "F 3 4"], cameras: Cameras, view: int) -> Cameras:
+    """Frames at `pose` with the focal length and size of a captured view, without its distortion."""
+    like = cameras.select(torch.full((len(pose),), view, device=pose.device))
+    return replace(like, pose=pose, distortion=torch.zeros_like(like.distortion), lens=torch.full_like(like.lens, PINHOLE))
+
+
+def _at_least(name: str, value: int, low: int) -> None:
+    if value < low:
+        raise UsageError(f"camera path: {name} is {value}; must be at least {low}")
+
+
+def _unit(vector: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(vector, dim=-1, eps=1e-300)
+
+
+def _across(up: Tensor) -> Tensor:
+    """A vector across a unit vector: along the axis that it is least like."""
+    spare = torch.zeros_like(up)
+    spare[up.abs().argmin()] = 1.0
+    across: Tensor = torch.linalg.cross(up, spare)
+    return across
+
+
+def _spacing(apart: Annotated[Tensor, "V V"]) -> float:
+    """The distance from a camera to the nearest other one, such that nine in ten are closer."""
+    others = apart + torch.diag(torch.full_like(apart[0], torch.inf))
+    return float(others.amin(dim=-1).quantile(0.9))
+
+
+def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:
+    """The point closest to all optical axes, in front of the cameras; None where the axes are too parallel to say."""
+    forward = -pose[:, :, 2]
+    across = torch.eye(3, dtype=pose.dtype, device=pose.device) - forward[:, :, None] * forward[:, None, :]
+    system = across.mean(dim=0)
+    values = torch.linalg.eigvalsh(system)
+    # The smallest eigenvalue is the mean squared sine between the axes: 1e-3 is 2 degrees.
+    if float(values[0]) < 1e-3:
+        return None
+    target = torch.linalg.solve(system, (across @ pose[:, :, 3:]).mean(dim=0)[:, 0])
+    ahead = ((target - pose[:, :, 3]) * forward).sum(dim=-1)
+    return target if float((ahead > 0).double().mean()) > 0.75 else None
+
+
+def _focus_depth(cameras: Cameras, view: int, points: Tensor | None, depths: Tensor | None) -> float:
+    """Depth along the axis of a view at which what it shows lies."""
+    pose = cameras.pose[view]
+    if points is not None and len(points):
+        local = (points.to(pose) - pose[:, 3]) @ pose[:, :3]
+        seen = local[local[:, 2] < 0]
+        at = (seen[:, :2] / -seen[:, 2:]).abs()
+        inside = (at <= cameras.size[view] / 2 / cameras.focal[view]).all(dim=-1)
+        if int(inside.sum()) >= 8:
+            return float(-seen[inside, 2].median())
+    if depths is not None:
+        near, far = (float(depth) for depth in depths[view])
+        return 1 / (0.25 / near + 0.75 / far)
+    target = _meeting(cameras.pose)
+    ahead = 0.0 if target is None else float((pose[:, 3] - target) @ pose[:, 2])
+    spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
+    # Parallel axes show something far away compared with the baseline, as in any capture that can be reconstructed.
+    return ahead if ahead > 0 else (4 * spread if spread > 0 else 1.0)
+
+
+def _sweep(azimuth: Annotated[Tensor, "V"], frames: int) -> Annotated[Tensor, "F"]:
+    """Angles of a closed walk over the azimuths: a circle, or to and fro where more than 100 degrees hold no camera."""
+    phase = torch.arange(frames, dtype=azimuth.dtype, device=azimuth.device) / frames
+    around = azimuth.sort().values
+    gaps = torch.cat([around[1:], around[:1] + 2 * math.pi]) - around
+    widest = int(gaps.argmax())
+    first = float(around[(widest + 1) % len(around)])
+    if float(gaps[widest]) < math.radians(100):
+        return first + 2 * math.pi * phase
+    arc = 2 * math.pi - float(gaps[widest])
+    return first + arc * (1 - torch.cos(2 * math.pi * phase)) / 2
