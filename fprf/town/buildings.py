@@ -38,12 +38,12 @@ def _gabled(lot: Lot, low: float, high: float, eave: float, rise: float, along: 
     return extrude(profile, axis, *sweep, [_HIDDEN, roof, roof, gable, gable])
 
 
-def house(lot: Lot, rng: np.random.Generator) -> list[Shape]:
-    """A house of one to three floors under a gabled or a flat roof."""
+def house(lot: Lot, style: int, rng: np.random.Generator) -> list[Shape]:
+    """A house of one to three floors under a gabled or a flat roof; the style is that of its walls."""
     storeys = 1 + int(rng.random() < 0.75) + int(rng.random() < 0.3)
     wall = Finish(
         Material.FACADE,
-        style=int(rng.integers(0, 4)),
+        style=style,
         tint=int(rng.integers(0, 8)),
         storeys=storeys,
         shutters=int(rng.random() < 0.45),

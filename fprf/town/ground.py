@@ -52,15 +52,15 @@ def paint_ground(points: Array, look: Palette) -> Colours:
         at = np.flatnonzero(kind == label)
         colour[at] = painter(x[at], y[at], look)
     if look.littering > 0:
-        share = np.array([0.0, 1.0, 0.45, 0.7], dtype=np.float32)[kind] * np.float32(look.littering)
-        fallen = step(0.6 * noise2(4.2 * x, 4.2 * y, 41) + 0.4 * noise2(0.7 * x, 0.7 * y, 43) + 0.72 * share, 0.72, 0.82)
+        share = np.array([0.0, 1.0, 0.3, 0.6], dtype=np.float32)[kind] * np.float32(look.littering)
+        fallen = step(0.6 * noise2(6.5 * x, 6.5 * y, 41) + 0.4 * noise2(0.7 * x, 0.7 * y, 43) + 0.72 * share, 0.72, 0.82)
         hue = mix(np.array(look.litter) * 0.75, np.array(look.litter) * 1.25, noise2(6 * x, 6 * y, 45))
         colour = mix(colour, hue, fallen * 0.85)
     if look.snowing > 0:
-        share = np.array([0.0, 1.0, 0.42, 0.72], dtype=np.float32)[kind] * np.float32(look.snowing)
+        share = np.array([0.0, 1.0, 0.36, 0.72], dtype=np.float32)[kind] * np.float32(look.snowing)
         track = band(np.abs(y) - 1.05, 0.35, 0.25) + band(np.abs(y) - 2.55, 0.35, 0.25)
         share -= np.where(kind == ROAD, 0.22 * track, 0).astype(np.float32)
-        lies = step(fractal2(0.9 * x, 0.9 * y, 51) * 0.6 + share, 0.55, 0.85)
+        lies = step((0.6 * fractal2(0.6 * x, 1.4 * y, 51) + 0.4 * noise2(4 * x, 4 * y, 55)) * 0.7 + share, 0.55, 0.82)
         tone = 0.94 + 0.06 * fractal2(1.6 * x, 1.6 * y, 53)
         colour = mix(colour, np.array(look.snow) * tone[:, None], lies * 0.95)
     return colour

@@ -57,12 +57,15 @@ class Town(NamedTuple):
 def _row(side: int, rng: np.random.Generator) -> list[Shape]:
     """Houses, gardens and driveways of one side of the street."""
     shapes: list[Shape] = []
+    styles = rng.permutation(4)
+    number = 0
     x = START + float(rng.uniform(-1.0, 1.0))
     while x < END - 7.0:
         width = float(rng.uniform(6.5, 9.5))
         front = WALK_HALF + float(rng.uniform(2.2, 4.0))
         lot = Lot(x, x + width, front, float(rng.uniform(7.0, 9.0)), side)
-        shapes += house(lot, rng)
+        shapes += house(lot, int(styles[number % 4]), rng)
+        number += 1
         door = x + (width / max(1, round(width / 2.7))) * (max(1, round(width / 2.7)) // 2 + 0.5)
         for _ in range(int(rng.integers(1, 4))):
             at = float(rng.uniform(x + 0.6, x + width - 0.6))

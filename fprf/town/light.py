@@ -127,6 +127,6 @@ def sky(direction: Array, look: Palette) -> Colours:
         whole = np.floor(grid)
         i, j = whole.astype(np.int64).T
         apart = grid - whole - 0.3 - 0.4 * np.stack([hashed(141, i, j), hashed(142, i, j)], 1)
-        star = np.exp(-(apart**2).sum(1) / 0.012) * (hashed(143, i, j) > 0.82) * hashed(144, i, j)
+        star = np.exp(-(apart**2).sum(1) / 0.012) * (hashed(143, i, j) > 0.88) * hashed(144, i, j)
         colour = colour + look.stars * (star * (1 - cover[:, 0]))[:, None]
     return np.clip(colour, 0, 1).astype(np.float32)

@@ -15,13 +15,13 @@ __all__ = ["foliage_normals", "paint"]
 
 Colours = NDArray[np.float32]
 Array = NDArray[np.float64]
-_WOOD_RATE, _LEAF_RATE = 0.9, 2.6
+_WOOD_RATE, _LEAF_RATE = 1.2, 4.2
 """Noise cells per metre in the distant wood and in near crowns."""
 
 
 def foliage_normals(points: Array, normals: Colours, distant: NDArray[np.bool_]) -> Colours:
     """Normals [N 3] roughened by leaves; a function of the point alone."""
-    p = points * np.where(distant, 0.7, 2.2)[:, None]
+    p = points * np.where(distant, 0.9, 3.4)[:, None]
     x, y, z = p.T
     rough = np.stack([noise3(x, y, z, 81 + i) for i in range(3)], 1) - np.float32(0.5)
     bent = normals + np.float32(1.7) * rough
@@ -34,8 +34,8 @@ def _foliage(town: Town, face: NDArray[np.integer], points: Array, normals: Colo
     rate = np.where(distant, _WOOD_RATE, _LEAF_RATE)[:, None]
     fine = fractal3(points * rate, 1.0, 91)
     broad = fractal3(points * rate * 0.3, 1.0, 95)
-    colour = mix(pairs[:, 0], pairs[:, 1], step(0.65 * fine + 0.35 * broad, 0.25, 0.75))
-    colour = colour * (0.62 + 0.38 * step(fine, 0.2, 0.5))[:, None]
+    colour = mix(pairs[:, 0], pairs[:, 1], step(0.6 * fine + 0.4 * broad, 0.15, 0.85))
+    colour = colour * (0.70 + 0.30 * step(fine, 0.15, 0.5))[:, None]
     return _snowed(colour, fine, normals, look, 0.85)
 
 

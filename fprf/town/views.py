@@ -32,7 +32,7 @@ def walk(*, seed: int, views: int, width: int, height: int) -> list[View]:
         x = _FROM + (_TO - _FROM) * (k + 0.5) / views
         y = -2.6 * math.sin(math.radians(1.8 * yaw)) + 1.2 * math.sin(2.4 * k) + float(rng.uniform(-0.3, 0.3))
         place = np.array([x, float(np.clip(y, -3.2, 3.2)), float(rng.uniform(1.6, 2.4))])
-        result.append(View(_pose(place, yaw, float(rng.uniform(3.0, 8.0))), focal, width, height))
+        result.append(View(_pose(place, yaw, float(rng.uniform(4.0, 9.0))), focal, width, height))
     return result
 
 

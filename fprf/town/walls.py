@@ -59,8 +59,8 @@ def _window(parts: Parts, key: NDArray[np.float32], look: Palette) -> tuple[Colo
     edge = np.minimum(parts.half - np.abs(parts.across), np.minimum(parts.up, parts.tall - parts.up))
     bars = np.maximum(band(parts.across, 0.035), band(parts.up - 0.64 * parts.tall, 0.035))
     frame = np.maximum(1 - step(edge, 0.07, 0.11), bars)
-    lit = (key < look.lit) * (0.55 + 0.75 * (key * 13 % 1)) * (1.15 - 0.45 * height) * (1 - 0.45 * drape)
-    glow = np.array(look.light) ** 2 * (lit * (1 - 0.85 * frame))[:, None]
+    lit = (key < look.lit) * (0.30 + 0.50 * (key * 13 % 1)) * (1.15 - 0.45 * height) * (1 - 0.45 * drape)
+    glow = np.array(look.light) ** 2.2 * (lit * (1 - 0.85 * frame))[:, None]
     return mix(colour, np.array(look.trim), frame), glow.astype(np.float32)
 
 

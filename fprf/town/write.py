@@ -1,0 +1,184 @@
+"""A town as a scene folder that any reader of Nerfstudio's format understands, with the truth beside the images.
+
+transforms.json           cameras, split
+images/0000.png           sRGB
+depth/0000.npz            `depth` [H W] float32, metres along the unit ray through the pixel's centre, inf = sky
+labels/0000.png           class ids, one channel
+points.npz                `xyz` [P 3] float32 surface points, `rgb` [P 3] uint8
+palette.json, town.json   colours and light; the settings, written last
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from .classes import CLASSES
+from .layout import build_town
+from .palettes import Palette
+from .palettes import palette as palette_of
+from .render import Picture, render
+from .trace import View, directions
+from .views import is_test, walk
+
+__all__ = ["TownSettings", "is_town", "read_truth", "write_town"]
+
+_EDITION = 1
+"""Counts the looks of the town: raised with every change to its pictures, so that cached folders are rendered anew."""
+_POINTS = 256
+"""Surface points kept per training view."""
+_RECORD = "town.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TownSettings:
+    """What a folder holds."""
+
+    seed: int
+    palette: str
+    views: int
+    width: int
+    height: int
+    edition: int = _EDITION
+
+    @property
+    def key(self) -> str:
+        """A short hash, for folder names."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def is_town(folder: Path) -> bool:
+    """Whether a folder says that it is a town."""
+    return (folder / _RECORD).is_file()
+
+
+def _files(views: int) -> list[str]:
+    kinds = (("images", "png"), ("depth", "npz"), ("labels", "png"))
+    stems = [f"{kind}/{k:04d}.{suffix}" for kind, suffix in kinds for k in range(views)]
+    return [*stems, "transforms.json", "points.npz", "palette.json"]
+
+
+def _complete(folder: Path, settings: TownSettings) -> bool:
+    """Whether a folder holds exactly these settings, all files present."""
+    try:
+        found = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    same = isinstance(found, dict) and found.get("settings") == asdict(settings)
+    return same and all((folder / name).is_file() for name in _files(settings.views))
+
+
+def read_truth(folder: Path, view: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth [H W] (inf = sky) and labels [H W] of a view of a town folder. Raises DataError where they are missing."""
+    depth, label = folder / "depth" / f"{view:04d}.npz", folder / "labels" / f"{view:04d}.png"
+    try:
+        with np.load(depth) as stored:
+            distance = np.asarray(stored["depth"], dtype=np.float32)
+        kinds = cv2.imdecode(np.frombuffer(label.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"{depth}: {error}; remove the folder {folder} and let it be rendered again") from error
+    if kinds is None:
+        raise DataError(f"{label}: not an image; remove the folder {folder} and let it be rendered again")
+    return distance, np.asarray(kinds, dtype=np.uint8)
+
+
+def _save_image(path: Path, image: NDArray[np.uint8]) -> None:
+    done, data = cv2.imencode(".png", image)
+    assert done
+    path.write_bytes(data.tobytes())
+
+
+def _save_json(path: Path, value: object) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def _transforms(views: list[View]) -> dict[str, object]:
+    names = [f"images/{k:04d}.png" for k in range(len(views))]
+    bottom = [0.0, 0.0, 0.0, 1.0]
+    return {
+        "camera_model": "PINHOLE",
+        "fl_x": views[0].focal,
+        "fl_y": views[0].focal,
+        "cx": views[0].width / 2,
+        "cy": views[0].height / 2,
+        "w": views[0].width,
+        "h": views[0].height,
+        "frames": [
+            {"file_path": name, "transform_matrix": [*view.pose.tolist(), bottom]}
+            for name, view in zip(names, views, strict=True)
+        ],
+        "train_filenames": [name for k, name in enumerate(names) if not is_test(k)],
+        "test_filenames": [name for k, name in enumerate(names) if is_test(k)],
+    }
+
+
+def _surface(view: View, picture: Picture, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    at = np.flatnonzero(np.isfinite(picture.depth))
+    at = rng.permutation(at)[:_POINTS]
+    ray = np.stack(directions(view, 1), -1).reshape(-1, 3)[at]
+    points = view.pose[:, 3] + ray * picture.depth.reshape(-1, 1)[at]
+    return points.astype(np.float32), picture.rgb.reshape(-1, 3)[at]
+
+
+def _fill(folder: Path, settings: TownSettings, look: Palette) -> None:
+    town = build_town(settings.seed)
+    views = walk(seed=settings.seed, views=settings.views, width=settings.width, height=settings.height)
+    rng = np.random.default_rng([0x9015, settings.seed])
+    for name in ("images", "depth", "labels"):
+        (folder / name).mkdir()
+    cloud = []
+    for k, view in enumerate(views):
+        picture = render(town, view, look)
+        _save_image(folder / "images" / f"{k:04d}.png", np.ascontiguousarray(picture.rgb[..., ::-1]))
+        _save_image(folder / "labels" / f"{k:04d}.png", picture.labels)
+        np.savez_compressed(folder / "depth" / f"{k:04d}.npz", depth=picture.depth)
+        if not is_test(k):
+            cloud.append(_surface(view, picture, rng))
+    np.savez_compressed(
+        folder / "points.npz", xyz=np.concatenate([c[0] for c in cloud]), rgb=np.concatenate([c[1] for c in cloud])
+    )
+    _save_json(folder / "transforms.json", _transforms(views))
+    _save_json(folder / "palette.json", asdict(look))
+    _save_json(folder / _RECORD, {"settings": asdict(settings), "classes": list(CLASSES)})
+
+
+def write_town(folder: Path, *, seed: int, palette: str, views: int, width: int, height: int) -> None:
+    """Renders a town into a folder, all or nothing; a complete one of the same settings is left as it is.
+
+    Raises DataError where the folder holds something else, or can't be written.
+    """
+    settings = TownSettings(seed=seed, palette=palette, views=views, width=width, height=height)
+    look = palette_of(palette)
+    if _complete(folder, settings):
+        return
+    if folder.exists() and not is_town(folder) and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(f"{folder}: holds something that is not a town; name a folder that is empty or new")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as scratch:
+            fresh = Path(scratch) / "town"
+            fresh.mkdir()
+            _fill(fresh, settings, look)
+            _place(fresh, folder, settings)
+    except OSError as error:
+        raise DataError(f"{folder}: can't be written ({error}); free some space or name another folder") from error
+
+
+def _place(fresh: Path, folder: Path, settings: TownSettings) -> None:
+    """Moves a finished folder to its place; of several writers of the same one, the first wins."""
+    if folder.exists():
+        if _complete(folder, settings):
+            return
+        os.rename(folder, fresh.with_name("old"))
+    try:
+        os.rename(fresh, folder)
+    except OSError:
+        if not _complete(folder, settings):
+            raise
