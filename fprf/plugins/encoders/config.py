@@ -52,7 +52,7 @@ class BundledContentConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class BundledSemanticConfig(EncoderConfig):
-    """Ships with the package: a small network distilled from MobileNet-class features, stride 8; day and night agree."""
+    """Ships with the package: a small network distilled from MobileNet-class features, stride 8, steady in any light."""
 
     weights: Path | None = None
     """A file made by `fprf pretrain semantic`. By default the one that ships."""
@@ -66,12 +66,12 @@ class BundledSemanticConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Vgg19Config(EncoderConfig):
-    """VGG-19 trained on ImageNet, the paper's content encoder. torchvision's weights are downloaded once, unless named."""
+    """VGG-19 of ImageNet, the paper's content encoder. torchvision's weights are downloaded once, unless named."""
 
     layer: str = "relu2_1"
     """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
     weights: Path | None = None
-    """torchvision's vgg19-dcbb9e9d.pth, or a safetensors file with torchvision's keys. By default the download cache."""
+    """torchvision's vgg19-dcbb9e9d.pth, or a safetensors file with its keys. By default the download cache."""
     normalise: bool = True
     """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
 
@@ -81,7 +81,7 @@ class Vgg19Config(EncoderConfig):
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or end before the layer."""
-        from .vgg import build_vgg19
+        from .vgg_weights import build_vgg19
 
         return build_vgg19(self.layer, weights=self.weights, normalise=self.normalise)
 

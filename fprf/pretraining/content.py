@@ -1,0 +1,138 @@
+"""Distils the content encoder: a slim network learns the principal components of normalised VGG-19 relu2_1.
+
+The components are those of guided-filtered features, which is what scenes learn; the student imitates the raw ones.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..datamanagers.config import GuidedConfig
+from ..errors import UsageError
+from ..interfaces import Encoder
+from ..plugins.encoders.bundled import CONTENT_KIND, load_content_encoder
+from ..plugins.encoders.students import ContentStudent
+from ..plugins.encoders.vgg_weights import build_vgg19
+from ..plugins.weightfiles import write_weights
+from .basis import Basis, fit_basis
+from .config import DistilConfig
+from .filtered import filtered_at, filtered_whole, random_pixels
+from .loop import generator_of, train
+from .photos import crop, find_photos, load_photo, split
+
+__all__ = ["content_report", "pretrain_content"]
+
+CHOICES = (24, 32, 48)
+ENERGY = 0.99
+BASIS_PHOTOS, BASIS_PIXELS = 120, 1000
+SCALES = (0.6, 1.5)
+"""Crops are that much larger or smaller than the photograph."""
+REPORT_PHOTOS = 16
+Report = dict[str, float | int | str]
+
+
+def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], None]) -> Report:
+    """Train, write `output`, and measure it on held-out photographs."""
+    if len(config.teachers) != 1:
+        raise UsageError(f"--teachers: {len(config.teachers)} files; `content` takes one, the weights of VGG-19")
+    teacher = build_vgg19("relu2_1", weights=config.teachers[0], normalise=True)
+    photos, held = split(find_photos(config.images))
+    say(f"{len(photos)} photographs to learn from, {len(held)} held out")
+    basis = content_basis(teacher, photos[:BASIS_PHOTOS], config.seed)
+    say(f"{len(basis.axes)} channels keep {100 * basis.kept:.2f} % of the filtered energy")
+    images, targets = _crops(teacher, basis, photos, config)
+    say(f"{len(images)} crops prepared")
+
+    torch.manual_seed(config.seed)
+    student = ContentStudent(len(basis.axes))
+
+    def loss(generator: torch.Generator) -> Tensor:
+        index = torch.randint(0, len(images), (config.batch,), generator=generator)
+        return F.mse_loss(student(images[index].float() / 255), targets[index].float())
+
+    steps = train(student, loss, config, output, say)
+    metadata = {
+        "kind": CONTENT_KIND,
+        "imitates": f"{len(basis.axes)} principal components of {teacher.identity}",
+        "made_by": f"fprf pretrain content, {steps} steps on {len(photos)} photographs, seed {config.seed}",
+        "licence": "Apache-2.0; trained by this project, holds no weights of its teacher",
+    }
+    write_weights(output, {name: value.half() for name, value in student.state_dict().items()}, metadata)
+    report = content_report(load_content_encoder(output), teacher, basis, held[:REPORT_PHOTOS])
+    return {"steps": steps, "channels": len(basis.axes), "energy_kept": round(basis.kept, 5), **report}
+
+
+def content_basis(teacher: Encoder, photos: Sequence[Path], seed: int) -> Basis:
+    """Principal components of the teacher's guided-filtered features."""
+    samples = []
+    for index, path in enumerate(photos):
+        photo = load_photo(path)
+        pixels = random_pixels(photo, BASIS_PIXELS, generator_of(seed, index))
+        samples.append(filtered_at(teacher, photo, pixels, GuidedConfig())[0])
+    return fit_basis(torch.cat(samples), CHOICES, ENERGY)
+
+
+def content_report(student: Encoder, teacher: Encoder, basis: Basis, photos: Sequence[Path]) -> Report:
+    """Relative L2 error of the student against its projected teacher, raw and guided-filtered, over whole photographs."""
+    error, energy = torch.zeros(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    projected = _Projected(teacher, basis)
+    for path in photos:
+        photo = load_photo(path)
+        image = photo.permute(2, 0, 1)[None]
+        pairs = [
+            (student(image), projected(image)),
+            (filtered_whole(student, photo, GuidedConfig()), filtered_whole(projected, photo, GuidedConfig())),
+        ]
+        for row, (found, wanted) in enumerate(pairs):
+            error[row] += (found - wanted).double().square().mean()
+            energy[row] += wanted.double().square().mean()
+    raw, filtered = (error / energy).sqrt().tolist()
+    return {"photos": len(photos), "relative_l2": round(raw, 4), "relative_l2_filtered": round(filtered, 4)}
+
+
+class _Projected(Encoder):
+    """The teacher, projected."""
+
+    def __init__(self, teacher: Encoder, basis: Basis) -> None:
+        super().__init__()
+        self.teacher, self.basis = teacher, basis
+
+    @property
+    def identity(self) -> str:
+        return f"{self.teacher.identity}:projected"
+
+    @property
+    def channels(self) -> int:
+        return len(self.basis.axes)
+
+    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
+        return self.basis.project(self.teacher(image))
+
+
+@torch.no_grad()
+def _crops(
+    teacher: Encoder, basis: Basis, photos: Sequence[Path], config: DistilConfig
+) -> tuple[Annotated[Tensor, "N 3 s s"], Annotated[Tensor, "N C t t"]]:
+    """Crops as bytes and their targets in half precision; some darker, flatter or tinted, as night scenes are."""
+    images, targets = [], []
+    for index, path in enumerate(photos):
+        generator = generator_of(config.seed + 1, index)
+        photo = load_photo(path)
+        batch = torch.stack([_toned(crop(photo, config.size, SCALES, generator), generator) for _ in range(config.crops)])
+        batch = (batch * 255).round()
+        images.append(batch.byte())
+        targets.append(basis.project(teacher(batch / 255)).half())
+    return torch.cat(images), torch.cat(targets)
+
+
+def _toned(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Annotated[Tensor, "3 H W"]:
+    draw = torch.rand(5, generator=generator)
+    if draw[0] > 0.3:
+        return image
+    gamma = 2 ** (2.4 * float(draw[1]) - 1.2)
+    gains = 0.5 + 0.7 * draw[2:5].view(3, 1, 1)
+    return (image**gamma * gains).clamp(0, 1)

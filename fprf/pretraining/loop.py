@@ -1,0 +1,109 @@
+"""The training loop of every pretraining: Adam, one cosine to zero by time or steps, a checkpoint to resume from.
+
+A batch is a function of (seed, step), so that a resumed run goes on as the interrupted one would have.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from ..plugins.weightfiles import read_weights, write_weights
+from .config import PretrainConfig
+
+__all__ = ["checkpoint_path", "generator_of", "train"]
+
+WARM_UP = 0.02
+"""Share of the run in which the rate rises."""
+EVERY_SECONDS = 60.0
+Say = Callable[[str], None]
+
+
+@dataclass
+class _Progress:
+    step: int = 0
+    seconds: float = 0.0
+
+    def done(self, config: PretrainConfig) -> float:
+        """How much of the run is over, 0 to 1."""
+        if config.steps is not None:
+            return min(1.0, self.step / config.steps)
+        return min(1.0, self.seconds / (60 * config.minutes))
+
+
+def generator_of(seed: int, step: int) -> torch.Generator:
+    """The generator of one step."""
+    return torch.Generator().manual_seed((seed << 32) + step)
+
+
+def checkpoint_path(output: Path) -> Path:
+    """Where the state of an unfinished run lies."""
+    return output.with_name(output.name + ".checkpoint")
+
+
+def train(
+    network: nn.Module, loss: Callable[[torch.Generator], Tensor], config: PretrainConfig, output: Path, say: Say
+) -> int:
+    """Train in place until the budget is spent; the number of steps. `loss` draws its batch from the generator."""
+    optimizer = torch.optim.Adam(network.parameters(), config.rate)
+    progress = _resume(network, optimizer, config, output)
+    if progress.step:
+        say(f"resumed at step {progress.step}")
+    network.train()
+    started, saved, spoken = time.monotonic() - progress.seconds, time.monotonic(), 0.0
+    while (done := progress.done(config)) < 1:
+        optimizer.param_groups[0]["lr"] = config.rate * min(1.0, done / WARM_UP + 0.01) * 0.5 * (1 + math.cos(math.pi * done))
+        value = loss(generator_of(config.seed, progress.step))
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        progress.step += 1
+        now = time.monotonic()
+        progress.seconds = now - started
+        if now - spoken > EVERY_SECONDS / 4:
+            say(f"step {progress.step}  {100 * done:.0f} %  loss {value.item():.5f}")
+            spoken = now
+        if now - saved > EVERY_SECONDS:
+            _save(network, optimizer, config, output, progress)
+            saved = now
+    network.eval()
+    checkpoint_path(output).unlink(missing_ok=True)
+    return progress.step
+
+
+def _key(config: PretrainConfig) -> str:
+    return repr(config)
+
+
+def _save(
+    network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path, progress: _Progress
+) -> None:
+    tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
+    for index, moments in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{index}.{name}": value for name, value in moments.items()}
+    metadata = {"config": _key(config), "progress": json.dumps([progress.step, progress.seconds])}
+    write_weights(checkpoint_path(output), tensors, metadata)
+
+
+def _resume(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path) -> _Progress:
+    """Continue the run of the same config; any other checkpoint is left alone and overwritten in time."""
+    path = checkpoint_path(output)
+    if not path.is_file():
+        return _Progress()
+    tensors, metadata = read_weights(path)
+    if metadata.get("config") != _key(config):
+        return _Progress()
+    network.load_state_dict({name[8:]: value for name, value in tensors.items() if name.startswith("network.")})
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimizer."):
+            _, index, moment = name.split(".")
+            state.setdefault(int(index), {})[moment] = value
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+    step, seconds = json.loads(metadata["progress"])
+    return _Progress(step=step, seconds=seconds)
