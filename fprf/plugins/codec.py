@@ -4,14 +4,13 @@ Strict: duplicate keys, NaN, unknown keys and foreign formats are refused. Writt
 """
 
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from .. import __version__
 from ..errors import ConfigError
+from ..output.atomic import write_text
 from . import registry
 from .slots import slots
 from .typed_json import Missing, from_json, to_json
@@ -35,17 +34,7 @@ def save_config(path: Path, config: "TrainConfig", method: str) -> None:
         "config": to_json(config),
     }
     text = json.dumps(whole, indent=1, allow_nan=False) + "\n"
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    part = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        part.chmod(0o644)  # mkstemp made it private; a run folder is made to be shared
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_text(path, text)
 
 
 def load_config(path: Path) -> "tuple[TrainConfig, str]":

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 
 from ..errors import PluginError
 
-__all__ = ["Entry", "entry", "forget", "installed", "load", "load_object", "name_of", "nearest", "peek", "unreadable"]
+__all__ = ["Entry", "entry", "forget", "groups", "installed", "load", "load_object", "name_of", "nearest", "peek", "unreadable"]
 
 T = TypeVar("T")
 
@@ -40,6 +40,11 @@ class _Scan(NamedTuple):
 def installed(group: str) -> Mapping[str, tuple[Entry, ...]]:
     """Entries of a group by name, sorted. A name that several packages claim has several entries."""
     return _scan().groups.get(group, MappingProxyType({}))
+
+
+def groups() -> tuple[str, ...]:
+    """Every group that some package registers in."""
+    return tuple(sorted(_scan().groups))
 
 
 def unreadable() -> tuple[str, ...]:

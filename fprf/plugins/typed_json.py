@@ -70,8 +70,7 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
         tag = {"type": registry.name_of(kind.group, type(value))} if kind else {}
         hints = hints_of(type(value))
         return tag | {
-            f.name: _encode(getattr(value, f.name), hints[f.name], f"{path}.{f.name}")
-            for f in dataclasses.fields(value)
+            f.name: _encode(getattr(value, f.name), hints[f.name], f"{path}.{f.name}") for f in dataclasses.fields(value)
         }
     if isinstance(value, enum.Enum):
         return value.value
@@ -79,9 +78,7 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
         return value.as_posix()
     if isinstance(value, tuple | list):
         hint = next((h for h in members(hint) if get_origin(h) in (tuple, list)), tuple[Any, ...])
-        return [
-            _encode(v, h, f"{path}.{i}") for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True))
-        ]
+        return [_encode(v, h, f"{path}.{i}") for i, (v, h) in enumerate(zip(value, _items(hint, len(value)), strict=True))]
     if isinstance(value, Mapping):
         hint = next((h for h in members(hint) if get_origin(h) is dict), dict[str, Any])
         return {str(k): _encode(v, get_args(hint)[1], f"{path}.{k}") for k, v in value.items()}

@@ -1,0 +1,113 @@
+"""The command line: `fprf VERB ...`. A verb's module is imported when it is used; `--help` imports nothing heavy.
+
+Exit codes: 0 done, 1 our fault, 2 the user's mistake (one line on standard error), 130 interrupted.
+"""
+
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from . import __version__
+from .errors import FprfError, UsageError
+from .plugins.registry import nearest
+
+__all__ = ["VERBS", "Verb", "main"]
+
+_PIPE_CLOSED = 141
+"""What a shell reports for a program that SIGPIPE ended."""
+
+
+class Verb(NamedTuple):
+    """One command: `fprf.commands.NAME` with `run(args) -> exit code`."""
+
+    usage: str
+    summary: str
+
+
+VERBS = {
+    "demo": Verb("[--output DIR]", "embedded scene: train, restyle, gallery; no network, no data"),
+    "train": Verb("METHOD|CONFIG.json --data DIR", "train a scene, or go on where a run stopped"),
+    "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
+    "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
+    "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
+    "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
+    "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
+    "doctor": Verb("[RUN|DIR]", "look over this machine, a run or a scene folder"),
+}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one verb and return its exit code."""
+    given = list(sys.argv[1:] if args is None else args)
+    debug = "--debug" in given or os.environ.get("FPRF_DEBUG", "") not in ("", "0")
+    try:
+        code = _dispatch([arg for arg in given if arg != "--debug"])
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains when it ends
+        return _PIPE_CLOSED
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except FprfError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        else:
+            print(_our_fault(error), file=sys.stderr)
+        return 1
+    return code
+
+
+def _dispatch(args: list[str]) -> int:
+    if not args or args[0] in ("-h", "--help"):
+        print(_help())
+        return 0 if args else 2
+    if args[0] == "--version":
+        print(f"fprf {__version__}")
+        return 0
+    verb, rest = args[0], args[1:]
+    if verb not in VERBS:
+        raise UsageError(f"fprf {verb}: no such verb{nearest(verb, VERBS)} (verbs: {', '.join(VERBS)})")
+    try:
+        code = importlib.import_module(f".commands.{verb}", __package__).run(rest)
+    except SystemExit as end:  # --help ends this way
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    return int(code)
+
+
+def _help() -> str:
+    bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if _colour() else ("", "", "")
+    width = max(map(len, VERBS))
+    broad = max(len(verb.usage) for verb in VERBS.values())
+    lines = [
+        f"{bold}fprf {__version__}{plain}: restyle 3D radiance fields with photographs, feed-forward",
+        "",
+        "usage: fprf VERB [ARGUMENTS]",
+        "",
+        *(f"  {bold}{name:<{width}}{plain}  {verb.usage:<{broad}}  {dim}{verb.summary}{plain}" for name, verb in VERBS.items()),
+        "",
+        "`fprf VERB --help` shows every flag of a verb, `fprf train` lists the methods. Start with `fprf demo`.",
+    ]
+    return "\n".join(lines)
+
+
+def _colour() -> bool:
+    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def _our_fault(error: Exception) -> str:
+    """Kind, text and place of an error that is nobody's mistake but ours, or a plug-in's."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({os.path.relpath(frames[-1].filename)}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
+    return (
+        f"internal error: {type(error).__name__}: {error}{place}\n"
+        "This is a fault of fprf or of a plug-in. Run it again with --debug for the whole traceback, and report that."
+    )

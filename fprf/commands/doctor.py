@@ -1,0 +1,224 @@
+"""`fprf doctor`: what this machine offers, what a scene folder holds, how a run stands. Each problem names its remedy."""
+
+import os
+import platform
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
+
+from .. import __version__
+from ..plugins import registry
+from ..plugins.codec import Missing
+from ..plugins.slots import slots
+from .parsing import parse
+
+__all__ = ["Finding", "machine", "run", "run_folder", "scene_folder"]
+
+_MIB = 1 << 20
+
+
+class Finding(NamedTuple):
+    """One line of the report."""
+
+    what: str
+    found: str
+    remedy: str = ""
+    """The one command or act that mends it; empty where nothing is wrong."""
+    optional: bool = False
+    """Everything else works without it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorConfig:
+    """What to look over."""
+
+    target: Path | None = None
+    """A run or a scene folder; none = this machine."""
+
+
+def run(args: list[str]) -> int:
+    """Print the findings; 1 if something that is needed is wrong."""
+    if len(args) == 1 and not args[0].startswith("-"):  # tyro has no positional argument that may be absent
+        args = ["--target", args[0]]
+    target = parse(DoctorConfig(), args, prog="fprf doctor [RUN|DIR]", description=(__doc__ or "").partition(": ")[2]).target
+    if target is None:
+        findings = machine()
+    elif (target / "config.json").is_file():
+        findings = run_folder(target)
+    else:
+        findings = scene_folder(target)
+    console = Console(highlight=False)
+    bad = False
+    for finding in findings:
+        mark = "[green]ok[/]      " if not finding.remedy else "[yellow]optional[/]" if finding.optional else "[red]problem[/] "
+        bad |= bool(finding.remedy) and not finding.optional
+        console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
+        if finding.remedy:
+            console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
+    return int(bad)
+
+
+def machine() -> Iterator[Finding]:
+    """Versions, processors, accelerators, optional packages, weights, plug-ins."""
+    yield Finding("fprf", f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
+    yield from _packages()
+    yield from _guarded("torch", _torch)
+    yield Finding("disk", f"{shutil.disk_usage(Path.cwd()).free / 1024**3:.1f} GiB free here")
+    yield from _weights()
+    count = sum(len(registry.installed(group)) for group in registry.groups())
+    bad = registry.unreadable()
+    yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
+    for complaint in bad:
+        yield Finding("plug-ins", complaint, "reinstall or uninstall that package")
+
+
+def scene_folder(data: Path) -> Iterator[Finding]:
+    """Format, views, sizes and splits of a scene. Raises DataError where it cannot be parsed."""
+    from ..datamanagers.parsers.config import DataParserConfig
+    from ..datamanagers.parsers.recognise import recognise
+
+    parser = recognise(data)
+    yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
+    scene = parser.build().parse(data, 1)
+    sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
+    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
+    lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
+    yield Finding("views", f"{len(scene.paths)} of {shown} pixels, {' and '.join(lenses)} lens")
+    yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
+    absent = [path for path in scene.paths if not path.is_file()]
+    if absent:
+        yield Finding("images", f"{len(absent)} are absent, the first is {absent[0]}", "restore them, or remove their poses")
+    points = 0 if scene.points is None else len(scene.points)
+    yield Finding("points", f"{points} of the reconstruction" if points else "none; bounds come from the cameras")
+    yield Finding("next", f"fprf train fprf-lite --data {shlex.quote(str(data))}")
+
+
+def run_folder(folder: Path) -> Iterator[Finding]:
+    """Config, progress, plug-ins and what was computed of a run. Raises ConfigError where its config cannot be read."""
+    from ..plugins.codec import load_config
+
+    config, method = load_config(folder / "config.json")
+    yield Finding("run", f"method {method}, scene {config.data}, {config.steps} steps asked for")
+    steps = _steps(folder)
+    again = f"fprf train {shlex.quote(str(folder / 'config.json'))} --output {shlex.quote(str(folder))}"
+    if not steps:
+        yield Finding("checkpoints", "none is complete", again)
+    else:
+        short = steps[-1] < config.steps and config.minutes is None
+        yield Finding("checkpoints", f"step {steps[-1]} of {config.steps}", again if short else "", optional=True)
+    for slot in slots(config):
+        if isinstance(slot.value, Missing):
+            package = slot.value.package or "the package that provides it"
+            remedy = f"install {package}, or choose another with --{slot.path} NAME; rendering goes on without it"
+            yield Finding("plug-ins", slot.value.reason, remedy, optional=slot.path.endswith("encoder"))
+    for name, use in (("scene.json", "rendering"), ("style.safetensors", "restyling")):
+        there = (folder / name).is_file()
+        yield Finding(name, "there" if there else f"absent; {use} needs it", "" if there else again)
+    measured = (folder / "metrics.json").is_file()
+    yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else f"fprf eval {shlex.quote(str(folder))}", True)
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    yield Finding("size", f"{size / _MIB:.1f} MiB")
+
+
+def _packages() -> Iterator[Finding]:
+    """What pyproject.toml asks for, without importing it."""
+    for requirement in requires("fprf") or ():
+        name = requirement.split(";")[0].split("<")[0].split(">")[0].split("=")[0].strip()
+        extra = requirement.partition("extra == ")[2].strip("\"'")
+        if extra in ("test", "dev"):
+            continue
+        try:
+            yield Finding(name, version(name))
+        except PackageNotFoundError:
+            remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
+            yield Finding(name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra))
+
+
+def _torch() -> Iterator[Finding]:
+    import torch
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield Finding("processor", f"{platform.machine()}, {cores} cores usable, {torch.get_num_threads()} threads")
+    if torch.cuda.is_available():
+        for at in range(torch.cuda.device_count()):
+            device = torch.cuda.get_device_properties(at)
+            yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
+        yield _installed("triton", "kernels for CUDA", "pip install triton")
+    elif torch.backends.mps.is_available():
+        yield Finding("mps", "Apple GPU")
+    else:
+        yield Finding("accelerator", "none: `--device auto` takes the processor")
+
+
+def _installed(name: str, purpose: str, remedy: str) -> Finding:
+    try:
+        return Finding(name, f"{version(name)}, {purpose}")
+    except PackageNotFoundError:
+        return Finding(name, f"not installed: no {purpose}", remedy, optional=True)
+
+
+def _weights() -> Iterator[Finding]:
+    """Networks that ship with the package, and those that were downloaded."""
+    plugins = Path(__file__).parents[1] / "plugins"
+    for folder, names in _SHIPPED.items():
+        there = sorted(path.stem for path in (plugins / folder / "weights").glob("*.safetensors"))
+        absent = [name for name in names if name not in there] or (["any"] if not there else [])
+        found = ", ".join(there) or "none"
+        remedy = "pip install --force-reinstall --no-deps fprf" if absent else ""
+        yield Finding(folder, f"in the package: {found}" + (f"; absent: {', '.join(absent)}" if absent else ""), remedy)
+    cached = []
+    for folder, pattern in _CACHES:
+        cached += sorted((Path.home() / folder).glob(pattern))
+    yield Finding("cached", ", ".join(path.name for path in cached) or "no downloads yet")
+
+
+def _steps(folder: Path) -> list[int]:
+    """Steps of the complete checkpoints; complete is what has a manifest."""
+    names = [path.parent.name.removeprefix("step-") for path in folder.glob("checkpoints/step-*/manifest.json")]
+    return sorted(int(name) for name in names if name.isdecimal())
+
+
+def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """A broken installation is a finding, not a crash."""
+    try:
+        yield from look()
+    except Exception as error:
+        yield Finding(what, f"{type(error).__name__}: {error}", f"pip install --force-reinstall {what}")
+
+
+_CACHES:
+        cached += sorted((Path.home() / folder).glob(pattern))
+    yield Finding("cached", ", ".join(path.name for path in cached) or "no downloads yet")
+
+
+def _steps(folder: Path) -> list[int]:
+    """Steps of the complete checkpoints; complete is what has a manifest."""
+    names = [path.parent.name.removeprefix("step-") for path in folder.glob("checkpoints/step-*/manifest.json")]
+    return sorted(int(name) for name in names if name.isdecimal())
+
+
+def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """A broken installation is a finding, not a crash."""
+    try:
+        yield from look()
+    except Exception as error:
+        yield Finding(what, f"{type(error).__name__}: {error}", f"pip install --force-reinstall {what}")
+
+
+def _bare(arg: str) -> bool:
+    return not arg.startswith("-")
+
+
+_SHIPPED = {"encoders": ("content", "semantic"), "decoders": ()}
+_CACHES = (
+    (".cache/fprf/weights", "*"),
+    (".cache/torch/hub/checkpoints", "vgg19-*.pth"),
+    (".cache/huggingface/hub", "models--facebook--dino*"),
+)
