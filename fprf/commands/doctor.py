@@ -47,7 +47,8 @@ def run(args: list[str]) -> int:
     """Print the findings; 1 if something that is needed is wrong."""
     if len(args) == 1 and not args[0].startswith("-"):  # tyro has no positional argument that may be absent
         args = ["--target", args[0]]
-    target = parse(DoctorConfig(), args, prog="fprf doctor [RUN|DIR]", description=(__doc__ or "").partition(": ")[2]).target
+    about = "`fprf doctor` looks over this machine, `fprf doctor RUN` a run, `fprf doctor DIR` a scene folder."
+    target = parse(DoctorConfig(), args, prog="fprf doctor", description=about).target
     if target is None:
         findings = machine()
     elif (target / "config.json").is_file():
@@ -121,8 +122,9 @@ def run_folder(folder: Path) -> Iterator[Finding]:
     for name, use in (("scene.json", "rendering"), ("style.safetensors", "restyling")):
         there = (folder / name).is_file()
         yield Finding(name, "there" if there else f"absent; {use} needs it", "" if there else again)
+    measure = f"fprf eval {shlex.quote(str(folder))}"
     measured = (folder / "metrics.json").is_file()
-    yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else f"fprf eval {shlex.quote(str(folder))}", True)
+    yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else measure, True)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     yield Finding("size", f"{size / _MIB:.1f} MiB")
 
@@ -193,30 +195,8 @@ def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Findi
         yield Finding(what, f"{type(error).__name__}: {error}", f"pip install --force-reinstall {what}")
 
 
-_CACHES:
-        cached += sorted((Path.home() / folder).glob(pattern))
-    yield Finding("cached", ", ".join(path.name for path in cached) or "no downloads yet")
-
-
-def _steps(folder: Path) -> list[int]:
-    """Steps of the complete checkpoints; complete is what has a manifest."""
-    names = [path.parent.name.removeprefix("step-") for path in folder.glob("checkpoints/step-*/manifest.json")]
-    return sorted(int(name) for name in names if name.isdecimal())
-
-
-def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """A broken installation is a finding, not a crash."""
-    try:
-        yield from look()
-    except Exception as error:
-        yield Finding(what, f"{type(error).__name__}: {error}", f"pip install --force-reinstall {what}")
-
-
-def _bare(arg: str) -> bool:
-    return not arg.startswith("-")
-
-
-_SHIPPED = {"encoders": ("content", "semantic"), "decoders": ()}
+_SHIPPED: dict[str, tuple[str, ...]] = {"encoders": ("content", "semantic"), "decoders": ()}
+"""Files that must be there; of decoders any will do."""
 _CACHES = (
     (".cache/fprf/weights", "*"),
     (".cache/torch/hub/checkpoints", "vgg19-*.pth"),
