@@ -64,12 +64,14 @@ def _radial_inverse(k: Tensor, u: Tensor, reach: Tensor) -> Tensor:
     for _ in range(_STEPS):
         share, slope = _powers(k, rho)
         error = share * rho - u
-        if bool(((error.abs() <= _TOLERANCE * (1 + u)) | beyond).all()):
+        done = (error.abs() <= _TOLERANCE * (1 + u)) | beyond
+        if bool(done.all()):
             break
         high = torch.where(error > 0, rho, high)
         low = torch.where(error > 0, low, rho)
         step = rho - error / torch.where(slope > 0, slope, torch.ones_like(slope))
-        rho = torch.where((slope > 0) & (step > low) & (step < high), step, (low + high) / 2)
+        step = torch.where((slope > 0) & (step > low) & (step < high), step, (low + high) / 2)
+        rho = torch.where(done, rho, step)
     return torch.where(beyond, torch.where(torch.isfinite(reach), reach, high), rho)
 
 

@@ -49,27 +49,27 @@ class ColmapParser(DataParser):
             raise DataError(f"{folder}: the model has no images; run COLMAP's mapper again")
         name, root = inside(data, "parser.images", self.config.images)
         index = dict(zip(model.point_ids.tolist(), range(len(model.point_ids)), strict=True))
-        bounds = _depths(model, index)
         lenses = {id_: _lens(f"{folder}: camera {id_}", camera) for id_, camera in model.cameras.items()}
         views = []
-        for image, depths in zip(model.images, bounds, strict=True):
+        for image in model.images:
             where = f"{folder}: image {image.name!r}"
             if image.camera not in lenses:
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
             camera = model.cameras[image.camera]
             focal, centre, distortion, lens = lenses[image.camera]
             inner, path = inside(root, where, image.name)
+            pose = _pose(where, image)
             views.append(
                 View(
                     name=inner,
                     path=path,
-                    pose=_pose(where, image),
+                    pose=pose,
                     size=(camera.width, camera.height),
                     focal=focal,
                     centre=centre,
                     distortion=distortion,
                     lens=lens,
-                    depths=depths,
+                    depths=_depths(model, index, image, pose),
                 )
             )
         views.sort(key=lambda view: view.name)
@@ -126,14 +126,14 @@ def _lens(where: str, camera: ColmapCamera) -> _Lens:
     return focal, centre, bent, FISHEYE if camera.model.endswith("FISHEYE") else OPENCV if any(bent) else PINHOLE
 
 
-def _depths(model: ColmapModel, index: dict[int, int]) -> list[tuple[float, float] | None]:
-    """Bounds of the observed points' depths by image; none at all where an image observes too few for a percentile."""
-    bounds: list[tuple[float, float] | None] = []
-    for image in model.images:
-        rows = [index[point] for point in image.observed.tolist() if point in index]
-        pose = _pose(image.name, image)
+def _depths(
+    model: ColmapModel, index: dict[int, int], image: ColmapImage, pose: NDArray[np.float64]
+) -> tuple[float, float] | None:
+    """Bounds of the depths of the points that an image observes; None where they are too few for a percentile."""
+    rows = [index[point] for point in image.observed.tolist() if point in index]
+    # Damaged coordinates may overflow; what is not finite is left out.
+    with np.errstate(over="ignore", invalid="ignore"):
         depth = (model.points[rows] - pose[:, 3]) @ -pose[:, 2]
-        depth = depth[np.isfinite(depth) & (depth > 0)]
-        near, far = np.percentile(depth, (0.1, 99.9)) if len(depth) >= 8 else (0.0, 0.0)
-        bounds.append((float(near), float(far)) if 0 < near < far else None)
-    return bounds
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    near, far = np.percentile(depth, (0.1, 99.9)) if len(depth) >= 8 else (0.0, 0.0)
+    return (float(near), float(far)) if 0 < near < far else None

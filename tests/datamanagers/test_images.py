@@ -1,0 +1,211 @@
+"""Image files of every kind, whole and damaged."""
+
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import Capture, write_image, write_transforms
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fprf.datamanagers.image_header import header_of, read_header
+from fprf.datamanagers.images import load_image, load_images
+from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.errors import DataError
+
+FUZZ = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def png(size: tuple[int, int], bits: int, colour: int, rows: list[bytes], extra: bytes = b"") -> bytes:
+    """A PNG by hand, for kinds that OpenCV cannot write."""
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", *size, bits, colour, 0, 0, 0))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + head
+        + extra
+        + chunk(b"IDAT", zlib.compress(b"".join(b"\0" + r for r in rows)))
+        + chunk(b"IEND", b"")
+    )
+
+
+def encoded(suffix: str, image: np.ndarray) -> bytes:
+    return bytes(cv2.imencode(suffix, image)[1])
+
+
+NOISE = np.random.default_rng(0).integers(0, 256, (12, 18, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff"])
+def test_lossless_files_come_back_bit_for_bit_as_rgb(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(encoded(suffix, NOISE))
+    loaded = load_image(path)
+    assert loaded.dtype == np.uint8 and loaded.flags.c_contiguous
+    assert np.array_equal(loaded, NOISE[:, :, ::-1])
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".bmp", ".tiff"])
+def test_headers_tell_the_size_without_decoding(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / "wrong_extension.txt"
+    path.write_bytes(encoded(suffix, NOISE))
+    header = read_header(path)
+    assert (header.width, header.height, header.alpha) == (18, 12, False)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".webp", ".tiff"])
+def test_headers_tell_transparency(suffix: str) -> None:
+    header = header_of(encoded(suffix, np.dstack([NOISE, NOISE[:, :, 0]])))
+    assert header is not None and header.alpha
+
+
+def test_transparency_is_straight_and_shows_the_background(tmp_path: Path) -> None:
+    image = np.dstack([np.full((1, 3, 3), (30, 20, 10), dtype=np.uint8), np.array([[255, 0, 51]], dtype=np.uint8)])
+    (tmp_path / "a.png").write_bytes(encoded(".png", image))
+    white = load_image(tmp_path / "a.png")
+    assert white.tolist() == [[[10, 20, 30], [255, 255, 255], [206, 208, 210]]]
+    red = load_image(tmp_path / "a.png", background=(1.0, 0.0, 0.0))
+    assert red.tolist() == [[[10, 20, 30], [255, 0, 0], [206, 4, 6]]]
+
+
+def test_transparency_is_composited_before_reduction(tmp_path: Path) -> None:
+    # A hidden pixel's colour must not bleed: black hidden beside opaque red on white is the mean of red and white.
+    image = np.array([[[0, 0, 255, 255], [0, 0, 0, 0]]] * 2, dtype=np.uint8)
+    (tmp_path / "a.png").write_bytes(encoded(".png", image))
+    assert load_image(tmp_path / "a.png", (1, 1))[0, 0].tolist() == [255, 128, 128]
+
+
+def test_grey_palette_and_grey_with_alpha(tmp_path: Path) -> None:
+    kinds = {
+        "grey": (png((3, 1), 8, 0, [bytes([0, 100, 255])]), [[0] * 3, [100] * 3, [255] * 3]),
+        "bilevel": (png((3, 1), 1, 0, [b"\xa0"]), [[255] * 3, [0] * 3, [255] * 3]),
+        "grey_alpha": (png((3, 1), 8, 4, [bytes([10, 255, 10, 0, 0, 255])]), [[10] * 3, [255] * 3, [0] * 3]),
+        "palette": (
+            png((3, 1), 8, 3, [bytes([0, 1, 0])], chunk(b"PLTE", bytes([1, 2, 3, 4, 5, 6])) + chunk(b"tRNS", b"\xff\x00")),
+            [[1, 2, 3], [255] * 3, [1, 2, 3]],
+        ),
+    }
+    for name, (data, expected) in kinds.items():
+        (tmp_path / name).write_bytes(data)
+        assert load_image(tmp_path / name).tolist() == [expected], name
+    assert read_header(tmp_path / "palette").alpha and not read_header(tmp_path / "grey").alpha
+
+
+def test_16_bits_are_rounded_to_8(tmp_path: Path) -> None:
+    deep = np.array([[[0, 257 * 7, 65535], [128, 129, 257 * 200 + 128]]], dtype=np.uint16)
+    (tmp_path / "a.png").write_bytes(encoded(".png", deep))
+    assert load_image(tmp_path / "a.png")[0, :, ::-1].tolist() == [[0, 7, 255], [0, 1, 200]]
+
+
+def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
+    plain = encoded(".jpg", NOISE)
+    exif = b"Exif\0\0II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
+    turned = plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:]
+    (tmp_path / "a.jpg").write_bytes(turned)
+    (tmp_path / "b.jpg").write_bytes(plain)
+    assert cv2.imread(str(tmp_path / "a.jpg")).shape[:2] == (18, 12)
+    assert np.array_equal(load_image(tmp_path / "a.jpg"), load_image(tmp_path / "b.jpg"))
+
+
+def test_reduction_averages_areas(tmp_path: Path) -> None:
+    image = write_image(tmp_path / "a.png", (20, 12))[:, :, ::-1]
+    small = load_image(tmp_path / "a.png", (5, 3)).astype(float)
+    assert np.abs(small - image.reshape(3, 4, 5, 4, 3).mean((1, 3))).max() <= 0.5 + 1e-6
+    assert load_image(tmp_path / "a.png", (40, 24)).shape == (24, 40, 3)
+
+
+@pytest.mark.parametrize(
+    ("content", "finding"),
+    [
+        (b"", "empty"),
+        (b"no image at all", "no PNG, JPEG"),
+        (png((20_000, 20_000), 8, 2, []), "20000x20000 pixels; at most 1e+08"),
+        (png((0, 5), 8, 2, []), "0x5 pixels"),
+        (encoded(".png", NOISE)[:-12], "truncated"),
+        (encoded(".png", NOISE)[:200], "truncated"),
+        (encoded(".jpg", NOISE)[:-2], "truncated"),
+        (encoded(".jpg", NOISE)[:700], "truncated"),
+        (encoded(".png", NOISE)[:100] + b"?" + encoded(".png", NOISE)[101:], "checksum"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path: Path, content: bytes, finding: str) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=re.escape(finding)) as caught:
+        load_image(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_thumbnail_s_end_does_not_hide_truncation(tmp_path: Path) -> None:
+    jpeg = encoded(".jpg", NOISE)
+    thumbnail = encoded(".jpg", NOISE[:4, :4])
+    whole = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail + jpeg[2:]
+    (tmp_path / "a.jpg").write_bytes(whole)
+    assert load_image(tmp_path / "a.jpg").shape == (12, 18, 3)
+    (tmp_path / "a.jpg").write_bytes(whole[:-20])
+    with pytest.raises(DataError, match="truncated"):
+        load_image(tmp_path / "a.jpg")
+
+
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"nothing\.png: cannot be read"):
+        load_image(tmp_path / "nothing.png")
+
+
+def spoilt(data: bytes) -> st.SearchStrategy[bytes]:
+    """A file with a few bytes changed, and perhaps cut."""
+    change = st.lists(st.tuples(st.integers(0, len(data) - 1), st.integers(0, 255)), max_size=4)
+
+    def apply(changes: list[tuple[int, int]], stop: int) -> bytes:
+        copy = bytearray(data)
+        for place, value in changes:
+            copy[place] = value
+        return bytes(copy[:stop])
+
+    return st.builds(apply, change, st.integers(0, len(data)))
+
+
+@FUZZ
+@given(st.one_of([spoilt(encoded(suffix, NOISE)) for suffix in (".png", ".jpg", ".webp", ".bmp", ".tiff")]))
+def test_any_bytes_give_an_image_or_a_data_error(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(content)
+    try:
+        image = load_image(path)
+    except DataError:
+        return
+    assert image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8
+
+
+@pytest.mark.parametrize("reader", [header_of])
+@given(
+    st.binary(max_size=64), st.sampled_from([b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"RIFF....WEBP", b"BM", b"II*\0", b"MM\0*"])
+)
+@settings(max_examples=100, deadline=None)
+def test_headers_of_any_bytes(reader: Callable[[bytes], object], tail: bytes, magic: bytes) -> None:
+    reader(magic + tail)
+
+
+def test_all_views_of_a_scene_at_their_cameras_sizes(tmp_path: Path) -> None:
+    capture = Capture.make(3)
+    write_transforms(tmp_path, capture)
+    images = load_images(parse_scene(tmp_path, 2, None))
+    assert [image.shape for image in images] == [(8, 12, 3)] * 3
+    for name, image in zip(capture.names, images, strict=True):
+        assert np.array_equal(image, load_image(tmp_path / "images" / name, (12, 8)))
+
+
+def test_an_image_that_was_rotated_after_parsing_is_refused(tmp_path: Path) -> None:
+    write_transforms(tmp_path, Capture.make(3))
+    scene = parse_scene(tmp_path, 1, None)
+    write_image(scene.paths[1], (16, 24))
+    with pytest.raises(DataError, match="16x24 pixels do not fit its camera's 24x16"):
+        load_images(scene)

@@ -1,0 +1,224 @@
+"""COLMAP models, binary and text."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_files import Capture, write_colmap
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fprf.datamanagers.parsers.colmap import model_folder
+from fprf.datamanagers.parsers.colmap_model import MODELS, read_model
+from fprf.datamanagers.parsers.config import ColmapConfig
+from fprf.datamanagers.scene import Scene
+from fprf.errors import DataError
+
+FUZZ = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+ID = {name: index for index, (name, _) in enumerate(MODELS)}
+
+
+def parse(folder: Path, images: str = "images", downscale: int = 1) -> Scene:
+    return ColmapConfig(images=images).build().parse(folder, downscale)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_model_is_the_capture(tmp_path: Path, binary: bool) -> None:
+    capture = Capture.make(focal=(20.0, 21.0))
+    write_colmap(tmp_path, capture, binary=binary)
+    scene = parse(tmp_path)
+    assert np.allclose(scene.cameras.pose.numpy(), capture.poses, atol=1e-14)
+    assert scene.cameras.focal[0].tolist() == [20.0, 21.0] and scene.cameras.centre[0].tolist() == [12.0, 8.0]
+    assert scene.cameras.lens.unique().tolist() == [0] and scene.test.tolist() == [0, 8]
+    assert scene.points is not None and np.array_equal(scene.points.numpy(), capture.points)
+    depth = (capture.points - capture.poses[3, :, 3]) @ -capture.poses[3, :, 2]
+    assert scene.depths is not None
+    assert scene.depths[3].tolist() == pytest.approx(np.percentile(depth, (0.1, 99.9)).tolist(), rel=1e-12)
+
+
+def test_binary_and_text_agree_to_the_bit(tmp_path: Path) -> None:
+    capture = Capture.make()
+    one = read_model(write_colmap(tmp_path / "a", capture))
+    other = read_model(write_colmap(tmp_path / "b", capture, binary=False))
+    assert one.cameras == other.cameras
+    assert np.array_equal(one.points, other.points) and np.array_equal(one.point_ids, other.point_ids)
+    for a, b in zip(one.images, other.images, strict=True):
+        assert (a.name, a.camera, a.quaternion, a.translation) == (b.name, b.camera, b.quaternion, b.translation)
+        assert np.array_equal(a.observed, b.observed)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "lens", "distortion"),
+    [
+        ("SIMPLE_PINHOLE", (20, 12, 8), 0, (0, 0, 0, 0, 0, 0)),
+        ("PINHOLE", (20, 20, 12, 8), 0, (0, 0, 0, 0, 0, 0)),
+        ("SIMPLE_RADIAL", (20, 12, 8, 0.1), 1, (0.1, 0, 0, 0, 0, 0)),
+        ("SIMPLE_RADIAL", (20, 12, 8, 0), 0, (0, 0, 0, 0, 0, 0)),
+        ("RADIAL", (20, 12, 8, 0.1, 0.2), 1, (0.1, 0.2, 0, 0, 0, 0)),
+        ("OPENCV", (20, 20, 12, 8, 0.1, 0.2, 0.3, 0.4), 1, (0.1, 0.2, 0, 0, 0.3, 0.4)),
+        ("FULL_OPENCV", (20, 20, 12, 8, 0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0), 1, (0.1, 0.2, 0.5, 0, 0.3, 0.4)),
+        ("OPENCV_FISHEYE", (20, 20, 12, 8, 0.1, 0.2, 0.3, 0.4), 2, (0.1, 0.2, 0.3, 0.4, 0, 0)),
+        ("SIMPLE_RADIAL_FISHEYE", (20, 12, 8, 0.1), 2, (0.1, 0, 0, 0, 0, 0)),
+        ("RADIAL_FISHEYE", (20, 12, 8, 0.1, 0.2), 2, (0.1, 0.2, 0, 0, 0, 0)),
+    ],
+)
+@pytest.mark.parametrize("binary", [True, False])
+def test_lenses(
+    tmp_path: Path, model: str, params: tuple[float, ...], lens: int, distortion: tuple[float, ...], binary: bool
+) -> None:
+    write_colmap(tmp_path, Capture.make(2), binary=binary, model=(ID[model], model), params=params)
+    cameras = parse(tmp_path).cameras
+    assert cameras.focal[0].tolist() == [20, 20] and cameras.centre[0].tolist() == [12, 8]
+    assert cameras.lens[0].item() == lens and cameras.distortion[0].tolist() == list(distortion)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("FULL_OPENCV", (20, 20, 12, 8, 0, 0, 0, 0, 0, 0.1, 0, 0)),
+        ("FOV", (20, 20, 12, 8, 0.9)),
+        ("THIN_PRISM_FISHEYE", (20.0,) * 12),
+    ],
+)
+def test_other_lenses_are_refused_with_a_remedy(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
+    write_colmap(tmp_path, Capture.make(2), model=(ID[model], model), params=params)
+    with pytest.raises(DataError, match=f"the lens {model} .*image_undistorter"):
+        parse(tmp_path)
+
+
+def test_models_are_found_in_three_places(tmp_path: Path) -> None:
+    sparse = write_colmap(tmp_path, Capture.make(2))
+    assert model_folder(tmp_path) == sparse
+    for place in (tmp_path / "sparse", tmp_path):
+        for file in list(sparse.iterdir()):
+            file.rename(place / file.name)
+        sparse = place
+        assert model_folder(tmp_path) == place and len(parse(tmp_path).paths) == 2
+    (tmp_path / "cameras.bin").unlink()
+    assert model_folder(tmp_path) is None
+    with pytest.raises(DataError, match=r"no cameras\.bin or cameras\.txt"):
+        parse(tmp_path)
+
+
+def test_points_are_optional(tmp_path: Path) -> None:
+    for binary, suffix in ((True, "bin"), (False, "txt")):
+        sparse = write_colmap(tmp_path / suffix, Capture.make(2), binary=binary)
+        (sparse / f"points3D.{suffix}").unlink()
+        scene = parse(tmp_path / suffix)
+        assert scene.points is None and scene.depths is None
+
+
+def test_reduced_images_must_be_named(tmp_path: Path) -> None:
+    small = Capture.make(2, size=(12, 8), focal=(10.0, 10.0))
+    write_colmap(tmp_path, small, images="images_2", model=(1, "PINHOLE"), params=(10.0, 10.0, 6.0, 4.0))
+    path = tmp_path / "sparse" / "0" / "cameras.bin"
+    path.write_bytes(struct.pack("<QIiQQ4d", 1, 7, 1, 24, 16, 20.0, 20.0, 12.0, 8.0))
+    cameras = parse(tmp_path, "images_2").cameras
+    assert cameras.size[0].tolist() == [12, 8] and cameras.focal[0].tolist() == [10.0, 10.0]
+    (tmp_path / "images_2").rename(tmp_path / "images")
+    with pytest.raises(DataError, match="12x8 pixels, but its camera has 24x16"):
+        parse(tmp_path)
+
+
+def test_names_that_leave_the_images_or_come_twice(tmp_path: Path) -> None:
+    for name, finding in (("../../x.png", "leaves"), ("/etc/x.png", "leaves"), ("0000.png", "registered twice")):
+        sparse = write_colmap(tmp_path, Capture.make(2))
+        images = sparse / "images.bin"
+        images.write_bytes(images.read_bytes().replace(b"0001.png\0", name.encode() + b"\0"))
+        with pytest.raises(DataError, match=finding):
+            parse(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "finding"),
+    [
+        (12, float("nan"), "quaternion"),
+        (20, 5.0, "quaternion"),
+        (44, float("inf"), "no finite"),
+    ],
+)
+def test_bad_poses_name_the_image(tmp_path: Path, place: int, value: float, finding: str) -> None:
+    path = write_colmap(tmp_path, Capture.make(2)) / "images.bin"
+    data = bytearray(path.read_bytes())
+    data[place : place + 8] = struct.pack("<d", value)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=f"image '0000.png': .*{finding}"):
+        parse(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_counts_are_checked_before_memory_is_taken(tmp_path: Path, file: str) -> None:
+    path = write_colmap(tmp_path, Capture.make(2)) / file
+    for count in (3, 2**28, 2**63, 2**64 - 1):
+        path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:100])
+        with pytest.raises(DataError, match=f"{file}: byte [0-9]+: .* are left"):
+            parse(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_truncation_anywhere_is_a_data_error(tmp_path: Path, file: str) -> None:
+    path = write_colmap(tmp_path, Capture.make(2)) / file
+    whole = path.read_bytes()
+    for stop in sorted({*range(min(len(whole), 120)), *range(0, len(whole), 37)}):
+        path.write_bytes(whole[:stop])
+        with pytest.raises(DataError, match=f"{file}: byte"):
+            read_model(path.parent)
+    path.write_bytes(whole + b"\0")
+    with pytest.raises(DataError, match="bytes too many"):
+        read_model(path.parent)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "finding"),
+    [
+        ("cameras.txt", "7 PINHOLE 24 16 20 20 12\n", "line 1: not `ID MODEL"),
+        ("cameras.txt", "7 STRANGE 24 16 20 20 12 8\n", "line 1: not `ID MODEL"),
+        ("cameras.txt", "7 PINHOLE 24 16 20 20 twelve 8\n", "line 1: not numbers"),
+        ("cameras.txt", "7 PINHOLE 24.5 16 20 20 12 8\n", "line 1: not whole numbers"),
+        ("cameras.txt", "7 PINHOLE 24 16 20 20 12 8\n" * 2, "line 2: camera 7 occurs twice"),
+        ("cameras.txt", "7 PINHOLE 0 16 20 20 12 8\n", "0x16 pixels"),
+        ("cameras.txt", "7 PINHOLE 24 16 nan 20 12 8\n", "not all finite"),
+        ("cameras.txt", "", "its camera 7 is not in the model"),
+        ("images.txt", "", "no images"),
+        ("images.txt", "# x\n1 1 0 0 0 0 0 0 7\n", "line 2: not `ID QW"),
+        ("images.txt", "1 1 0 0 0 0 0 0 7 a.png\n1 2\n", "line 2: 2 numbers"),
+        ("images.txt", "1 1 0 0 0 0 0 0 7 a.png\n1 2 " + "9" * 30 + "\n", "beyond 64 bits"),
+        ("points3D.txt", "1 2 3\n", "line 1: not `ID X Y Z"),
+        ("points3D.txt", "x 2 3 4 1 2 3 0.5\n", "line 1: not whole numbers"),
+    ],
+)
+def test_bad_text_names_its_line(tmp_path: Path, file: str, text: str, finding: str) -> None:
+    (write_colmap(tmp_path, Capture.make(2), binary=False) / file).write_text(text)
+    with pytest.raises(DataError, match=finding):
+        parse(tmp_path)
+
+
+def test_an_image_without_features_and_a_name_with_spaces(tmp_path: Path) -> None:
+    sparse = write_colmap(tmp_path, Capture.make(2), binary=False)
+    (tmp_path / "images" / "0000.png").rename(tmp_path / "images" / "a b.png")
+    (sparse / "images.txt").write_text("1 1 0 0 0 0 0 0 7 a b.png\n\n2 1 0 0 0 1 0 0 7 0001.png\n")
+    scene = parse(tmp_path)
+    assert [path.name for path in scene.paths] == ["0001.png", "a b.png"] and scene.depths is None
+
+
+@FUZZ
+@given(st.data(), st.sampled_from(["cameras", "images", "points3D"]), st.booleans())
+def test_any_bytes_are_a_scene_or_a_data_error(tmp_path: Path, data: st.DataObject, file: str, binary: bool) -> None:
+    suffix = "bin" if binary else "txt"
+    root = tmp_path / suffix
+    if not root.exists():
+        write_colmap(root, Capture.make(2), binary=binary)
+        for path in (root / "sparse" / "0").iterdir():
+            path.with_suffix(".whole").write_bytes(path.read_bytes())
+    for whole in (root / "sparse" / "0").glob("*.whole"):
+        whole.with_suffix(f".{suffix}").write_bytes(whole.read_bytes())
+    path = root / "sparse" / "0" / f"{file}.{suffix}"
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(0, 4))):
+        content[data.draw(st.integers(0, min(len(content), 400) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.sampled_from([len(content), len(content) // 2]))])
+    try:
+        parse(root)
+    except DataError as error:
+        assert "\n" not in str(error)

@@ -1,0 +1,232 @@
+"""Nerfstudio, instant-ngp and Blender JSON."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_files import Capture, write_image, write_transforms
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fprf.datamanagers.parsers.config import TransformsConfig
+from fprf.datamanagers.scene import Scene
+from fprf.errors import DataError
+
+FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def parse(folder: Path, downscale: int = 1, file: str = "") -> Scene:
+    return TransformsConfig(file=file).build().parse(folder, downscale)
+
+
+def edit(folder: Path, content: dict[str, object], **changes: object) -> None:
+    (folder / "transforms.json").write_text(json.dumps({**content, **changes}))
+
+
+def test_global_and_per_frame_intrinsics_are_the_same(tmp_path: Path) -> None:
+    capture = Capture.make(focal=(20.0, 21.0), k=(0.05, -0.02, 0.001, -0.002))
+    write_transforms(tmp_path / "a", capture)
+    write_transforms(tmp_path / "b", capture, per_frame=True)
+    one, other = parse(tmp_path / "a"), parse(tmp_path / "b")
+    for field in ("pose", "focal", "centre", "size", "distortion", "lens"):
+        assert getattr(one.cameras, field).tolist() == getattr(other.cameras, field).tolist()
+    assert np.allclose(one.cameras.pose.numpy(), capture.poses, atol=1e-14)
+    assert one.cameras.distortion[0].tolist() == [0.05, -0.02, 0.0, 0.0, 0.001, -0.002]
+    assert one.cameras.lens.unique().tolist() == [1]
+    assert one.points is not None and np.allclose(one.points.numpy(), capture.points, atol=1e-6)
+    assert one.depths is None and one.test.tolist() == [0, 8]
+
+
+def test_views_are_sorted_by_name(tmp_path: Path) -> None:
+    capture = Capture.make(5)
+    content = write_transforms(tmp_path, capture)
+    edit(tmp_path, content, frames=list(reversed(content["frames"])))  # type: ignore[call-overload]
+    assert [path.name for path in parse(tmp_path).paths] == list(capture.names)
+    assert np.allclose(parse(tmp_path).cameras.pose.numpy(), capture.poses, atol=1e-14)
+
+
+def test_depths_stand_by_frame_or_once(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, Capture.make(3), near=2.0, far=8.0)
+    content["frames"][1]["near"] = 3.0  # type: ignore[index]
+    edit(tmp_path, content)
+    depths = parse(tmp_path).depths
+    assert depths is not None and depths.tolist() == [[2.0, 8.0], [3.0, 8.0], [2.0, 8.0]]
+
+
+@pytest.mark.parametrize(
+    ("camera", "lens", "distortion"),
+    [
+        ({}, 0, [0.0] * 6),
+        ({"camera_model": "PINHOLE"}, 0, [0.0] * 6),
+        ({"camera_model": "OPENCV"}, 0, [0.0] * 6),
+        ({"camera_model": "OPENCV", "k3": 0.1, "k4": 0.2}, 1, [0.0, 0.0, 0.1, 0.2, 0.0, 0.0]),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1}, 2, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        ({"is_fisheye": True}, 2, [0.0] * 6),
+        ({"k1": None}, 0, [0.0] * 6),
+    ],
+)
+def test_lenses(tmp_path: Path, camera: dict[str, object], lens: int, distortion: list[float]) -> None:
+    write_transforms(tmp_path, Capture.make(2), **camera)
+    cameras = parse(tmp_path).cameras
+    assert cameras.lens.tolist() == [lens] * 2 and cameras.distortion[0].tolist() == distortion
+
+
+def test_what_is_left_out_follows_from_the_image(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, Capture.make(2))
+    for key in ("w", "h", "cx", "cy", "fl_x", "fl_y"):
+        del content[key]
+    edit(tmp_path, content, camera_angle_x=math.pi / 2)
+    cameras = parse(tmp_path).cameras
+    assert cameras.size[0].tolist() == [24, 16] and cameras.centre[0].tolist() == [12.0, 8.0]
+    assert cameras.focal[0].tolist() == pytest.approx([12.0, 12.0])
+    edit(tmp_path, content, fl_x=30.0)
+    assert parse(tmp_path).cameras.focal[0].tolist() == [30.0, 30.0]
+    edit(tmp_path, content, fl_x=30.0, camera_angle_y=math.pi / 2)
+    assert parse(tmp_path).cameras.focal[0].tolist() == pytest.approx([30.0, 8.0])
+
+
+def test_another_file_is_named_by_the_config(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, Capture.make(3))
+    (tmp_path / "transforms_4.json").write_text(json.dumps({**content, "frames": content["frames"][:2]}))  # type: ignore[index]
+    assert len(parse(tmp_path, file="transforms_4.json").paths) == 2
+    with pytest.raises(DataError, match="leaves"):
+        parse(tmp_path, file="../transforms.json")
+    with pytest.raises(DataError, match="cannot be read"):
+        parse(tmp_path, file="absent.json")
+
+
+def blender(folder: Path, part: str, count: int) -> None:
+    frames = []
+    for k in range(count):
+        write_image(folder / part / f"r_{k}.png", (10, 10), channels=4, seed=k)
+        frames.append({"file_path": f"./{part}/r_{k}", "transform_matrix": np.eye(4).tolist(), "rotation": 0.1})
+    (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": 0.6911, "frames": frames}))
+
+
+def test_blender_s_two_files(tmp_path: Path) -> None:
+    blender(tmp_path, "train", 4)
+    blender(tmp_path, "test", 2)
+    scene = parse(tmp_path)
+    assert scene.alpha and len(scene.paths) == 6
+    assert {scene.paths[k].parent.name for k in scene.train} == {"train"} and len(scene.train) == 4
+    assert {scene.paths[k].parent.name for k in scene.test} == {"test"} and len(scene.test) == 2
+    assert scene.cameras.focal[0, 0].item() == pytest.approx(5 / math.tan(0.6911 / 2))
+
+
+def test_blender_s_training_file_alone_is_split_by_the_rule(tmp_path: Path) -> None:
+    blender(tmp_path, "train", 4)
+    assert parse(tmp_path).test.tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test"),
+    [
+        ({"train_filenames": ["images/0001.png"], "test_filenames": ["images/0003.png"]}, [1], [3]),
+        ({"train_filenames": ["./images/0001.png"]}, [1], [0, 2, 3]),
+        ({"train_filenames": ["images/0001.png"], "val_filenames": ["images/0000.png"]}, [1], [2, 3]),
+        ({"test_filenames": ["images/0000.png", "images/0002.png"]}, [1, 3], [0, 2]),
+    ],
+)
+def test_the_capture_says_what_is_held_out(tmp_path: Path, lists: dict[str, object], train: list[int], test: list[int]) -> None:
+    write_transforms(tmp_path, Capture.make(4), **lists)
+    scene = parse(tmp_path)
+    assert scene.train.tolist() == train and scene.test.tolist() == test
+
+
+@pytest.mark.parametrize(
+    ("changes", "finding"),
+    [
+        ({"frames": []}, "no list of frames"),
+        ({"frames": None}, "no list of frames"),
+        ({"fl_x": 0}, "focal length is 0"),
+        ({"fl_y": -3}, "focal length is -3"),
+        ({"fl_x": "20"}, "fl_x is '20', not a number"),
+        ({"w": 25}, "24x16 pixels, but its camera has 25x16"),
+        ({"w": 0}, "w and h are 0 and 16"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not supported"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "fisheye with tangential"),
+        ({"camera_model": "PINHOLE", "k1": 0.1}, "PINHOLE with distortion"),
+        ({"near": 3, "far": 1}, "0 < near < far"),
+        ({"test_filenames": ["images/0009.png"]}, "'images/0009.png', which no frame is"),
+        ({"test_filenames": ["images/0000.png"], "train_filenames": ["images/0000.png"]}, "is in train_filenames and in"),
+        ({"test_filenames": "x"}, "test_filenames is 'x'"),
+        ({"fl_x": None, "fl_y": None, "camera_angle_x": 4.0}, "between 0 and pi"),
+        ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
+    ],
+)
+def test_what_the_file_must_not_say(tmp_path: Path, changes: dict[str, object], finding: str) -> None:
+    edit(tmp_path, write_transforms(tmp_path, Capture.make(2)), **changes)
+    with pytest.raises(DataError, match=finding) as caught:
+        parse(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "finding"),
+    [
+        ({"file_path": "images/none.png"}, r"1 of 3 images are missing, the first is .*none\.png"),
+        ({"file_path": "/etc/passwd"}, r"frames\[1\]: the path '/etc/passwd' leaves"),
+        ({"file_path": "../0001.png"}, r"frames\[1\]: the path"),
+        ({"file_path": None}, r"frames\[1\]: file_path is missing"),
+        ({"file_path": "images/0000.png"}, "0000.png occurs twice"),
+        ({"transform_matrix": np.eye(4)[:2].tolist()}, r"frames\[1\]: transform_matrix is a list, not 3 or 4 rows"),
+        ({"transform_matrix": (2 * np.eye(4)).tolist()}, r"frames\[1\] \(images/0001.png\): the pose's last row"),
+        ({"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, r"frames\[1\] \(images/0001.png\): the pose holds no rotation"),
+        ({"transform_matrix": [["a"] * 4] * 4}, "not 3 or 4 rows"),
+        ({"transform_matrix": None}, "transform_matrix is missing"),
+    ],
+)
+def test_bad_frames_are_named(tmp_path: Path, changes: dict[str, object], finding: str) -> None:
+    content = write_transforms(tmp_path, Capture.make(3))
+    content["frames"][1].update(changes)  # type: ignore[index]
+    edit(tmp_path, content)
+    with pytest.raises(DataError, match=finding):
+        parse(tmp_path)
+
+
+def test_no_file_at_all(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"neither transforms\.json nor transforms_train\.json"):
+        parse(tmp_path)
+
+
+def test_points_of_another_shape_are_refused_and_infinite_ones_dropped(tmp_path: Path) -> None:
+    write_transforms(tmp_path, Capture.make(2))
+    np.savez(tmp_path / "points.npz", xyz=np.array([[0, 0, 1], [np.inf, 0, 0], [np.nan, 0, 0]]))
+    points = parse(tmp_path).points
+    assert points is not None and points.tolist() == [[0.0, 0.0, 1.0]]
+    np.savez(tmp_path / "points.npz", xyz=np.zeros((4, 2)))
+    with pytest.raises(DataError, match=r"\(4, 2\), not \[P 3\]"):
+        parse(tmp_path)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+    max_leaves=8,
+)
+KEYS = ["w", "h", "fl_x", "cx", "k1", "p1", "camera_model", "near", "far", "file_path", "transform_matrix", "frames"]
+
+
+@FUZZ
+@given(st.dictionaries(st.sampled_from([*KEYS, "train_filenames", "is_fisheye"]), JSON, max_size=3), st.booleans())
+def test_any_values_are_a_scene_or_a_data_error(tmp_path: Path, changes: dict[str, object], in_frame: bool) -> None:
+    if not (tmp_path / "whole").exists():
+        (tmp_path / "whole").write_text(json.dumps(write_transforms(tmp_path, Capture.make(2))))
+    content = json.loads((tmp_path / "whole").read_text())
+    (content["frames"][1] if in_frame else content).update(changes)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    try:
+        parse(tmp_path)
+    except DataError as error:
+        assert "\n" not in str(error)
+
+
+def test_truncation_anywhere_is_a_data_error(tmp_path: Path) -> None:
+    write_transforms(tmp_path, Capture.make(2))
+    whole = (tmp_path / "transforms.json").read_bytes()
+    for stop in range(0, len(whole) - 1, 7):
+        (tmp_path / "transforms.json").write_bytes(whole[:stop])
+        with pytest.raises(DataError, match="no valid JSON"):
+            parse(tmp_path)

@@ -1,0 +1,139 @@
+"""Which parser a folder gets, and the same scene in every format."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from capture_files import Capture, write_colmap, write_llff, write_transforms
+
+from fprf.datamanagers.parsers.config import ColmapConfig, DataParserConfig, LlffConfig, TownConfig, TransformsConfig
+from fprf.datamanagers.parsers.recognise import parse_scene, recognise
+from fprf.datamanagers.scene import Scene
+from fprf.errors import ConfigError, DataError
+from fprf.rendering.cameras import project, rays_through
+
+
+def rays(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
+    """A few rays of every view, at the same share of each image."""
+    view = torch.arange(len(scene.cameras)).repeat_interleave(4)
+    share = torch.tensor([[0.1, 0.2], [0.9, 0.15], [0.5, 0.5], [0.3, 0.95]], dtype=torch.float64)
+    return rays_through(scene.cameras, view, share.repeat(len(scene.cameras), 1) * scene.cameras.size[view])
+
+
+def assert_same(one: Scene, other: Scene, tolerance: float = 1e-12) -> None:
+    assert [path.stem for path in one.paths] == [path.stem for path in other.paths]
+    assert torch.equal(one.train, other.train) and torch.equal(one.test, other.test)
+    for a, b in zip(rays(one), rays(other), strict=True):
+        assert (a - b).abs().max() <= tolerance
+
+
+@pytest.mark.parametrize("downscale", [1, 2, 3])
+def test_one_capture_in_every_format_has_the_same_rays(tmp_path: Path, downscale: int) -> None:
+    capture = Capture.make(9)
+    write_transforms(tmp_path / "transforms", capture)
+    write_llff(tmp_path / "llff", capture)
+    write_llff(tmp_path / "llff_8", capture, images="images_8", factor=8)
+    write_colmap(tmp_path / "colmap", capture)
+    write_colmap(tmp_path / "text", capture, binary=False)
+    first = parse_scene(tmp_path / "transforms", downscale, None)
+    for name in ("llff", "llff_8", "colmap", "text"):
+        assert_same(first, parse_scene(tmp_path / name, downscale, None))
+
+
+def test_one_distorted_capture_in_two_formats(tmp_path: Path) -> None:
+    k = (0.05, -0.02, 0.001, -0.002)
+    capture = Capture.make(4, k=k)
+    write_transforms(tmp_path / "a", capture)
+    write_colmap(tmp_path / "b", capture, model=(4, "OPENCV"), params=(20.0, 20.0, 12.0, 8.0, *k))
+    assert_same(parse_scene(tmp_path / "a", 2, None), parse_scene(tmp_path / "b", 2, None))
+
+
+def test_formats_are_told_by_their_files(tmp_path: Path) -> None:
+    capture = Capture.make(2)
+    write_colmap(tmp_path, capture)
+    assert recognise(tmp_path) == ColmapConfig()
+    (tmp_path / "transforms_4.json").write_text("{}")
+    assert recognise(tmp_path) == ColmapConfig()
+    write_llff(tmp_path, capture)
+    assert recognise(tmp_path) == LlffConfig()
+    write_transforms(tmp_path, capture)
+    assert recognise(tmp_path) == TransformsConfig()
+
+
+def test_blender_and_a_single_file_of_another_name(tmp_path: Path) -> None:
+    (tmp_path / "transforms_4.json").write_text("{}")
+    assert recognise(tmp_path) == TransformsConfig(file="transforms_4.json")
+    (tmp_path / "transforms_train.json").write_text("{}")
+    assert recognise(tmp_path) == TransformsConfig()
+
+
+def test_the_town_is_a_name_and_not_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert recognise(Path("town")) == TownConfig()
+    (tmp_path / "town").mkdir()
+    with pytest.raises(DataError, match="but nothing"):
+        recognise(Path("town"))
+
+
+def test_what_was_found_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such folder"):
+        recognise(tmp_path / "absent")
+    for name in "abcdefg":
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=r"but 7 entries \(a, b, c, d, e, \.\.\.\)"):
+        recognise(tmp_path)
+    with pytest.raises(DataError, match="a file; give the scene folder"):
+        recognise(tmp_path / "a")
+
+
+def test_a_named_parser_wins(tmp_path: Path) -> None:
+    capture = Capture.make(3)
+    write_colmap(tmp_path, capture)
+    write_llff(tmp_path, capture)
+    assert parse_scene(tmp_path, 1, ColmapConfig()).points is not None
+    assert parse_scene(tmp_path, 1, LlffConfig()).points is None
+
+
+def test_the_town_s_ranges() -> None:
+    for field in ("views", "width", "height"):
+        with pytest.raises(ConfigError, match=field):
+            TownConfig(**{field: 1})
+
+
+SCENES = ["blender_lego", "drone_caliterra", "fox", "llff_fern", "llff_flower", "m360_bonsai", "street_lund"]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_real_scenes(shared: Path, name: str) -> None:
+    folder = shared / "data" / "scenes" / name
+    scene = parse_scene(folder, 1, None)
+    others: list[DataParserConfig] = []
+    if (folder / "poses_bounds.npy").exists():
+        others.append(LlffConfig(images="images_8"))
+        assert_same(scene, parse_scene(folder, 1, LlffConfig(images="images_4")))
+        assert_same(scene, parse_scene(folder, 1, TransformsConfig(file="transforms_4.json")))
+    if (folder / "sparse").exists():
+        others.append(ColmapConfig())
+    for config in others:
+        assert_same(scene, parse_scene(folder, 1, config))
+    assert sorted(scene.train.tolist() + scene.test.tolist()) == list(range(len(scene.paths)))
+    if scene.points is not None:
+        view = torch.arange(len(scene.cameras))
+        point = scene.points[:: max(1, len(scene.points) // 200)]
+        pairs = torch.cartesian_prod(view, torch.arange(len(point)))
+        pixel, depth = project(scene.cameras, pairs[:, 0], point[pairs[:, 1]])
+        inside = ((pixel > 0) & (pixel < scene.cameras.size[pairs[:, 0]])).all(-1)
+        # Each view sees some of the points, and nearly all that it sees lie within its bounds.
+        assert torch.bincount(pairs[inside, 0], minlength=len(view)).min() > 0
+        if scene.depths is not None:
+            near, far = scene.depths[pairs[inside, 0]].unbind(-1)
+            assert ((depth[inside] > 0.5 * near) & (depth[inside] < 2 * far)).double().mean() > 0.9
+
+
+def test_real_points_of_both_sources_agree(shared: Path) -> None:
+    folder = shared / "data" / "scenes" / "street_lund"
+    one = parse_scene(folder, 1, TransformsConfig()).points
+    other = parse_scene(folder, 1, ColmapConfig()).points
+    assert one is not None and other is not None
+    assert np.allclose(np.sort(one.numpy(), 0), np.sort(other.numpy(), 0), rtol=1e-6)
