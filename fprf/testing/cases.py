@@ -1,0 +1,67 @@
+"""Inputs for the contracts: small, seeded, of every letter in `fprf.types`."""
+
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..style.dictionary import StyleDictionary
+from ..style.scene import SceneStyle
+from ..types import Rays
+
+__all__ = ["dictionary", "normal", "points", "rays", "scene", "uniform"]
+
+
+def uniform(*shape: int) -> Tensor:
+    """In [0, 1]."""
+    return torch.rand(shape, generator=torch.Generator().manual_seed(1))
+
+
+def normal(*shape: int) -> Tensor:
+    """Mean 0, deviation 1."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(2))
+
+
+def points(count: int) -> Annotated[Tensor, "N 3"]:
+    """In the unit cube, among them its centre and two of its corners."""
+    inner = 2 * uniform(count - 3, 3) - 1
+    return torch.cat([inner, torch.zeros(1, 3), torch.ones(1, 3), -torch.ones(1, 3)])
+
+
+def rays(count: int) -> Rays:
+    """From outside the unit cube through it."""
+    direction = torch.nn.functional.normalize(normal(count, 3), dim=1)
+    near, far = torch.full((count,), 0.5), torch.full((count,), 3.5)
+    return Rays(origin=-2 * direction, direction=direction, view=direction, near=near, far=far)
+
+
+def dictionary(codes: int, channels: int, dims: int) -> StyleDictionary:
+    """Style codes of one reference."""
+    return StyleDictionary(
+        keys=normal(codes, dims),
+        mean=normal(codes, channels),
+        covariance=_covariances(codes, channels),
+        share=torch.full((codes,), 1 / codes),
+        reference=torch.zeros(codes, dtype=torch.int64),
+        weight=torch.ones(codes),
+        names=("reference",),
+    )
+
+
+def scene(regions: int, channels: int, dims: int) -> SceneStyle:
+    """A scene of equally large regions."""
+    covariances = _covariances(regions + 1, channels)
+    return SceneStyle(
+        mean=normal(channels),
+        covariance=covariances[-1],
+        keys=normal(regions, dims),
+        region_mean=normal(regions, channels),
+        region_covariance=covariances[:-1],
+        share=torch.full((regions,), 1 / regions),
+        semantic_mean=torch.zeros(dims),
+    )
+
+
+def _covariances(count: int, channels: int) -> Annotated[Tensor, "N C C"]:
+    factor = normal(count, channels, channels)
+    return factor @ factor.mT / channels + 0.1 * torch.eye(channels)

@@ -1,0 +1,241 @@
+"""What every plug-in must keep to, as functions that a plug-in's own tests call: `check_encoder(MyConfig())`.
+
+Each builds the plug-in from its config, as the program does, and raises AssertionError with one sentence on the first
+breach. They take a second or so on a CPU and need no data but what is passed to them.
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from ..datamanagers.parsers.config import DataParserConfig
+from ..errors import DataError
+from ..fields.config import ContentFieldConfig, SemanticFieldConfig
+from ..fields.layouts import LayoutConfig
+from ..interfaces import BlockLayout, ContentField, DataParser, Decoder, Encoder, Executor, Sampler, SemanticField, Stylizer
+from ..plugins.config import PluginConfig
+from ..plugins.decoders.config import DecoderConfig
+from ..plugins.encoders.config import EncoderConfig
+from ..plugins.executors.config import ExecutorConfig
+from ..plugins.samplers.config import SamplerConfig
+from ..plugins.stylizers.config import StylizerConfig
+from ..plugins.typed_json import from_json, to_json
+from ..types import Rays, Sampled, Want
+from . import cases
+from .breaches import close, penalties, pointwise, require, same, same_parameters, tensor, trainable
+
+__all__ = [
+    "check_config",
+    "check_content_field",
+    "check_decoder",
+    "check_encoder",
+    "check_executor",
+    "check_layout",
+    "check_parser",
+    "check_sampler",
+    "check_semantic_field",
+    "check_stylizer",
+]
+
+
+def check_config(config: PluginConfig) -> None:
+    """A frozen dataclass that its defaults build, that compares by value, and that JSON carries there and back."""
+    kind = type(config)
+    parameters = getattr(kind, "__dataclass_params__", None)
+    require(parameters is not None and parameters.frozen, f"{kind.__name__}: must be a dataclass(frozen=True, kw_only=True)")
+    require(kind() == kind(), f"{kind.__name__}: two with the same values must be equal")
+    require(from_json(to_json(config), kind) == config, f"{kind.__name__}: must survive JSON unchanged")
+    for field in dataclasses.fields(kind):
+        require(field.name not in ("type", "build"), f"{kind.__name__}: a field must not be called {field.name!r}")
+        require(field.kw_only is True, f"{kind.__name__}.{field.name}: fields must be keyword-only")
+
+
+def check_encoder(config: EncoderConfig) -> None:
+    """Any size, any batch, frozen, deterministic, finite, and with an identity that is the same each time."""
+    check_config(config)
+    encoder, name = config.build(), type(config).__name__
+    require(isinstance(encoder, Encoder), f"{name}: build() gives {type(encoder).__name__}, not an fprf.interfaces.Encoder")
+    require(not encoder.training, f"{name}: must be in evaluation mode")
+    require(not any(p.requires_grad for p in encoder.parameters()), f"{name}: its parameters must not want gradients")
+    require(config.build().identity == encoder.identity, f"{name}: identity must be the same for the same config")
+    for height, width in ((64, 96), (49, 37), (96, 64)):
+        image = cases.uniform(2, 3, height, width)
+        features = encoder(image)
+        tensor(features, (2, encoder.channels, None, None), f"{name} of {height} x {width} pixels")
+        h, w = features.shape[2:]
+        require(1 <= h <= height and 1 <= w <= width, f"{name}: {h} x {w} features of {height} x {width} pixels")
+        skew = (w / width) / (h / height)
+        require(0.4 < skew < 2.5, f"{name}: {h} x {w} features do not keep the aspect of {height} x {width} pixels")
+        require(not features.requires_grad, f"{name}: features must not carry gradients to the weights")
+        same(encoder(image), features, 0.0, f"{name}: must be deterministic")
+        same(encoder(image[1:]), features[1:], 1e-3, f"{name}: an image's features must not depend on its batch")
+    for level in (0.0, 1.0):
+        tensor(encoder(torch.full((1, 3, 40, 40), level)), (1, encoder.channels, None, None), f"{name} of a flat image")
+
+
+def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None:
+    """Colours in [0, 1], point by point, frozen. `encoder` is the identity of an encoder that it has weights for."""
+    check_config(config)
+    decoder, name = config.build(encoder=encoder, channels=channels), type(config).__name__
+    require(isinstance(decoder, Decoder), f"{name}: build() gives {type(decoder).__name__}, not an fprf.interfaces.Decoder")
+    require(not any(p.requires_grad for p in decoder.parameters()), f"{name}: must be frozen")
+    content = torch.cat([cases.normal(9, channels), cases.normal(9, channels) * 1e3])
+    colour = decoder(content)
+    tensor(colour, (18, 3), name)
+    require(bool(((colour >= 0) & (colour <= 1)).all()), f"{name}: colours must lie in [0, 1], for any features")
+    pointwise(lambda points: decoder(points), content, name)
+
+
+def check_stylizer(config: StylizerConfig) -> None:
+    """Point by point, finite, honest about what it needs; its matches are shares of the style codes."""
+    check_config(config)
+    name = type(config).__name__
+    for codes, regions, dims in ((5, 3, 4), (1, 1, 4), (2, 1, 0)):
+        stylizer = config.build(dictionary=cases.dictionary(codes, 8, dims), scene=cases.scene(regions, 8, dims))
+        require(isinstance(stylizer, Stylizer), f"{name}: build() gives {type(stylizer).__name__}, not a Stylizer")
+        require(Want.CONTENT in stylizer.needs, f"{name}: needs must hold Want.CONTENT")
+        allowed = Want.CONTENT | Want.SEMANTIC
+        require(stylizer.needs | allowed == allowed, f"{name}: may need content and semantics, and nothing else")
+        content, semantic = cases.normal(11, 8), cases.normal(11, dims)
+        given = semantic if Want.SEMANTIC in stylizer.needs else None
+        styled = stylizer(content, given)
+        tensor(styled, (11, 8), name)
+        same(stylizer(content, given), styled, 0.0, f"{name}: must be deterministic")
+        some = None if given is None else given[:4]
+        same(stylizer(content[:4], some), styled[:4], 1e-4, f"{name}: a point must not depend on the others")
+        none = None if given is None else given[:0]
+        tensor(stylizer(content[:0], none), (0, 8), f"{name} of no points")
+        match = stylizer.match(semantic)
+        tensor(match, (11, codes), f"{name}.match")
+        whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(11), 1e-4)
+        require(whole, f"{name}.match: rows must be shares that sum to 1")
+
+
+def check_sampler(config: SamplerConfig) -> None:
+    """Sorted edges between near and far, the same without a generator and with one of the same seed."""
+    check_config(config)
+    sampler, name = config.build(seed=0), type(config).__name__
+    require(isinstance(sampler, Sampler), f"{name}: build() gives {type(sampler).__name__}, not an fprf.interfaces.Sampler")
+    same_parameters(sampler, config.build(seed=0), name)
+    for count in (6, 1, 0):
+        rays = cases.rays(count)
+        for seed in (None, 3):
+            sampled, again = (_sample(sampler, rays, seed) for _ in range(2))
+            require(sampled.t.shape[0] == count and sampled.t.shape[1] >= 2, f"{name}: t must be [R E], E = samples + 1")
+            tensor(sampled.s, tuple(sampled.t.shape), f"{name}: s")
+            tensor(sampled.t, tuple(sampled.s.shape), f"{name}: t")
+            same(again.t, sampled.t, 0.0, f"{name}: must be a function of the rays, the step and the generator")
+            for edges, low, high in ((sampled.s, torch.zeros(count), torch.ones(count)), (sampled.t, rays.near, rays.far)):
+                require(bool((edges.diff(dim=1) >= 0).all()), f"{name}: edges must be sorted")
+                slack = 1e-4 * (high - low)[:, None]
+                inside = (edges >= low[:, None] - slack) & (edges <= high[:, None] + slack)
+                require(bool(inside.all()), f"{name}: edges must lie between near and far")
+            for level in sampled.levels:
+                shape = (count, level.s.shape[1] - 1)
+                tensor(level.weights, shape, f"{name}: weights of a proposal level")
+                require(bool((level.weights >= 0).all()), f"{name}: proposal weights must be at least 0")
+    penalties(sampler.penalties(), name)
+
+
+def check_content_field(config: ContentFieldConfig) -> None:
+    """Density at least 0, content of so many channels, a function of its seed, trainable in every parameter."""
+    check_config(config)
+    field, name = config.build(channels=7, seed=0), type(config).__name__
+    require(isinstance(field, ContentField), f"{name}: build() gives {type(field).__name__}, not a ContentField")
+    same_parameters(field, config.build(channels=7, seed=0), name)
+    points, view = cases.points(13), nn.functional.normalize(cases.normal(13, 3), dim=1)
+    sample = field.density(points)
+    tensor(sample.density, (13,), f"{name}: density")
+    require(bool((sample.density >= 0).all()), f"{name}: density must be at least 0")
+    content = field.content(sample.latent, view)
+    tensor(content, (13, 7), f"{name}: content")
+    same(field.content(sample.latent[4:9], view[4:9]), content[4:9], 1e-4, f"{name}: points must not depend on others")
+    pointwise(lambda some: field.density(some).density, points, name)
+    tensor(field.content(sample.latent[:0], view[:0]), (0, 7), f"{name}: content of no points")
+    penalties(field.penalties(), name)
+    trainable(field, sample.density.sum() + content.square().sum(), name)
+
+
+def check_semantic_field(config: SemanticFieldConfig) -> None:
+    """Features of so many channels, a function of its seed, trainable in every parameter."""
+    check_config(config)
+    field, name = config.build(channels=5, seed=0), type(config).__name__
+    require(isinstance(field, SemanticField), f"{name}: build() gives {type(field).__name__}, not a SemanticField")
+    same_parameters(field, config.build(channels=5, seed=0), name)
+    points = cases.points(13)
+    features = field(points)
+    tensor(features, (13, 5), name)
+    pointwise(lambda some: field(some), points, name)
+    penalties(field.penalties(), name)
+    trainable(field, features.square().sum(), name)
+
+
+def check_layout(config: LayoutConfig) -> None:
+    """Boxes with room in them, and weights that sum to 1 everywhere and vanish outside their boxes."""
+    check_config(config)
+    layout, name = config.build(), type(config).__name__
+    require(isinstance(layout, BlockLayout), f"{name}: build() gives {type(layout).__name__}, not a BlockLayout")
+    boxes = layout.boxes
+    tensor(boxes, (None, 2, 3), f"{name}: boxes")
+    require(bool((boxes[:, 0] < boxes[:, 1]).all()), f"{name}: a box's lowest corner must lie below its highest")
+    points = cases.points(64)
+    blend = layout.blend(points)
+    tensor(blend, (64, len(boxes)), f"{name}: blend")
+    whole = bool((blend >= 0).all()) and close(blend.sum(1), torch.ones(64), 1e-4)
+    require(whole, f"{name}: blend: rows must be at least 0 and sum to 1")
+    inside = ((points[:, None] >= boxes[:, 0] - 1e-5) & (points[:, None] <= boxes[:, 1] + 1e-5)).all(2)
+    require(not bool(((blend > 0) & ~inside).any()), f"{name}: a block must have no weight outside its box")
+    pointwise(layout.blend, points, name)
+
+
+def check_parser(config: DataParserConfig, data: Path) -> None:
+    """A scene of `data`, a folder of that format: rigid poses, cameras that fit the paths, disjoint splits."""
+    check_config(config)
+    parser, name = config.build(), type(config).__name__
+    require(isinstance(parser, DataParser), f"{name}: build() gives {type(parser).__name__}, not a DataParser")
+    scene, half = parser.parse(data, 1), parser.parse(data, 2)
+    count, cameras = len(scene.paths), scene.cameras
+    require(count > 0 and len(cameras) == count, f"{name}: {count} paths but {len(cameras)} cameras")
+    require(cameras.pose.dtype == torch.float64 and tuple(cameras.pose.shape) == (count, 3, 4), f"{name}: pose [V 3 4] fp64")
+    turn = cameras.pose[:, :, :3]
+    rigid = close(turn @ turn.mT, torch.eye(3).double().expand(count, 3, 3), 1e-3)
+    require(rigid and bool((torch.linalg.det(turn) > 0).all()), f"{name}: poses must be rotations, right-handed")
+    require(bool((cameras.focal > 0).all() and (cameras.size > 0).all()), f"{name}: focal lengths and sizes must be above 0")
+    views = torch.cat([scene.train, scene.test])
+    require(len(set(views.tolist())) == len(views), f"{name}: a view must not be in train and test")
+    require(len(scene.train) > 0 and 0 <= int(views.min()) <= int(views.max()) < count, f"{name}: splits must index views")
+    require(bool((half.cameras.size - scene.cameras.size / 2).abs().max() <= 1), f"{name}: downscale=2 must halve the size")
+    require(parser.parse(data, 1).paths == scene.paths, f"{name}: the order of the views must be the same each time")
+    try:
+        parser.parse(data / "no-such-folder", 1)
+    except DataError:
+        return
+    raise AssertionError(f"{name}: a folder that is absent must be a DataError")
+
+
+def check_executor(config: ExecutorConfig) -> None:
+    """Results in the order of the tasks; an error reaches the caller."""
+    check_config(config)
+    executor, name = config.build(), type(config).__name__
+    require(isinstance(executor, Executor), f"{name}: build() gives {type(executor).__name__}, not an Executor")
+    require(executor.map(math.factorial, [5, 0, 3]) == [120, 1, 6], f"{name}: results must be in the order of the tasks")
+    require(executor.map(math.factorial, []) == [], f"{name}: no tasks, no results")
+    try:
+        executor.map(math.factorial, [1, -1])
+    except ValueError:
+        return
+    raise AssertionError(f"{name}: an error in a task must reach the caller")
+
+
+def _sample(sampler: Sampler, rays: Rays, seed: int | None) -> Sampled:
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    step = None if seed is None else 10
+    sampled: Sampled = sampler(rays, locate=lambda x: x.clamp(-1, 1), distance=_linear, step=step, generator=generator)
+    return sampled
+
+
+def _linear(s: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    return near[:, None] + s * (far - near)[:, None]
