@@ -130,7 +130,8 @@ def _over_empty(picture: Annotated[Tensor, "H W 3"], cover: Annotated[Tensor, "H
 
 def _entropy(weights: Annotated[Tensor, "H W T"]) -> Annotated[Tensor, "H W"]:
     """In nats; 0 log 0 = 0."""
-    return torch.special.entr(weights.clamp(min=0)).sum(dim=-1)
+    entropy: Tensor = torch.special.entr(weights.clamp(min=0)).sum(dim=-1)
+    return entropy
 
 
 def _code_colours(reference: Annotated[Tensor, "T"], count: int) -> Annotated[Tensor, "T 3"]:

@@ -59,27 +59,32 @@ def slerp(
 def catmull_rom(
     keys: Annotated[Tensor, "M 3"], gap: Annotated[Tensor, "F"], u: Annotated[Tensor, "F"]
 ) -> Annotated[Tensor, "F 3"]:
-    """Through every key, with a continuous direction; centripetal: knots are spaced by the root of the distance.
+    """Through every key with a continuous velocity, each gap in the same time.
 
-    Unlike the uniform form it makes no loops where keys are unevenly spaced (Yuksel et al. 2011). A missing neighbour
-    at either end is the mirror image of the other one.
+    Directions at keys are those of the centripetal spline, whose knots are spaced by the root l of the distance: unlike
+    the uniform one it makes no loops (Yuksel et al. 2011). Speeds are those of the shorter gap, l_short · v with
+    |v| <= 2 l_short, so that keys in a line are passed without turning back (Fritsch and Carlson 1980) and a key that
+    comes twice is a rest. A missing neighbour at either end is the mirror image of the other one.
     """
     if len(keys) == 1:
         return keys[gap]
-    padded = torch.cat([2 * keys[:1] - keys[1:2], keys, 2 * keys[-1:] - keys[-2:-1], keys[-1:]])
-    before, start, end, after = (padded[gap + shift] for shift in range(4))
-    left, here, right = ((b - a).norm(dim=-1, keepdim=True).sqrt() for a, b in ((before, start), (start, end), (end, after)))
-    # Keys in one place have no spacing; any stands in, for their difference is 0.
-    here = torch.where(here > 0, here, torch.ones_like(here))
-    left, right = torch.where(left > 0, left, here), torch.where(right > 0, right, here)
-    chord = end - start
-    leave = chord + here * ((start - before) / left - (end - before) / (left + here))
-    arrive = chord + here * ((after - end) / right - (after - start) / (here + right))
+    padded = torch.cat([2 * keys[:1] - keys[1:2], keys, 2 * keys[-1:] - keys[-2:-1]])
+    chord = padded.diff(dim=0)
+    root = chord.norm(dim=-1, keepdim=True).sqrt()
+    # Where a root is 0 so is the shorter one, and with it the velocity, whatever the quotient.
+    rate = chord / torch.where(root > 0, root, torch.ones_like(root))
+    left, right = root[:-1], root[1:]
+    both = left + right
+    share = left / torch.where(both > 0, both, torch.ones_like(both))
+    # Of the derivatives of the quadratic through three keys, the one at the middle key.
+    velocity = torch.minimum(left, right) * ((1 - share) * rate[:-1] + share * rate[1:])
+    # A frame at the very end lies in the gap after the last key, with u = 0.
+    after = (gap + 1).clamp(max=len(keys) - 1)
     u = u[:, None]
     square, cube = u**2, u**3
     return (
-        (2 * cube - 3 * square + 1) * start
-        + (cube - 2 * square + u) * leave
-        + (3 * square - 2 * cube) * end
-        + (cube - square) * arrive
+        (2 * cube - 3 * square + 1) * keys[gap]
+        + (cube - 2 * square + u) * velocity[gap]
+        + (3 * square - 2 * cube) * keys[after]
+        + (cube - square) * velocity[after]
     )

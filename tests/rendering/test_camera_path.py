@@ -1,0 +1,111 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import DataError
+from fprf.rendering.camera_path import read_camera_path, write_camera_path
+from fprf.rendering.cameras import Cameras
+from fprf.rendering.paths import look_at
+
+IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+def file(path: Path, **changes: Any) -> Path:
+    frame = {"camera_to_world": IDENTITY, "fov": 90.0, "aspect": 1.5}
+    content = {"render_width": 300, "render_height": 200, "camera_path": [frame], **changes}
+    path.write_text(json.dumps(content))
+    return path
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 6), st.floats(20, 4000), st.floats(1, 120), st.integers(0, 99))
+def test_what_is_written_reads_back(
+    tmp_path_factory: pytest.TempPathFactory, count: int, focal: float, fps: float, seed: int
+) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    position = torch.randn(count, 3, dtype=torch.float64, generator=draw)
+    pose = look_at(position, position + torch.randn(count, 3, dtype=torch.float64, generator=draw), torch.eye(3).double()[2])
+    cameras = Cameras(
+        pose=pose,
+        focal=torch.full((count, 2), focal, dtype=torch.float64),
+        centre=torch.tensor([[160.0, 120.0]]).double().repeat(count, 1),
+        size=torch.tensor([[320, 240]]).repeat(count, 1),
+        distortion=torch.zeros(count, 6).double(),
+        lens=torch.zeros(count, dtype=torch.int64),
+    )
+    path = tmp_path_factory.getbasetemp() / "path.json"
+    write_camera_path(path, cameras, fps)
+    found, rate = read_camera_path(path)
+    assert rate == fps
+    torch.testing.assert_close(found.pose, cameras.pose, atol=1e-12, rtol=0)
+    torch.testing.assert_close(found.focal, cameras.focal, atol=0, rtol=1e-9)
+    assert torch.equal(found.centre, cameras.centre) and torch.equal(found.size, cameras.size)
+
+
+def test_a_file_as_the_viewer_exports_it(tmp_path: Path) -> None:
+    cameras, fps = read_camera_path(file(tmp_path / "p.json", camera_type="perspective", seconds=4, keyframes=[{}]))
+    assert fps == 24 and cameras.focal.tolist() == [[pytest.approx(100.0)] * 2]
+    assert cameras.centre.tolist() == [[150, 100]] and cameras.size.tolist() == [[300, 200]]
+    rows = [IDENTITY[:4], IDENTITY[4:8], IDENTITY[8:12], IDENTITY[12:]]
+    nested = file(tmp_path / "q.json", fps=30, camera_path=[{"camera_to_world": rows, "fov": 90}])
+    again, fps = read_camera_path(nested)
+    assert fps == 30 and torch.equal(again.pose, cameras.pose)
+
+
+def test_a_rounded_rotation_is_made_exact(tmp_path: Path) -> None:
+    turned = [0.70711, -0.70711, 0, 1, 0.70711, 0.70711, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1]
+    cameras, _ = read_camera_path(file(tmp_path / "p.json", camera_path=[{"camera_to_world": turned, "fov": 60}]))
+    rotation = cameras.pose[0, :, :3]
+    assert float((rotation.T @ rotation - torch.eye(3)).abs().max()) < 1e-14
+    assert cameras.pose[0, :, 3].tolist() == [1, 2, 3]
+
+
+FRAME = {"camera_to_world": IDENTITY, "fov": 60}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"camera_type": "equirectangular"}, "camera_type is \"equirectangular\"; must be 'perspective'"),
+        ({"render_width": 0}, "render_width is 0; must be a whole number"),
+        ({"render_height": 10.5}, "render_height is 10.5"),
+        ({"render_height": None}, "render_height is null"),
+        ({"fps": 0}, "fps is 0; must be a number between 0 and 1000"),
+        ({"fps": True}, "fps is true"),
+        ({"camera_path": []}, r"camera_path is \[\]; must be a list of at least one frame"),
+        ({"camera_path": {}}, "camera_path is {}"),
+        ({"camera_path": [3]}, r"camera_path\[0\] is 3"),
+        ({"camera_path": [FRAME, {**FRAME, "fov": 180}]}, r"camera_path\[1\].fov is 180"),
+        ({"camera_path": [{**FRAME, "fov": None}]}, "fov is null"),
+        ({"camera_path": [{"fov": 60}]}, "camera_to_world is null; must be 16 finite numbers"),
+        ({"camera_path": [{**FRAME, "camera_to_world": IDENTITY[:12]}]}, "must be 16 finite numbers"),
+        ({"camera_path": [{**FRAME, "camera_to_world": [*IDENTITY[:15], "x"]}]}, "must be 16 finite numbers"),
+        ({"camera_path": [{**FRAME, "camera_to_world": [float("nan"), *IDENTITY[1:]]}]}, "must be 16 finite numbers"),
+        ({"camera_path": [{**FRAME, "camera_to_world": [2, *IDENTITY[1:]]}]}, "without scale or mirroring"),
+        ({"camera_path": [{**FRAME, "camera_to_world": [-1, *IDENTITY[1:]]}]}, "without scale or mirroring"),
+        ({"camera_path": [{**FRAME, "camera_to_world": [0] * 16}]}, "without scale or mirroring"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        read_camera_path(file(tmp_path / "p.json", **changes))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "\x00", "[" * 100_000])
+def test_what_is_no_camera_path_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(DataError, match="export the camera path again"):
+        read_camera_path(tmp_path / "p.json")
+
+
+def test_files_that_are_not_there_and_paths_of_nothing(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such camera path; give spiral"):
+        read_camera_path(tmp_path / "none.json")
+    empty = read_camera_path(file(tmp_path / "p.json"))[0].select(torch.tensor([], dtype=torch.int64))
+    with pytest.raises(DataError, match="no frames"):
+        write_camera_path(tmp_path / "q.json", empty, 24)
