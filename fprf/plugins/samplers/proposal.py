@@ -42,7 +42,7 @@ class ProposalSampler(Sampler):
             t = distance(s, rays.near, rays.far)
             points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
             with torch.set_grad_enabled(learns):
-                density = field(locate(points.view(-1, 3))).view(len(s), -1)
+                density = field(locate(points.view(-1, 3))).view(points.shape[:2])
                 w = transmittance_weights(density, t)
             if learns:
                 levels.append(Level(s, w))
