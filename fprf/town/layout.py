@@ -143,6 +143,10 @@ def build_town(seed: int) -> Town:
     for shape in shapes:
         first.append(len(faces))
         faces += shape.faces
-    solid = [s for s in shapes if s.low[2] < 0.4 and abs(s.low[1] + s.high[1]) < 40.0 and s.low[0] > -12.0]
+    solid = [
+        s
+        for s in shapes
+        if s.low[2] < 0.4 and abs(s.low[1] + s.high[1]) < 40.0 and s.low[0] > -12.0 and np.ptp([s.low[0], s.high[0]]) > 0.7
+    ]
     prints = np.array([[*s.low[:2], *s.high[:2], s.high[2]] for s in solid])
     return Town(seed, tuple(shapes), tuple(first), _table(faces), prints, np.array(lights))

@@ -1,10 +1,8 @@
-"""Light: the sun with hard shadows, the sky's ambient light, lamps, haze; and the sky itself.
+"""Light on surfaces: the sun with hard shadows, the sky's ambient light, lamps, haze.
 
 Lambertian throughout: what a surface point sends out is a function of the point, so that all views agree on it. Haze
 too depends on the place (how far outside the street it lies), not on the camera.
 """
-
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +11,14 @@ from .layout import END, START, Town
 from .paint import foliage_normals, paint
 from .palettes import Palette
 from .shapes import Material
-from .texture import fractal2, hashed, noise2, step
+from .sky import sun_direction
+from .texture import noise2, step
 from .trace import shadowed
 
-__all__ = ["shade", "sky", "sun_direction"]
+__all__ = ["shade"]
 
 Colours = NDArray[np.float32]
 Array = NDArray[np.float64]
-
-
-def sun_direction(look: Palette) -> Array:
-    """Unit vector towards the sun."""
-    a, e = math.radians(look.azimuth), math.radians(look.elevation)
-    return np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
 
 
 def _linear(srgb: NDArray[np.floating]) -> Colours:
@@ -38,7 +31,7 @@ def _encode(light: NDArray[np.floating]) -> Colours:
     x = np.maximum(light, 0)
     x = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
     x = np.clip(x, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)
+    return np.asarray(np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055), np.float32)
 
 
 def _normals(town: Town, face: NDArray[np.integer], points: Array) -> Colours:
@@ -46,7 +39,7 @@ def _normals(town: Town, face: NDArray[np.integer], points: Array) -> Colours:
     flat = np.cross(faces.u, faces.v)
     round_ = (points - faces.centre[face]) * faces.curve[face]
     length = np.linalg.norm(round_, axis=1, keepdims=True)
-    return np.where(length > 0, round_ / np.maximum(length, 1e-12), flat[face]).astype(np.float32)
+    return np.asarray(np.where(length > 0, round_ / np.maximum(length, 1e-12), flat[face]), np.float32)
 
 
 def _occlusion(town: Town, points: Array, ground: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -107,26 +100,5 @@ def shade(town: Town, look: Palette, face: NDArray[np.integer], points: Array) -
     colour = _linear(albedo) * light * look.exposure + glow * look.exposure
     outside = np.maximum(np.abs(points[:, 1]) - 9.0, np.maximum(START - points[:, 0], points[:, 0] - END))
     haze = (1 - np.exp(-np.maximum(outside, 0) / 40.0 * 2.0)) * look.haziness
-    return _encode(colour) * (1 - haze[:, None]).astype(np.float32) + (np.array(look.haze) * haze[:, None]).astype(np.float32)
-
-
-def sky(direction: Array, look: Palette) -> Colours:
-    """sRGB colours [N 3] in [0, 1] of the sky in unit directions [N 3]."""
-    height = np.clip(direction[:, 2], 0.0, 1.0)
-    rise = step(height, -0.05, 0.75)[:, None] ** 0.7
-    colour = np.array(look.horizon) * (1 - rise) + np.array(look.zenith) * rise
-    # Clouds lie on a plane overhead; flattened towards the horizon, where they would alias.
-    plane = direction[:, :2] / (height + 0.28)[:, None] * 2.2
-    puff = 0.7 * fractal2(plane[:, 0], plane[:, 1], 131) + 0.3 * fractal2(3 * plane[:, 0], 3 * plane[:, 1], 133)
-    cover = step(puff, 0.78 - 0.45 * look.cloudiness, 1.02 - 0.45 * look.cloudiness)[:, None] * 0.85
-    toward = np.clip(direction @ sun_direction(look), 0, 1)[:, None]
-    colour = colour + np.array(look.glow) * (toward**6 + 1.5 * toward**60)
-    colour = colour * (1 - cover) + (np.array(look.clouds) * (0.86 + 0.2 * toward**4)) * cover
-    if look.stars > 0:
-        grid = direction[:, :2] / (height + 0.5)[:, None] * 26.0
-        whole = np.floor(grid)
-        i, j = whole.astype(np.int64).T
-        apart = grid - whole - 0.3 - 0.4 * np.stack([hashed(141, i, j), hashed(142, i, j)], 1)
-        star = np.exp(-(apart**2).sum(1) / 0.012) * (hashed(143, i, j) > 0.88) * hashed(144, i, j)
-        colour = colour + look.stars * (star * (1 - cover[:, 0]))[:, None]
-    return np.clip(colour, 0, 1).astype(np.float32)
+    hazy = np.array(look.haze) * haze[:, None]
+    return np.asarray(_encode(colour) * (1 - haze[:, None]) + hazy, np.float32)

@@ -25,7 +25,7 @@ def foliage_normals(points: Array, normals: Colours, distant: NDArray[np.bool_])
     x, y, z = p.T
     rough = np.stack([noise3(x, y, z, 81 + i) for i in range(3)], 1) - np.float32(0.5)
     bent = normals + np.float32(1.7) * rough
-    return bent / np.linalg.norm(bent, axis=1, keepdims=True)
+    return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True), np.float32)
 
 
 def _foliage(town: Town, face: NDArray[np.integer], points: Array, normals: Colours, look: Palette) -> Colours:
@@ -82,7 +82,8 @@ def _car(kind: Material, town: Town, face: NDArray[np.integer], points: Array, l
 
 def _plain(kind: Material, points: Array, look: Palette) -> Colours:
     if kind == Material.TRUNK:
-        streak = noise3(*(points * np.array([9.0, 9.0, 1.6])).T, 111)
+        x, y, z = (points * np.array([9.0, 9.0, 1.6])).T
+        streak = noise3(x, y, z, 111)
         return mix(np.array(look.bark) * 0.7, np.array(look.bark) * 1.25, streak)
     if kind == Material.LANTERN:
         return mix(np.array(look.light), np.array(look.trim), np.full(len(points), 0.6))

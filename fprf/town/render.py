@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .layout import Town
-from .light import shade, sky
+from .light import shade
 from .palettes import Palette
+from .sky import sky
 from .surface import labels
 from .trace import View, cast, directions
 
-__all__ = ["Picture", "geometry", "render"]
+__all__ = ["Picture", "colours", "geometry", "render"]
 
 _SAMPLES = 2
 """Colour samples per pixel side."""

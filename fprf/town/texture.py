@@ -23,7 +23,7 @@ def hashed(seed: int, *cell: NDArray[np.int64]) -> Array:
 def _split(x: NDArray[np.floating]) -> tuple[NDArray[np.int64], Array]:
     whole = np.floor(x)
     part = (x - whole).astype(np.float32)
-    return whole.astype(np.int64), part * part * (3 - 2 * part)
+    return whole.astype(np.int64), np.asarray(part * part * (3 - 2 * part), np.float32)
 
 
 def noise2(x: NDArray[np.floating], y: NDArray[np.floating], seed: int) -> Array:
@@ -31,7 +31,7 @@ def noise2(x: NDArray[np.floating], y: NDArray[np.floating], seed: int) -> Array
     (i, a), (j, b) = _split(x), _split(y)
     low = hashed(seed, i, j) * (1 - a) + hashed(seed, i + 1, j) * a
     high = hashed(seed, i, j + 1) * (1 - a) + hashed(seed, i + 1, j + 1) * a
-    return low * (1 - b) + high * b
+    return np.asarray(low * (1 - b) + high * b, np.float32)
 
 
 def noise3(x: NDArray[np.floating], y: NDArray[np.floating], z: NDArray[np.floating], seed: int) -> Array:
@@ -41,9 +41,9 @@ def noise3(x: NDArray[np.floating], y: NDArray[np.floating], z: NDArray[np.float
     def plane(m: NDArray[np.int64]) -> Array:
         low = hashed(seed, i, j, m) * (1 - a) + hashed(seed, i + 1, j, m) * a
         high = hashed(seed, i, j + 1, m) * (1 - a) + hashed(seed, i + 1, j + 1, m) * a
-        return low * (1 - b) + high * b
+        return np.asarray(low * (1 - b) + high * b, np.float32)
 
-    return plane(k) * (1 - c) + plane(k + 1) * c
+    return np.asarray(plane(k) * (1 - c) + plane(k + 1) * c, np.float32)
 
 
 def fractal2(x: NDArray[np.floating], y: NDArray[np.floating], seed: int) -> Array:
@@ -60,12 +60,12 @@ def fractal3(p: NDArray[np.floating], rate: float, seed: int) -> Array:
 def step(x: NDArray[np.floating], low: float, high: float) -> Array:
     """Smooth rise from 0 at low to 1 at high."""
     s = np.clip((x - low) / (high - low), 0.0, 1.0).astype(np.float32)
-    return s * s * (3 - 2 * s)
+    return np.asarray(s * s * (3 - 2 * s), np.float32)
 
 
 def band(x: NDArray[np.floating], half: float | NDArray[np.floating], soft: float = 0.02) -> Array:
     """1 where |x| < half, falling to 0 within `soft` metres on both sides of the edge."""
-    return np.clip((half - np.abs(x)) / (2 * soft) + 0.5, 0.0, 1.0).astype(np.float32)
+    return np.asarray(np.clip((half - np.abs(x)) / (2 * soft) + 0.5, 0.0, 1.0), np.float32)
 
 
 def cells(
@@ -83,4 +83,4 @@ def cells(
 def mix(a: NDArray[np.floating], b: NDArray[np.floating], share: NDArray[np.floating]) -> Array:
     """Colours a and b ([3] or [N 3]) mixed by share [N] of b: [N 3]."""
     s = share[:, None].astype(np.float32)
-    return (a * (1 - s) + b * s).astype(np.float32)
+    return np.asarray(a * (1 - s) + b * s, np.float32)

@@ -13,7 +13,7 @@ FIELD_OF_VIEW = 75.0
 """Horizontal, in degrees."""
 _YAW = (0.0, 50.0, -24.0, 24.0, -50.0)
 """Degrees to the left of the street's direction, in turn: five of them, so that every 8th view meets all."""
-_FROM, _TO = -3.0, 27.0
+_FROM, _TO = -2.0, 24.0
 _EVERY = 8
 
 
@@ -23,14 +23,18 @@ def is_test(view: int) -> bool:
 
 
 def walk(*, seed: int, views: int, width: int, height: int) -> list[View]:
-    """Poses along the street, snaking from one side of the road to the other; looks to a side come from across it."""
+    """Poses up the street and back down again, always facing its far end; looks to a side come from across the road.
+
+    The walk starts a tenth into its loop: the rearmost views, which see what no other does, are then for training.
+    """
     rng = np.random.default_rng([0x3A1C, seed])
     focal = width / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     result = []
     for k in range(views):
         yaw = _YAW[k % len(_YAW)] + float(rng.uniform(-6, 6))
-        x = _FROM + (_TO - _FROM) * (k + 0.5) / views
-        y = -2.6 * math.sin(math.radians(1.8 * yaw)) + 1.2 * math.sin(2.4 * k) + float(rng.uniform(-0.3, 0.3))
+        way = 1.0 - abs(2.0 * (((k + 0.5) / views + 0.1) % 1.0) - 1.0)
+        x = _FROM + (_TO - _FROM) * way
+        y = -2.6 * math.sin(math.radians(1.8 * yaw)) + 1.4 * math.sin(2.4 * k) + float(rng.uniform(-0.3, 0.3))
         place = np.array([x, float(np.clip(y, -3.2, 3.2)), float(rng.uniform(1.6, 2.4))])
         result.append(View(_pose(place, yaw, float(rng.uniform(4.0, 9.0))), focal, width, height))
     return result

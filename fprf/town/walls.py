@@ -17,7 +17,21 @@ _BRICK, _PLASTER, _CLAPBOARD, _TIMBER, _STONE = range(5)
 
 
 def _choose(colours: tuple[tuple[float, float, float], ...], index: NDArray[np.integer]) -> Colours:
-    return np.array(colours, dtype=np.float32)[index % len(colours)]
+    return np.asarray(np.array(colours, dtype=np.float32)[index % len(colours)])
+
+
+def _some(parts: Parts, at: NDArray[np.int64]) -> Parts:
+    return Parts(
+        window=parts.window[at],
+        door=parts.door[at],
+        shutter=parts.shutter[at],
+        across=parts.across[at],
+        up=parts.up[at],
+        half=parts.half[at],
+        tall=parts.tall[at],
+        column=parts.column[at],
+        storey=parts.storey[at],
+    )
 
 
 def _bare(style: int, tint: NDArray[np.int64], u: Array, v: Array, look: Palette) -> Colours:
@@ -31,13 +45,13 @@ def _bare(style: int, tint: NDArray[np.int64], u: Array, v: Array, look: Palette
     if style == _CLAPBOARD:
         within = (v % 0.36) / 0.36
         tone = 0.90 + 0.10 * within + 0.06 * broad - 0.26 * band((v % 0.36) - 0.03, 0.035, 0.025)
-        return (base * tone[:, None]).astype(np.float32)
+        return np.asarray(base * tone[:, None], np.float32)
     if style == _STONE:
         number, joint = cells(u, v, 1.1, 0.55, 0.025, 0.5, 65)
         tone = 0.84 + 0.20 * number + 0.12 * broad - 0.22 * joint
-        return (np.array(look.stone) * tone[:, None]).astype(np.float32)
+        return np.asarray(np.array(look.stone) * tone[:, None], np.float32)
     tone = 0.90 + 0.10 * broad + 0.07 * noise2(4 * u, 4 * v, 67)
-    return (base * tone[:, None]).astype(np.float32)
+    return np.asarray(base * tone[:, None], np.float32)
 
 
 def _timber(u: Array, v: Array, parts: Parts, pitch: Array) -> NDArray[np.float32]:
@@ -105,9 +119,9 @@ def paint_walls(faces: FaceTable, face: NDArray[np.integer], points: Array, look
     glow = np.zeros_like(colour)
     at = np.flatnonzero(parts.window)
     key = hashed(71, face.astype(np.int64), parts.column, parts.storey)
-    colour[at], glow[at] = _window(Parts(*(p[at] for p in parts)), key[at], look)
+    colour[at], glow[at] = _window(_some(parts, at), key[at], look)
     at = np.flatnonzero(parts.door)
-    colour[at] = _door(Parts(*(p[at] for p in parts)), tint[at], look)
+    colour[at] = _door(_some(parts, at), tint[at], look)
     if look.snowing > 0:
         colour = mix(colour, np.array(look.snow), sill * above * look.snowing)
     grime = 1 - 0.18 * (1 - step(v, 0.0, 1.6)) * house
