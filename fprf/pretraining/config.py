@@ -17,6 +17,8 @@ class PretrainConfig:
 
     images: tuple[Path, ...] = ()
     """Folders of photographs, searched at every depth; one in twelve is held out for the report."""
+    photos: int | None = None
+    """Use only so many of the photographs."""
     output: Path | None = None
     """Weights file to write. A checkpoint lies beside it until it is finished; run again to resume."""
     minutes: float = 8.0
@@ -31,6 +33,8 @@ class PretrainConfig:
     """Every draw is a function of it."""
 
     def __post_init__(self) -> None:
+        if self.photos is not None:
+            at_least("photos", self.photos, 2)
         positive("minutes", self.minutes)
         if self.steps is not None:
             at_least("steps", self.steps, 1)

@@ -23,6 +23,8 @@ from .config import DistilConfig
 from .filtered import filtered_at, filtered_whole, random_pixels
 from .loop import generator_of, train
 from .photos import crop, find_photos, load_photo, split
+from .prepared import prepared, prepared_path
+from .toning import toned
 
 __all__ = ["content_report", "pretrain_content"]
 
@@ -40,11 +42,11 @@ def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], No
     if len(config.teachers) != 1:
         raise UsageError(f"--teachers: {len(config.teachers)} files; `content` takes one, the weights of VGG-19")
     teacher = build_vgg19("relu2_1", weights=config.teachers[0], normalise=True)
-    photos, held = split(find_photos(config.images))
+    photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
     basis = content_basis(teacher, photos[:BASIS_PHOTOS], config.seed)
     say(f"{len(basis.axes)} channels keep {100 * basis.kept:.2f} % of the filtered energy")
-    images, targets = _crops(teacher, basis, photos, config)
+    images, targets = prepared(lambda: _crops(teacher, basis, photos, config), config, output)
     say(f"{len(images)} crops prepared")
 
     torch.manual_seed(config.seed)
@@ -63,6 +65,7 @@ def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], No
     }
     write_weights(output, {name: value.half() for name, value in student.state_dict().items()}, metadata)
     report = content_report(load_content_encoder(output), teacher, basis, held[:REPORT_PHOTOS])
+    prepared_path(output).unlink(missing_ok=True)
     return {"steps": steps, "channels": len(basis.axes), "energy_kept": round(basis.kept, 5), **report}
 
 
@@ -122,17 +125,8 @@ def _crops(
     for index, path in enumerate(photos):
         generator = generator_of(config.seed + 1, index)
         photo = load_photo(path)
-        batch = torch.stack([_toned(crop(photo, config.size, SCALES, generator), generator) for _ in range(config.crops)])
+        batch = torch.stack([toned(crop(photo, config.size, SCALES, generator), generator) for _ in range(config.crops)])
         batch = (batch * 255).round()
         images.append(batch.byte())
         targets.append(basis.project(teacher(batch / 255)).half())
     return torch.cat(images), torch.cat(targets)
-
-
-def _toned(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Annotated[Tensor, "3 H W"]:
-    draw = torch.rand(5, generator=generator)
-    if draw[0] > 0.3:
-        return image
-    gamma = 2 ** (2.4 * float(draw[1]) - 1.2)
-    gains = 0.5 + 0.7 * draw[2:5].view(3, 1, 1)
-    return (image**gamma * gains).clamp(0, 1)

@@ -30,7 +30,7 @@ Report = dict[str, float | int | str]
 def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[[str], None]) -> Report:
     """Train, write `output`, and measure it on held-out photographs."""
     encoder = config.encoder.build()
-    photos, held = split(find_photos(config.images))
+    photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
     features, colours = _samples(encoder, photos, config)
     mean = features.mean(0)

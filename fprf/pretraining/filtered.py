@@ -32,9 +32,7 @@ def filtered_at(
 
 
 @torch.no_grad()
-def filtered_whole(
-    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], guided: GuidedConfig
-) -> Annotated[Tensor, "N C"]:
+def filtered_whole(encoder: Encoder, photo: Annotated[Tensor, "H W 3"], guided: GuidedConfig) -> Annotated[Tensor, "N C"]:
     """Features at every pixel, row by row."""
     features = encoder(photo.permute(2, 0, 1)[None])[0]
     radius = _radius(photo, guided)

@@ -46,9 +46,7 @@ def checkpoint_path(output: Path) -> Path:
     return output.with_name(output.name + ".checkpoint")
 
 
-def train(
-    network: nn.Module, loss: Callable[[torch.Generator], Tensor], config: PretrainConfig, output: Path, say: Say
-) -> int:
+def train(network: nn.Module, loss: Callable[[torch.Generator], Tensor], config: PretrainConfig, output: Path, say: Say) -> int:
     """Train in place until the budget is spent; the number of steps. `loss` draws its batch from the generator."""
     optimizer = torch.optim.Adam(network.parameters(), config.rate)
     progress = _resume(network, optimizer, config, output)
@@ -80,9 +78,7 @@ def _key(config: PretrainConfig) -> str:
     return repr(config)
 
 
-def _save(
-    network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path, progress: _Progress
-) -> None:
+def _save(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path, progress: _Progress) -> None:
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     for index, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{name}": value for name, value in moments.items()}

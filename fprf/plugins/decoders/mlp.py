@@ -67,9 +67,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     return tensors, metadata
 
 
-def _loaded(
-    path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *, encoder: str, channels: int
-) -> MlpDecoder:
+def _loaded(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *, encoder: str, channels: int) -> MlpDecoder:
     hidden, inputs = tensors["first.weight"].shape
     if metadata["encoder"] != encoder or inputs != channels:
         raise WeightsError(

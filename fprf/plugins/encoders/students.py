@@ -62,9 +62,7 @@ class SemanticStudent(nn.Module):
 class _ConvNorm(nn.Module):
     """Convolution, batch normalisation, ReLU."""
 
-    def __init__(
-        self, inputs: int, outputs: int, size: int, *, stride: int = 1, dilation: int = 1, groups: int = 1
-    ) -> None:
+    def __init__(self, inputs: int, outputs: int, size: int, *, stride: int = 1, dilation: int = 1, groups: int = 1) -> None:
         super().__init__()
         padding = dilation * (size // 2)
         self.conv = nn.Conv2d(inputs, outputs, size, stride, padding, dilation, groups, bias=False)

@@ -1,0 +1,99 @@
+"""DINO and DINOv2 through `transformers` (extra `encoders`): final-norm tokens of any block, at any stride.
+
+The stride is reached by resizing: one patch of the resized image covers `stride` pixels of the one given. Blocks after
+the chosen one are never loaded.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ...errors import WeightsError
+from ...interfaces import Encoder
+from ..weightfiles import tensors_hash
+from .frozen import freeze
+
+__all__ = ["VitEncoder", "build_vit"]
+
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+# ViT interpolates its position table on demand, DINOv2 always does.
+CALLS: Mapping[str, Mapping[str, bool]] = {"dino": {"interpolate_pos_encoding": True}, "dinov2": {}}
+
+
+class VitEncoder(Encoder):
+    """Patch tokens of a vision transformer `model` with patches of `patch` pixels."""
+
+    def __init__(self, family: str, model: nn.Module, *, name: str, patch: int, channels: int, stride: int) -> None:
+        super().__init__()
+        self._call, self._patch, self._stride, self._channels = CALLS[family], patch, stride, channels
+        used = {key: value for key, value in model.state_dict().items() if not key.startswith("pooler.")}
+        self._identity = f"{family}:{name}:stride{stride}:{tensors_hash(used)}"
+        self.model = model
+        freeze(self)
+
+    @property
+    def identity(self) -> str:
+        """Family, model, block, stride and a hash of the weights."""
+        return self._identity
+
+    @property
+    def channels(self) -> int:
+        """Width of the tokens."""
+        return self._channels
+
+    @torch.no_grad()
+    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
+        """Features, one per `stride` pixels, cells covering the whole image evenly."""
+        height, width = (max(1, round(n / self._stride)) for n in image.shape[-2:])
+        size = (height * self._patch, width * self._patch)
+        if size != tuple(image.shape[-2:]):
+            image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
+        mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (MEAN, STD))
+        tokens: Tensor = self.model(pixel_values=(image - mean) / std, **self._call).last_hidden_state
+        # Class and register tokens come first.
+        return tokens[:, -height * width :].transpose(1, 2).unflatten(2, (height, width)).contiguous()
+
+
+def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
+    """The encoder from the hub's cache, the hub or a folder. Raises WeightsError where one of its parts is absent."""
+    try:
+        from transformers import AutoConfig, AutoModel
+        from transformers.utils import logging
+    except ImportError as error:
+        raise WeightsError(
+            f"{family}: needs the package transformers ({error}); pip install 'fprf[encoders]', "
+            "or choose an encoder that ships: bundled-semantic, bundled-content"
+        ) from error
+    verbosity = logging.get_verbosity()
+    logging.set_verbosity_error()  # else it lists the blocks that are left out
+    try:
+        config = AutoConfig.from_pretrained(name)
+        blocks = int(config.num_hidden_layers)
+        config.num_hidden_layers = _block(layer, blocks, name)
+        model = AutoModel.from_pretrained(name, config=config)
+    except (OSError, ValueError, KeyError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise WeightsError(
+            f"{family}: {name} cannot be loaded ({reason}); with a network run `hf download {name}` once, "
+            "or put config.json and model.safetensors into a folder and name it with --semantic.encoder.model FOLDER"
+        ) from error
+    finally:
+        logging.set_verbosity(verbosity)
+    return VitEncoder(
+        family,
+        model,
+        name=f"{name.rstrip('/').rpartition('/')[2]}:block{config.num_hidden_layers}",
+        patch=int(config.patch_size),
+        channels=int(config.hidden_size),
+        stride=stride,
+    )
+
+
+def _block(layer: int, blocks: int, name: str) -> int:
+    block = layer if layer > 0 else blocks + 1 + layer
+    if not 1 <= block <= blocks:
+        raise WeightsError(f"{name}: has no block {layer}; allowed are 1 to {blocks}, or -1 to -{blocks}")
+    return block

@@ -1,0 +1,30 @@
+"""Crops and targets that are made once: kept beside the output until the run is finished, so that resuming is quick."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from torch import Tensor
+
+from ..plugins.weightfiles import read_weights, write_weights
+from .config import PretrainConfig
+
+__all__ = ["prepared", "prepared_path"]
+
+Pair = tuple[Tensor, Tensor]
+
+
+def prepared_path(output: Path) -> Path:
+    """Where the crops of an unfinished run lie."""
+    return output.with_name(output.name + ".prepared")
+
+
+def prepared(make: Callable[[], Pair], config: PretrainConfig, output: Path) -> Pair:
+    """Inputs and targets: those of an interrupted run of the same config, or made anew and kept."""
+    path = prepared_path(output)
+    if path.is_file():
+        tensors, metadata = read_weights(path)
+        if metadata.get("config") == repr(config):
+            return tensors["inputs"], tensors["targets"]
+    inputs, targets = make()
+    write_weights(path, {"inputs": inputs, "targets": targets}, {"config": repr(config)})
+    return inputs, targets
