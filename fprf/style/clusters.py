@@ -12,7 +12,10 @@ from torch import Tensor
 from ..errors import NumericsError
 from .statistics import double
 
-__all__ = ["Clusters", "kmeans"]
+__all__ = ["CLUSTERED", "Clusters", "kmeans", "nearest"]
+
+CLUSTERED = 20_480
+"""Rows worth clustering: more do not move the centroids, and cost more than half a second."""
 
 _ITERATIONS = 40
 """Lloyd steps at most: photographs settle in 10 to 40, and pure noise (which never does) stays below 0.3 s."""
@@ -53,6 +56,13 @@ def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated
         label = moved
     centres, label = _means(points, mass, label, len(centres))
     return Clusters((centres + middle).to(x), label.to(x.device))
+
+
+def nearest(x: Annotated[Tensor, "N D"], centres: Annotated[Tensor, "k D"]) -> Annotated[Tensor, "N"]:
+    """int64 index of the nearest centre of each row."""
+    points, targets = double(x), double(centres)
+    middle = targets.mean(0)
+    return _nearest(points - middle, targets - middle).to(x.device)
 
 
 def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> Tensor:

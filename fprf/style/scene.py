@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CheckpointError, DataError
-from .clusters import kmeans
+from .clusters import CLUSTERED, kmeans
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import attention, score_spread, unit
 from .statistics import Moments, covariance, double, group_moments
@@ -21,9 +21,6 @@ regions' statistics are taken with it."""
 
 _FAINT = 1e-3
 """Memberships below this are dropped: a point then belongs to one or two regions and the others cost nothing."""
-
-_CLUSTERED = 32768
-"""Rows that k-means sees at most: more do not move the centroids, and clustering stays below half a second."""
 
 
 class SceneStyle(NamedTuple):
@@ -67,7 +64,7 @@ def scene_style(
     semantic = content.new_zeros(len(content), 0) if semantic is None else semantic[keep]
     keys = semantic.new_zeros(1, 0)
     if semantic.shape[1] > 0:
-        every = -(-len(semantic) // _CLUSTERED)
+        every = -(-len(semantic) // CLUSTERED)
         keys = kmeans(semantic[::every], regions, seed=seed, weights=weights[::every]).centres
     middle = (double(weights) @ double(semantic) / double(weights).sum()).to(semantic)
     alive, belongs = _regions(semantic, keys, middle)
