@@ -68,7 +68,10 @@ def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
 
 
 def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
-    """The arguments as tyro spells them: `none` as None, `true` as True, a bare `--switch` as `--switch True`."""
+    """The arguments as tyro spells them.
+
+    `none` is None, `true` is True, a bare `--path.switch` is `--path.switch True`, `--path.no-switch` is its opposite.
+    """
     spelled: list[str] = []
     for at, arg in enumerate(args):
         key, equals, inline = arg.partition("=")
@@ -77,6 +80,8 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
             spelled.append(f"{key}={_literal(inline, flag)}")
         elif flag and flag.boolean and args[at + 1 : at + 2] not in _TRUTHS:
             spelled += [arg, "True"]
+        elif (opposite := flags.get(re.sub(r"(^--|\.)no-(?=[^.]*$)", r"\1", _dashed(arg)))) and not flag and opposite.boolean:
+            spelled += [opposite.text, "False"]
         elif at and not arg.startswith("--") and (before := flags.get(_dashed(args[at - 1]))):
             spelled.append(_literal(arg, before))
         else:
