@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -26,7 +27,7 @@ class GuidedConfig:
     eps: float = 1e-3
     """Regularisation in squared colour units, colours in [0, 1]; at least 1e-6."""
     stride: int = 8
-    """Pixels between stored coefficients."""
+    """Pixels between stored coefficients; at most a fifth of the window is used, so small images keep their accuracy."""
 
     def __post_init__(self) -> None:
         between("guided.radius", self.radius, 0.0, 1.0)
@@ -44,10 +45,18 @@ class DataManagerConfig(PluginConfig):
     """Format of the scene folder; none = recognised from what lies in it."""
 
     def build(
-        self, *, scene: Scene, content: Encoder | None, semantic: Encoder | None, dim: int, cache: Path, seed: int
+        self,
+        *,
+        scene: Scene,
+        content: Encoder | None,
+        semantic: Encoder | None,
+        dim: int,
+        cache: Path,
+        seed: int,
+        progress: Callable[[int, int, str], None] | None = None,
     ) -> DataManager:
         """The data manager; features are computed into `cache` unless they lie there already. `dim` is the number of
-        principal semantic components that the field learns."""
+        principal semantic components that the field learns; `progress(done, total, what)` is told of the features."""
         raise NotImplementedError
 
 
@@ -67,9 +76,19 @@ class RayBatchesConfig(DataManagerConfig):
         between("datamanager.semantic_share", self.semantic_share, 0.0, 1.0)
 
     def build(
-        self, *, scene: Scene, content: Encoder | None, semantic: Encoder | None, dim: int, cache: Path, seed: int
+        self,
+        *,
+        scene: Scene,
+        content: Encoder | None,
+        semantic: Encoder | None,
+        dim: int,
+        cache: Path,
+        seed: int,
+        progress: Callable[[int, int, str], None] | None = None,
     ) -> DataManager:
         """The data manager."""
         from .batches import RayBatches
 
-        return RayBatches(self, scene=scene, content=content, semantic=semantic, dim=dim, cache=cache, seed=seed)
+        return RayBatches(
+            self, scene=scene, content=content, semantic=semantic, dim=dim, cache=cache, seed=seed, progress=progress
+        )

@@ -1,0 +1,70 @@
+"""Principal components of a scene's semantic features: centred, orthonormal, fitted in float64.
+
+y = (x - mean) matrix. Distances and inner products of centred features survive up to the energy that is dropped, so scores
+between a scene and its references, both projected, are what they were.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..checks import at_least
+from ..errors import DataError, NumericsError
+
+__all__ = ["Basis", "fit_basis"]
+
+
+class Basis(NamedTuple):
+    """I = Cin channels in, D out. float32."""
+
+    mean: Annotated[Tensor, "I"]
+    matrix: Annotated[Tensor, "I D"]
+    """Orthonormal columns, most variance first."""
+    energy: float = 1.0
+    """Share of the samples' variance that the columns keep, in [0, 1]."""
+
+    def project(self, x: Annotated[Tensor, "... I"]) -> Annotated[Tensor, "... D"]:
+        """Features in the basis, on the device and in the type of `x`."""
+        return (x - self.mean.to(x)) @ self.matrix.to(x)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """What `from_tensors` takes: for a tensor file."""
+        return {
+            "mean": self.mean,
+            "matrix": self.matrix.contiguous(),
+            "energy": torch.tensor(self.energy, dtype=torch.float64),
+        }
+
+    @classmethod
+    def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "Basis":
+        """The basis of `tensors()`. Raises DataError where a tensor is missing or shapes do not fit."""
+        missing = {"mean", "matrix", "energy"} - tensors.keys()
+        if missing:
+            raise DataError(f"basis: {', '.join(sorted(missing))} missing; it needs mean, matrix and energy")
+        mean, matrix = tensors["mean"], tensors["matrix"]
+        if mean.ndim != 1 or matrix.ndim != 2 or len(mean) != len(matrix):
+            raise DataError(f"basis: mean {tuple(mean.shape)} and matrix {tuple(matrix.shape)}; they must be [I] and [I D]")
+        return cls(mean, matrix, float(tensors["energy"]))
+
+
+def fit_basis(samples: Annotated[Tensor, "N I"], dim: int) -> Basis:
+    """The min(dim, I) directions of most variance; with all of them, a rotation. The sign is such that each column's
+    largest entry is positive. Raises DataError without samples, NumericsError where one is not finite.
+    """
+    at_least("semantic.dim", dim, 1)
+    if samples.ndim != 2 or not samples.numel():
+        raise DataError(f"basis: samples {tuple(samples.shape)}; at least one feature vector [N I] is needed")
+    if not torch.isfinite(samples).all():
+        raise NumericsError(f"basis: some of the {len(samples)} feature samples are not finite; check the encoder")
+    x = samples.detach().cpu().double()
+    mean = x.mean(0)
+    centred = x - mean
+    values, vectors = torch.linalg.eigh(centred.T @ centred / len(x))
+    values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)[:, :dim]
+    largest = vectors.abs().argmax(0, keepdim=True)
+    vectors = vectors * vectors.gather(0, largest).sign()
+    total = values.sum()
+    energy = float(values[:dim].sum() / total) if total > 0 else 1.0
+    return Basis(mean.float(), vectors.float().contiguous(), energy)

@@ -1,0 +1,123 @@
+"""Training batches: random pixels of all training views with their colours and feature targets.
+
+A batch is a pure function of (seed, step): its generator is seeded by BLAKE2b of the two, so any step can be drawn without the
+ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share nothing.
+"""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import DataError
+from ..interfaces import DataManager, Encoder
+from ..types import Batch
+from .config import RayBatchesConfig
+from .features import FeatureStore, Progress, extract
+from .images import load_image, load_images
+from .scene import Scene
+
+__all__ = ["RayBatches", "generator_of"]
+
+# Images decoded at a time (in threads) before they are copied together.
+DECODE = 16
+WHITE = (1.0, 1.0, 1.0)
+
+
+def generator_of(seed: int, step: int) -> torch.Generator:
+    """The CPU generator of a step's pixels."""
+    name = f"fprf pixels {seed} {step}".encode()
+    return torch.Generator().manual_seed(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1)
+
+
+class RayBatches(DataManager):
+    """Pixels drawn uniformly, with replacement, from all pixels of the training views.
+
+    Images are held as uint8, one after the other; feature coefficients stay in memory-mapped files under `cache`. Transparent
+    scenes are composited on white. `progress(done, total, what)` is told how far features are.
+    """
+
+    def __init__(
+        self,
+        config: RayBatchesConfig,
+        *,
+        scene: Scene,
+        content: Encoder | None,
+        semantic: Encoder | None,
+        dim: int,
+        cache: Path,
+        seed: int,
+        progress: Progress | None = None,
+    ) -> None:
+        if not len(scene.train):
+            raise DataError(f"{scene.name}: no training views; at least one image must not be held out")
+        self.background = WHITE if scene.alpha else None
+        """Colour (RGB in [0, 1]) behind transparent pixels; None for opaque scenes."""
+        self._config, self._scene, self._seed = config, scene, seed
+        self._views = scene.train.tolist()
+        self._sizes = scene.cameras.size[scene.train]
+        self._ends = self._sizes.prod(1).cumsum(0)
+        self._slots = {view: slot for slot, view in enumerate(self._views)}
+        self._pixels = self._load()
+        self.content_store: FeatureStore | None = None
+        self.semantic_store: FeatureStore | None = None
+        if content is not None:
+            self.content_store = extract(
+                cache / "content", self._views, self._stored, content, config.guided, progress=progress
+            )
+        if semantic is not None:
+            self.semantic_store = extract(
+                cache / "semantic", self._views, self._stored, semantic, config.guided, dim=dim, progress=progress
+            )
+
+    def batch(self, step: int) -> Batch:
+        """The pixels of a step; the first `semantic_share` of them carry semantics."""
+        at = torch.randint(len(self._pixels), (self._config.rays,), generator=generator_of(self._seed, step))
+        slot = torch.searchsorted(self._ends, at, right=True)
+        width, height = self._sizes[slot].unbind(1)
+        local = at - (self._ends[slot] - width * height)
+        pixel = torch.stack([local % width, local // width], 1) + 0.5
+        view, rgb = self._scene.train[slot], self._pixels[at].float() / 255
+        share = round(self._config.semantic_share * len(at))
+        content, semantic = self.content_store, self.semantic_store
+        return Batch(
+            view=view,
+            pixel=pixel,
+            rgb=rgb,
+            content=content.at(view, pixel, rgb) if content is not None else None,
+            semantic=semantic.at(view[:share], pixel[:share], rgb[:share]) if semantic is not None and share else None,
+        )
+
+    def image(self, view: int) -> Annotated[Tensor, "H W 3"]:
+        """One view of the scene as a float image in [0, 1]; held-out ones are read when asked for."""
+        if view in self._slots:
+            return self._stored(view).float() / 255
+        width, height = self._scene.cameras.size[view].tolist()
+        return torch.from_numpy(load_image(self._scene.paths[view], (width, height), self.background)).float() / 255
+
+    def _stored(self, view: int) -> Annotated[Tensor, "H W 3"]:
+        slot = self._slots[view]
+        width, height = self._sizes[slot].tolist()
+        end = int(self._ends[slot])
+        return self._pixels[end - width * height : end].reshape(height, width, 3)
+
+    def _load(self) -> Annotated[Tensor, "P 3"]:
+        """All training pixels, uint8, view after view."""
+        pixels = torch.empty(int(self._ends[-1]), 3, dtype=torch.uint8)
+        filled = 0
+        for first in range(0, len(self._views), DECODE):
+            views = self._views[first : first + DECODE]
+            part = replace(
+                self._scene,
+                paths=tuple(self._scene.paths[view] for view in views),
+                cameras=self._scene.cameras.select(torch.tensor(views)),
+            )
+            for image in load_images(part, self.background):
+                rows = torch.from_numpy(np.ascontiguousarray(image)).reshape(-1, 3)
+                pixels[filled : filled + len(rows)] = rows
+                filled += len(rows)
+        return pixels

@@ -1,0 +1,241 @@
+"""Feature targets of every view of a scene, at any pixel, for a few megabytes an image.
+
+Extraction runs the encoder once a view at the image's own size and keeps guided-filter coefficients (`ops.guided`) in files
+(`store_files`); `FeatureStore.at` reads the cells around the pixels of a batch and applies them. Full-size feature maps
+never exist. Semantic features are projected on principal components of the training views before they are kept.
+"""
+
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import DataError, NumericsError, PluginError
+from ..interfaces import Encoder
+from ..ops import guided
+from ..output.atomic import write_json
+from . import store_files
+from .basis import Basis, fit_basis
+from .config import GuidedConfig
+from .store_files import Entry
+
+if TYPE_CHECKING:
+    from ..ops.guided_kernels import ViewArrays
+
+__all__ = ["FeatureStore", "Progress", "extract"]
+
+Progress = Callable[[int, int, str], None]
+"""Told (done, total, what)."""
+
+BASIS_VIEWS = 64
+BASIS_CELLS = 32_768
+# Features met while fitting the basis are remembered up to this, so that small scenes are encoded once, not twice.
+REMEMBER_BYTES = 1 << 28
+MOMENT_PIXELS = 2048
+# A and b move within a window's fifth: measured on photographs, a coarser grid costs more than 1.5 % of the features' spread.
+CELLS_PER_WINDOW = 5
+_COMPILED = importlib.util.find_spec("numba") is not None
+
+
+class FeatureStore:
+    """Targets of some views of a scene; see `extract`."""
+
+    def __init__(self, entries: Mapping[int, Entry], basis: Basis | None = None) -> None:
+        if not entries:
+            raise DataError("feature store: no views; a scene needs at least one training view")
+        self.basis = basis
+        """What the encoder's features were projected on; None = kept raw."""
+        self._entries = dict(entries)
+        first = next(iter(self._entries.values()))
+        self.channels = len(first.scale)
+        self.bytes = sum(e.coefs.numel() * 2 for e in self._entries.values())
+        """Size of the coefficients."""
+        self.mean, self.std = _spread(list(self._entries.values()))
+        """Mean over all channels, and root mean square over the channels' standard deviations, over all pixels."""
+        self._arrays = {view: _arrays(entry) for view, entry in self._entries.items()} if _COMPILED else {}
+
+    @property
+    def scale(self) -> float:
+        """The unit of losses: `std`, or 1 where the features never change."""
+        return self.std if self.std > 0 else 1.0
+
+    def at(
+        self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"], rgb: Annotated[Tensor, "R 3"]
+    ) -> Annotated[Tensor, "R C"]:
+        """Features, float32, raw. `view` counts in the scene; pixel is x, y with centres at +0.5; rgb in [0, 1] is the
+        image's own colour there. Raises DataError for a view that is not in the store.
+        """
+        views = view.detach().cpu().numpy()
+        order = np.argsort(views, kind="stable")
+        ordered = views[order]
+        starts = np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1)).tolist()
+        groups = [order[a:b] for a, b in zip(starts, [*starts[1:], len(order)], strict=True)]
+        missing = [int(views[g[0]]) for g in groups if int(views[g[0]]) not in self._entries]
+        if missing:
+            raise DataError(f"feature store: view {missing[0]} has no features; {len(self._entries)} training views have")
+        positions, colours = pixel.detach().cpu().float().contiguous(), rgb.detach().cpu().float().contiguous()
+        out = torch.empty(len(views), self.channels)
+        (self._compiled if _COMPILED else self._plain)(views, groups, positions, colours, out)
+        return out.to(view.device)
+
+    def _compiled(self, views: np.ndarray, groups: list[np.ndarray], pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
+        from ..ops.guided_kernels import gather_views
+
+        met = [self._arrays[int(views[group[0]])] for group in groups]
+        gather_views(met, groups, pixel.numpy(), (rgb - store_files.GREY).numpy(), out.numpy())
+
+    def _plain(self, views: np.ndarray, groups: list[np.ndarray], pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
+        for group in groups:
+            entry, rows = self._entries[int(views[group[0]])], torch.from_numpy(group)
+            height, width = entry.size.tolist()
+            out[rows] = guided.apply(entry.plain(), pixel[rows], rgb[rows], (height, width))
+
+
+def extract(
+    folder: Path,
+    views: Sequence[int],
+    image: Callable[[int], Annotated[Tensor, "H W 3"]],
+    encoder: Encoder,
+    config: GuidedConfig,
+    *,
+    dim: int | None = None,
+    progress: Progress | None = None,
+) -> FeatureStore:
+    """The store of some views, made in `folder` as far as it is not there yet.
+
+    `image` gives a view as uint8; `dim` asks for that many principal components (fewer, where the encoder has fewer). A
+    run that is cut off goes on where it stopped. Raises NumericsError where the encoder's features are not finite,
+    PluginError where they are not of the shape it promises.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    store_files.remove_stale(folder)
+    prints = {view: _fingerprint(image(view)) for view in views}
+    remembered: dict[int, Tensor] = {}
+    basis = _basis(folder, prints, image, encoder, dim, remembered) if dim is not None else None
+    projection = store_files.digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
+    entries: dict[int, Entry] = {}
+    keys = {}
+    for done, view in enumerate(views):
+        if progress is not None:
+            progress(done, len(views), f"features of {encoder.identity}")
+        pixels = image(view)
+        radius, stride = _window(config, pixels.shape)
+        settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
+        keys[view] = key = store_files.digest(prints[view], encoder.identity, settings, projection)
+        entry = store_files.read(folder, key)
+        if entry is None:
+            features = remembered.get(view)
+            features = _encode(encoder, pixels, view) if features is None else features
+            made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)
+            store_files.write(folder, key, made)
+            # Read back: what trains is what lies on disk, mapped rather than held in memory.
+            entry = store_files.read(folder, key) or made
+        remembered.pop(view, None)
+        entries[view] = entry
+    if progress is not None:
+        progress(len(views), len(views), f"features of {encoder.identity}")
+    store = FeatureStore(entries, basis)
+    # Written last: whoever finds it finds every file it names.
+    manifest = {
+        "encoder": encoder.identity,
+        "channels": store.channels,
+        "mean": store.mean,
+        "std": store.std,
+        "energy": basis.energy if basis is not None else 1.0,
+        "files": {str(view): key for view, key in keys.items()},
+    }
+    write_json(folder / f"manifest-{store_files.digest(*keys.values())}.json", manifest)
+    return store
+
+
+def _window(config: GuidedConfig, shape: Sequence[int]) -> tuple[int, int]:
+    """Radius and stride in pixels; the stride is at most a fifth of the window."""
+    radius = round(config.radius * min(shape[:2]))
+    return radius, min(config.stride, max(1, (2 * radius + 1) // CELLS_PER_WINDOW))
+
+
+def _fingerprint(pixels: Annotated[Tensor, "H W 3"]) -> str:
+    return store_files.digest(str(tuple(pixels.shape)), pixels.contiguous().numpy().tobytes())
+
+
+@torch.no_grad()
+def _encode(encoder: Encoder, pixels: Annotated[Tensor, "H W 3"], view: int) -> Annotated[Tensor, "C h w"]:
+    weight = next(chain(encoder.parameters(), encoder.buffers()), None)
+    image = (pixels.float() / 255).permute(2, 0, 1)[None]
+    features: Tensor = encoder(image if weight is None else image.to(weight.device))
+    if features.ndim != 4 or features.shape[:2] != (1, encoder.channels) or not features.numel():
+        raise PluginError(
+            f"encoder {encoder.identity}: features {tuple(features.shape)} of one image; "
+            f"it promises [1 {encoder.channels} h w]: report it to its author"
+        )
+    if not torch.isfinite(features).all():
+        raise NumericsError(f"encoder {encoder.identity}: features of view {view} are not finite; check image and weights")
+    return features[0].float()
+
+
+def _make(features: Tensor, pixels: Tensor, basis: Basis | None, *, radius: int, eps: float, stride: int) -> Entry:
+    """A view's entry, moments measured on what it will answer."""
+    if basis is not None:
+        features = basis.project(features.movedim(0, -1)).movedim(-1, 0)
+    guide = pixels.float() / 255
+    size = (int(pixels.shape[0]), int(pixels.shape[1]))
+    entry = store_files.pack(guided.coefficients(features, guide, radius=radius, eps=eps, stride=stride), size)
+    at = torch.randint(size[0] * size[1], (MOMENT_PIXELS,), generator=torch.Generator().manual_seed(0))
+    pixel = torch.stack([at % size[1], at // size[1]], 1) + 0.5
+    values = guided.apply(entry.plain(), pixel, guide.reshape(-1, 3)[at], size).double()
+    return entry._replace(moments=torch.stack([values.mean(0), values.var(0, correction=0)]))
+
+
+def _basis(
+    folder: Path,
+    prints: Mapping[int, str],
+    image: Callable[[int], Tensor],
+    encoder: Encoder,
+    dim: int,
+    remembered: dict[int, Tensor],
+) -> Basis:
+    """Fitted on cells drawn from up to BASIS_VIEWS views, spread evenly; kept in a file of its own."""
+    views = list(prints)
+    chosen = views[:: max(1, -(-len(views) // BASIS_VIEWS))]
+    key = store_files.digest("basis", str(dim), str(BASIS_CELLS), encoder.identity, *(prints[view] for view in chosen))
+    kept = store_files.read_tensors(folder, key)
+    if kept is not None:
+        return Basis.from_tensors(kept)
+    generator = torch.Generator().manual_seed(0)
+    samples, held = [], 0
+    for view in chosen:
+        features = _encode(encoder, image(view), view)
+        held += features.numel() * 4
+        if held <= REMEMBER_BYTES:
+            remembered[view] = features
+        cells = features.flatten(1).T.cpu()
+        count = min(len(cells), max(1, BASIS_CELLS // len(chosen)))
+        samples.append(cells[torch.randperm(len(cells), generator=generator)[:count]])
+    basis = fit_basis(torch.cat(samples), dim)
+    store_files.write_tensors(folder, key, basis.tensors())
+    return basis
+
+
+def _arrays(entry: Entry) -> "ViewArrays":
+    """What the kernel takes of a view."""
+    from ..ops.guided_kernels import ViewArrays
+
+    rows, columns, _, run = entry.coefs.shape
+    height, width = entry.size.tolist()
+    bits = entry.coefs.view(torch.uint16).numpy().reshape(rows * columns, 4 * run)
+    return ViewArrays(bits, rows, columns, height, width, entry.scale.numpy(), entry.centre.numpy())
+
+
+def _spread(entries: Sequence[Entry]) -> tuple[float, float]:
+    """Mean and RMS standard deviation over all views, each counted by its pixels."""
+    weight = torch.stack([entry.size.prod() for entry in entries]).double()
+    weight = (weight / weight.sum())[:, None]
+    means, variances = torch.stack([entry.moments for entry in entries]).unbind(1)
+    mean = (weight * means).sum(0)
+    variance = (weight * (variances + (means - mean).square())).sum(0)
+    return float(mean.mean()), float(variance.mean().sqrt())
