@@ -11,7 +11,7 @@ __all__ = ["FIELD_OF_VIEW", "is_test", "walk"]
 
 FIELD_OF_VIEW = 75.0
 """Horizontal, in degrees."""
-_YAW = (0.0, 50.0, -24.0, 24.0, -50.0)
+_YAW = (0.0, 43.0, -22.0, 22.0, -43.0)
 """Degrees to the left of the street's direction, in turn: five of them, so that every 8th view meets all."""
 _FROM, _TO = -2.0, 24.0
 _EVERY = 8
@@ -34,7 +34,7 @@ def walk(*, seed: int, views: int, width: int, height: int) -> list[View]:
         yaw = _YAW[k % len(_YAW)] + float(rng.uniform(-6, 6))
         way = 1.0 - abs(2.0 * (((k + 0.5) / views + 0.1) % 1.0) - 1.0)
         x = _FROM + (_TO - _FROM) * way
-        y = -2.6 * math.sin(math.radians(1.8 * yaw)) + 1.4 * math.sin(2.4 * k) + float(rng.uniform(-0.3, 0.3))
+        y = -2.6 * math.sin(math.radians(2.0 * yaw)) + 1.4 * math.sin(2.4 * k) + float(rng.uniform(-0.3, 0.3))
         place = np.array([x, float(np.clip(y, -3.2, 3.2)), float(rng.uniform(1.6, 2.4))])
         result.append(View(_pose(place, yaw, float(rng.uniform(4.0, 9.0))), focal, width, height))
     return result

@@ -1,0 +1,193 @@
+"""The folder on disk and the parser: complete, atomic, reused."""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from fprf.datamanagers.parsers.config import TownConfig
+from fprf.errors import DataError
+from fprf.town import write
+from fprf.town.classes import CLASSES, SKY
+from fprf.town.layout import build_town
+from fprf.town.palettes import palette
+from fprf.town.render import render
+from fprf.town.views import FIELD_OF_VIEW, walk
+from fprf.town.write import TownSettings, is_town, read_truth, write_town
+
+SMALL = {"seed": 2, "palette": "autumn", "views": 9, "width": 24, "height": 18}
+
+TINY = {**SMALL, "views": 2}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("towns") / "town"
+    write_town(path, **SMALL)
+    return path
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "cache" / "fprf"
+
+
+def test_folder_holds_everything(folder):
+    names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    assert names == sorted([*write._files(9), "town.json"])
+    record = json.loads((folder / "town.json").read_text())
+    assert record["classes"] == list(CLASSES)
+    assert record["settings"] == {**SMALL, "edition": write._EDITION}
+    assert json.loads((folder / "palette.json").read_text())["name"] == "autumn"
+    assert [path.name for path in folder.parent.iterdir()] == ["town"], "nothing temporary is left"
+
+
+def test_files_are_the_pictures(folder):
+    town, views = build_town(2), walk(seed=2, views=9, width=24, height=18)
+    for k in (0, 7):
+        shot = render(town, views[k], palette("autumn"))
+        assert np.array_equal(cv2.imread(str(folder / f"images/{k:04d}.png"))[..., ::-1], shot.rgb)
+        depth, kinds = read_truth(folder, k)
+        assert np.array_equal(depth, shot.depth)
+        assert np.array_equal(kinds, shot.labels)
+        assert np.array_equal(np.isinf(depth), kinds == SKY)
+
+
+def test_transforms_follow_the_format(folder):
+    top = json.loads((folder / "transforms.json").read_text())
+    assert top["camera_model"] == "PINHOLE"
+    assert (top["w"], top["h"], top["cx"], top["cy"]) == (24, 18, 12, 9)
+    assert 2 * math.degrees(math.atan(12 / top["fl_x"])) == pytest.approx(FIELD_OF_VIEW)
+    assert [frame["file_path"] for frame in top["frames"]] == [f"images/{k:04d}.png" for k in range(9)]
+    assert top["test_filenames"] == ["images/0000.png", "images/0008.png"]
+    assert len(top["train_filenames"]) == 7
+    for frame in top["frames"]:
+        matrix = np.array(frame["transform_matrix"])
+        assert matrix[3].tolist() == [0, 0, 0, 1]
+
+
+def test_points_lie_on_surfaces(folder):
+    with np.load(folder / "points.npz") as stored:
+        xyz, rgb = stored["xyz"], stored["rgb"]
+    assert xyz.shape == rgb.shape
+    assert len(xyz) > 7 * 100
+    assert (xyz.dtype, rgb.dtype) == (np.float32, np.uint8)
+    assert xyz[:, 2].min() > -0.01
+    view = walk(seed=2, views=9, width=24, height=18)[1]
+    depth, _ = read_truth(folder, 1)
+    off = xyz[: write._POINTS] - view.pose[:, 3]
+    local = off @ view.pose[:, :3]
+    x = np.floor(view.focal * local[:, 0] / -local[:, 2] + 12).astype(int)
+    y = np.floor(-view.focal * local[:, 1] / -local[:, 2] + 9).astype(int)
+    np.testing.assert_allclose(np.linalg.norm(off, axis=1), depth[y, x], rtol=1e-4)
+
+
+def test_same_settings_give_the_same_bytes(tmp_path):
+    for name in ("one", "two"):
+        write_town(tmp_path / name, **TINY)
+    for name in ("images/0001.png", "labels/0001.png", "transforms.json", "palette.json", "town.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_a_complete_folder_is_reused(folder, monkeypatch):
+    monkeypatch.setattr(write, "_fill", lambda *_: pytest.fail("rendered again"))
+    write_town(folder, **SMALL)
+
+
+def test_a_damaged_folder_is_rendered_again(tmp_path):
+    path = tmp_path / "town"
+    write_town(path, **TINY)
+    (path / "images/0001.png").unlink()
+    write_town(path, **TINY)
+    assert (path / "images/0001.png").is_file()
+    write_town(path, **{**TINY, "palette": "night"})
+    assert json.loads((path / "palette.json").read_text())["name"] == "night"
+    assert [p.name for p in tmp_path.iterdir()] == ["town"]
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
+    calls = []
+
+    def failing(path, image):
+        calls.append(path)
+        if len(calls) == 3:
+            raise OSError("No space left on device")
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(write, "_save_image", failing)
+    with pytest.raises(DataError, match="No space left"):
+        write_town(tmp_path / "town", **SMALL)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_somebody_elses_folder_is_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(DataError, match="not a town"):
+        write_town(tmp_path, **SMALL)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+    assert not is_town(tmp_path)
+
+
+def test_the_slower_of_two_writers_yields(folder, tmp_path):
+    fresh = tmp_path / "fresh"
+    fresh.mkdir()
+    before = (folder / "town.json").stat().st_ino
+    write._place(fresh, folder, TownSettings(**SMALL))
+    assert (folder / "town.json").stat().st_ino == before
+
+
+def test_truth_that_is_missing_is_reported(folder, tmp_path):
+    with pytest.raises(DataError, match=r"0099\.npz"):
+        read_truth(folder, 99)
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "labels").mkdir()
+    np.savez(tmp_path / "depth/0000.npz", depth=np.zeros((2, 2)))
+    (tmp_path / "labels/0000.png").write_bytes(b"no image")
+    with pytest.raises(DataError, match="not an image"):
+        read_truth(tmp_path, 0)
+
+
+def test_keys_differ_with_every_setting():
+    base = {**SMALL}
+    keys = {TownSettings(**base).key}
+    for name, value in (("seed", 3), ("palette", "day"), ("views", 10), ("width", 25), ("height", 19), ("edition", 99)):
+        keys.add(TownSettings(**{**base, name: value}).key)
+    assert len(keys) == 7
+
+
+def test_parser_renders_once_into_the_cache(cache, monkeypatch):
+    config = TownConfig(**TINY)
+    scene = config.build().parse(Path("town"), 1)
+    assert scene.name == "town"
+    assert len(scene.cameras) == 2
+    assert (scene.train.tolist(), scene.test.tolist()) == ([1], [0])
+    assert scene.points is not None
+    assert scene.cameras.size.tolist() == [[24, 18]] * 2
+    poses = np.stack([view.pose for view in walk(seed=2, views=2, width=24, height=18)])
+    torch.testing.assert_close(scene.cameras.pose, torch.from_numpy(poses), atol=1e-12, rtol=0)
+    assert [p.name for p in cache.iterdir()] == [f"town-{TownSettings(**TINY).key}"]
+    monkeypatch.setattr(write, "_fill", lambda *_: pytest.fail("rendered again"))
+    half = config.build().parse(Path("nowhere"), 2)
+    assert half.cameras.size.tolist() == [[12, 9]] * 2
+    assert half.paths == scene.paths
+
+
+def test_parser_reads_town_folders_and_refuses_others(cache, folder, tmp_path):
+    scene = TownConfig().build().parse(folder, 1)
+    assert len(scene.cameras) == 9
+    assert not cache.exists()
+    (tmp_path / "photos").mkdir()
+    with pytest.raises(DataError, match=r"no town\.json"):
+        TownConfig().build().parse(tmp_path / "photos", 1)
+
+
+def test_parser_reports_an_unknown_palette(cache):
+    with pytest.raises(DataError, match="choose one of"):
+        TownConfig(palette="dusk").build().parse(Path("town"), 1)
+    assert not cache.exists()

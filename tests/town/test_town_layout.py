@@ -1,0 +1,156 @@
+"""Layout, labels, views: the same classes in every town, cameras that stand free and see enough of each other's scene."""
+
+import numpy as np
+import pytest
+
+from fprf.town.classes import CLASSES, DOOR, LAWN, ROAD, SIDEWALK, SKY, WINDOW
+from fprf.town.layout import ROAD_HALF, build_town
+from fprf.town.palettes import PALETTES
+from fprf.town.render import geometry
+from fprf.town.shapes import Material, Polyhedron
+from fprf.town.surface import facade_parts, ground_class, labels
+from fprf.town.trace import directions
+from fprf.town.views import is_test, walk
+
+SEEDS = range(4)
+
+
+def world(view, depth):
+    rays = np.stack(directions(view, 1), -1)
+    return view.pose[:, 3] + rays * np.where(np.isfinite(depth), depth, 0.0)[..., None]
+
+
+def project(view, points):
+    """Row, column and distance of points [N 3]; row -1 where they lie outside the image."""
+    off = points - view.pose[:, 3]
+    local = off @ view.pose[:, :3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = view.focal * local[:, 0] / -local[:, 2] + view.width / 2
+        y = -view.focal * local[:, 1] / -local[:, 2] + view.height / 2
+        inside = (local[:, 2] < -0.05) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
+        row, column = np.where(inside, np.floor(y), -1).astype(int), np.where(inside, np.floor(x), -1).astype(int)
+    return row, column, np.linalg.norm(off, axis=1)
+
+
+@pytest.fixture(scope="module")
+def walked():
+    views = walk(seed=0, views=40, width=48, height=36)
+    town = build_town(0)
+    return views, [geometry(town, view) for view in views]
+
+
+def test_towns_are_functions_of_their_seed():
+    for field in ("material", "tint", "origin", "extent"):
+        a, b, c = (getattr(build_town(seed).faces, field) for seed in (1, 1, 2))
+        assert np.array_equal(a, b)
+        assert not np.array_equal(a, c)
+    first, same, other = (walk(seed=s, views=4, width=8, height=8) for s in (1, 1, 2))
+    assert all(np.array_equal(a.pose, b.pose) for a, b in zip(first, same, strict=True))
+    assert not any(np.array_equal(a.pose, b.pose) for a, b in zip(first, other, strict=True))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_every_town_shows_every_class(seed):
+    town = build_town(seed)
+    views = walk(seed=seed, views=40, width=40, height=30)
+    seen = sum(np.bincount(geometry(town, view)[1].ravel(), minlength=len(CLASSES)) for view in views[::3])
+    assert len(seen) == len(CLASSES) <= 12
+    assert (seen > 14 * 1200 * 0.001).all(), dict(zip(CLASSES, seen, strict=True))
+
+
+def test_sky_is_what_has_no_depth(walked):
+    for depth, kinds in walked[1]:
+        assert np.array_equal(kinds == SKY, np.isinf(depth))
+
+
+def test_labels_of_the_ground_follow_the_place():
+    points = np.array([[5, 0, 0], [5, ROAD_HALF + 0.3, 0], [5, -7.0, 0], [45, 0, 0], [45, 12.0, 0]])
+    expected = [ROAD, SIDEWALK, LAWN, SIDEWALK, LAWN]
+    assert ground_class(points).tolist() == expected
+    assert labels(build_town(0), np.zeros(5, int), points).tolist() == expected
+    assert labels(build_town(0), np.full(5, -1), points).tolist() == [SKY] * 5
+
+
+def test_fronts_have_one_door_and_rows_of_windows():
+    faces = build_town(0).faces
+    fronts = np.flatnonzero((faces.material == Material.FACADE) & (faces.door >= 0) & (faces.style < 4))
+    assert len(fronts) >= 6
+    for front in fronts:
+        wide, high = faces.extent[front]
+        u, v = np.meshgrid(np.arange(0.02, wide, 0.04), np.arange(0.02, high, 0.04))
+        at = np.full(u.size, front)
+        parts = facade_parts(faces, at, u.ravel(), v.ravel())
+        assert not (parts.door & parts.window).any()
+        assert not (parts.shutter & (parts.door | parts.window)).any()
+        holes = set(zip(parts.column[parts.window], parts.storey[parts.window], strict=True))
+        assert len(holes) == faces.columns[front] * faces.storeys[front] - 1, "one opening is the door"
+        assert np.ptp(u.ravel()[parts.door]) == pytest.approx(1.24, abs=0.1)
+        assert v.ravel()[parts.door].min() < 0.05
+
+
+def test_solids_are_closed_and_their_frames_orthonormal():
+    for shape in build_town(2).shapes:
+        for face in shape.faces:
+            assert face.u @ face.v == pytest.approx(0, abs=1e-12)
+            assert np.linalg.norm(face.u) == pytest.approx(1)
+            assert np.linalg.norm(face.v) == pytest.approx(1)
+        if isinstance(shape, Polyhedron):
+            middle = (shape.low + shape.high) / 2
+            assert (shape.normals @ middle < shape.offsets).all()
+
+
+def test_cameras_are_rigid_upright_and_at_eye_level():
+    views = walk(seed=3, views=40, width=160, height=120)
+    for view in views:
+        r = view.pose[:, :3]
+        np.testing.assert_allclose(r.T @ r, np.eye(3), atol=1e-12)
+        assert np.linalg.det(r) == pytest.approx(1)
+        assert r[2, 0] == pytest.approx(0, abs=1e-12), "no roll"
+        assert r[2, 1] > 0.9, "up is up"
+        assert 1.5 <= view.pose[2, 3] <= 2.5
+        assert abs(view.pose[1, 3]) < ROAD_HALF
+    centres = np.stack([view.pose[:, 3] for view in views])
+    assert np.ptp(centres[:, 0]) > 20
+    assert np.ptp(centres[:, 1]) > 3
+    assert [k for k in range(40) if is_test(k)] == [0, 8, 16, 24, 32]
+
+
+def test_points_keep_their_label_in_every_view(walked):
+    views, pictures = walked
+    agree = total = 0
+    for a, b in ((0, 1), (3, 4), (10, 13), (20, 24), (30, 36)):
+        depth, kinds = pictures[a]
+        points = world(views[a], depth)[np.isfinite(depth)]
+        row, column, distance = project(views[b], points)
+        other = pictures[b][0][row, column]
+        seen = (row >= 0) & (np.abs(other - distance) < 0.01 * distance)
+        agree += (pictures[b][1][row, column] == kinds[np.isfinite(depth)])[seen].sum()
+        total += seen.sum()
+    assert total > 800
+    assert agree / total > 0.93, "the rest are pixels that straddle an edge"
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_held_out_views_are_seen_by_three_training_views(seed):
+    town = build_town(seed)
+    views = walk(seed=seed, views=40, width=64, height=48)
+    pictures = [geometry(town, view) for view in views]
+    counts = []
+    for k in filter(is_test, range(40)):
+        depth = pictures[k][0]
+        points = world(views[k], depth)[np.isfinite(depth)]
+        count = np.zeros(len(points), int)
+        for j in (j for j in range(40) if not is_test(j)):
+            row, column, distance = project(views[j], points)
+            count += (row >= 0) & (np.abs(pictures[j][0][row, column] - distance) < 0.1 + 0.05 * distance)
+        counts.append(count)
+    assert (np.concatenate(counts) >= 3).mean() >= 0.95
+
+
+def test_palettes_are_named_and_whole():
+    assert set(PALETTES) == {"day", "autumn", "night", "winter", "sunset"}
+    for name, look in PALETTES.items():
+        assert look.name == name
+        assert len(look.leaves) == 7
+        assert len(look.roofs) == 4
+    assert WINDOW != DOOR

@@ -1,0 +1,157 @@
+"""The vectorised tracer against one ray at a time, written from the definitions of the solids."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.town.layout import Town, build_town
+from fprf.town.shapes import Cylinder, Ellipsoid, Finish, Material, Polyhedron, box, cylinder, ellipsoid, extrude, pyramid
+from fprf.town.trace import View, _enter, cast, directions, shadowed
+from fprf.town.views import walk
+
+GREY = Finish(Material.TRIM)
+TOWN = build_town(0)
+
+
+def inside(shape, p):
+    """Whether a point lies in a solid."""
+    if isinstance(shape, Polyhedron):
+        return all(sum(n[i] * p[i] for i in range(3)) <= c for n, c in zip(shape.normals, shape.offsets, strict=True))
+    if isinstance(shape, Ellipsoid):
+        return sum(((p[i] - shape.centre[i]) / shape.radii[i]) ** 2 for i in range(3)) <= 1
+    return math.hypot(p[0] - shape.centre[0], p[1] - shape.centre[1]) <= shape.radius
+
+
+def slow_enter(shape, o, d):
+    """Entry distance of one ray in plain floats, inf where it misses."""
+    if isinstance(shape, Polyhedron):
+        start, stop = -math.inf, math.inf
+        for n, offset in zip(shape.normals, shape.offsets, strict=True):
+            room = offset - sum(float(n[i]) * o[i] for i in range(3))
+            slope = sum(float(n[i]) * d[i] for i in range(3))
+            if slope == 0:
+                if room < 0:
+                    return math.inf
+            elif slope < 0:
+                start = max(start, room / slope)
+            else:
+                stop = min(stop, room / slope)
+        return start if 1e-4 < start <= stop else math.inf
+    if isinstance(shape, Ellipsoid):
+        p, q = ([(v[i] - w[i]) / shape.radii[i] for i in range(3)] for v, w in ((o, shape.centre), (d, (0, 0, 0))))
+    else:
+        p, q = (
+            [(v[i] - w[i]) / shape.radius for i in range(2) for v, w in ((o, shape.centre),)],
+            [d[i] / shape.radius for i in range(2)],
+        )
+    a, b, c = sum(v * v for v in q), 2 * sum(v * w for v, w in zip(p, q, strict=True)), sum(v * v for v in p) - 1
+    if b * b - 4 * a * c <= 0:
+        return math.inf
+    t = (-b - math.sqrt(b * b - 4 * a * c)) / (2 * a)
+    if isinstance(shape, Cylinder) and not shape.low[2] <= o[2] + t * d[2] <= shape.high[2]:
+        return math.inf
+    return t if t > 1e-4 else math.inf
+
+
+def slow_distance(town: Town, o, d) -> float:
+    ground = -o[2] / d[2] if d[2] < 0 else math.inf
+    return min(ground, *(slow_enter(shape, o, d) for shape in town.shapes))
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_depth_is_that_of_a_plain_loop(seed):
+    town = build_town(seed)
+    rng = np.random.default_rng(seed)
+    for view in walk(seed=seed, views=5, width=40, height=30):
+        d = np.stack(directions(view, 1), -1)
+        distance = cast(town, view, directions(view, 1), 1).distance
+        for row, column in zip(rng.integers(0, 30, 24), rng.integers(0, 40, 24), strict=True):
+            slow = slow_distance(town, view.pose[:, 3].tolist(), d[row, column].tolist())
+            assert distance[row, column] == pytest.approx(slow, rel=1e-10)
+
+
+def test_finer_grids_and_smaller_windows_change_no_ray():
+    view = walk(seed=0, views=5, width=30, height=20)[1]
+    triple = cast(TOWN, view, directions(view, 3), 3)
+    single = cast(TOWN, view, directions(view, 1), 1)
+    np.testing.assert_allclose(triple.distance[1::3, 1::3], single.distance, rtol=1e-12)
+    assert (triple.face[1::3, 1::3] == single.face).mean() > 0.999
+
+
+def test_directions_are_units_through_pixel_centres():
+    pose = np.column_stack([np.eye(3), np.zeros(3)])
+    x, y, z = directions(View(pose, 50.0, 5, 3), 1)
+    np.testing.assert_allclose(x * x + y * y + z * z, 1)
+    assert (x[1, 2], y[1, 2], z[1, 2]) == (0, 0, -1)
+    assert x[1, 4] / -z[1, 4] == pytest.approx(2 / 50)
+    assert y[0, 2] / -z[0, 2] == pytest.approx(1 / 50)
+
+
+def test_rays_parallel_to_a_side_pass_or_hit():
+    solid = box((0, 0, 0), (1, 1, 1), [GREY] * 6)
+    o = tuple(np.array(c) for c in ([-1.0, -1.0], [0.5, 2.0], [0.5, 0.5]))
+    d = tuple(np.array(c) for c in ([1.0, 1.0], [0.0, 0.0], [0.0, 0.0]))
+    t, face = _enter(solid, o, d)
+    assert t.tolist() == [1.0, math.inf]
+    assert solid.faces[face[0]].u.tolist() == [0.0, -1.0, 0.0], "seen from -x, right is -y"
+
+
+SOLIDS = [
+    box((-1, -0.5, 0), (1, 0.5, 2), [GREY] * 6),
+    extrude([(-1, 0), (1, 0), (0, 1.2)], 0, -2, 1, [GREY] * 5),
+    extrude([(-1, 0), (1, 0), (0, 1.2)], 1, -2, 1, [GREY] * 5),
+    pyramid((-1, -1, 0.2), (1, 1, 2), GREY),
+    ellipsoid((0.2, 0, 1), (1, 0.5, 0.7), GREY),
+    cylinder(0, 0.3, 0, 2, 0.4, GREY),
+]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, len(SOLIDS) - 1), st.integers(0, 2**31))
+def test_a_ray_enters_where_inside_begins(index, seed):
+    shape = SOLIDS[index]
+    rng = np.random.default_rng(seed)
+    o = rng.normal(size=3)
+    o *= 5 / np.linalg.norm(o)
+    d = rng.uniform(-1, 1, 3) + np.array([0.0, 0.0, 1.0]) - o
+    d /= np.linalg.norm(d)
+    t, face = _enter(shape, tuple(o), tuple(np.array([c]) for c in d))
+    found = float(t[0])
+    assert found == pytest.approx(slow_enter(shape, o.tolist(), d.tolist()))
+    if isinstance(shape, Cylinder):
+        return
+    steps = np.arange(0, min(found, 12) - 1e-3, 0.05)
+    assert not any(inside(shape, o + s * d) for s in steps)
+    if found < math.inf:
+        assert inside(shape, o + (found + 1e-9) * d) or not inside(shape, o + (found + 0.02) * d)
+        hit = shape.faces[int(np.asarray(face).ravel()[0])]
+        if isinstance(shape, Polyhedron):
+            normal = np.cross(hit.u, hit.v)
+            at = o + found * d - hit.origin
+            assert normal @ d < 0
+            assert at @ normal == pytest.approx(0, abs=1e-9)
+            assert -1e-9 <= at @ hit.u <= hit.extent[0] + 1e-9
+            assert -1e-9 <= at @ hit.v <= hit.extent[1] + 1e-9
+
+
+def test_shadows_are_those_of_a_plain_loop():
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-5, 40, 150), rng.uniform(-8, 8, 150), rng.uniform(0, 3, 150)])
+    sun = np.array([-0.5, -0.6, 0.6])
+    sun /= np.linalg.norm(sun)
+    leafy = np.array([TOWN.faces.material[k] == Material.FOLIAGE for k in TOWN.first])
+    solid, leaves = shadowed(TOWN, points, sun, leafy)
+    for k, p in enumerate(points.tolist()):
+        hits = np.array([slow_enter(shape, p, sun.tolist()) < math.inf for shape in TOWN.shapes])
+        assert (solid[k], leaves[k]) == (bool((hits & ~leafy).any()), bool((hits & leafy).any()))
+    assert 0.1 < (solid | leaves).mean() < 0.9
+
+
+def test_everything_ends_at_the_wood():
+    for view in walk(seed=1, views=5, width=32, height=24):
+        distance = cast(TOWN, view, directions(view, 1), 1).distance
+        assert distance.min() > 1.5
+        assert distance[np.isfinite(distance)].max() < 90
