@@ -99,7 +99,7 @@ def _avenue(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float, fl
         for k in range(6):
             x = -5.0 + shift + 8.2 * k
             if x < END and rng.random() < 0.85:
-                shapes += tree(x, side * (WALK_HALF + 0.9), float(rng.uniform(1.15, 1.6)), rng)
+                shapes += tree(x, side * (WALK_HALF + 0.9), float(rng.uniform(1.05, 1.65)), rng)
         for k in range(5):
             x = -2.0 + 11.0 * k + (5.5 if side > 0 else 0.0)
             shapes += lamp(x, side * (ROAD_HALF + 0.55))

@@ -25,13 +25,13 @@ def tree(x: float, y: float, size: float, rng: np.random.Generator) -> list[Shap
         ]
     stem = 2.1 + 0.4 * size
     shapes: list[Shape] = [cylinder(x, y, 0.0, stem + 0.8, 0.11 + 0.05 * size, bark)]
-    shapes.append(ellipsoid((x, y, stem + 0.95 * size), (0.95 * size, 0.95 * size, 0.9 * size), leaf))
+    shapes.append(ellipsoid((x, y, stem + 0.95 * size), (0.85 * size, 0.85 * size, 0.95 * size), leaf))
     turn = float(rng.uniform(0, 2 * math.pi))
-    count = 5
+    count = 7
     for k in range(count):
-        angle = turn + 2 * math.pi * k / count
-        away, up = 0.62 * size, float(rng.uniform(0.25, 0.95)) * size
-        radius = float(rng.uniform(0.5, 0.68)) * size
+        angle = turn + 2.4 * k
+        away, up = float(rng.uniform(0.5, 0.75)) * size, (0.3 + 1.1 * k / count) * size
+        radius = float(rng.uniform(0.42, 0.62)) * size
         centre = (x + away * math.cos(angle), y + away * math.sin(angle), stem + up)
         shapes.append(ellipsoid(centre, (radius, radius, 0.85 * radius), leaf))
     return shapes

@@ -74,7 +74,7 @@ def _window(parts: Parts, key: NDArray[np.float32], look: Palette) -> tuple[Colo
     bars = np.maximum(band(parts.across, 0.035), band(parts.up - 0.64 * parts.tall, 0.035))
     frame = np.maximum(1 - step(edge, 0.07, 0.11), bars)
     lit = (key < look.lit) * (0.30 + 0.50 * (key * 13 % 1)) * (1.15 - 0.45 * height) * (1 - 0.45 * drape)
-    glow = np.array(look.light) ** 2.2 * (lit * (1 - 0.85 * frame))[:, None]
+    glow = np.array(look.light) ** 3.0 * (lit * (1 - 0.85 * frame))[:, None]
     return mix(colour, np.array(look.trim), frame), glow.astype(np.float32)
 
 
