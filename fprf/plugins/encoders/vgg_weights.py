@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import pickle
 import re
 import urllib.error
 import urllib.request
@@ -31,13 +30,13 @@ def build_vgg19(layer: str, *, weights: Path | None, normalise: bool) -> Vgg19En
     path = weights if weights is not None else _cached() or _download()
     tensors, metadata = read_weights(path) if path.suffix == ".safetensors" else (_read_pth(path), {})
     mean, std = (_triple(metadata, key, path) for key in ("mean", "std"))
-    plain = Vgg19Encoder(layer, tensors, mean=mean, std=std, scale=None, source=str(path))
     if not normalise:
-        return plain
+        return Vgg19Encoder(layer, tensors, mean=mean, std=std, scale=None, source=str(path))
     scale = tensors.get(f"mean_activation.conv{layer[4:]}")
     if scale is None:
-        # Filters with a file of their own means are few; noise with the spectrum of photographs estimates the rest.
-        scale = vgg19_activations(plain, pink_noise()).float()
+        # Few files bring their own means; noise with the spectrum of photographs estimates those of the others.
+        unscaled = Vgg19Encoder(layer, tensors, mean=mean, std=std, scale=torch.ones(1), source=str(path))
+        scale = vgg19_activations(unscaled, pink_noise()).float()
     scale = scale.clamp_min(1e-3 * float(scale.mean()))  # a filter that hardly ever fires must not be blown up
     return Vgg19Encoder(layer, tensors, mean=mean, std=std, scale=scale, source=str(path))
 
@@ -92,7 +91,7 @@ def _read_pth(path: Path) -> dict[str, Tensor]:
     _check_hash(path, path.name)
     try:
         tensors = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError) as error:
+    except Exception as error:  # the unpickler raises whatever the bytes lead it to
         raise WeightsError(f"{path}: not a file of tensors ({type(error).__name__}); torchvision's is {URL}") from error
     if not isinstance(tensors, dict):
         raise WeightsError(f"{path}: holds a {type(tensors).__name__}, not named tensors; torchvision's is {URL}")

@@ -54,7 +54,7 @@ class VitEncoder(Encoder):
         mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (MEAN, STD))
         tokens: Tensor = self.model(pixel_values=(image - mean) / std, **self._call).last_hidden_state
         # Class and register tokens come first.
-        return tokens[:, -height * width :].transpose(1, 2).unflatten(2, (height, width)).contiguous()
+        return tokens[:, -height * width :].transpose(1, 2).reshape(len(image), self._channels, height, width)
 
 
 def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
