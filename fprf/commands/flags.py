@@ -152,7 +152,7 @@ def _dashed(key: str) -> str:
 def _plain(refusal: str) -> str:
     """Text of a box: no frame, no colours, one line."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
-    return " ".join(re.sub(r"[╭╮╰╯│─]", " ", text).split())
+    return " ".join(re.sub(r"[╭╮╰╯│─]|-{3,}", " ", text).split())
 
 
 def _count(hint: Any) -> int:

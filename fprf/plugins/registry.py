@@ -150,7 +150,10 @@ def _scan() -> _Scan:
         for point in points:
             if point.group.startswith(_PREFIX):
                 found.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
-    groups = {group: MappingProxyType({name: tuple(names[name]) for name in sorted(names)}) for group, names in found.items()}
+    groups = {
+        group: MappingProxyType({name: tuple(sorted(names[name], key=lambda each: each.package)) for name in sorted(names)})
+        for group, names in found.items()
+    }
     return _Scan(MappingProxyType(groups), tuple(bad))
 
 

@@ -69,9 +69,10 @@ def _encode(value: Any, hint: Any, path: str) -> Any:
         kind = next(filter(is_slot, members(hint)), None)
         tag = {"type": registry.name_of(kind.group, type(value))} if kind else {}
         hints = hints_of(type(value))
-        return tag | {
-            f.name: _encode(getattr(value, f.name), hints[f.name], f"{path}.{f.name}") for f in dataclasses.fields(value)
-        }
+        names = [f.name for f in dataclasses.fields(value)]
+        if kind and "type" in names:
+            raise ConfigError(f"{path}: {type(value).__name__} has a field `type`, which names the plug-in; rename it")
+        return tag | {name: _encode(getattr(value, name), hints[name], f"{path}.{name}") for name in names}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, Path):

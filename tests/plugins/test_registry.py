@@ -1,0 +1,145 @@
+import sys
+
+import pytest
+from fake_packages import ENCODER, Packages
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fprf.errors import PluginError
+from fprf.fields.config import ContentFieldConfig, SemanticPlanesConfig
+from fprf.plugins import registry
+from fprf.plugins.encoders.config import EncoderConfig, RandomConfig, Vgg19Config
+
+GROUP = "fprf.encoders"
+
+
+def test_built_ins_are_listed_by_name_and_found_by_class() -> None:
+    assert list(registry.installed(GROUP)) == sorted(registry.installed(GROUP))
+    assert registry.load(GROUP, "vgg19", EncoderConfig) is Vgg19Config
+    assert registry.name_of(GROUP, RandomConfig) == "random"
+    assert registry.entry(GROUP, "vgg19").package.startswith("fprf ")
+    assert GROUP in registry.groups() and all(group.startswith("fprf.") for group in registry.groups())
+    assert not registry.installed("fprf.no-such-group")
+
+
+def test_every_built_in_name_inverts() -> None:
+    for group in registry.groups():
+        for name in registry.installed(group) if group != "fprf.methods" else ():
+            found = registry.load_object(group, name)
+            assert isinstance(found, type)
+            assert registry.name_of(group, found) == name
+
+
+def test_a_strangers_plugin_is_listed_without_being_imported(packages: Packages) -> None:
+    packages.install("acme-clip", {GROUP: {"acme": "acme_a:ClipConfig"}}, code={"acme_a": ENCODER.format(name="Clip")})
+    assert "acme" in registry.installed(GROUP)
+    assert registry.peek(GROUP, "acme") is None
+    assert "acme_a" not in sys.modules
+    found = registry.load(GROUP, "acme", EncoderConfig)
+    assert found.__name__ == "ClipConfig"
+    assert registry.peek(GROUP, "acme") is found
+    assert registry.entry(GROUP, "acme").origin == "acme_a:ClipConfig from acme-clip 1"
+
+
+def test_a_missing_name_suggests_the_nearest_and_lists_all() -> None:
+    with pytest.raises(PluginError, match=r"no plug-in 'vgg_19' is installed; did you mean 'vgg19'\?") as caught:
+        registry.load(GROUP, "vgg_19", EncoderConfig)
+    assert "bundled-content" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_two_packages_of_one_name_are_named_and_hurt_only_that_name(packages: Packages) -> None:
+    for name in ("acme-one", "acme-two"):
+        module = name.replace("-", "_")
+        packages.install(name, {GROUP: {"twice": f"{module}:AConfig"}}, code={module: ENCODER.format(name="A")})
+    with pytest.raises(PluginError, match=r"several packages provide 'twice': .*acme-one 1.*acme-two 1; uninstall"):
+        registry.load(GROUP, "twice", EncoderConfig)
+    assert registry.load(GROUP, "vgg19", EncoderConfig) is Vgg19Config
+
+
+@pytest.mark.parametrize(
+    ("source", "shown"),
+    [
+        ("import not_there_at_all", "ModuleNotFoundError: No module named 'not_there_at_all'"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("class Odd(BaseException): ...\nraise Odd('odd')", "Odd: odd"),
+        ("def f(:", "SyntaxError"),
+        ("x = 1", "AttributeError"),
+    ],
+)
+def test_a_broken_import_names_the_package_and_the_cause(packages: Packages, source: str, shown: str) -> None:
+    packages.install("acme-bad", {GROUP: {"bad": "acme_bad:BadConfig"}}, code={"acme_bad": source})
+    assert "bad" in registry.installed(GROUP)
+    with pytest.raises(PluginError, match=r"'bad' \(acme_bad:BadConfig from acme-bad 1\) failed to import") as caught:
+        registry.load(GROUP, "bad", EncoderConfig)
+    assert shown in str(caught.value)
+
+
+def test_an_interrupt_while_importing_is_an_interrupt(packages: Packages) -> None:
+    packages.install("acme-slow", {GROUP: {"slow": "acme_slow:S"}}, code={"acme_slow": "raise KeyboardInterrupt"})
+    with pytest.raises(KeyboardInterrupt):
+        registry.load(GROUP, "slow", EncoderConfig)
+
+
+@pytest.mark.parametrize(("value", "shown"), [("3", "is 3"), ("int", "is int"), ("lambda: 0", "is <function")])
+def test_the_wrong_type_is_refused(packages: Packages, value: str, shown: str) -> None:
+    packages.install("acme-odd", {GROUP: {"odd": "acme_odd:thing"}}, code={"acme_odd": f"thing = {value}"})
+    with pytest.raises(PluginError, match="not a EncoderConfig") as caught:
+        registry.load(GROUP, "odd", EncoderConfig)
+    assert shown in str(caught.value)
+
+
+def test_another_kind_of_the_same_group_is_refused() -> None:
+    with pytest.raises(PluginError, match="is SemanticPlanesConfig, not a ContentFieldConfig"):
+        registry.load("fprf.fields", registry.name_of("fprf.fields", SemanticPlanesConfig), ContentFieldConfig)
+
+
+def test_a_reexported_class_has_its_name(packages: Packages) -> None:
+    code = {"acme_inner": ENCODER.format(name="In"), "acme_outer": "from acme_inner import InConfig"}
+    packages.install("acme-outer", {GROUP: {"outer": "acme_outer:InConfig"}}, code=code)
+    found = registry.load(GROUP, "outer", EncoderConfig)
+    assert found.__module__ == "acme_inner"
+    assert registry.name_of(GROUP, found) == "outer"
+
+
+def test_a_class_without_entry_point_has_no_name() -> None:
+    with pytest.raises(PluginError, match=r"has no entry point in fprf\.encoders.*NAME ="):
+        registry.name_of(GROUP, ContentFieldConfig)
+
+
+def test_damaged_metadata_hurts_nobody_else(packages: Packages) -> None:
+    packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign here\n")
+    packages.raw("acme-foreign", "[console_scripts]\nno equals sign here\n")
+    assert "vgg19" in registry.installed(GROUP)
+    complaints = registry.unreadable()
+    assert len(complaints) == 1 and str(packages.root) in complaints[0]
+
+
+def test_the_first_copy_on_the_path_wins(packages: Packages) -> None:
+    second = packages.root / "second"
+    second.mkdir()
+    packages.install("acme-clip", {GROUP: {"acme": "acme_b:ClipConfig"}}, code={"acme_b": ENCODER.format(name="Clip")})
+    sys.path.append(str(second))
+    try:
+        Packages(second).raw("Acme_Clip", f"[{GROUP}]\nacme = acme_old:ClipConfig\n", version="0.1")
+        assert registry.entry(GROUP, "acme").package == "acme-clip 1"
+    finally:
+        sys.path.remove(str(second))
+
+
+def test_the_scan_is_kept_until_forgotten(packages: Packages) -> None:
+    before = registry.installed(GROUP)
+    assert registry.installed(GROUP) is before
+    registry.forget()
+    assert registry.installed(GROUP) == before and registry.installed(GROUP) is not before
+
+
+@given(st.text(max_size=20))
+def test_nearest_is_a_clause_about_an_allowed_name(name: str) -> None:
+    clause = registry.nearest(name, ["vgg19", "dino"])
+    assert clause in ("", "; did you mean 'vgg19'?", "; did you mean 'dino'?")
+
+
+@given(st.text(max_size=20).filter(lambda name: name not in registry.installed(GROUP)))
+def test_any_unknown_name_is_one_plugin_error(name: str) -> None:
+    with pytest.raises(PluginError):
+        registry.load(GROUP, name, EncoderConfig)
