@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from .types import Batch, FieldSample, Rays, Sampled, Want
 
 if TYPE_CHECKING:
+    from .datamanagers.features import FeatureStore
     from .datamanagers.scene import Scene
 
 __all__ = [
@@ -152,6 +153,11 @@ class DataParser(ABC):
 
 class DataManager(ABC):
     """Training batches and views of one scene."""
+
+    content_store: "FeatureStore | None"
+    """Targets of the content field: their channels and the unit of their loss; None where nobody asked."""
+    semantic_store: "FeatureStore | None"
+    """Targets of the semantic field, with the basis that they are expressed in."""
 
     @abstractmethod
     def batch(self, step: int) -> Batch:

@@ -1,0 +1,74 @@
+"""`fprf eval RUN`: measure a run on views it has not seen."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.table import Table
+
+from ..errors import UsageError
+from .parsing import parse
+from .progress import Display
+
+__all__ = ["EvalConfig", "run"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalConfig:
+    """What to measure."""
+
+    run: Path = Path()
+    """Run folder."""
+    split: Literal["test", "train", "all"] = "test"
+    """Views to judge."""
+    data: Path | None = None
+    """Scene folder, where it has moved since training."""
+    images: bool = True
+    """Write the renders to RUN/renders/SPLIT."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+
+def run(args: list[str]) -> int:
+    """Render the split, write metrics.json, print a table."""
+    description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
+    config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
+    from ..datamanagers.parsers.recognise import parse_scene
+    from ..engine.loading import load_run
+    from ..evaluation.judge import judge
+    from ..output.atomic import write_json
+    from ..output.images import to_uint8
+    from ..output.video import write_frames
+
+    trained = load_run(config.run, config.device)
+    data = config.data or trained.config.data
+    scene = parse_scene(data, trained.config.downscale, trained.config.datamanager.parser)
+    if tuple(p.stem for p in scene.paths) != trained.known.names:
+        raise UsageError(
+            f"{data}: its images are not those of the run; name the folder with --data"
+        )
+    views = trained.known.split(config.split)
+    with Display() as display:
+        metrics, renders = judge(trained, scene, views, display.count)
+    metrics = {"method": trained.method, "scene": trained.known.name, "split": config.split, **metrics}
+    write_json(config.run / "metrics.json", metrics)
+    if config.images:
+        names = [trained.known.names[v] for v in views]
+        write_frames(config.run / "renders" / config.split, names, [to_uint8(v.rgb) for v in renders])
+    _print(metrics)
+    return 0
+
+
+def _print(metrics: dict[str, object]) -> None:
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
+    units = {"psnr": "dB", "rays_per_second": "rays/s", "peak_rss_mib": "MiB", "seconds_per_view": "s", "train_seconds": "s"}
+    for key in ("psnr", "ssim", "seconds_per_view", "rays_per_second", "kept_samples_share", "peak_rss_mib", "train_seconds"):
+        value = metrics[key]
+        assert isinstance(value, float)
+        table.add_row(key, f"{value:,.3f}" if value < 1000 else f"{value:,.0f}", units.get(key, ""))
+    warped = metrics["consistency"]
+    assert isinstance(warped, dict)
+    if warped["rmse"] is not None:
+        table.add_row("consistency rmse", f"{warped['rmse']:.4f}", f"over {warped['valid_share']:.0%} of the pixels")
+    Console(highlight=False).print(table)

@@ -1,0 +1,118 @@
+"""`fprf render RUN --path PATH --output X.mp4`: fly through a scene, plain or restyled."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from ..checks import at_least
+from ..errors import UsageError
+from .parsing import parse
+from .progress import Display
+from .stylize import StyleConfig, build_style
+
+if TYPE_CHECKING:
+    from ..engine.loading import Trained
+    from ..output.images import Picture
+    from ..rendering.cameras import Cameras
+    from ..rendering.renderer import Restyle
+
+__all__ = ["RenderVerbConfig", "camera_path", "frames_of", "run"]
+
+MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderVerbConfig(StyleConfig):
+    """What to film, and how."""
+
+    run: Path = Path()
+    """Run folder."""
+    output: Path = Path("render.mp4")
+    """A film (.mp4) or a folder for numbered PNG frames."""
+    path: str = "interpolate"
+    """spiral, orbit, interpolate, dataset, or a camera-path JSON file of Nerfstudio."""
+    split: Literal["test", "train", "all"] = "all"
+    """Views that `interpolate` and `dataset` go through."""
+    frames: int = 120
+    """Frames of a spiral or orbit; about as many of an interpolation."""
+    fps: float = 24.0
+    """Frames per second of a film."""
+    references: tuple[Path, ...] = ()
+    """Photographs whose style the scene takes; none = as captured."""
+    depth: bool = False
+    """Film depth instead of colour."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("frames", self.frames, 1)
+        at_least("fps", self.fps, 1)
+
+
+def run(args: list[str]) -> int:
+    """Make the path, render it, write the film or the frames."""
+    description = "Fly through a trained scene, plain or restyled, to a film or frames."
+    config = parse(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
+    from ..engine.loading import load_run
+    from ..output.video import write_frames, write_video
+
+    trained = load_run(config.run, config.device)
+    cameras, names = camera_path(trained, config)
+    restyle = build_style(trained, config.references, config).restyle if config.references else None
+    start = time.perf_counter()
+    with Display() as display:
+        frames = frames_of(trained, cameras, restyle, display, depth=config.depth)
+        if config.output.suffix.lower() == ".mp4":
+            codec = write_video(config.output, frames, config.fps)
+            made = f"{config.output} ({codec})"
+        else:
+            write_frames(config.output, names, frames)
+            made = str(config.output)
+    seconds = time.perf_counter() - start
+    print(f"{len(cameras)} frames in {made}, {seconds / len(cameras):.2f} s each")
+    return 0
+
+
+def camera_path(trained: "Trained", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
+    """Cameras of the path and a name for each frame; captured views keep the stem of their image."""
+    import torch
+
+    from ..rendering import paths
+    from ..rendering.camera_path import read_camera_path
+
+    known = trained.known
+    views = torch.tensor(known.split(config.split))
+    numbers = [f"{i:05d}" for i in range(10 * config.frames + 1)]
+    if config.path == "dataset":
+        return paths.dataset(known.cameras, views), [known.names[v] for v in views.tolist()]
+    if config.path in ("spiral", "orbit"):
+        move = paths.spiral if config.path == "spiral" else paths.orbit
+        return move(known.cameras, config.frames), numbers
+    if config.path == "interpolate":
+        order = paths.tour(known.cameras, views)
+        between = max(0, round((config.frames - 1) / max(1, len(order) - 1)) - 1)
+        cameras = paths.interpolate(known.cameras, order, between)
+        return cameras, [f"{i:05d}" for i in range(len(cameras))]
+    file = Path(config.path)
+    if not file.is_file():
+        raise UsageError(f"--path {config.path}: neither a file nor one of {', '.join(MOTIONS)}")
+    cameras, _ = read_camera_path(file)
+    return cameras, [f"{i:05d}" for i in range(len(cameras))]
+
+
+def frames_of(
+    trained: "Trained", cameras: "Cameras", restyle: "Restyle | None", display: Display, *, depth: bool = False
+) -> Iterator["Picture"]:
+    """Rendered frames one by one."""
+    from ..engine.views import render_view
+    from ..output.images import to_uint8
+    from ..output.maps import depth_image
+
+    for i in range(len(cameras)):
+        display.count(i, len(cameras), "rendering")
+        view = render_view(trained.model, trained.known.facts, cameras, i, trained.config.render, restyle)
+        yield depth_image(view.depth, view.opacity) if depth else to_uint8(view.rgb)
+    display.count(len(cameras), len(cameras), "rendering")

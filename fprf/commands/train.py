@@ -1,0 +1,134 @@
+"""`fprf train METHOD|CONFIG.json`: train a scene, or go on where a run stopped."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import UsageError
+from .parsing import load_method, methods, parse
+
+if TYPE_CHECKING:
+    from ..config import TrainConfig
+    from ..engine.prepare import Prepared
+    from ..engine.run import Run
+    from ..engine.trainer import Report
+
+__all__ = ["default_output", "run", "train_scene"]
+
+LINE_SECONDS = 5.0
+"""Time between lines in events.jsonl, and on standard error where it is no terminal."""
+
+
+def run(args: list[str]) -> int:
+    """Parse, prepare, train, measure the scene's style."""
+    if not args or args[0] in ("-h", "--help"):
+        print(_usage())
+        return 0 if args else 2
+    if args[0].startswith("-"):
+        raise UsageError(f"fprf train {args[0]}: the method comes first, for example `fprf train fprf-lite {args[0]} ...`")
+    config, method = load_method(args[0])
+    source = Path(args[0])
+    if source.suffix == ".json" and config.output is None:
+        config = replace(config, output=source.parent)
+    config = parse(config, args[1:], prog=f"fprf train {args[0]}", description=f"Train a scene with {method}.")
+    train_scene(config, method)
+    return 0
+
+
+def default_output(config: "TrainConfig", method: str) -> Path:
+    """runs/SCENE-METHOD."""
+    return Path("runs") / f"{config.data.resolve().name or 'scene'}-{method}"
+
+
+def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> Path:
+    """Train to the end and return the run folder. An existing run there is resumed if its config fits."""
+    from ..engine import prepare, style_pass, trainer
+    from ..engine.run import Run
+    from ..style.scene import to_tensors
+    from .progress import Display
+
+    start = time.perf_counter()
+    output = config.output or default_output(config, method)
+    config = replace(config, output=output)
+    folder = Run(output)
+    with Display(quiet=quiet) as display:
+        display.say(f"{method} on {config.data}, run folder {output}")
+        prepared = prepare.prepare(config, display.features)
+        _check_same(folder, config)
+        folder.root.mkdir(parents=True, exist_ok=True)
+        folder.save_config(config, method)
+        folder.save_known(prepared.scene, config.data, prepared.facts)
+        if prepared.basis is not None:
+            folder.save_tensors("basis", dict(prepared.basis._asdict()))
+        display.say(_described(prepared))
+        log = _Log(folder)
+
+        def report(event: "Report") -> None:
+            display.training(event)
+            log(event)
+
+        spent = time.perf_counter() - start
+        model = config.executor.build().map(lambda block: trainer.train(config, prepared, folder, report, spent=spent), [0])[0]
+        display.say("measuring the scene's own style")
+        style = style_pass.measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
+        folder.save_tensors("style", to_tensors(style))
+        display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
+    return output
+
+
+class _Log:
+    """Lines for events.jsonl, not more often than every few seconds, and the last one always."""
+
+    def __init__(self, folder: "Run") -> None:
+        self.folder, self.last = folder, -LINE_SECONDS
+
+    def __call__(self, event: "Report") -> None:
+        now = time.perf_counter()
+        if now - self.last < LINE_SECONDS and event.share < 1:
+            return
+        self.last = now
+        self.folder.log(
+            {
+                "step": event.step,
+                "seconds": round(event.seconds, 2),
+                "psnr": round(event.psnr, 3),
+                "rays_per_second": round(event.rays_per_second),
+                "kept": round(event.kept, 4),
+                "skipped_steps": event.skipped,
+                "losses": {name: float(f"{value:.4g}") for name, value in event.losses.items()},
+            }
+        )
+
+
+def _described(prepared: "Prepared") -> str:
+    scene, facts = prepared.scene, prepared.facts
+    width, height = (int(v) for v in scene.cameras.size[0])
+    semantics = f", {facts.dim} semantic" if facts.dim else ", no semantic"
+    return (
+        f"{scene.name}: {len(scene.train)} + {len(scene.test)} views of {width}x{height}, space {facts.space.kind}, "
+        f"{facts.channels} content{semantics} channels"
+    )
+
+
+def _check_same(folder: "Run", config: "TrainConfig") -> None:
+    """A run goes on with its own config; only how long, how often saved and where may change."""
+    if not folder.exists:
+        return
+    old, _ = folder.load_config()
+    free = {"steps", "minutes", "output", "data", "device", "checkpoint_minutes"}
+    changed = [name for name in vars(old) if name not in free and getattr(old, name) != getattr(config, name)]
+    if changed:
+        raise UsageError(
+            f"{folder.root}: holds a run with another {', '.join(changed)}; resume it with "
+            f"`fprf train {folder.root / 'config.json'}`, or choose another --output"
+        )
+
+
+def _usage() -> str:
+    lines = ["usage: fprf train METHOD|CONFIG.json [--data DIR] [any field]", "", "methods:"]
+    listed = list(methods())
+    width = max(len(name) for name, _ in listed)
+    lines += [f"  {name:<{width}}  {about}" for name, about in listed]
+    lines += ["", "`fprf train METHOD --help` lists every field; a saved config.json goes on with its run."]
+    return "\n".join(lines)

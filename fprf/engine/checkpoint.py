@@ -1,0 +1,118 @@
+"""Checkpoints: `checkpoints/step-N/` with model, optimiser and a manifest that is written last.
+
+A folder without a valid manifest was cut short and does not count. The two newest are kept. All draws are functions of
+(seed, step), so parameters, moments and the step are all there is to save.
+"""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import CheckpointError
+from ..output.atomic import write_json
+from . import tensorfiles
+from .model import Model
+
+__all__ = ["Saved", "load_latest", "restore", "save", "steps"]
+
+KEEP = 2
+"""Checkpoints that stay on disk."""
+
+
+class Saved(NamedTuple):
+    """What a checkpoint holds."""
+
+    step: int
+    seconds: float
+    """Training time until then."""
+    model: dict[str, Tensor]
+    optimizer: dict[str, Tensor]
+
+
+def _folder(root: Path, step: int) -> Path:
+    return root / f"step-{step:07d}"
+
+
+def steps(root: Path) -> list[int]:
+    """Steps of the complete checkpoints, oldest first."""
+    found = []
+    for manifest in root.glob("step-*/manifest.json"):
+        digits = manifest.parent.name.removeprefix("step-")
+        if digits.isdecimal():
+            found.append(int(digits))
+    return sorted(found)
+
+
+def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
+    """Write the checkpoint of a step, then drop all but the newest two."""
+    folder = _folder(root, step)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {
+        "model": tensorfiles.save(folder / "model.safetensors", model.state_dict()),
+        "optimizer": tensorfiles.save(folder / "optimizer.safetensors", _moments(optimizer)),
+    }
+    write_json(folder / "manifest.json", {"format": 1, "step": step, "seconds": seconds, "files": files})
+    for old in steps(root)[:-KEEP]:
+        (_folder(root, old) / "manifest.json").unlink()
+        shutil.rmtree(_folder(root, old))
+    return folder
+
+
+def load(root: Path, step: int) -> Saved:
+    """One checkpoint, verified. Raises CheckpointError."""
+    folder = _folder(root, step)
+    try:
+        manifest: dict[str, Any] = json.loads((folder / "manifest.json").read_text())
+        files, at, seconds = manifest["files"], int(manifest["step"]), float(manifest["seconds"])
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
+    return Saved(
+        at,
+        seconds,
+        tensorfiles.load(folder / "model.safetensors", files["model"]),
+        tensorfiles.load(folder / "optimizer.safetensors", files["optimizer"]),
+    )
+
+
+def load_latest(root: Path) -> tuple[Saved | None, list[str]]:
+    """The newest intact checkpoint, and a line for every newer one that was damaged. Raises where all are damaged."""
+    damaged: list[str] = []
+    for step in reversed(steps(root)):
+        try:
+            return load(root, step), damaged
+        except CheckpointError as e:
+            damaged.append(str(e))
+    if damaged:
+        raise CheckpointError(f"{root}: no intact checkpoint; the newest says: {damaged[0]}")
+    return None, damaged
+
+
+def restore(saved: Saved, model: Model, optimizer: torch.optim.Optimizer | None) -> None:
+    """Put a checkpoint into a model and its optimiser. Raises CheckpointError where they are of another config."""
+    own = model.state_dict()
+    wrong = [n for n in own if n not in saved.model or own[n].shape != saved.model[n].shape]
+    wrong += [n for n in saved.model if n not in own]
+    if wrong:
+        raise CheckpointError(f"checkpoint of step {saved.step}: {wrong[0]} does not fit the config; it was changed since")
+    model.load_state_dict(saved.model)
+    if optimizer is None or not saved.optimizer:
+        return
+    state = optimizer.state_dict()
+    state["state"] = {}
+    for name, tensor in saved.optimizer.items():
+        index, key = name.split(".", 1)
+        state["state"].setdefault(int(index), {})[key] = tensor
+    optimizer.load_state_dict(state)
+
+
+def _moments(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    return {
+        f"{index}.{key}": value
+        for index, values in optimizer.state_dict()["state"].items()
+        for key, value in values.items()
+        if isinstance(value, Tensor)
+    }

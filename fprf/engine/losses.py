@@ -1,0 +1,61 @@
+"""The training terms (paper, Eq. 3 and 4, and K-Planes' regularisers). A term of weight 0 is never computed."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..config import LossConfig
+from ..rendering.stepfun import distortion, interlevel
+from ..types import Batch, Rendered, Want
+from .model import Facts, Model
+
+__all__ = ["terms", "wanted"]
+
+
+def wanted(config: LossConfig, batch: Batch) -> Want:
+    """What must be rendered for the terms that count."""
+    want = Want.DENSITY
+    if config.rgb > 0:
+        want |= Want.COLOUR
+    if config.content > 0 and batch.content is not None:
+        want |= Want.CONTENT
+    if config.semantic > 0 and batch.semantic is not None:
+        want |= Want.SEMANTIC
+    return want
+
+
+def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, model: Model) -> dict[str, Tensor]:
+    """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits any encoder."""
+    result: dict[str, Tensor] = {}
+    if rendered.rgb is not None and config.rgb > 0:
+        result["rgb"] = F.mse_loss(rendered.rgb, batch.rgb)
+    if rendered.content is not None and batch.content is not None:
+        result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
+    if rendered.semantic is not None and batch.semantic is not None:
+        result["semantic"] = F.l1_loss(rendered.semantic, batch.semantic) / facts.semantic_scale
+    sampled, weights = rendered.sampled, rendered.weights
+    assert sampled is not None and weights is not None
+    if config.interlevel > 0 and sampled.levels:
+        parts = [interlevel(sampled.s, weights, level.s, level.weights) for level in sampled.levels]
+        result["interlevel"] = torch.stack(parts).sum()
+    if config.distortion > 0:
+        result["distortion"] = distortion(sampled.s, weights)
+    penalties = model.penalties() if config.variation > 0 or config.proposal_variation > 0 else {}
+    for name, weight in (("variation", config.variation), ("proposal_variation", config.proposal_variation)):
+        if weight > 0 and name in penalties:
+            result[name] = penalties[name]
+    return result
+
+
+def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
+    """Weighted sum."""
+    weights = {
+        "rgb": config.rgb,
+        "content": config.content,
+        "semantic": config.semantic,
+        "interlevel": config.interlevel,
+        "distortion": config.distortion,
+        "variation": config.variation,
+        "proposal_variation": config.proposal_variation,
+    }
+    return torch.stack([weights[name] * value for name, value in parts.items()]).sum()

@@ -1,0 +1,81 @@
+"""A scene's networks together, built from a config and what was found out about the scene. No data, no losses, no files."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from torch import Tensor, nn
+
+from ..config import TrainConfig
+from ..rendering.renderer import Parts
+from ..rendering.space import Space
+
+__all__ = ["Facts", "Model", "build_model"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """What training found out about a scene: enough to rebuild its model without images or encoders."""
+
+    space: Space
+    channels: int
+    """Content channels."""
+    dim: int
+    """Semantic channels of the field; 0 = no semantics."""
+    content_encoder: str
+    """Identity of the content encoder, to which the decoder belongs."""
+    semantic_encoder: str
+    """Identity of the semantic encoder; empty without one."""
+    content_scale: float
+    """RMS standard deviation of the content targets: the unit of the content loss."""
+    semantic_scale: float
+    """The same for semantics."""
+    background: tuple[float, float, float] | None
+    """Colour behind everything, if anything can be seen through."""
+
+
+class Model(nn.Module):
+    """Sampler, fields and frozen decoder of one scene."""
+
+    def __init__(self, parts: Parts) -> None:
+        super().__init__()
+        self.space = parts.space
+        self.sampler = parts.sampler
+        self.field = parts.field
+        self.semantic = parts.semantic
+        self.decoder = parts.decoder
+
+    @property
+    def parts(self) -> Parts:
+        """For the renderer."""
+        return Parts(self.space, self.sampler, self.field, self.semantic, self.decoder)
+
+    def learned(self) -> list[nn.Parameter]:
+        """Parameters that training moves, in a fixed order: everything but the decoder."""
+        return [p for p in self.parameters() if p.requires_grad]
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Regularisers of all parts by loss name."""
+        terms = self.field.penalties() | self.sampler.penalties()
+        return terms | self.semantic.penalties() if self.semantic is not None else terms
+
+
+def background_of(facts: Facts, device: torch.device) -> Annotated[Tensor, "3"] | None:
+    """The background as a tensor."""
+    return None if facts.background is None else torch.tensor(facts.background, device=device)
+
+
+def build_model(config: TrainConfig, facts: Facts) -> Model:
+    """The model at its seeded start. Raises WeightsError where no decoder fits the content encoder."""
+    decoder = config.content.decoder.build(encoder=facts.content_encoder, channels=facts.channels)
+    decoder.requires_grad_(False)
+    semantic = config.semantic.field.build(channels=facts.dim, seed=config.seed + 2) if facts.dim else None
+    return Model(
+        Parts(
+            facts.space,
+            config.sampler.build(seed=config.seed),
+            config.content.field.build(channels=facts.channels, seed=config.seed + 1),
+            semantic,
+            decoder,
+        )
+    )

@@ -1,0 +1,78 @@
+"""Before the first step: parse the scene, find its space, extract features, build the model."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from ..config import TrainConfig
+from ..datamanagers.basis import Basis
+from ..datamanagers.parsers.recognise import parse_scene
+from ..datamanagers.scene import Scene
+from ..errors import PluginError
+from ..interfaces import DataManager
+from ..rendering.bounds import find_space
+from .model import Facts
+
+__all__ = ["Prepared", "cache_folder", "device_of", "prepare"]
+
+
+class Prepared(NamedTuple):
+    """A scene that is ready to be trained."""
+
+    scene: Scene
+    manager: DataManager
+    facts: Facts
+    basis: Basis | None
+    """Semantic basis; None without semantics."""
+
+
+def cache_folder() -> Path:
+    """Where features and embedded scenes are kept between runs: $XDG_CACHE_HOME/fprf or ~/.cache/fprf."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fprf"
+
+
+def device_of(name: str) -> torch.device:
+    """`auto` is CUDA, then MPS, then the CPU. Raises PluginError for a device that torch does not know here."""
+    if name == "auto":
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as e:
+        raise PluginError(f"device: {name!r} is not available here; use cpu or auto") from e
+
+
+def prepare(config: TrainConfig, progress: Callable[[int, int, str], None] | None = None) -> Prepared:
+    """Everything but the model. `progress(done, total, what)` is told of the features."""
+    boxes = config.blocks.build().boxes
+    if len(boxes) != 1:
+        raise PluginError(f"blocks: this layout cuts {len(boxes)} blocks; training takes one so far, choose --blocks single")
+    scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
+    content = config.content.encoder.build()
+    semantic = config.semantic.encoder.build() if config.semantic.encoder is not None else None
+    manager = config.datamanager.build(
+        scene=scene,
+        content=content,
+        semantic=semantic,
+        dim=config.semantic.dim,
+        cache=cache_folder() / "features",
+        seed=config.seed,
+        progress=progress,
+    )
+    content_store, semantic_store = manager.content_store, manager.semantic_store
+    background = config.render.background or ((1.0, 1.0, 1.0) if scene.alpha else None)
+    facts = Facts(
+        space=find_space(scene),
+        channels=content.channels,
+        dim=semantic_store.channels if semantic_store is not None else 0,
+        content_encoder=content.identity,
+        semantic_encoder=semantic.identity if semantic is not None else "",
+        content_scale=content_store.scale if content_store is not None else 1.0,
+        semantic_scale=semantic_store.scale if semantic_store is not None else 1.0,
+        background=background,
+    )
+    return Prepared(scene, manager, facts, semantic_store.basis if semantic_store is not None else None)

@@ -1,0 +1,144 @@
+"""A run folder: everything that is needed to render and restyle a scene, and nothing that runs code.
+
+    config.json         the knobs, plug-ins by name
+    scene.json          what was found out: space, cameras, names, splits, sizes
+    basis.safetensors   semantic basis, to bring references into the scene's terms
+    style.safetensors   the scene's own statistics and regions
+    events.jsonl        one line every few seconds of training
+    metrics.json        written by `fprf eval`
+    checkpoints/        see `engine.checkpoint`
+
+It can be moved and shared: it holds no absolute path that matters and needs neither images nor encoders to render.
+"""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from ..config import TrainConfig
+from ..datamanagers.scene import Scene
+from ..errors import CheckpointError
+from ..output.atomic import atomic_path, write_json
+from ..plugins.codec import load_config, save_config
+from ..rendering.cameras import Cameras
+from ..rendering.space import Space
+from .model import Facts
+
+__all__ = ["Known", "Run"]
+
+FORMAT = 1
+_CAMERA = ("pose", "focal", "centre", "size", "distortion", "lens")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """The content of scene.json."""
+
+    name: str
+    data: str
+    """Where the images lay when it was trained: a hint for `eval`, not a need."""
+    names: tuple[str, ...]
+    """Stem of each view's image."""
+    cameras: Cameras
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+    facts: Facts
+
+    def split(self, name: str) -> tuple[int, ...]:
+        """Views of `train`, `test` or `all`."""
+        return {"train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[name]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One folder."""
+
+    root: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.root / "checkpoints"
+
+    @property
+    def exists(self) -> bool:
+        """Whether a run was begun here."""
+        return (self.root / "config.json").is_file()
+
+    def save_config(self, config: TrainConfig, method: str) -> None:
+        """Write config.json."""
+        save_config(self.root / "config.json", config, method)
+
+    def load_config(self) -> tuple[TrainConfig, str]:
+        """Config and method name. Raises CheckpointError where this is no run folder."""
+        if not self.exists:
+            raise CheckpointError(f"{self.root}: no config.json here, so it is no run folder; `fprf train` makes one")
+        return load_config(self.root / "config.json")
+
+    def save_known(self, scene: Scene, data: Path, facts: Facts) -> None:
+        """Write scene.json."""
+        document = {
+            "format": FORMAT,
+            "name": scene.name,
+            "data": str(data),
+            "names": [p.stem for p in scene.paths],
+            "cameras": {key: getattr(scene.cameras, key).tolist() for key in _CAMERA},
+            "train": scene.train.tolist(),
+            "test": scene.test.tolist(),
+            "facts": dataclasses.asdict(facts),
+        }
+        write_json(self.root / "scene.json", document)
+
+    def load_known(self) -> Known:
+        """Read scene.json. Raises CheckpointError."""
+        path = self.root / "scene.json"
+        try:
+            document: dict[str, Any] = json.loads(path.read_text())
+            facts = dict(document["facts"])
+            space = {k: _tupled(v) for k, v in facts.pop("space").items()}
+            raw = document["cameras"]
+            cameras = Cameras(
+                *(torch.tensor(raw[key], dtype=torch.int64 if key in ("size", "lens") else torch.float64) for key in _CAMERA)
+            )
+            return Known(
+                name=document["name"],
+                data=document["data"],
+                names=tuple(document["names"]),
+                cameras=cameras,
+                train=tuple(document["train"]),
+                test=tuple(document["test"]),
+                facts=Facts(space=Space(**space), **{k: _tupled(v) for k, v in facts.items()}),
+            )
+        except (OSError, ValueError, KeyError, TypeError) as e:
+            raise CheckpointError(f"{path}: cannot be read ({e!r}); train the scene again") from e
+
+    def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
+        """Write NAME.safetensors."""
+        with atomic_path(self.root / f"{name}.safetensors") as temporary:
+            save_file({k: v.contiguous() for k, v in tensors.items()}, temporary)
+
+    def load_tensors(self, name: str) -> dict[str, Tensor]:
+        """Read NAME.safetensors. Raises CheckpointError where training did not get that far."""
+        path = self.root / f"{name}.safetensors"
+        if not path.is_file():
+            raise CheckpointError(f"{path}: not written yet; finish training with `fprf train {self.root}/config.json`")
+        try:
+            return load_file(path)
+        except (OSError, SafetensorError) as e:
+            raise CheckpointError(f"{path}: cannot be read ({e}); train again") from e
+
+    def log(self, event: dict[str, Any]) -> None:
+        """Append one line to events.jsonl."""
+        with (self.root / "events.jsonl").open("a") as f:
+            f.write(json.dumps(event, allow_nan=False) + "\n")
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(_tupled(v) for v in value) if isinstance(value, list) else value

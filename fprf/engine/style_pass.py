@@ -1,0 +1,62 @@
+"""One exact pass over the trained scene: the statistics and regions that every style builds on (design: statistics in kind).
+
+Features are those of the very samples that the renderer keeps, weighted by their rendering weights, on a fixed lattice of
+pixels over all training views; moments are merged in float64, so neither order nor chunk size matters.
+"""
+
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..config import TrainConfig
+from ..rendering.cameras import Cameras, rays_through
+from ..rendering.renderer import march
+from ..style.scene import SceneStyle, scene_style
+from ..style.statistics import empty, merge, moments
+from .model import Model
+
+__all__ = ["lattice", "measure_style"]
+
+
+def lattice(cameras: Cameras, views: Annotated[Tensor, "V"], rays: int) -> tuple[Tensor, Tensor]:
+    """View [R] and pixel [R 2] of about so many pixels, at even steps through all the views' pixels."""
+    area = cameras.size[views].prod(-1)
+    ends = area.cumsum(0)
+    count = min(rays, int(ends[-1]))
+    at = (torch.arange(count, dtype=torch.float64) + 0.5) * (float(ends[-1]) / count)
+    at = at.long()
+    which = torch.searchsorted(ends, at, right=True)
+    within = at - (ends[which] - area[which])
+    view = views[which]
+    width = cameras.size[view, 0]
+    return view, torch.stack([within % width, within // width], -1) + 0.5
+
+
+@torch.inference_mode()
+def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"]) -> SceneStyle:
+    """Content statistics over the training views and the scene's semantic regions, on the CPU."""
+    device = next(model.parameters()).device
+    view, pixel = lattice(cameras, views, config.statistics.rays)
+    whole = None
+    contents, semantics, weights = [], [], []
+    for start in range(0, len(view), config.render.chunk):
+        part = slice(start, start + config.render.chunk)
+        rays = model.space.rays(*rays_through(cameras, view[part], pixel[part]))
+        rays = type(rays)(*(x.to(device) for x in rays))
+        kept = march(rays, model.parts, budget=config.render.budget).kept
+        content = model.field.content(kept.latent, kept.view)
+        own = moments(content, kept.weight)
+        whole = merge(whole if whole is not None else empty(content.shape[1]), own)
+        contents.append(content.cpu())
+        weights.append(kept.weight.cpu())
+        if model.semantic is not None:
+            semantics.append(model.semantic(kept.point).cpu())
+    return scene_style(
+        torch.cat(contents),
+        torch.cat(semantics) if semantics else None,
+        torch.cat(weights),
+        whole,
+        config.statistics.regions,
+        config.seed,
+    )

@@ -1,0 +1,166 @@
+"""The training loop. Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped."""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..config import TrainConfig
+from ..errors import NumericsError
+from ..rendering.cameras import Cameras, rays_through
+from ..rendering.renderer import render_rays
+from ..types import Batch, Rays
+from . import checkpoint
+from .losses import terms, total, wanted
+from .model import Facts, Model, background_of, build_model
+from .prepare import Prepared, device_of
+from .run import Run
+from .schedule import progress, rate
+
+__all__ = ["Report", "step_generator", "train"]
+
+PATIENCE = 3
+"""Steps in a row with a non-finite loss after which training stops: it will not recover by itself."""
+SMOOTHING = 0.95
+"""Decay of the running means that are shown."""
+REPORT_SECONDS = 0.5
+"""Time between reports."""
+
+
+class Report(NamedTuple):
+    """How training goes."""
+
+    step: int
+    share: float
+    """Share of the way, 0 to 1."""
+    seconds: float
+    psnr: float
+    """Of the training rays, smoothed."""
+    rays_per_second: float
+    kept: float
+    """Share of the samples that met the content network."""
+    losses: dict[str, float]
+    skipped: int
+    """Steps skipped because their loss was not finite."""
+
+
+def step_generator(seed: int, step: int, device: torch.device) -> torch.Generator:
+    """Draws of one step: the seed in the upper bits, the step in the lower ones."""
+    return torch.Generator(device).manual_seed((seed << 32) ^ step)
+
+
+def train(config: TrainConfig, prepared: Prepared, run: Run, report: Callable[[Report], None], *, spent: float = 0.0) -> Model:
+    """Train, or go on from the newest checkpoint, until the steps or the minutes are over; `spent` seconds count as used.
+
+    An interrupt saves first, then goes on upwards. Raises NumericsError where the loss stays non-finite.
+    """
+    device = device_of(config.device)
+    model = build_model(config, prepared.facts).to(device)
+    optimizer = torch.optim.Adam(
+        model.learned(), lr=config.optimizer.rate, betas=(0.9, config.optimizer.beta2), eps=config.optimizer.eps, fused=True
+    )
+    saved, _ = checkpoint.load_latest(run.checkpoints)
+    if saved is not None:
+        checkpoint.restore(saved, model, optimizer)
+    loop = _Loop(config, prepared, model, optimizer, device)
+    step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
+    start = last_saved = last_report = time.perf_counter()
+    clock = before
+    try:
+        while progress(config, step, clock) < 1:
+            result = loop.step(step, progress(config, step, clock))
+            step += 1
+            now = time.perf_counter()
+            clock = before + now - start
+            if now - last_report > REPORT_SECONDS:
+                last_report = now
+                report(result(progress(config, step, clock), clock))
+            if now - last_saved > 60 * config.checkpoint_minutes:
+                checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
+                last_saved = time.perf_counter()
+    except KeyboardInterrupt:
+        checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
+        raise
+    if saved is None or step > saved.step:
+        checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
+    if loop.steps:
+        report(loop.summary(step, 1.0, clock))
+    return model
+
+
+class _Loop:
+    """The state that lives between steps but is not saved: running means for the display."""
+
+    def __init__(
+        self, config: TrainConfig, prepared: Prepared, model: Model, optimizer: torch.optim.Optimizer, device: torch.device
+    ) -> None:
+        self.config, self.model, self.optimizer, self.device = config, model, optimizer, device
+        self.facts: Facts = prepared.facts
+        self.manager, self.cameras = prepared.manager, prepared.scene.cameras
+        self.background = background_of(prepared.facts, device)
+        self.mean: dict[str, float] = {}
+        self.steps = self.skipped = self.failed = 0
+        self.rays = 0
+        self.begun = time.perf_counter()
+
+    def step(self, step: int, share: float) -> Callable[[float, float], Report]:
+        """One step; the answer makes a report when one is due."""
+        batch = self._to_device(self.manager.batch(step))
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate(self.config.optimizer, step, share)
+        rendered = render_rays(
+            space_rays(self.model, self.cameras, batch),
+            self.model.parts,
+            want=wanted(self.config.loss, batch),
+            budget=self.config.render.train_budget,
+            background=self.background,
+            step=step,
+            generator=step_generator(self.config.seed, step, self.device),
+            semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
+            semantic_samples=self.config.semantic.samples,
+        )
+        parts = terms(self.config.loss, self.facts, rendered, batch, self.model)
+        loss = total(self.config.loss, parts)
+        self.optimizer.zero_grad(set_to_none=True)
+        if torch.isfinite(loss):
+            self.failed = 0
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimizer.step()
+        else:
+            self._skip(step, parts)
+        self._remember(parts, rendered.counts["kept"] / max(1, rendered.counts["samples"]))
+        self.steps, self.rays = self.steps + 1, self.rays + len(batch.rgb)
+        return lambda share, seconds: self.summary(step + 1, share, seconds)
+
+    def summary(self, step: int, share: float, seconds: float) -> Report:
+        """Running means, corrected for their start."""
+        scale = 1 / (1 - SMOOTHING**self.steps)
+        losses = {name: value * scale for name, value in self.mean.items() if name != "kept"}
+        rgb = torch.tensor(losses.get("rgb", 1.0)).clamp_min(1e-10)
+        speed = self.rays / (time.perf_counter() - self.begun)
+        return Report(step, share, seconds, float(-10 * rgb.log10()), speed, self.mean["kept"] * scale, losses, self.skipped)
+
+    def _remember(self, parts: dict[str, Tensor], kept: float) -> None:
+        for name, value in {**{n: float(v.detach()) for n, v in parts.items()}, "kept": kept}.items():
+            if value == value:
+                self.mean[name] = SMOOTHING * self.mean.get(name, 0.0) + (1 - SMOOTHING) * value
+
+    def _skip(self, step: int, parts: dict[str, Tensor]) -> None:
+        self.skipped, self.failed = self.skipped + 1, self.failed + 1
+        if self.failed >= PATIENCE:
+            bad = ", ".join(name for name, value in parts.items() if not torch.isfinite(value))
+            raise NumericsError(
+                f"step {step}: {bad} is not finite for {PATIENCE} steps in a row; lower --optimizer.rate, or check the images"
+            )
+
+    def _to_device(self, batch: Batch) -> Batch:
+        if self.device.type == "cpu":
+            return batch
+        return Batch(*(x.to(self.device, non_blocking=True) if x is not None else None for x in batch))
+
+
+def space_rays(model: Model, cameras: Cameras, batch: Batch) -> Rays:
+    """Rays of a batch in the model's space."""
+    return model.space.rays(*rays_through(cameras, batch.view, batch.pixel))

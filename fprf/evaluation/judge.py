@@ -1,0 +1,64 @@
+"""Renders of a run against its photographs: quality, speed, memory, consistency."""
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from ..datamanagers.images import load_image
+from ..datamanagers.scene import Scene
+from ..engine.loading import Trained
+from ..engine.views import View, render_view
+from .consistency import consistency
+from .metrics import image_metrics, mean_metrics
+
+__all__ = ["judge", "peak_memory"]
+
+
+def peak_memory() -> float:
+    """Most resident memory that this process ever held, in MiB."""
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return used / 2**20 if sys.platform == "darwin" else used / 2**10  # bytes there, KiB on Linux
+
+
+def judge(
+    trained: Trained, scene: Scene, views: Sequence[int], progress: Callable[[int, int, str], None]
+) -> tuple[dict[str, Any], list[View]]:
+    """Metrics of the views (means and each by name), and the renders.
+
+    Seconds are those of rendering alone. Consistency warps each view into the next one of the list by the rendered depth.
+    """
+    facts, cameras = trained.known.facts, trained.known.cameras
+    renders, rows, seconds = [], {}, 0.0
+    for i, view in enumerate(views):
+        progress(i, len(views), "rendering")
+        start = time.perf_counter()
+        render = render_view(trained.model, facts, cameras, view, trained.config.render)
+        seconds += time.perf_counter() - start
+        renders.append(render)
+        width, height = (int(v) for v in cameras.size[view])
+        truth = torch.from_numpy(load_image(scene.paths[view], (width, height), facts.background)).float() / 255
+        rows[trained.known.names[view]] = image_metrics(render.rgb, truth)
+    progress(len(views), len(views), "rendering")
+    pixels = sum(v.rgb.shape[0] * v.rgb.shape[1] for v in renders)
+    chosen = cameras.select(torch.tensor(list(views)))
+    pairs = [(i, i + 1) for i in range(len(views) - 1)]
+    warped = consistency([v.rgb for v in renders], [v.depth for v in renders], chosen, pairs)
+    means = mean_metrics(rows.values())
+    return {
+        **means,
+        "lpips": None,
+        "views": len(views),
+        "render_seconds": seconds,
+        "seconds_per_view": seconds / max(1, len(views)),
+        "rays_per_second": pixels / max(seconds, 1e-9),
+        "kept_samples_share": sum(v.kept for v in renders) / max(1, len(renders)),
+        "peak_rss_mib": peak_memory(),
+        "train_seconds": trained.seconds,
+        "train_steps": trained.step,
+        "consistency": warped,
+        "per_view": rows,
+    }, renders
