@@ -81,10 +81,12 @@ def catmull_rom(
     # A frame at the very end lies in the gap after the last key, with u = 0.
     after = (gap + 1).clamp(max=len(keys) - 1)
     u = u[:, None]
-    square, cube = u**2, u**3
-    return (
+    square = u.square()
+    cube = square * u
+    place: Tensor = (
         (2 * cube - 3 * square + 1) * keys[gap]
         + (cube - 2 * square + u) * velocity[gap]
         + (3 * square - 2 * cube) * keys[after]
         + (cube - square) * velocity[after]
     )
+    return place

@@ -1,0 +1,70 @@
+(() => {
+  "use strict";
+  const wipe = document.querySelector(".wipe");
+  if (!wipe) return;
+  const slider = wipe.querySelector("input");
+  const before = wipe.querySelector(".before");
+  const after = wipe.querySelector(".after");
+  const tag = wipe.querySelector(".tag.two");
+  const shown = { style: 0, view: 0 };
+
+  const move = (at) => {
+    slider.value = Math.min(100, Math.max(0, at));
+    wipe.style.setProperty("--at", `${slider.value}%`);
+    slider.setAttribute("aria-valuetext", `${Math.round(slider.value)} % original`);
+  };
+  slider.addEventListener("input", () => move(Number(slider.value)));
+  slider.addEventListener("keydown", (event) => {
+    const way = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
+    if (!way) return;
+    event.preventDefault();
+    move(Number(slider.value) + way * (event.shiftKey ? 10 : 2));
+  });
+
+  const follow = (event) => {
+    const box = wipe.getBoundingClientRect();
+    move((100 * (event.clientX - box.left)) / box.width);
+  };
+  wipe.addEventListener("pointerdown", (event) => {
+    if (event.button) return;
+    wipe.setPointerCapture(event.pointerId);
+    follow(event);
+    slider.focus({ preventScroll: true, focusVisible: false });
+    event.preventDefault();
+  });
+  wipe.addEventListener("pointermove", (event) => {
+    if (wipe.hasPointerCapture(event.pointerId)) follow(event);
+  });
+
+  const show = (change) => {
+    Object.assign(shown, change);
+    const one = document.querySelector(`[data-view="${shown.view}"] img`);
+    const two = document.querySelector(`[data-shot="${shown.style}-${shown.view}"] img`);
+    before.src = one.src;
+    before.alt = one.alt;
+    after.src = two.src;
+    after.alt = two.alt;
+    const { width, height } = one.dataset;
+    wipe.style.setProperty("--ratio", String(width / height));
+    wipe.style.setProperty("--most", `${2.6 * width}px`);
+    document.querySelectorAll("[data-style], [data-view]").forEach((button) => {
+      const { style, view } = button.dataset;
+      button.setAttribute("aria-pressed", String(style === String(shown.style) || view === String(shown.view)));
+    });
+    tag.textContent = document.querySelector(`[data-style="${shown.style}"]`).textContent.trim();
+  };
+  document.addEventListener("click", (event) => {
+    const button = event.target.closest("button");
+    if (!button) return;
+    const { style, view, shot } = button.dataset;
+    if (style) show({ style: Number(style) });
+    if (view) show({ view: Number(view) });
+    if (shot) {
+      const [style, view] = shot.split("-").map(Number);
+      show({ style, view });
+      wipe.scrollIntoView({ block: "center" });
+      slider.focus({ preventScroll: true });
+    }
+  });
+  move(50);
+})();

@@ -1,0 +1,272 @@
+"""One page that shows a restyled scene: compare, styles, geometry, flight, figures. A single file without any request."""
+
+import base64
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from itertools import groupby
+from pathlib import Path
+from string import Template
+from typing import NamedTuple
+from urllib.parse import quote
+
+from ..errors import DataError
+from .atomic import write_text
+from .figures import Metrics, figures, number
+from .images import Picture, data_uri, shrink, to_uint8
+from .maps import palette
+
+__all__ = ["Reference", "Style", "write_gallery"]
+
+_VIEW_SIDE, _MAP_SIDE, _SMALL_SIDE = 1024, 512, 80
+"""Longest sides in pixels of embedded views, of maps and references, and of thumbnails."""
+_EMBEDDED_VIDEO = 8 * 2**20
+"""Bytes up to which a film is put into the page."""
+
+
+class Reference(NamedTuple):
+    """A photograph that a style was taken from."""
+
+    name: str
+    image: Picture
+
+
+class Style(NamedTuple):
+    """A restyled scene: one picture per view, in the order of the originals."""
+
+    name: str
+    views: Sequence[Picture]
+    references: Sequence[str] = ()
+    """Names of its references, in dictionary order."""
+    shares: Sequence[float] = ()
+    """How much of the scene each of them styled (`maps.match_summary`); none where that was not measured."""
+    matches: Sequence[Picture] = ()
+    """Match maps (`maps.match_image`), one per view or fewer."""
+
+
+def write_gallery(
+    path: Path,
+    *,
+    title: str,
+    scene: Mapping[str, str | int | float],
+    view_names: Sequence[str],
+    originals: Sequence[Picture],
+    references: Sequence[Reference],
+    styles: Sequence[Style],
+    depth: Sequence[Picture] = (),
+    metrics: "Metrics | None" = None,
+    video: Path | None = None,
+) -> None:
+    """Write the page to `path` (.html), whole or not at all.
+
+    `scene` holds a few facts by their labels ("Photographs": 34). `originals` are the unstylised renders. A film is
+    embedded where it is H.264 of at most 8 MiB, else linked beside the page. Every name is shown as text, whatever it
+    holds. Raises DataError where numbers of views differ or a style names an unknown reference.
+    """
+    _fitting(view_names, originals, references, styles)
+    known = {reference.name: reference for reference in references}
+    parts = [
+        ("", _opening(title, scene)),
+        ("Compare", _compare(view_names, originals, styles, known)),
+        ("Styles", _styles(view_names, styles, known)),
+        ("Geometry", _geometry(view_names, depth)),
+        ("Flight", "" if video is None else _flight(video, path)),
+        ("Figures", _figures(metrics or {})),
+    ]
+    present = [(name, part) for name, part in parts if part]
+    here = files(__package__)
+    page = Template((here / "gallery.html").read_text("utf-8")).substitute(
+        title=escape(title),
+        css=(here / "gallery.css").read_text("utf-8"),
+        script=(here / "gallery.js").read_text("utf-8"),
+        nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present if name),
+        body="\n".join(part for _, part in present),
+    )
+    write_text(path, page)
+
+
+def _fitting(
+    view_names: Sequence[str], originals: Sequence[Picture], references: Sequence[Reference], styles: Sequence[Style]
+) -> None:
+    if len(view_names) != len(originals) or not originals:
+        raise DataError(f"gallery: {len(originals)} originals and {len(view_names)} view names; at least one, as many of each")
+    known = {reference.name for reference in references}
+    for style in styles:
+        if len(style.views) != len(originals):
+            raise DataError(f"gallery: style {style.name} has {len(style.views)} views, there are {len(originals)} originals")
+        for name in style.references:
+            if name not in known:
+                raise DataError(f"gallery: style {style.name} names reference {name}; known are {', '.join(sorted(known))}")
+        if style.shares and len(style.shares) != len(style.references):
+            raise DataError(f"gallery: style {style.name} has {len(style.shares)} shares of {len(style.references)} references")
+
+
+def _img(picture: Picture, side: int, alt: str, *, eager: bool = False, of: str = "") -> str:
+    small = shrink(picture, side)
+    height, width = small.shape[:2]
+    lazy = "" if eager else ' loading="lazy"'
+    kind = f' class="{of}"' if of else ""
+    # width and height hold the place while the picture is decoded; data-* survive CSS for the script.
+    return (
+        f'<img{kind} src="{data_uri(small)}" alt="{escape(alt)}" width="{width}" height="{height}" '
+        f'data-width="{width}" data-height="{height}" decoding="async"{lazy}>'
+    )
+
+
+def _ratio(picture: Picture) -> str:
+    return f"{picture.shape[1] / picture.shape[0]:.5f}"
+
+
+def _opening(title: str, scene: Mapping[str, str | int | float]) -> str:
+    facts = "\n".join(f"<div><dt>{escape(name)}</dt><dd>{escape(number(fact))}</dd></div>" for name, fact in scene.items())
+    listed = f'\n<dl class="facts">\n{facts}\n</dl>' if facts else ""
+    return f'<section class="opening">\n<h1>{escape(title)}</h1>{listed}\n</section>'
+
+
+def _compare(
+    view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style], known: Mapping[str, Reference]
+) -> str:
+    if not styles:
+        return ""
+    first, most = originals[0], 2.6 * min(_VIEW_SIDE, originals[0].shape[1])
+    picks = "\n".join(
+        f'<button class="pick" type="button" data-style="{index}" aria-pressed="{str(index == 0).lower()}">'
+        f"{_stack(style, known)}<span>{escape(style.name)}</span></button>"
+        for index, style in enumerate(styles)
+    )
+    film = "\n".join(
+        f'<button type="button" data-view="{index}" aria-pressed="{str(index == 0).lower()}" title="{escape(name)}">'
+        f"{_img(picture, _VIEW_SIDE, f'View {name}, original', eager=True)}</button>"
+        for index, (name, picture) in enumerate(zip(view_names, originals, strict=True))
+    )
+    return f"""<section class="compare" id="compare" aria-label="Compare">
+<div class="stage">
+<figure class="wipe" style="--at:50%;--ratio:{_ratio(first)};--most:{most:.0f}px">
+{_img(styles[0].views[0], _VIEW_SIDE, f"View {view_names[0]}, {styles[0].name}", eager=True, of="after")}
+{_img(first, _VIEW_SIDE, f"View {view_names[0]}, original", eager=True, of="before")}
+<span class="tag one">Original</span><span class="tag two">{escape(styles[0].name)}</span>
+<input type="range" min="0" max="100" step="any" value="50" aria-label="How much of the original is shown">
+<span class="seam"></span>
+</figure>
+</div>
+<div class="choose">
+<div><h2 id="pick-style">Style</h2>
+<div class="picks" role="group" aria-labelledby="pick-style">
+{picks}
+</div></div>
+<div><h2 id="pick-view">View</h2>
+<div class="film" role="group" aria-labelledby="pick-view">
+{film}
+</div></div>
+</div>
+</section>"""
+
+
+def _stack(style: Style, known: Mapping[str, Reference]) -> str:
+    small = [_img(known[name].image, _SMALL_SIDE, "", eager=True) for name in style.references[:3]]
+    return f'<span class="stack">{"".join(small)}</span>' if small else ""
+
+
+def _styles(view_names: Sequence[str], styles: Sequence[Style], known: Mapping[str, Reference]) -> str:
+    if not styles:
+        return ""
+    blocks = "\n".join(_style(index, style, view_names, known) for index, style in enumerate(styles))
+    return f"""<section class="styles" id="styles">
+<h2>Styles</h2>
+<p class="lead">The same trained scene, restyled by photographs. Choose a view to compare it above.</p>
+{blocks}
+</section>"""
+
+
+def _style(index: int, style: Style, view_names: Sequence[str], known: Mapping[str, Reference]) -> str:
+    cards = "\n".join(
+        f'<button class="card" type="button" data-shot="{index}-{view}" style="--ratio:{_ratio(picture)}">'
+        f"{_img(picture, _VIEW_SIDE, f'View {name}, {style.name}')}<span>{escape(name)}</span></button>"
+        for view, (name, picture) in enumerate(zip(view_names, style.views, strict=True))
+    )
+    matches = ""
+    if style.matches:
+        maps = _figures_grid(style.matches, view_names, "reference of every place")
+        matches = f'\n<div class="under"><p class="label">Which reference each place took its style from</p>\n{maps}\n</div>'
+    return f"""<article class="style">
+<div><h3>{escape(style.name)}</h3>
+{_sources(style, known)}</div>
+<div><div class="grid">
+{cards}
+</div>{matches}</div>
+</article>"""
+
+
+def _sources(style: Style, known: Mapping[str, Reference]) -> str:
+    """The references of a style: with the colours of its match maps and with shares, where there are any."""
+    rows = []
+    colours = to_uint8(palette(len(style.references))[None])[0] if style.references else []
+    for place, name in enumerate(style.references):
+        chip = f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>' if style.matches else ""
+        share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>' if style.shares else ""
+        image = _img(known[name].image, _MAP_SIDE, f"Reference {name}")
+        rows.append(f'<figure class="source">{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>')
+    return f'<div class="sources">{"".join(rows)}</div>' if rows else ""
+
+
+def _figures_grid(pictures: Sequence[Picture], view_names: Sequence[str], what: str) -> str:
+    cards = "\n".join(
+        f'<figure class="card" style="--ratio:{_ratio(picture)}">{_img(picture, _MAP_SIDE, f"View {name}, {what}")}'
+        f"<figcaption>{escape(name)}</figcaption></figure>"
+        for name, picture in zip(view_names, pictures, strict=False)
+    )
+    return f'<div class="grid small">\n{cards}\n</div>'
+
+
+def _geometry(view_names: Sequence[str], depth: Sequence[Picture]) -> str:
+    if not depth:
+        return ""
+    return f"""<section id="geometry">
+<h2>Geometry</h2>
+<p class="lead">Rendered depth: near is bright, far is dark, nothing is grey. All styles share it.</p>
+{_figures_grid(depth, view_names, "depth")}
+</section>"""
+
+
+def _flight(video: Path, page: Path) -> str:
+    with video.open("rb") as film:
+        data = film.read(_EMBEDDED_VIDEO + 1)
+    beside = quote(Path(os.path.relpath(video, page.parent)).as_posix())
+    # The codec's box lies at the front of what we write; other codecs do not play in browsers.
+    if b"avc1" not in data:
+        link = f'<a href="{escape(beside)}">{escape(video.name)}</a>'
+        shown = f'<p class="lead">This film needs a player outside of the browser: {link}</p>'
+    else:
+        small = len(data) <= _EMBEDDED_VIDEO
+        source = f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}" if small else escape(beside)
+        kind = 'controls loop muted playsinline preload="metadata" aria-label="Flight through the scene"'
+        shown = f'<video src="{source}" {kind}></video>'
+    return f'<section id="flight">\n<h2>Flight</h2>\n<div class="film-box">{shown}</div>\n</section>'
+
+
+def _figures(metrics: "Metrics") -> str:
+    tables = []
+    for group, rows in groupby(figures(metrics), key=lambda figure: figure.group):
+        body = _cells((row.label, row.value, row.unit) for row in rows)
+        tables.append(
+            f"<table>\n<caption>{escape(group or 'Quality and cost')}</caption>\n{_HEAD}\n<tbody>\n{body}\n</tbody>\n</table>"
+        )
+    if not tables:
+        return ""
+    listed = "\n".join(tables)
+    return f'<section id="figures">\n<h2>Figures</h2>\n<div class="figures">\n{listed}\n</div>\n</section>'
+
+
+_HEAD = (
+    '<thead><tr><th scope="col">Figure</th><th scope="col" class="value">Value</th>'
+    '<th scope="col" class="unit">Unit</th></tr></thead>'
+)
+
+
+def _cells(rows: Iterable[tuple[str, str, str]]) -> str:
+    return "\n".join(
+        f'<tr><th scope="row">{escape(label)}</th><td class="value">{escape(value)}</td>'
+        f'<td class="unit">{escape(unit)}</td></tr>'
+        for label, value, unit in rows
+    )
