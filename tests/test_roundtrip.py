@@ -1,0 +1,77 @@
+"""Every built-in config survives the command line and JSON; every flag that help shows can be set."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fprf.commands.flags import flags_of
+from fprf.commands.parsing import load_method, parse
+from fprf.commands.plugins import KINDS
+from fprf.config import TrainConfig
+from fprf.plugins import registry
+from fprf.plugins.codec import from_json, load_config, save_config, to_json
+from fprf.plugins.slots import slots
+from fprf.testing import check_config
+
+METHODS = [name for name in registry.installed("fprf.methods") if registry.entry("fprf.methods", name).package[:5] == "fprf "]
+PLUGINS = [(group, name) for group in KINDS for name in registry.installed(group)]
+
+
+def spelled(value: Any) -> list[str]:
+    if isinstance(value, tuple):
+        return [word for each in value for word in spelled(each)]
+    return ["none"] if value is None else [str(value)]
+
+
+def command_line(config: Any) -> Iterator[str]:
+    """The whole config as flags."""
+    for slot in slots(config):
+        yield f"--{slot.path}"
+        yield "none" if slot.value is None else registry.name_of(slot.kind.group, type(slot.value))
+    for text, flag in flags_of(config).items():
+        value = config
+        for part in flag.path.split("."):
+            value = getattr(value, part)
+        yield from (text, *spelled(value))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_survives_json_and_the_command_line(name: str, tmp_path: Path) -> None:
+    config, _ = load_method(name)
+    assert from_json(json.loads(json.dumps(to_json(config))), TrainConfig) == config
+    save_config(tmp_path / "config.json", config, name)
+    assert load_config(tmp_path / "config.json") == (config, name)
+    for start in METHODS:
+        default, _ = load_method(start)
+        assert parse(default, list(command_line(config)), prog="x", description="") == config
+
+
+@pytest.mark.parametrize(("group", "name"), PLUGINS)
+def test_a_plugin_config_keeps_to_the_contract(group: str, name: str) -> None:
+    kind = registry.load_object(group, name)
+    assert isinstance(kind, type) and issubclass(kind, KINDS[group])
+    assert (kind.__doc__ or "").strip(), "the docstring is its help"
+    check_config(kind())
+
+
+@pytest.mark.parametrize(("group", "name"), PLUGINS)
+def test_a_plugin_can_be_chosen_and_all_its_fields_set(group: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    default, _ = load_method("fprf-lite")
+    chosen = registry.load_object(group, name)
+    assert isinstance(chosen, type)
+    places = [slot.path for slot in slots(default) if slot.kind.group == group and issubclass(chosen, slot.kind)]
+    if not places:
+        pytest.skip(f"no slot of the knob tree takes {group}")
+    config = parse(default, [f"--{places[0]}", name], prog="x", description="")
+    assert {slot.path: type(slot.value) for slot in slots(config)}[places[0]] is chosen
+    assert parse(default, list(command_line(config)), prog="x", description="") == config
+    with pytest.raises(SystemExit):
+        parse(config, ["--help"], prog="x", description="")
+    shown = capsys.readouterr().out
+    for field in dataclasses.fields(chosen):
+        if not any(slot.path == f"{places[0]}.{field.name}" for slot in slots(config)):
+            assert f"--{places[0]}.{field.name}".replace("_", "-") in shown
