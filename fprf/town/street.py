@@ -14,7 +14,7 @@ _HIDDEN = Finish(Material.TRIM)
 
 
 def tree(x: float, y: float, size: float, rng: np.random.Generator) -> list[Shape]:
-    """A round crown of several ellipsoids, or a tall slim one; about 3 + 2 size metres high."""
+    """A round crown of several ellipsoids, about 2 + 2 size metres high, or a slim poplar, 5.6 + 2 size high."""
     leaf = Finish(Material.FOLIAGE, tint=int(rng.integers(0, 6)))
     bark = Finish(Material.TRUNK)
     if rng.random() < 0.2:
