@@ -57,12 +57,13 @@ class FeatureStore:
         """Size of the coefficients."""
         self.mean, self.std = _spread(list(self._entries.values()))
         """Mean over all channels, and root mean square over the channels' standard deviations, over all pixels."""
+        self._magnitude = max(float(e.centre.abs().max()) for e in self._entries.values())
         self._arrays = {view: _arrays(entry) for view, entry in self._entries.items()} if _COMPILED else {}
 
     @property
     def scale(self) -> float:
-        """The unit of losses: `std`, or 1 where the features never change."""
-        return self.std if self.std > 0 else 1.0
+        """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
+        return self.std if self.std > 1e-6 * self._magnitude else 1.0
 
     def at(
         self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"], rgb: Annotated[Tensor, "R 3"]
@@ -72,9 +73,7 @@ class FeatureStore:
         """
         views = view.detach().cpu().numpy()
         order = np.argsort(views, kind="stable")
-        ordered = views[order]
-        starts = np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1)).tolist()
-        groups = [order[a:b] for a, b in zip(starts, [*starts[1:], len(order)], strict=True)]
+        groups = np.split(order, np.flatnonzero(np.diff(views[order])) + 1) if len(order) else []
         missing = [int(views[g[0]]) for g in groups if int(views[g[0]]) not in self._entries]
         if missing:
             raise DataError(f"feature store: view {missing[0]} has no features; {len(self._entries)} training views have")

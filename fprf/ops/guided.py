@@ -27,7 +27,8 @@ from ..errors import DataError
 
 __all__ = ["apply", "coefficients", "upsample"]
 
-FINENESS = 16.0
+# Measured on photographs: 8 to 12 cost a tenth of the error that the stride brings anyway, 6 doubles it.
+FINENESS = 10.0
 # Largest intermediate, in elements (64 MiB of float32): channels are worked on in groups that fit.
 GROUP = 1 << 24
 

@@ -1,0 +1,262 @@
+"""The feature store: right values, made once, never another image's or another encoder's."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from fprf.datamanagers import features as module
+from fprf.datamanagers.config import GuidedConfig
+from fprf.datamanagers.features import FeatureStore, extract
+from fprf.errors import DataError, NumericsError, PluginError
+from fprf.interfaces import Encoder
+from fprf.ops import guided
+
+SIZES = {0: (30, 44), 3: (30, 44), 4: (25, 37), 9: (50, 20)}
+
+
+class Counting(Encoder):
+    """Box means, mixed to some channels; counts how often it is asked."""
+
+    def __init__(self, channels: int = 5, stride: int = 4, gain: float = 1.0, offset: float = 0.0, name: str = "") -> None:
+        super().__init__()
+        self.register_buffer("mix", gain * torch.randn(channels, 3, generator=torch.Generator().manual_seed(0)))
+        self.stride, self.offset, self.name = stride, offset, name or f"counting {channels} {gain} {offset}"
+        self.calls = 0
+        self.fail_after = 1 << 30
+
+    @property
+    def identity(self) -> str:
+        return self.name
+
+    @property
+    def channels(self) -> int:
+        return len(self.get_buffer("mix"))
+
+    def forward(self, image: Tensor) -> Tensor:
+        self.calls += 1
+        if self.calls > self.fail_after:
+            raise KeyboardInterrupt
+        small = F.adaptive_avg_pool2d(image, (max(1, image.shape[2] // self.stride), max(1, image.shape[3] // self.stride)))
+        return torch.einsum("ci,bihw->bchw", self.get_buffer("mix"), small.square()) + self.offset
+
+
+def picture(view: int) -> Tensor:
+    height, width = SIZES[view]
+    coarse = torch.rand(1, 3, 5, 6, generator=torch.Generator().manual_seed(view))
+    smooth = F.interpolate(coarse, (height, width), mode="bilinear") + F.interpolate(coarse.flip(2), (height, width))
+    return (smooth[0].permute(1, 2, 0) * 127).byte().contiguous()
+
+
+def draw(count: int = 300) -> tuple[Tensor, Tensor, Tensor]:
+    """Random pixels of the views with their colours."""
+    view = torch.tensor(list(SIZES))[torch.randint(len(SIZES), (count,))]
+    pixel, rgb = torch.empty(count, 2), torch.empty(count, 3)
+    for i, v in enumerate(view.tolist()):
+        height, width = SIZES[v]
+        x, y = int(torch.randint(width, ())), int(torch.randint(height, ()))
+        pixel[i], rgb[i] = torch.tensor([x + 0.5, y + 0.5]), picture(v)[y, x].float() / 255
+    return view, pixel, rgb
+
+
+def build(folder: Path, encoder: Encoder, config: GuidedConfig | None = None, dim: int | None = None) -> FeatureStore:
+    return extract(folder, list(SIZES), picture, encoder, config or GuidedConfig(radius=0.2), dim=dim)
+
+
+def truth(encoder: Encoder, view: Tensor, pixel: Tensor, rgb: Tensor) -> Tensor:
+    """What the filter says, in float32, one ray at a time."""
+    found = torch.empty(len(view), encoder.channels)
+    for v in view.unique().tolist():
+        rows = view == v
+        guide = picture(v).float() / 255
+        radius = round(0.2 * min(SIZES[v]))
+        stride = min(8, (2 * radius + 1) // 5)
+        maps = encoder(guide.permute(2, 0, 1)[None])[0]
+        coefs = guided.coefficients(maps, guide, radius=radius, eps=1e-3, stride=stride)
+        found[rows] = guided.apply(coefs, pixel[rows], rgb[rows], SIZES[v])
+    return found
+
+
+@pytest.mark.parametrize("channels", [1, 5, 8, 21])
+def test_the_store_answers_what_the_filter_says(tmp_path: Path, channels: int) -> None:
+    encoder = Counting(channels)
+    store = build(tmp_path, encoder)
+    where = draw()
+    expected = truth(encoder, *where)
+    assert store.channels == channels and store.basis is None
+    found = store.at(*where)
+    assert found.dtype == torch.float32
+    assert (found - expected).abs().max() <= 4e-3 * expected.std()
+
+
+def test_compiled_and_plain_answers_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, where = build(tmp_path, Counting(11)), draw()
+    where[1][:4] = torch.tensor([[0.0, 0.0], [1e3, 1e3], [-5.0, 3.0], [3.0, -5.0]])
+    compiled = store.at(*where)
+    monkeypatch.setattr(module, "_COMPILED", False)
+    assert (store.at(*where) - compiled).abs().max() <= 1e-5 * compiled.abs().max()
+
+
+def test_offsets_and_magnitudes_cost_no_accuracy(tmp_path: Path) -> None:
+    plain, where = Counting(4), draw()
+    small = build(tmp_path, plain)
+    large = build(tmp_path, Counting(4, gain=1e6, offset=1e7))
+    difference = (large.at(*where) - 1e7) / 1e6 - small.at(*where)
+    assert difference.abs().max() <= 4e-3 * small.std
+    assert large.std == pytest.approx(1e6 * small.std, rel=1e-2)
+    assert large.mean == pytest.approx(1e7 + 1e6 * small.mean, rel=1e-3)
+
+
+def test_mean_and_spread_are_those_of_the_targets(tmp_path: Path) -> None:
+    encoder = Counting(6)
+    store = build(tmp_path, encoder)
+    values = []
+    for view, (height, width) in SIZES.items():
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        pixel = torch.stack([x, y], -1).flatten(0, 1) + 0.5
+        values.append(store.at(torch.full((height * width,), view), pixel, picture(view).flatten(0, 1).float() / 255))
+    every = torch.cat(values)
+    # 4 x 2048 drawn pixels: a mean to 1 % of a deviation, a variance to sqrt(2 / 8192); three of those.
+    assert store.mean == pytest.approx(float(every.mean()), abs=0.04 * store.std)
+    assert store.std == pytest.approx(float(every.var(0).mean().sqrt()), rel=0.03)
+    assert store.scale == store.std
+
+
+def test_features_that_never_change_have_scale_one(tmp_path: Path) -> None:
+    store = build(tmp_path, Counting(2, gain=0.0, offset=3.0))
+    assert store.std <= 1e-6 and store.scale == 1.0
+    assert (store.at(*draw(5)) - 3.0).abs().max() <= 1e-6
+    assert build(tmp_path, Counting(2, gain=0.0)).scale == 1.0
+
+
+def test_semantics_are_the_projected_features(tmp_path: Path) -> None:
+    """The filter is linear, so projecting before it or after is the same."""
+    encoder, where = Counting(12), draw()
+    raw, store = build(tmp_path / "raw", encoder), build(tmp_path / "semantic", encoder, dim=3)
+    assert store.basis is not None and store.channels == 3 and store.basis.energy > 0.99
+    expected = store.basis.project(raw.at(*where))
+    assert (store.at(*where) - expected).abs().max() <= 8e-3 * expected.std()
+    wide = build(tmp_path / "semantic", encoder, dim=50)
+    assert wide.channels == 12
+
+
+def test_features_are_made_once(tmp_path: Path) -> None:
+    encoder = Counting()
+    first = build(tmp_path, encoder)
+    assert encoder.calls == len(SIZES)
+    again = build(tmp_path, encoder)
+    assert encoder.calls == len(SIZES)
+    where = draw(50)
+    assert torch.equal(first.at(*where), again.at(*where))
+    assert (first.mean, first.std) == (again.mean, again.std)
+
+
+def test_a_small_scene_is_encoded_once_for_basis_and_features(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder, where = Counting(), draw(50)
+    one = build(tmp_path / "a", encoder, dim=2)
+    assert encoder.calls == len(SIZES)
+    monkeypatch.setattr(module, "REMEMBER_BYTES", 0)
+    two = build(tmp_path / "b", encoder, dim=2)
+    assert encoder.calls == 3 * len(SIZES)
+    assert torch.equal(one.at(*where), two.at(*where))
+    build(tmp_path / "b", encoder, dim=2)
+    assert encoder.calls == 3 * len(SIZES)
+
+
+def test_whatever_changes_the_features_changes_the_files(tmp_path: Path) -> None:
+    build(tmp_path, Counting(name="one"))
+    for other, config, dim, changed in (
+        (Counting(name="two"), GuidedConfig(radius=0.2), None, 4),
+        (Counting(name="one"), GuidedConfig(radius=0.3), None, 4),
+        (Counting(name="one"), GuidedConfig(radius=0.2, eps=1e-4), None, 4),
+        (Counting(name="one"), GuidedConfig(radius=0.2, stride=1), None, 3),  # view 9 is so narrow that it was 1 before
+        (Counting(name="one"), GuidedConfig(radius=0.2), 2, 4),
+    ):
+        build(tmp_path, other, config, dim)
+        assert other.calls == changed
+
+
+def test_a_changed_image_is_encoded_again_and_only_it(tmp_path: Path) -> None:
+    encoder = Counting()
+    build(tmp_path, encoder)
+
+    def image(view: int) -> Tensor:
+        pixels = picture(view)
+        if view == 4:
+            pixels[0, 0, 0] ^= 1
+        return pixels
+
+    extract(tmp_path, list(SIZES), image, encoder, GuidedConfig(radius=0.2))
+    assert encoder.calls == len(SIZES) + 1
+
+
+def test_damaged_and_swapped_files_are_made_again(tmp_path: Path) -> None:
+    encoder, where = Counting(), draw(50)
+    expected = build(tmp_path, encoder).at(*where)
+    one, two, three, _ = sorted(tmp_path.glob("*.safetensors"))
+    one.write_bytes(one.read_bytes()[:-7])
+    content = two.read_bytes()
+    two.unlink()
+    two.write_bytes(three.read_bytes())
+    three.unlink()
+    three.write_bytes(content)
+    assert torch.equal(build(tmp_path, encoder).at(*where), expected)
+    assert encoder.calls == len(SIZES) + 3
+
+
+def test_an_interrupted_extraction_goes_on(tmp_path: Path) -> None:
+    encoder = Counting()
+    encoder.fail_after = 2
+    with pytest.raises(KeyboardInterrupt):
+        build(tmp_path, encoder)
+    assert not list(tmp_path.glob("manifest*")) and len(list(tmp_path.iterdir())) == 2
+    encoder.calls, encoder.fail_after = 0, 99
+    build(tmp_path, encoder)
+    assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.glob("manifest*"))) == 1
+
+
+def test_progress_is_told_and_reaches_the_end(tmp_path: Path) -> None:
+    told: list[tuple[int, int, str]] = []
+    extract(
+        tmp_path,
+        [0, 3],
+        picture,
+        Counting(),
+        GuidedConfig(),
+        progress=lambda done, total, what: told.append((done, total, what)),
+    )
+    assert [t[:2] for t in told] == [(0, 2), (1, 2), (2, 2)] and "counting" in told[0][2]
+
+
+def test_a_view_without_features_is_named(tmp_path: Path) -> None:
+    store = build(tmp_path, Counting())
+    with pytest.raises(DataError, match="view 7 has no features"):
+        store.at(torch.tensor([0, 7]), torch.zeros(2, 2), torch.zeros(2, 3))
+    assert store.at(torch.zeros(0, dtype=torch.long), torch.zeros(0, 2), torch.zeros(0, 3)).shape == (0, 5)
+    with pytest.raises(DataError, match="no views"):
+        FeatureStore({})
+
+
+def test_encoders_that_break_their_promise_are_named(tmp_path: Path) -> None:
+    with pytest.raises(NumericsError, match=r"counting 2 nan .* view 0 are not finite"):
+        build(tmp_path, Counting(2, gain=float("nan")))
+
+    class Liar(Counting):
+        @property
+        def channels(self) -> int:
+            return 3
+
+    with pytest.raises(PluginError, match="promises"):
+        build(tmp_path, Liar(2))
+    assert not list(tmp_path.glob("*"))
+
+
+def test_files_stay_small(tmp_path: Path) -> None:
+    """A photograph of 378x504 with 128 channels fits in 4 MB; its full-size half-precision map would be 49 MB."""
+    image = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (378, 504, 3), dtype=np.uint8))
+    store = extract(tmp_path, [0], lambda view: image, Counting(128, stride=16), GuidedConfig())
+    assert store.bytes <= 4 << 20
+    assert sum(p.stat().st_size for p in tmp_path.glob("*.safetensors")) <= store.bytes + 8192
