@@ -87,39 +87,46 @@ def _brown(distortion: Tensor, xy: Tensor) -> Tensor:
 
 
 def _brown_newton(distortion: Tensor, xy: Tensor, target: Tensor, reach: Tensor) -> Tensor:
-    """Solve `_brown`(xy) = target by Newton steps that are halved until the residual shrinks."""
-    p1, p2 = distortion[:, 4], distortion[:, 5]
-    k1, k2, k3, k4 = distortion[:, :4].unbind(-1)
-    error = _brown(distortion, xy) - target
+    """Solve `_brown`(xy) = target by Newton steps that are halved until the residual shrinks; stop where none does."""
+    solved = xy.clone()
+    live = torch.arange(len(xy), device=xy.device)
+    keep = torch.ones_like(live, dtype=torch.bool)
     for _ in range(_STEPS):
+        error = _brown(distortion, xy) - target
         size = error.norm(dim=-1)
-        if bool((size <= _TOLERANCE * (1 + target.norm(dim=-1))).all()):
+        keep &= size > _TOLERANCE * (1 + target.norm(dim=-1))
+        if not bool(keep.any()):
             break
-        x, y = xy.unbind(-1)
-        s = x * x + y * y
-        share, _ = _powers(distortion[:, :4], s.sqrt())
-        change = 2 * (k1 + s * (2 * k2 + s * (3 * k3 + s * 4 * k4)))
-        xx = share + change * x * x + 2 * p1 * y + 6 * p2 * x
-        yy = share + change * y * y + 6 * p1 * y + 2 * p2 * x
-        across = change * x * y + 2 * p1 * x + 2 * p2 * y
-        det = xx * yy - across.square()
-        det = torch.where(det.abs() > 1e-12, det, torch.full_like(det, 1e-12))
-        ex, ey = error.unbind(-1)
-        step = torch.stack([(yy * ex - across * ey) / det, (xx * ey - across * ex) / det], -1)
-        scale = torch.ones_like(size)
+        live, xy, target, reach, distortion = live[keep], xy[keep], target[keep], reach[keep], distortion[keep]
+        size = size[keep]
+        trial = xy - _brown_step(distortion, xy, error[keep])
         for _ in range(8):
-            trial = xy - scale[:, None] * step
             worse = (_brown(distortion, trial) - target).norm(dim=-1) >= size
             worse |= trial.norm(dim=-1) > 1.1 * reach
-            if not worse.any():
+            if not bool(worse.any()):
                 break
-            scale = torch.where(worse, scale / 2, scale)
-        better = ~worse
-        if not better.any():
-            break
-        xy = torch.where(better[:, None], trial, xy)
-        error = _brown(distortion, xy) - target
-    return xy
+            trial = torch.where(worse[:, None], (xy + trial) / 2, trial)
+        keep = ~worse
+        xy = torch.where(worse[:, None], xy, trial)
+        solved[live] = xy
+    return solved
+
+
+def _brown_step(distortion: Tensor, xy: Tensor, error: Tensor) -> Tensor:
+    """The Newton step: the inverse of the distortion's Jacobian at xy, times the error."""
+    k1, k2, k3, k4, p1, p2 = distortion.unbind(-1)
+    x, y = xy.unbind(-1)
+    s = x * x + y * y
+    share, _ = _powers(distortion[:, :4], s.sqrt())
+    change = 2 * (k1 + s * (2 * k2 + s * (3 * k3 + s * 4 * k4)))
+    xx = share + change * x * x + 2 * p1 * y + 6 * p2 * x
+    yy = share + change * y * y + 6 * p1 * y + 2 * p2 * x
+    across = change * x * y + 2 * p1 * x + 2 * p2 * y
+    det = xx * yy - across.square()
+    # Where the map is singular any long step will do: it is halved until it helps.
+    det = torch.where(det.abs() > 1e-12, det, torch.full_like(det, 1e-12))
+    ex, ey = error.unbind(-1)
+    return torch.stack([(yy * ex - across * ey) / det, (xx * ey - across * ex) / det], -1)
 
 
 def bend(

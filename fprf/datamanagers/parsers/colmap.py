@@ -4,6 +4,7 @@ COLMAP's lenses become ours; its world-to-camera poses in OpenCV axes become cam
 is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that it observes (LLFF's rule).
 """
 
+import math
 from collections import Counter
 from pathlib import Path
 from typing import TypeAlias
@@ -82,7 +83,7 @@ class ColmapParser(DataParser):
 
 def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
     q = np.array(image.quaternion)
-    length = float(np.linalg.norm(q)) if np.isfinite(q).all() else 0.0
+    length = math.hypot(*image.quaternion)
     if not 0.9 < length < 1.1:
         raise DataError(f"{where}: the quaternion {q.tolist()} has not length 1; export the model again")
     w, x, y, z = q / length
@@ -94,7 +95,9 @@ def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
         ]
     )
     back = rotation.T
-    centre = -back @ np.array(image.translation)
+    # A damaged translation may overflow; `rigid` refuses what is not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
+        centre = -back @ np.array(image.translation)
     return rigid(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
 
 
