@@ -60,7 +60,7 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
         folder.save_config(config, method)
         folder.save_known(prepared.scene, config.data, prepared.facts)
         if prepared.basis is not None:
-            folder.save_tensors("basis", dict(prepared.basis._asdict()))
+            folder.save_tensors("basis", prepared.basis.tensors())
         display.say(_described(prepared))
         log = _Log(folder)
 

@@ -47,5 +47,4 @@ def load_style(run: Run) -> tuple[SceneStyle, Basis | None]:
     scene = from_tensors(run.load_tensors("style"))
     if scene.keys.shape[1] == 0:
         return scene, None
-    tensors = run.load_tensors("basis")
-    return scene, Basis(**tensors)
+    return scene, Basis.from_tensors(run.load_tensors("basis"))

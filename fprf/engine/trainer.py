@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..config import TrainConfig
 from ..errors import NumericsError
-from ..rendering.cameras import Cameras, rays_through
+from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays
 from . import checkpoint
@@ -98,7 +98,8 @@ class _Loop:
     ) -> None:
         self.config, self.model, self.optimizer, self.device = config, model, optimizer, device
         self.facts: Facts = prepared.facts
-        self.manager, self.cameras = prepared.manager, prepared.scene.cameras
+        self.manager = prepared.manager
+        self.through = PixelRays(prepared.scene.cameras)
         self.background = background_of(prepared.facts, device)
         self.mean: dict[str, float] = {}
         self.steps = self.skipped = self.failed = 0
@@ -111,7 +112,7 @@ class _Loop:
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
         rendered = render_rays(
-            space_rays(self.model, self.cameras, batch),
+            self._rays(batch),
             self.model.parts,
             want=wanted(self.config.loss, batch),
             budget=self.config.render.train_budget,
@@ -155,12 +156,12 @@ class _Loop:
                 f"step {step}: {bad} is not finite for {PATIENCE} steps in a row; lower --optimizer.rate, or check the images"
             )
 
+    def _rays(self, batch: Batch) -> Rays:
+        rays = self.model.space.rays(*self.through(batch.view.cpu(), batch.pixel.cpu()))
+        return rays if self.device.type == "cpu" else Rays(*(x.to(self.device) for x in rays))
+
     def _to_device(self, batch: Batch) -> Batch:
         if self.device.type == "cpu":
             return batch
         return Batch(*(x.to(self.device, non_blocking=True) if x is not None else None for x in batch))
 
-
-def space_rays(model: Model, cameras: Cameras, batch: Batch) -> Rays:
-    """Rays of a batch in the model's space."""
-    return model.space.rays(*rays_through(cameras, batch.view, batch.pixel))
