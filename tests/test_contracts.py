@@ -1,0 +1,263 @@
+"""The contracts themselves: built-ins keep to them, and each breach is told."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from fprf import testing
+from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.fields.layouts import LayoutConfig, SingleConfig
+from fprf.interfaces import BlockLayout, Decoder, Encoder, Executor, Sampler, Stylizer
+from fprf.plugins import registry
+from fprf.plugins.decoders.config import DecoderConfig
+from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
+from fprf.plugins.executors.config import ExecutorConfig, SerialConfig
+from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
+from fprf.plugins.stylizers.config import StylizerConfig
+from fprf.testing.contracts import _linear
+from fprf.types import Sampled, Want
+
+BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
+    (testing.check_encoder, RandomConfig(channels=5, stride=3)),
+    (testing.check_sampler, UniformConfig(samples=4)),
+    (testing.check_sampler, ProposalConfig(samples=(8,), final=4, resolutions=(8,))),
+    (testing.check_content_field, PlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
+    (testing.check_semantic_field, SemanticPlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
+    (testing.check_layout, SingleConfig()),
+    (testing.check_executor, SerialConfig()),
+    *(
+        (testing.check_stylizer, registry.load("fprf.stylizers", n, StylizerConfig)())
+        for n in registry.installed("fprf.stylizers")
+    ),
+]
+
+
+@pytest.mark.parametrize(("check", "config"), BUILT_IN, ids=lambda value: getattr(value, "__name__", type(value).__name__))
+def test_built_ins_keep_to_the_contract(check: Callable[[Any], None], config: Any) -> None:
+    check(config)
+
+
+class GoodEncoder(Encoder):
+    def __init__(self) -> None:
+        super().__init__()
+        self.eval()
+
+    @property
+    def identity(self) -> str:
+        return "good"
+
+    @property
+    def channels(self) -> int:
+        return 3
+
+    def forward(self, image: Tensor) -> Tensor:
+        return image[..., ::2, ::2]
+
+
+class Unstable(GoodEncoder):
+    def forward(self, image: Tensor) -> Tensor:
+        return image + torch.rand_like(image)
+
+
+class BatchNormed(GoodEncoder):
+    def forward(self, image: Tensor) -> Tensor:
+        return image - image.mean()
+
+
+class Square(GoodEncoder):
+    def forward(self, image: Tensor) -> Tensor:
+        return torch.nn.functional.interpolate(image, (64, 12))
+
+
+class Miscounted(GoodEncoder):
+    @property
+    def channels(self) -> int:
+        return 4
+
+
+class Divides(GoodEncoder):
+    def forward(self, image: Tensor) -> Tensor:
+        return image / image.amax((1, 2, 3), keepdim=True)
+
+
+class Named(GoodEncoder):
+    @property
+    def identity(self) -> str:
+        return str(id(self))
+
+
+class Training(GoodEncoder):
+    def __init__(self) -> None:
+        super().__init__()
+        self.train()
+
+
+class Learning(GoodEncoder):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TryConfig(EncoderConfig):
+    kind: str = "GoodEncoder"
+
+    def build(self) -> Encoder:
+        made: Encoder = KINDS[self.kind]()
+        return made
+
+
+KINDS: dict[str, Callable[[], Any]] = {
+    kind.__name__: kind
+    for kind in (GoodEncoder, Unstable, BatchNormed, Square, Miscounted, Divides, Named, Training, Learning, dict)
+}
+
+
+def test_a_plain_encoder_passes() -> None:
+    testing.check_encoder(TryConfig())
+
+
+@pytest.mark.parametrize(
+    ("kind", "breach"),
+    [
+        ("Unstable", "must be deterministic"),
+        ("BatchNormed", "must not depend on its batch"),
+        ("Square", "do not keep the aspect"),
+        ("Miscounted", "expected shape"),
+        ("Divides", "not finite"),
+        ("Named", "identity must be the same"),
+        ("Training", "evaluation mode"),
+        ("Learning", "must not want gradients"),
+        ("dict", "not an fprf.interfaces.Encoder"),
+    ],
+)
+def test_a_breach_of_an_encoder_is_told(kind: str, breach: str) -> None:
+    with pytest.raises(AssertionError, match=breach):
+        testing.check_encoder(TryConfig(kind=kind))
+
+
+@dataclass(frozen=True)
+class Positional(EncoderConfig):
+    layer: int = 1
+
+    def build(self) -> Encoder:
+        return GoodEncoder()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Typed(EncoderConfig):
+    type: int = 1
+
+
+def test_breaches_of_a_config_are_told() -> None:
+    with pytest.raises(AssertionError, match="keyword-only"):
+        testing.check_config(Positional())
+    with pytest.raises(AssertionError, match="must not be called 'type'"):
+        testing.check_config(Typed())
+
+
+class Backwards(Sampler):
+    def forward(self, rays: Any, *, locate: Any, distance: Any, step: Any, generator: Any) -> Sampled:
+        s = torch.linspace(1, 0, 5).expand(len(rays.near), 5)
+        return Sampled(s, distance(s, rays.near, rays.far))
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackwardsConfig(SamplerConfig):
+    def build(self, *, seed: int) -> Sampler:
+        return Backwards()
+
+
+class Bright(Decoder):
+    def forward(self, content: Tensor) -> Tensor:
+        return content[:, :3]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrightConfig(DecoderConfig):
+    def build(self, *, encoder: str, channels: int) -> Decoder:
+        return Bright()
+
+
+class Averaging(Stylizer):
+    @property
+    def needs(self) -> Want:
+        return Want.CONTENT
+
+    def forward(self, content: Tensor, semantic: Tensor | None) -> Tensor:
+        return content - content.mean(0)
+
+    def match(self, semantic: Tensor) -> Tensor:
+        return torch.ones(len(semantic), 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AveragingConfig(StylizerConfig):
+    def build(self, *, dictionary: Any, scene: Any) -> Stylizer:
+        return Averaging()
+
+
+class Halves(BlockLayout):
+    @property
+    def boxes(self) -> Tensor:
+        return torch.tensor([[[-1.0, -1, -1], [0, 1, 1]], [[0, -1, -1], [1, 1, 1]]])
+
+    def blend(self, points: Tensor) -> Tensor:
+        return torch.full((len(points), 2), 0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HalvesConfig(LayoutConfig):
+    def build(self) -> BlockLayout:
+        return Halves()
+
+
+class Silent(Executor):
+    def map(self, function: Any, tasks: Any) -> list[Any]:
+        return [function(task) for task in tasks if task >= 0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SilentConfig(ExecutorConfig):
+    def build(self) -> Executor:
+        return Silent()
+
+
+@pytest.mark.parametrize(
+    ("check", "config", "breach"),
+    [
+        (testing.check_sampler, BackwardsConfig(), "must be sorted"),
+        (testing.check_stylizer, AveragingConfig(), "must not depend on the others"),
+        (testing.check_layout, HalvesConfig(), "no weight outside its box"),
+        (testing.check_executor, SilentConfig(), "must reach the caller"),
+    ],
+)
+def test_breaches_of_other_kinds_are_told(check: Callable[[Any], None], config: Any, breach: str) -> None:
+    with pytest.raises(AssertionError, match=breach):
+        check(config)
+
+
+def test_a_decoder_out_of_range_is_told() -> None:
+    with pytest.raises(AssertionError, match=r"must lie in \[0, 1\]"):
+        testing.check_decoder(BrightConfig(), encoder="any", channels=6)
+
+
+def test_a_parser_is_checked_on_a_real_scene(shared: Any) -> None:
+    from fprf.datamanagers.parsers.config import LlffConfig, TransformsConfig
+
+    scenes = shared / "data" / "scenes"
+    testing.check_parser(TransformsConfig(), scenes / "fox")
+    with pytest.raises(Exception, match="poses_bounds"):
+        testing.check_parser(LlffConfig(), scenes / "fox")
+
+
+def test_the_measure_of_the_cases_is_linear() -> None:
+    s = torch.tensor([[0.0, 0.5, 1.0]])
+    assert _linear(s, torch.tensor([1.0]), torch.tensor([3.0])).tolist() == [[1.0, 2.0, 3.0]]
