@@ -12,9 +12,9 @@ from torch import Tensor
 from ..errors import NumericsError
 from .statistics import double
 
-__all__ = ["CLUSTERED", "Clusters", "kmeans", "nearest"]
+__all__ = ["Clusters", "kmeans"]
 
-CLUSTERED = 20_480
+_ROWS = 20_480
 """Rows worth clustering: more do not move the centroids, and cost more than half a second."""
 
 _ITERATIONS = 40
@@ -33,6 +33,7 @@ class Clusters(NamedTuple):
 def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated[Tensor, "N"] | None = None) -> Clusters:
     """Clusters of the rows, the same for the same input and seed. No rows give no clusters; equal rows give one.
 
+    Of more than 20 480 rows a random sample is clustered, and the others join the nearest centres.
     Weights >= 0 count a row several times, or not at all; if all are 0 they are taken as equal. Raises NumericsError
     for values that are not finite.
     """
@@ -46,7 +47,20 @@ def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated
         mass = torch.ones_like(mass)
     middle = mass @ points / mass.sum()
     points = points - middle
-    centres = _seed(points, mass, k, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    if len(points) <= _ROWS:
+        centres, label = _lloyd(points, mass, k, generator)
+    else:
+        some = torch.randperm(len(points), generator=generator)[:_ROWS].to(points.device)
+        some = some if bool(mass[some].any()) else mass.topk(_ROWS).indices
+        centres, _ = _lloyd(points[some], mass[some], k, generator)
+        label = _nearest(points, centres)
+    return Clusters((centres + middle).to(x), label.to(x.device))
+
+
+def _lloyd(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Centres and labels of centred points."""
+    centres = _seed(points, mass, k, generator)
     label = _nearest(points, centres)
     for _ in range(_ITERATIONS):
         centres, label = _means(points, mass, label, len(centres))
@@ -54,15 +68,7 @@ def kmeans(x: Annotated[Tensor, "N D"], k: int, *, seed: int, weights: Annotated
         if torch.equal(moved, label):
             break
         label = moved
-    centres, label = _means(points, mass, label, len(centres))
-    return Clusters((centres + middle).to(x), label.to(x.device))
-
-
-def nearest(x: Annotated[Tensor, "N D"], centres: Annotated[Tensor, "k D"]) -> Annotated[Tensor, "N"]:
-    """int64 index of the nearest centre of each row."""
-    points, targets = double(x), double(centres)
-    middle = targets.mean(0)
-    return _nearest(points - middle, targets - middle).to(x.device)
+    return _means(points, mass, label, len(centres))
 
 
 def _seed(points: Tensor, mass: Tensor, k: int, generator: torch.Generator) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..checks import at_least, between
 from ..errors import CheckpointError, DataError
-from .clusters import CLUSTERED, kmeans, nearest
+from .clusters import kmeans
 from .statistics import covariance, double, group_moments, mix, moments
 
 __all__ = [
@@ -196,9 +196,8 @@ def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: in
 def _cluster(semantic: Tensor, clusters: int, seed: int) -> tuple[Tensor, Tensor]:
     if semantic.shape[1] == 0:
         return torch.zeros(len(semantic), dtype=torch.int64), semantic[:1].float()
-    every = -(-len(semantic) // CLUSTERED)
-    found = kmeans(semantic.cpu()[::every], clusters, seed=seed)
-    return (found.label if every == 1 else nearest(semantic.cpu(), found.centres)), found.centres
+    found = kmeans(semantic.cpu(), clusters, seed=seed)
+    return found.label, found.centres
 
 
 def _content_hash(r: Reference) -> str:

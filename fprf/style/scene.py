@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CheckpointError, DataError
-from .clusters import CLUSTERED, kmeans
+from .clusters import kmeans
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import attention, score_spread, unit
 from .statistics import Moments, covariance, double, group_moments
@@ -15,12 +15,13 @@ from .statistics import moments as moments_of
 
 __all__ = ["SceneStyle", "check_fit", "from_tensors", "membership", "own_style", "region_units", "scene_style", "to_tensors"]
 
-_SOFTNESS = 0.2
+_SOFTNESS = 0.3
 """Temperature of points belonging to regions, relative to the spread of the scores: fixed with the scene, since the
 regions' statistics are taken with it."""
 
-_FAINT = 1e-3
-"""Memberships below this are dropped: a point then belongs to one or two regions and the others cost nothing."""
+_FAINT = 0.01
+"""Memberships below this share of the largest are dropped: a point then belongs to two or three regions and the others
+cost nothing. What jumps there is below an 8-bit step."""
 
 
 class SceneStyle(NamedTuple):
@@ -64,8 +65,7 @@ def scene_style(
     semantic = content.new_zeros(len(content), 0) if semantic is None else semantic[keep]
     keys = semantic.new_zeros(1, 0)
     if semantic.shape[1] > 0:
-        every = -(-len(semantic) // CLUSTERED)
-        keys = kmeans(semantic[::every], regions, seed=seed, weights=weights[::every]).centres
+        keys = kmeans(semantic, regions, seed=seed, weights=weights).centres
     middle = (double(weights) @ double(semantic) / double(weights).sum()).to(semantic)
     alive, belongs = _regions(semantic, keys, middle)
     keys, belongs = keys[alive], belongs * double(weights)[:, None]

@@ -35,16 +35,17 @@ def monge(
     are capped, which is where it stops matching the style exactly.
     """
     style_root = symmetric_root(_with_ridge(double(style)))
-    product = style_root @ symmetric_root(_with_ridge(double(content)))
-    left, value, _ = torch.linalg.svd(product)
+    left, value, _ = torch.linalg.svd(style_root @ symmetric_root(_with_ridge(double(content))))
     half = style_root @ (left / value.clamp_min(torch.finfo(value.dtype).tiny).sqrt()[..., None, :])
-    return limit_gain(half @ half.mT, gain)
+    product = half @ half.mT
+    return limit_gain((product + product.mT) / 2, gain)
 
 
 def limit_gain(t: Annotated[Tensor, "... C C"], gain: float) -> Annotated[Tensor, "... C C"]:
     """The symmetric positive map with no direction amplified more than `gain`; untouched, bit for bit, if none is."""
     value, vector = torch.linalg.eigh(t)
     capped = (vector * value.clamp(0.0, gain)[..., None, :]) @ vector.mT
+    capped = (capped + capped.mT) / 2
     return torch.where((value[..., -1] > gain)[..., None, None], capped, t)
 
 

@@ -1,0 +1,206 @@
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import CheckpointError, ConfigError, DataError
+from fprf.style.dictionary import (
+    Reference,
+    StyleDictionary,
+    build_dictionary,
+    code_odds,
+    load_dictionary,
+    save_dictionary,
+    whole_style,
+)
+
+
+def reference(name: str, n: int = 900, c: int = 5, d: int = 4, seed: int = 0, weight: float = 1.0) -> Reference:
+    """Three kinds of pixels, each with its own semantics and style."""
+    g = torch.Generator().manual_seed(seed)
+    kind = torch.arange(n) % 3
+    semantic = torch.eye(3, d)[kind] * 10 + torch.randn(n, d, generator=g) * 0.1
+    content = torch.randn(3, c, generator=g)[kind] * 3 + torch.randn(n, c, generator=g) * (kind[:, None] + 1)
+    return Reference(name, content, semantic, weight)
+
+
+def equal(a: StyleDictionary, b: StyleDictionary) -> bool:
+    return a.names == b.names and a.blend == b.blend and all(torch.equal(x, y) for x, y in zip(a[:6], b[:6], strict=True))
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.3, 1.0])
+def test_codes_are_the_blended_statistics_of_each_cluster_in_plain_float64(blend: float) -> None:
+    r = reference("a")
+    d = build_dictionary([r], clusters=3, blend=blend)
+    kind = torch.arange(900) % 3
+    content = r.content.double()
+    whole_mean, whole = content.mean(0), torch.cov(content.T, correction=0)
+    assert len(d.keys) == 3
+    for t in range(3):
+        inside = kind == int((d.keys[t]).argmax())
+        torch.testing.assert_close(d.keys[t].double(), r.semantic[inside].double().mean(0), rtol=1e-5, atol=1e-6)
+        mean, own = content[inside].mean(0), torch.cov(content[inside].T, correction=0)
+        torch.testing.assert_close(d.mean[t].double(), (1 - blend) * mean + blend * whole_mean, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(d.covariance[t].double(), (1 - blend) * own + blend * whole, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(d.share, torch.full((3,), 1 / 3))
+
+
+def test_the_order_of_the_references_plays_no_part() -> None:
+    refs = [reference(f"r{i}", seed=i, weight=1 + i) for i in range(4)]
+    expected = build_dictionary(refs)
+    for order in ((3, 2, 1, 0), (1, 3, 0, 2)):
+        assert equal(build_dictionary([refs[i] for i in order]), expected)
+    for i, name in enumerate(expected.names):
+        assert bool((expected.weight[expected.reference == i] == 1 + int(name[1])).all())
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 50), st.sampled_from([0, 1, 3]), st.sampled_from([0.0, 1.0, 1e4]), st.integers(1, 3))
+def test_never_nan_for_any_number_of_pixels_colours_and_clusters(
+    n: int, clusters: int, d: int, spread: float, images: int
+) -> None:
+    refs = [Reference(str(i), torch.randn(n, 3) * spread + 7, torch.randn(n, d) * spread - 3) for i in range(images)]
+    made = build_dictionary(refs, clusters=clusters)
+    assert all(bool(t.isfinite().all()) for t in made[:6])
+    assert 1 <= len(made.keys) <= images * min(n, clusters)
+    assert bool((made.share > 0).all())
+    torch.testing.assert_close(made.share.sum(), torch.tensor(float(images)), rtol=1e-5, atol=0.0)
+    assert bool((torch.linalg.eigvalsh(made.covariance.double())[:, 0] >= -1e-5 * made.covariance.abs().amax() - 1e-9).all())
+    mean, total = whole_style(made)
+    assert bool(mean.isfinite().all() & total.isfinite().all())
+
+
+def test_small_clusters_lean_on_their_image() -> None:
+    r = reference("a", n=320)
+    lonely = torch.full((8, 4), -50.0)
+    r = Reference("a", torch.cat([r.content, torch.full((8, 5), 100.0)]), torch.cat([r.semantic, lonely]))
+    d = build_dictionary([r], clusters=4, blend=0.0, min_members=32)
+    small = int(d.share.argmin())
+    expected = 0.25 * torch.full((5,), 100.0) + 0.75 * r.content.mean(0)
+    torch.testing.assert_close(d.mean[small], expected, rtol=1e-4, atol=1e-4)
+    assert bool((torch.linalg.eigvalsh(d.covariance[small]) > 0).all())
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.3, 0.9, 1.0])
+def test_the_whole_style_is_that_of_all_pixels_whatever_the_blend(blend: float) -> None:
+    refs = [reference("a", seed=1), reference("b", seed=2)]
+    mean, total = whole_style(build_dictionary(refs, clusters=3, blend=blend))
+    pixels = torch.cat([r.content for r in refs]).double()
+    torch.testing.assert_close(mean, pixels.mean(0), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(total, torch.cov(pixels.T, correction=0), rtol=1e-4, atol=1e-4)
+
+
+def test_weights_weigh_references_and_not_pixels() -> None:
+    a, b = reference("a", n=300, seed=1, weight=3.0), reference("b", n=900, seed=2)
+    d = build_dictionary([a, b], clusters=3)
+    mean, _ = whole_style(d)
+    torch.testing.assert_close(mean, (0.75 * a.content.mean(0) + 0.25 * b.content.mean(0)).double(), rtol=1e-4, atol=1e-5)
+    odds = code_odds(d)
+    assert float(odds[d.reference == d.names.index("a")].sum()) == pytest.approx(0.75)
+
+
+def test_large_photographs_are_clustered_on_a_sample_and_labelled_whole() -> None:
+    d = build_dictionary([reference("a", n=60_000)], clusters=3)
+    torch.testing.assert_close(d.share, torch.full((3,), 1 / 3))
+
+
+def test_without_semantics_a_reference_is_one_code() -> None:
+    d = build_dictionary([reference("a", d=0), reference("b", d=0, seed=1)])
+    assert d.keys.shape == (2, 0)
+    assert d.reference.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("refs", "said"),
+    [
+        ([], "none given"),
+        ([Reference("x.jpg", torch.zeros(0, 3), torch.zeros(0, 2))], r"x\.jpg: 0 content"),
+        ([Reference("x.jpg", torch.zeros(4, 3), torch.zeros(5, 2))], r"x\.jpg: 4 content and 5"),
+        ([reference("a"), Reference("x.jpg", torch.zeros(4, 3), torch.zeros(4, 4))], r"x\.jpg: 3 content"),
+        ([Reference("x.jpg", torch.full((4, 3), float("nan")), torch.zeros(4, 2))], r"x\.jpg: a feature"),
+        ([Reference("x.jpg", torch.zeros(4, 3), torch.zeros(4, 2), 0.0)], r"x\.jpg: weight 0\.0"),
+        ([Reference("x.jpg", torch.zeros(4, 3), torch.zeros(4, 2), float("nan"))], r"x\.jpg: weight nan"),
+    ],
+)
+def test_unusable_references_are_named(refs: list[Reference], said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        build_dictionary(refs)
+
+
+def test_knobs_have_ranges() -> None:
+    for knob in ({"clusters": 0}, {"blend": 1.5}, {"blend": float("nan")}, {"min_members": 0}):
+        with pytest.raises(ConfigError):
+            build_dictionary([reference("a")], **knob)
+
+
+def test_saved_and_loaded_it_is_the_same_bit_for_bit(tmp_path: Path) -> None:
+    d = build_dictionary([reference("ä b.jpg", seed=1), reference("c", seed=2, weight=2.5)])
+    file = tmp_path / "styles" / "dusk" / "dictionary.safetensors"
+    save_dictionary(file, d)
+    assert equal(load_dictionary(file), d)
+    save_dictionary(file, build_dictionary([reference("other")]))
+    assert load_dictionary(file).names == ("other",)
+    assert [p.name for p in file.parent.iterdir()] == [file.name]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "d.safetensors"
+    save_dictionary(file, build_dictionary([reference("old")]))
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fprf.style.dictionary.os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        save_dictionary(file, build_dictionary([reference("new")]))
+    assert load_dictionary(file).names == ("old",)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_every_flipped_bit_and_cut_is_found(tmp_path: Path) -> None:
+    file = tmp_path / "d.safetensors"
+    d = build_dictionary([reference("a", n=30, c=2)], clusters=2)
+    save_dictionary(file, d)
+    data = file.read_bytes()
+    for at in range(0, len(data), 7):
+        file.write_bytes(data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :])
+        try:
+            loaded = load_dictionary(file)
+        except CheckpointError as error:
+            assert str(file) in str(error)
+        else:
+            # Names and blend stand beside the checksum, in the header: their letters may change.
+            assert all(torch.equal(x, y) for x, y in zip(loaded[:6], d[:6], strict=True))
+    for cut in (0, 7, 100, len(data) - 1):
+        file.write_bytes(data[:cut])
+        with pytest.raises(CheckpointError):
+            load_dictionary(file)
+
+
+def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    with pytest.raises(CheckpointError, match="no style dictionary"):
+        load_dictionary(tmp_path / "none")
+    save_file({"keys": torch.zeros(1, 1)}, tmp_path / "other")
+    with pytest.raises(CheckpointError, match="not a style dictionary"):
+        load_dictionary(tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("mean", torch.zeros(3, 2), "wrong shape"),
+        ("mean", torch.full((3, 5), float("nan")), "not finite"),
+        ("reference", torch.tensor([0, 0, 4]), "names"),
+        ("share", torch.tensor([0.5, 0.5, 0.0]), "above 0"),
+        ("blend", 7.0, "above 0"),
+    ],
+)
+def test_whole_files_with_wrong_contents_are_refused(tmp_path: Path, field: str, value: object, said: str) -> None:
+    d = build_dictionary([reference("a")], clusters=3)._replace(**{field: value})
+    save_dictionary(tmp_path / "d", d)
+    with pytest.raises(CheckpointError, match=said):
+        load_dictionary(tmp_path / "d")

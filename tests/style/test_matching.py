@@ -1,0 +1,92 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import ConfigError
+from fprf.style.matching import attention, score_spread, share_mean, unit
+
+
+def plain_attention(q: torch.Tensor, k: torch.Tensor, temperature: float) -> torch.Tensor:
+    """Paper, Eq. 5 and 6, row by row in float64."""
+    out = []
+    for row in q.double():
+        r = torch.tensor([float((row * key).sum()) for key in k.double()], dtype=torch.float64) / temperature
+        e = (r - r.max()).exp()
+        out.append(e / e.sum())
+    return torch.stack(out)
+
+
+@pytest.mark.parametrize(("norm", "temperature"), [(30.0, 100.0), (100.0, 100.0), (100.0, 1.0), (265.0, 100.0), (1.0, 0.05)])
+def test_attention_is_the_papers_within_the_float32_bound(norm: float, temperature: float) -> None:
+    q, k = (norm * torch.nn.functional.normalize(torch.randn(n, 64), dim=1) for n in (40, 9))
+    a = attention(q, k, temperature)
+    largest = float((q.double() @ k.double().T).abs().max()) / temperature
+    bound = 2 * 6e-8 * largest + 8 * 6e-8
+    assert float((a.double() - plain_attention(q, k, temperature)).abs().max()) <= bound
+    torch.testing.assert_close(a.sum(1), torch.ones(40), rtol=0.0, atol=5e-7)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 9), st.integers(1, 6), st.floats(1e-38, 1e6), st.floats(0, 7e4), st.integers(0, 99))
+def test_attention_is_always_finite_and_sums_to_one(n: int, t: int, temperature: float, norm: float, seed: int) -> None:
+    g = torch.Generator().manual_seed(seed)
+    a = attention(torch.randn(n, 5, generator=g) * norm, torch.randn(t, 5, generator=g) * norm, temperature)
+    assert bool(a.isfinite().all())
+    torch.testing.assert_close(a.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan")])
+def test_temperatures_that_are_not_above_zero_are_refused(temperature: float) -> None:
+    with pytest.raises(ConfigError, match="temperature"):
+        attention(torch.ones(1, 2), torch.ones(1, 2), temperature)
+
+
+def test_zero_queries_and_keys_match_everything_alike() -> None:
+    k = unit(torch.randn(4, 3), torch.zeros(3))
+    torch.testing.assert_close(attention(torch.zeros(2, 3), k, 0.1), torch.full((2, 4), 0.25))
+    torch.testing.assert_close(attention(torch.randn(2, 3), torch.zeros(4, 3), 0.1), torch.full((2, 4), 0.25))
+
+
+def test_prior_multiplies_the_odds() -> None:
+    q, k = torch.randn(5, 3), torch.randn(4, 3)
+    prior = torch.tensor([1.0, 2.0, 0.5, 1.0])
+    expected = attention(q, k, 1.0) * prior
+    torch.testing.assert_close(attention(q, k, 1.0, prior), expected / expected.sum(1, keepdim=True))
+
+
+def test_float32_holds_under_autocast() -> None:
+    q, k = torch.randn(20, 32) * 10, torch.randn(6, 32) * 10
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        a = attention(q, k, 100.0)
+    assert torch.equal(a, attention(q, k, 100.0))
+
+
+def test_unit_gives_unit_rows_and_zero_at_the_centre() -> None:
+    centre = torch.full((6,), 100.0)
+    x = torch.cat([centre[None], centre + torch.randn(5, 6)])
+    u = unit(x, centre)
+    assert torch.equal(u[0], torch.zeros(6))
+    torch.testing.assert_close(u[1:].norm(dim=1), torch.ones(5))
+    # What rounding alone moved away from the centre has no direction either.
+    assert torch.equal(unit(centre[None] * (1 + 1e-7), centre), torch.zeros(1, 6))
+
+
+def test_spread_follows_the_scale_of_the_scores_and_ignores_common_offsets() -> None:
+    q, k = torch.randn(7, 5), torch.randn(6, 5)
+    spread = score_spread(q, k)
+    assert score_spread(q * 100, k * 3) == pytest.approx(300 * spread, rel=1e-5)
+    assert score_spread(q, k + torch.randn(5)) == pytest.approx(spread, rel=1e-5)
+    r = (q.double() @ k.double().T).tolist()
+    plain = (sum(sum((x - sum(row) / 6) ** 2 for x in row) for row in r) / 42) ** 0.5
+    assert spread == pytest.approx(plain, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(0, 3), (3, 0), (1, 3)])
+def test_spread_without_anything_to_tell_apart_is_one(shape: tuple[int, int]) -> None:
+    assert score_spread(torch.randn(shape[0], 4), torch.zeros(shape[1], 4)) == 1.0
+    assert score_spread(torch.randn(3, 4), torch.randn(1, 4)) == 1.0
+
+
+def test_share_mean_weighs() -> None:
+    torch.testing.assert_close(share_mean(torch.tensor([[0.0], [4.0]]), torch.tensor([3.0, 1.0])), torch.tensor([1.0]))

@@ -1,0 +1,137 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import CheckpointError, DataError
+from fprf.style.dictionary import Reference, build_dictionary, whole_style
+from fprf.style.scene import check_fit, from_tensors, membership, own_style, region_units, scene_style, to_tensors
+from fprf.style.statistics import covariance, mix, moments
+
+
+def points(n: int = 1200, c: int = 5, d: int = 4) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    kind = torch.arange(n) % 3
+    semantic = torch.eye(3, d)[kind] * 5 + torch.randn(n, d) * 0.3 + 20
+    return torch.randn(3, c)[kind] * 3 + torch.randn(n, c) * (kind[:, None] + 1), semantic, torch.rand(n)
+
+
+def test_regions_are_the_clusters_and_their_statistics_those_of_the_soft_membership() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 3, 0)
+    assert scene.keys.shape == (3, 4)
+    share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean)).double()
+    for k in range(3):
+        w = share[:, k] * weights
+        mean = (w[:, None] * content).sum(0) / w.sum()
+        apart = content - mean
+        torch.testing.assert_close(scene.region_mean[k].double(), mean, rtol=1e-4, atol=1e-5)
+        own = (w[:, None, None] * apart[:, :, None] * apart[:, None, :]).sum(0) / w.sum()
+        torch.testing.assert_close(scene.region_covariance[k].double(), own, rtol=1e-4, atol=1e-4)
+        assert float(scene.share[k]) == pytest.approx(float(w.sum() / weights.double().sum()), rel=1e-5)
+    assert len(share.argmax(1).unique()) == 3
+
+
+def test_regions_taken_together_are_the_scene() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 8, 0)
+    mean, total = mix(scene.region_mean, scene.region_covariance, scene.share)
+    torch.testing.assert_close(mean.float(), scene.mean, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(total.float(), scene.covariance, rtol=1e-4, atol=1e-4)
+    assert float(scene.share.sum()) == pytest.approx(1.0)
+
+
+def test_a_longer_pass_gives_the_scenes_statistics() -> None:
+    content, semantic, weights = points()
+    more = moments(torch.cat([content, content * 2]), torch.cat([weights, weights]))
+    scene = scene_style(content, semantic, weights, more, 3, 0)
+    torch.testing.assert_close(scene.mean, more.mean.float())
+    torch.testing.assert_close(scene.covariance, covariance(more).float())
+
+
+def test_points_of_weight_zero_count_for_nothing() -> None:
+    content, semantic, weights = points()
+    expected = scene_style(content, semantic, weights, None, 3, 0)
+    nothing = torch.full((5, 5), float("nan"))
+    padded = (torch.cat([content, nothing]), torch.cat([semantic, nothing[:, :4]]), torch.cat([weights, torch.zeros(5)]))
+    for a, b in zip(expected, scene_style(*padded, None, 3, 0), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_without_semantics_there_is_one_region() -> None:
+    content, _, weights = points()
+    scene = scene_style(content, None, weights, None, 8, 0)
+    assert scene.keys.shape == (1, 0) and scene.semantic_mean.shape == (0,)
+    torch.testing.assert_close(scene.region_mean[0], scene.mean)
+    torch.testing.assert_close(scene.region_covariance[0], scene.covariance)
+    assert scene.share.tolist() == [1.0]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 30), st.integers(1, 40), st.integers(1, 3), st.sampled_from([0.0, 1e-3, 1.0, 1e4]))
+def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: float) -> None:
+    content, semantic = torch.randn(n, 3) * spread, torch.randn(n, d) * spread + 5
+    scene = scene_style(content, semantic, torch.rand(n) + 0.01, None, regions, 0)
+    assert all(bool(t.isfinite().all()) for t in scene)
+    assert 1 <= len(scene.keys) <= min(n, regions)
+    assert bool((scene.share > 0).all())
+    share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean))
+    torch.testing.assert_close(share.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
+
+
+def test_an_empty_scene_is_an_error() -> None:
+    with pytest.raises(DataError, match="no point has weight"):
+        scene_style(torch.ones(3, 2), None, torch.zeros(3), None, 1, 0)
+
+
+def test_membership_is_a_point_by_point_function_and_drops_the_faintest() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 8, 0)
+    units, temperature = region_units(scene.keys, scene.semantic_mean)
+    share = membership(semantic, scene.semantic_mean, units, temperature)
+    part = membership(semantic[100:107], scene.semantic_mean, units, temperature)
+    torch.testing.assert_close(part, share[100:107], rtol=1e-5, atol=1e-6)
+    positive = share[share > 0]
+    assert bool((positive > 0.005).all())
+    assert membership(semantic[:0], scene.semantic_mean, units, temperature).shape == (0, len(units))
+
+
+def test_own_style_is_the_scene() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 3, 0)
+    for blend in (0.0, 0.3):
+        own = own_style(scene, blend)
+        mean, total = whole_style(own)
+        torch.testing.assert_close(mean.float(), scene.mean, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(total.float(), scene.covariance, rtol=1e-4, atol=1e-4)
+        check_fit(own, scene)
+
+
+def test_a_dictionary_of_other_encoders_does_not_fit() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 3, 0)
+    other = build_dictionary([Reference("a", torch.randn(50, 6), torch.randn(50, 4))])
+    with pytest.raises(DataError, match="6 content and 4 semantic channels, but the scene has 5 and 4"):
+        check_fit(other, scene)
+
+
+def test_tensors_round_trip() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 3, 0)
+    back = from_tensors(to_tensors(scene))
+    assert all(torch.equal(a, b) for a, b in zip(scene, back, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("share", None, "share missing"),
+        ("mean", torch.zeros(9), "expected"),
+        ("keys", torch.full((3, 4), float("inf")), "keys is not finite"),
+    ],
+)
+def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None, said: str) -> None:
+    content, semantic, weights = points()
+    tensors = to_tensors(scene_style(content, semantic, weights, None, 3, 0))
+    del tensors[name]
+    with pytest.raises(CheckpointError, match=said):
+        from_tensors(tensors if value is None else tensors | {name: value})

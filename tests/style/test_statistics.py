@@ -1,0 +1,142 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import NumericsError
+from fprf.style.statistics import covariance, deviation, empty, group_moments, merge, mix, moments
+
+
+def rows(n: int, c: int, *, scale: float = 1.0, offset: float = 0.0, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return torch.randn(n, c, generator=g) * scale + offset, torch.rand(n, generator=g)
+
+
+def two_pass(x: torch.Tensor, w: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Plain float64 loops."""
+    mean, scatter = torch.zeros(x.shape[1]).double(), torch.zeros(x.shape[1], x.shape[1]).double()
+    for row, weight in zip(x.double(), w.double(), strict=True):
+        mean += weight * row
+    mean /= w.double().sum()
+    for row, weight in zip(x.double(), w.double(), strict=True):
+        scatter += weight * torch.outer(row - mean, row - mean)
+    return mean, scatter / w.double().sum()
+
+
+def relative(a: torch.Tensor, b: torch.Tensor) -> float:
+    return float((a - b).abs().max() / b.abs().max())
+
+
+@pytest.mark.parametrize("offset", [0.0, 10.0, 1e3, 1e4])
+def test_moments_equal_a_two_pass_loop_at_any_offset(offset: float) -> None:
+    x, w = rows(257, 5, offset=offset)
+    mean, expected = two_pass(x, w)
+    m = moments(x, w)
+    assert relative(m.mean, mean) < 1e-13
+    assert relative(covariance(m), expected) < 1e-11
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 90), st.integers(1, 7), st.integers(0, 10), st.sampled_from([0.0, 5.0, 1e3]))
+def test_any_order_and_partition_gives_the_same(n: int, pieces: int, seed: int, offset: float) -> None:
+    x, w = rows(n, 3, offset=offset, seed=seed)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
+    parts = [moments(x[i], w[i]) for i in order.chunk(pieces)] if n else [empty(3)]
+    left, right = empty(3), empty(3)
+    for part in parts:
+        left = merge(left, part)
+    for part in reversed(parts):
+        right = merge(part, right)
+    whole = moments(x, w)
+    scale = whole.scatter.abs().max().clamp_min(1e-12)
+    for merged in (left, right):
+        # Rounding of the means, offset * 2^-53, enters the scatter times its square root: far below its scale.
+        assert float((merged.scatter - whole.scatter).abs().max() / scale) < 1e-11
+        assert float((merged.mean - whole.mean).abs().max()) <= 1e-12 * max(1.0, offset)
+        assert float((merged.weight - whole.weight).abs()) <= 1e-12 * max(1.0, float(whole.weight))
+
+
+def test_order_independent_within_1e_12_at_production_size() -> None:
+    x, w = rows(50_000, 16, offset=5.0)
+    whole, parts = moments(x, w), empty(16)
+    for i in torch.randperm(50_000).split(4096):
+        parts = merge(parts, moments(x[i], w[i]))
+    assert relative(parts.scatter, whole.scatter) < 1e-12
+    assert relative(parts.mean, whole.mean) < 1e-12
+
+
+def test_nothing_is_neutral_and_finite() -> None:
+    x, w = rows(9, 4)
+    for m in (merge(empty(4), moments(x, w)), merge(moments(x, w), empty(4))):
+        assert all(torch.equal(a, b) for a, b in zip(m, moments(x, w), strict=True))
+    assert torch.equal(covariance(empty(4)), torch.zeros(4, 4).double())
+    assert float(merge(empty(2), empty(2)).weight) == 0
+
+
+def test_rows_of_weight_zero_count_for_nothing_whatever_they_hold() -> None:
+    x, w = rows(9, 4)
+    bad = torch.cat([x, torch.full((2, 4), float("nan"))])
+    m = moments(bad, torch.cat([w, torch.zeros(2)]))
+    assert all(torch.equal(a, b) for a, b in zip(m, moments(x, w), strict=True))
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf")])
+def test_bad_weights_are_named(weight: float) -> None:
+    with pytest.raises(NumericsError, match="weight"):
+        moments(torch.zeros(1, 2), torch.tensor([weight]))
+
+
+def test_a_feature_that_is_not_finite_is_named() -> None:
+    with pytest.raises(NumericsError, match="feature"):
+        moments(torch.full((1, 2), float("inf")), torch.ones(1))
+
+
+def test_covariance_is_symmetric_and_no_variance_negative() -> None:
+    x, w = rows(500, 6, scale=1e-4, offset=1e4)
+    c = covariance(moments(x, w))
+    assert torch.equal(c, c.T)
+    assert bool((c.diagonal() >= 0).all())
+
+
+def test_group_moments_equal_moments_per_group() -> None:
+    x, _ = rows(301, 4)
+    belongs = torch.rand(301, 5) * (torch.rand(301, 5) > 0.5)
+    mean, covariances, share = group_moments(x, belongs)
+    for k in range(5):
+        one = moments(x, belongs[:, k])
+        torch.testing.assert_close(mean[k], one.mean, rtol=1e-12, atol=1e-14)
+        torch.testing.assert_close(covariances[k], covariance(one), rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(share, belongs.double().sum(0) / belongs.double().sum(), rtol=1e-12, atol=0.0)
+
+
+def test_groups_taken_together_are_the_whole() -> None:
+    x, _ = rows(400, 4, offset=3.0)
+    belongs = torch.softmax(torch.randn(400, 3).double() * 2, 1)
+    mean, total = mix(*group_moments(x, belongs))
+    whole = moments(x, torch.ones(400))
+    torch.testing.assert_close(mean, whole.mean, rtol=1e-10, atol=0.0)
+    torch.testing.assert_close(total, covariance(whole), rtol=1e-10, atol=1e-12)
+
+
+def test_an_empty_group_is_zero_and_not_nan() -> None:
+    mean, covariances, share = group_moments(torch.ones(4, 2), torch.tensor([[1.0, 0.0]] * 4))
+    assert torch.equal(mean[1], torch.zeros(2).double()) and torch.equal(covariances[1], torch.zeros(2, 2).double())
+    assert share.tolist() == [1.0, 0.0]
+
+
+def test_deviation_biases_no_live_channel_and_floors_dead_ones() -> None:
+    sigma = torch.tensor([5e-3, 1e-2, 2e-2, 1e-6, 0.0], dtype=torch.float64)
+    floored = deviation(torch.zeros(5).double(), sigma.square())
+    assert torch.equal(floored[:3], sigma.square().sqrt()[:3])
+    torch.testing.assert_close(floored[3:], torch.full((2,), 5e-5, dtype=torch.float64), rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_deviation_follows_the_scale(scale: float) -> None:
+    x = torch.rand(8).double()
+    torch.testing.assert_close(deviation(x * scale, x * scale**2), deviation(x, x) * scale, rtol=1e-12, atol=0.0)
+
+
+def test_deviation_of_nothing_is_above_zero() -> None:
+    assert bool((deviation(torch.zeros(3), torch.zeros(3)) > 0).all())
+    assert float(deviation(torch.full((3,), 100.0), torch.zeros(3)).min()) == pytest.approx(1e-4)
