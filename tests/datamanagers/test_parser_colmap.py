@@ -135,6 +135,7 @@ def test_names_that_leave_the_images_or_come_twice(tmp_path: Path) -> None:
     [
         (12, float("nan"), "quaternion"),
         (20, 5.0, "quaternion"),
+        (20, 1e300, "quaternion"),
         (44, float("inf"), "no finite"),
     ],
 )
