@@ -21,6 +21,8 @@ __all__ = ["View", "assemble", "found", "rigid"]
 
 _LOOSE = 1e-3
 """Largest deviation of RᵀR from 1 that counts as rounding and is repaired."""
+_FAR = 1e12
+"""Largest coordinate of a camera: beyond it float64 has no millimetres left."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +68,8 @@ def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     if not deviation <= _LOOSE or np.linalg.det(rotation) < 0:
         kind = f"off by {deviation:.2g}, at most {_LOOSE} is repaired" if not deviation <= _LOOSE else "a reflection"
         raise DataError(f"{where}: the pose holds no rotation ({kind}); remove scale and shear from the capture's poses")
+    if np.abs(matrix[:3, 3]).max() > _FAR:
+        raise DataError(f"{where}: the position {matrix[:3, 3].tolist()} lies beyond {_FAR:g}; run the reconstruction again")
     left, _, right = np.linalg.svd(rotation)
     return np.concatenate([left @ right, matrix[:3, 3:]], 1)
 
