@@ -37,8 +37,8 @@ class _Progress:
 
 
 def generator_of(seed: int, step: int) -> torch.Generator:
-    """The generator of one step."""
-    return torch.Generator().manual_seed((seed << 32) + step)
+    """The generator of one step. Only 32 bits of a seed count, so seeds are spread over them."""
+    return torch.Generator().manual_seed((seed * 0x9E3779B1 + step) % (1 << 32))
 
 
 def checkpoint_path(output: Path) -> Path:

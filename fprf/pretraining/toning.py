@@ -22,8 +22,8 @@ def toned(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Anno
     grey = (image * luma).sum(0, keepdim=True)
     image = grey + (image - grey) * (1 + 0.8 * draw[3])
     image = _turned(image, 0.5 * draw[4])
-    image = image * (1 + 0.25 * torch.tensor(draw[5:8]).view(3, 1, 1))
-    image = image.clamp(0, 1)
+    tint = 1 + 0.25 * torch.tensor(draw[5:8])
+    image = (image * tint.view(3, 1, 1)).clamp(0, 1)
     return nightfall(image, generator) if kind > 0.75 else image
 
 

@@ -57,6 +57,14 @@ def pretrain_line(encoder: str, output: str = "decoder.safetensors") -> str:
         layer, kind = settings[:2]
         flags += f" --encoder.layer {layer}" + (" --encoder.no-normalise" if kind == "plain" else "")
         flags += " --encoder.weights FILE"
+    elif name == "random":
+        channels, stride, seed = settings
+        flags += f" --encoder.channels {channels}"
+        flags += f" --encoder.stride {stride.removeprefix('stride')} --encoder.seed {seed.removeprefix('seed')}"
+    elif name in ("dino", "dinov2"):
+        model, block, stride = settings[:3]
+        flags += f" --encoder.model {model} --encoder.layer {block.removeprefix('block')}"
+        flags += f" --encoder.stride {stride.removeprefix('stride')}"
     return f"fprf pretrain decoder {flags} --images DIR --output {output}"
 
 

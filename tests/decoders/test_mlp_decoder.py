@@ -1,0 +1,117 @@
+"""D_VGG: the formula, and never with another encoder's features."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+
+from fprf.commands.parsing import parse
+from fprf.errors import WeightsError
+from fprf.plugins.decoders.config import MlpDecoderConfig
+from fprf.plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder, pretrain_line
+from fprf.plugins.encoders.config import BundledContentConfig, Vgg19Config
+from fprf.plugins.weightfiles import write_weights
+from fprf.pretraining.config import PretrainDecoderConfig
+
+
+def file_of(path: Path, encoder: str, channels: int = 6, hidden: int = 4) -> Path:
+    write_weights(path, MlpDecoder(channels, hidden).state_dict(), {"kind": DECODER_KIND, "encoder": encoder})
+    return path
+
+
+@settings(max_examples=20, deadline=None)
+@given(points=st.integers(0, 9), scale=st.floats(0, 1e4))
+def test_the_formula_in_float64(points: int, scale: float) -> None:
+    decoder = MlpDecoder(5, 7)
+    content = scale * torch.randn(points, 5)
+    found = decoder(content)
+    hidden = (content.double() @ decoder.first.weight.double().T + decoder.first.bias.double()).clamp_min(0)
+    expected = torch.sigmoid(hidden @ decoder.second.weight.double().T + decoder.second.bias.double())
+    assert found.shape == (points, 3)
+    # The sigmoid's slope is at most 1/4 and its argument grows with the features.
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-6 * (1 + scale))
+    assert ((found >= 0) & (found <= 1)).all()
+
+
+def test_gradients_reach_the_features_but_not_the_weights(tmp_path: Path) -> None:
+    decoder = load_decoder(file_of(tmp_path / "d.safetensors", "e:1"), encoder="e:1", channels=6)
+    content = torch.randn(3, 6, requires_grad=True)
+    decoder(content).sum().backward()
+    assert content.grad is not None
+    assert float(content.grad.abs().sum()) > 0
+    assert not any(parameter.requires_grad for parameter in decoder.parameters())
+    assert not decoder.training
+
+
+def test_another_encoder_is_refused_with_the_line_that_helps(tmp_path: Path) -> None:
+    path = file_of(tmp_path / "d.safetensors", "vgg19:relu2_1:normalised:aaaa")
+    with pytest.raises(WeightsError) as raised:
+        load_decoder(path, encoder="vgg19:relu3_1:plain:bbbb", channels=6)
+    text = str(raised.value)
+    assert "vgg19:relu2_1:normalised:aaaa" in text
+    assert "vgg19:relu3_1:plain:bbbb" in text
+    assert "fprf pretrain decoder --encoder vgg19 --encoder.layer relu3_1" in text
+    with pytest.raises(WeightsError, match="6 channels"):
+        load_decoder(path, encoder="vgg19:relu2_1:normalised:aaaa", channels=7)
+
+
+def test_no_shipped_decoder_names_those_that_ship() -> None:
+    with pytest.raises(WeightsError, match=r"bundled-content:.*--encoder dinov2 .*--content\.decoder\.weights FILE"):
+        MlpDecoderConfig().build(encoder="dinov2:dinov2-small:block12:stride8:0", channels=384)
+
+
+@pytest.mark.parametrize(
+    "identity",
+    [
+        "vgg19:relu3_1:plain:0",
+        "vgg19:relu2_1:normalised:0",
+        "bundled-content:0",
+        "random:7:stride3:seed2",
+        "dinov2:a:block3:stride8:0",
+    ],
+)
+def test_the_line_is_one_that_the_command_line_takes(identity: str) -> None:
+    words = pretrain_line(identity).split()
+    assert words[:3] == ["fprf", "pretrain", "decoder"]
+    config = parse(PretrainDecoderConfig(), words[3:], prog="fprf pretrain decoder", description="")
+    assert config.output == Path("decoder.safetensors")
+    if identity.startswith("vgg19:relu3_1"):
+        assert config.encoder == Vgg19Config(layer="relu3_1", normalise=False, weights=Path("FILE"))
+    if identity.startswith("random"):
+        assert config.encoder.build().identity == identity
+
+
+def test_the_bundled_encoder_has_its_decoder() -> None:
+    encoder = BundledContentConfig().build()
+    decoder = MlpDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels)
+    assert decoder(torch.zeros(2, encoder.channels)).shape == (2, 3)
+
+
+def test_colours_survive_encoding_and_decoding() -> None:
+    """Flat colours and a ramp through the shipped pair: mean error below a tenth."""
+    encoder = BundledContentConfig().build()
+    decoder = MlpDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels)
+    ramp = torch.linspace(0.15, 0.85, 64)
+    for tint in ((1.0, 1.0, 1.0), (1.0, 0.8, 0.6), (0.6, 0.8, 1.0)):
+        image = (ramp.view(1, 1, 1, -1) * torch.tensor(tint).view(1, 3, 1, 1)).expand(1, 3, 48, 64)
+        features = encoder(image)[0].flatten(1).T
+        smaller = torch.nn.functional.avg_pool2d(image, 2)[0].flatten(1).T
+        assert float((decoder(features) - smaller).abs().mean()) < 0.1
+
+
+def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
+    save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
+    write_weights(tmp_path / "nameless.safetensors", MlpDecoder(2, 2).state_dict(), {"kind": DECODER_KIND})
+    for name in ("other", "nameless"):
+        with pytest.raises(WeightsError, match="no decoder of"):
+            MlpDecoderConfig(weights=tmp_path / f"{name}.safetensors").build(encoder="e", channels=2)
+    with pytest.raises(WeightsError, match="no such weights file"):
+        MlpDecoderConfig(weights=tmp_path / "absent.safetensors").build(encoder="e", channels=2)
+
+
+def test_the_shipped_vgg_decoder_fits_the_caffe_weights(shared: Path) -> None:
+    encoder = Vgg19Config(weights=shared / "weights/vgg19_imagenet.safetensors").build()
+    assert MlpDecoderConfig().build(encoder=encoder.identity, channels=128).first.in_features == 128  # type: ignore[attr-defined]

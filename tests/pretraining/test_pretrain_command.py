@@ -1,0 +1,170 @@
+"""`fprf pretrain`: two steps of each kind give files that load; a broken-off run goes on where it was."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from photo_folder import photo_folder, teacher_files
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from fprf.commands.pretrain import run
+from fprf.errors import UsageError
+from fprf.plugins.decoders.config import MlpDecoderConfig
+from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig
+from fprf.plugins.weightfiles import read_weights
+from fprf.pretraining.config import PretrainConfig
+from fprf.pretraining.loop import checkpoint_path, generator_of, train
+
+QUICK = ["--steps", "2", "--batch", "2"]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(photo_folder(tmp_path_factory.mktemp("photos") / "all", 4))
+
+
+def vgg(folder: Path) -> str:
+    """VGG-19's shape up to conv2_1, random."""
+    tensors = {}
+    for place, (inputs, outputs) in {0: (3, 8), 2: (8, 8), 5: (8, 64)}.items():
+        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3) / (3 * inputs**0.5)
+        tensors[f"features.{place}.bias"] = torch.zeros(outputs)
+    save_file(tensors, folder / "vgg.safetensors")
+    return str(folder / "vgg.safetensors")
+
+
+def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
+    found: dict[str, float] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_content(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "content.safetensors"
+    args = ["--images", photos, "--teachers", vgg(tmp_path), "--output", str(output), "--size", "32", "--crops", "2"]
+    assert run(["content", *args, *QUICK]) == 0
+    report = report_of(capsys)
+    assert report["steps"] == 2
+    assert 0 < report["relative_l2"] < 10
+    encoder = BundledContentConfig(weights=output).build()
+    assert encoder.channels == report["channels"]
+    assert encoder(torch.rand(1, 3, 20, 21)).shape == (1, encoder.channels, 10, 11)
+    assert {file.name for file in tmp_path.iterdir()} == {"content.safetensors", "vgg.safetensors"}
+    assert "2 steps" in read_weights(output)[1]["made_by"]
+
+
+def test_semantic(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "semantic.safetensors"
+    teachers = [str(path) for path in teacher_files(tmp_path)]
+    args = ["--images", photos, "--teachers", *teachers, "--output", str(output), "--size", "64"]
+    assert run(["semantic", *args, *QUICK]) == 0
+    report = report_of(capsys)
+    assert -1 <= report["teacher_cosine"] <= 1
+    assert -1 <= report["night_cosine"] <= 1
+    encoder = BundledSemanticConfig(weights=output).build()
+    assert encoder(torch.rand(1, 3, 40, 70)).shape == (1, 48, 5, 9)
+
+
+def test_decoder(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "decoder.safetensors"
+    args = ["--images", photos, "--output", str(output), "--encoder", "random", "--encoder.channels", "5", "--pixels", "50"]
+    assert run(["decoder", *args, *QUICK]) == 0
+    encoder = RandomConfig(channels=5).build()
+    assert report_of(capsys)["encoder"] == encoder.identity
+    decoder = MlpDecoderConfig(weights=output).build(encoder=encoder.identity, channels=5)
+    assert decoder(torch.rand(4, 5)).shape == (4, 3)
+
+
+def test_a_decoder_learns_and_its_report_is_honest(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = []
+    for steps in ("1", "300"):
+        args = ["--images", photos, "--output", str(tmp_path / "d.safetensors"), "--encoder", "random", "--rate", "0.02"]
+        assert run(["decoder", *args, "--steps", steps, "--batch", "4"]) == 0
+        found.append(report_of(capsys)["psnr_db"])
+    assert found[1] > found[0] + 5
+
+
+def test_content_and_decoder_repeat_exactly(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [tmp_path / name for name in ("a.safetensors", "b.safetensors")]
+    for file in files:
+        args = ["--images", photos, "--output", str(file), "--encoder", "random", "--pixels", "30"]
+        assert run(["decoder", *args, *QUICK]) == 0
+    first, second = (read_weights(file) for file in files)
+    assert first[1] == second[1]
+    assert all(torch.equal(value, second[0][name]) for name, value in first[0].items())
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ([], "allowed are content, semantic, decoder"),
+        (["field"], "'field' to train"),
+        (["content"], "--images DIR"),
+        (["content", "--images", "."], "--output FILE"),
+        (["decoder", "--images", ".", "--teachers", "x"], "--teachers"),
+    ],
+)
+def test_mistakes(args: list[str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        run(args)
+
+
+@pytest.mark.parametrize("kind", ["content", "semantic"])
+def test_distilling_needs_teachers(kind: str, photos: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--teachers"):
+        run([kind, "--images", photos, "--output", str(tmp_path / "w.safetensors")])
+
+
+def quadratic(network: nn.Linear, broken_at: int | None = None) -> Callable[[torch.Generator], Tensor]:
+    calls = [0]
+
+    def loss(generator: torch.Generator) -> Tensor:
+        calls[0] += 1
+        if calls[0] == broken_at:
+            raise KeyboardInterrupt
+        result: Tensor = network(torch.randn(4, 3, generator=generator)).square().mean()
+        return result
+
+    return loss
+
+
+def network() -> nn.Linear:
+    torch.manual_seed(0)
+    return nn.Linear(3, 2)
+
+
+def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fprf.pretraining.loop.EVERY_SECONDS", -1.0)
+    config, output = PretrainConfig(steps=9), tmp_path / "w.safetensors"
+    whole, broken, resumed = network(), network(), network()
+    train(whole, quadratic(whole), config, tmp_path / "other.safetensors", lambda _: None)
+    with pytest.raises(KeyboardInterrupt):
+        train(broken, quadratic(broken, broken_at=6), config, output, lambda _: None)
+    said: list[str] = []
+    assert train(resumed, quadratic(resumed), config, output, said.append) == 9
+    assert said[0] == "resumed at step 5"
+    assert torch.equal(resumed.weight, whole.weight)
+    assert not checkpoint_path(output).exists()
+
+
+def test_a_checkpoint_of_another_config_is_not_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fprf.pretraining.loop.EVERY_SECONDS", -1.0)
+    output, net = tmp_path / "w.safetensors", network()
+    with pytest.raises(KeyboardInterrupt):
+        train(net, quadratic(net, broken_at=3), PretrainConfig(steps=9), output, lambda _: None)
+    assert checkpoint_path(output).exists()
+    said: list[str] = []
+    train(network(), quadratic(net), PretrainConfig(steps=1, seed=1), output, said.append)
+    assert not said[0].startswith("resumed")
+
+
+def test_a_time_limit_ends_a_run(tmp_path: Path) -> None:
+    net = network()
+    assert train(net, quadratic(net), PretrainConfig(minutes=0.002), tmp_path / "w.safetensors", lambda _: None) >= 1
+
+
+def test_generators_differ_by_seed_and_step() -> None:
+    draws = {float(torch.rand(1, generator=generator_of(seed, step))) for seed in range(3) for step in range(3)}
+    assert len(draws) == 9

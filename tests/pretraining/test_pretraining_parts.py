@@ -1,0 +1,146 @@
+"""Photographs, crops, light, principal components, prepared crops."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from photo_folder import photo_folder
+
+from fprf.datamanagers.config import GuidedConfig
+from fprf.errors import ConfigError, DataError
+from fprf.plugins.encoders.config import RandomConfig
+from fprf.pretraining.basis import fit_basis
+from fprf.pretraining.config import DistilConfig, PretrainDecoderConfig
+from fprf.pretraining.filtered import filtered_at, filtered_whole, random_pixels
+from fprf.pretraining.photos import crop, find_photos, load_photo, split
+from fprf.pretraining.prepared import prepared, prepared_path
+from fprf.pretraining.toning import nightfall, toned
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photo_folder(tmp_path_factory.mktemp("photos") / "all", 13)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_photos_are_found_at_every_depth_in_an_order_of_their_own(folder: Path, tmp_path: Path) -> None:
+    (folder / "notes.txt").write_text("no photograph")
+    found = find_photos([folder])
+    assert sorted(path.name for path in found) == sorted(f"{index}.png" for index in range(13))
+    assert [path.name for path in find_photos([photo_folder(tmp_path / "b", 13)])] == [path.name for path in found]
+    learn, held = split(found)
+    assert len(held) == 1
+    assert not set(learn) & set(held)
+    assert len(learn) + len(held) == 13
+
+
+def test_missing_folders_and_photographs_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="absent: no such folder"):
+        find_photos([tmp_path / "absent"])
+    with pytest.raises(DataError, match="0 photographs"):
+        find_photos([tmp_path])
+
+
+def test_large_photographs_are_reduced(folder: Path) -> None:
+    path = find_photos([folder])[0]
+    whole, small = load_photo(path), load_photo(path, 30)
+    assert max(small.shape[:2]) == 30
+    assert torch.equal(load_photo(path, 1000), whole)
+    assert abs(float(whole.mean() - small.mean())) < 0.02
+
+
+@settings(max_examples=25, deadline=None)
+@given(height=st.integers(2, 50), width=st.integers(2, 50), size=st.integers(2, 24), seed=st.integers(0, 99))
+def test_crops_are_squares_of_the_photo(height: int, width: int, size: int, seed: int) -> None:
+    photo = torch.rand(height, width, 3)
+    piece = crop(photo, size, (0.5, 2.0), generator(seed))
+    assert piece.shape == (3, size, size)
+    assert 0 <= piece.min() <= piece.max() <= 1
+    assert torch.equal(piece, crop(photo, size, (0.5, 2.0), generator(seed)))
+    flat = crop(torch.full((height, width, 3), 0.25), size, (0.5, 2.0), generator(seed))
+    torch.testing.assert_close(flat, torch.full_like(flat, 0.25))
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999))
+def test_light_stays_in_range_and_is_a_function_of_the_generator(seed: int) -> None:
+    image = torch.rand(3, 8, 9, generator=generator(seed))
+    for change in (toned, nightfall):
+        changed = change(image, generator(seed))
+        assert changed.shape == image.shape
+        assert 0 <= changed.min() <= changed.max() <= 1
+        assert torch.isfinite(changed).all()
+        assert torch.equal(changed, change(image, generator(seed)))
+    assert nightfall(image, generator(seed)).mean() < image.mean()
+
+
+def test_light_varies() -> None:
+    image = torch.rand(3, 8, 8)
+    means = torch.stack([toned(image, generator(seed)).mean() for seed in range(40)])
+    assert means.std() > 0.05
+    assert any(torch.equal(toned(image, generator(seed)), image) for seed in range(40))
+
+
+@settings(max_examples=10, deadline=None)
+@given(features=st.integers(3, 8), seed=st.integers(0, 99))
+def test_a_basis_is_orthonormal_and_keeps_what_it_says(features: int, seed: int) -> None:
+    samples = torch.randn(400, features, generator=generator(seed)) @ torch.randn(features, features) + 3
+    basis = fit_basis(samples, (1, 2, features), 0.8)
+    channels = len(basis.axes)
+    assert channels in (1, 2, features)
+    torch.testing.assert_close(basis.axes @ basis.axes.T, torch.eye(channels), rtol=0, atol=1e-5)
+    projected = basis.project(samples.T[None, :, :, None])[0, :, :, 0].double()
+    assert abs(float(projected.mean())) < 1e-4
+    assert float(projected.square().mean()) == pytest.approx(1, rel=1e-3)
+    energy = (samples - samples.mean(0)).double().square().sum()
+    assert float(projected.square().sum() * basis.scale**2 / energy) == pytest.approx(basis.kept, rel=1e-3)
+    assert basis.kept >= 0.8 or channels == features
+
+
+def test_a_whole_basis_keeps_distances() -> None:
+    samples = torch.randn(50, 5) * torch.tensor([3.0, 2.0, 1.0, 0.5, 0.1])
+    basis = fit_basis(samples, (5,), 1.0)
+    projected = basis.project(samples.T[None, :, :, None])[0, :, :, 0].T
+    found, wanted = (torch.pdist(x.double()) for x in (projected * basis.scale, samples))
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_filtered_pixels_are_those_of_the_whole_image(folder: Path) -> None:
+    photo, encoder = load_photo(find_photos([folder])[0]), RandomConfig(channels=3, stride=2).build()
+    pixels = random_pixels(photo, 40, generator())
+    features, rgb = filtered_at(encoder, photo, pixels, GuidedConfig())
+    assert torch.equal(rgb, photo[pixels[:, 0], pixels[:, 1]])
+    all_of_them = filtered_whole(encoder, photo, GuidedConfig()).view(*photo.shape[:2], 3)
+    torch.testing.assert_close(features, all_of_them[pixels[:, 0], pixels[:, 1]], rtol=1e-4, atol=1e-5)
+
+
+def test_crops_are_prepared_once_per_config(tmp_path: Path) -> None:
+    output, made = tmp_path / "out.safetensors", []
+
+    def make() -> tuple[torch.Tensor, torch.Tensor]:
+        made.append(1)
+        return torch.arange(4, dtype=torch.uint8), torch.rand(4).half()
+
+    config = DistilConfig()
+    first, second = (prepared(make, config, output) for _ in range(2))
+    assert len(made) == 1
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1].float(), second[1].float())
+    prepared(make, DistilConfig(seed=1), output)
+    assert len(made) == 2
+    assert prepared_path(output).is_file()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"minutes": 0}, {"steps": 0}, {"batch": 0}, {"rate": 0}, {"seed": -1}, {"photos": 1}, {"size": 8}, {"crops": 0}]
+)
+def test_ranges(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        DistilConfig(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="noise"):
+        PretrainDecoderConfig(noise=-1)
