@@ -5,49 +5,56 @@ import sys
 
 import pytest
 
+from fprf.cli import VERBS
+
 HEAVY = ("torch", "numpy", "cv2", "kornia", "trimesh", "numba", "safetensors", "transformers", "av")
-WATCH = f"\nimport sys\nprint(sorted(set({HEAVY!r}) & set(sys.modules)), file=sys.stderr)"
+BUILT_INS = """
+from fprf.plugins import registry
+for group in registry.groups():
+    for name in registry.installed(group):
+        if registry.entry(group, name).package.startswith("fprf "):
+            registry.load_object(group, name)()
+            report(f"{group} {name}")
+"""
+COMMANDS = [
+    ["--help"],
+    ["plugins"],
+    ["train"],
+    ["train", "--help"],
+    ["train", "fprf", "--help"],
+    ["train", "fprf-lite", "--sampler", "uniform", "--help"],
+    ["train", "fprf", "--stpes", "3"],
+    *([verb, "--help"] for verb in VERBS if verb != "train"),
+]
 
 
-def _fresh(code: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-c", code + WATCH], capture_output=True, text=True, timeout=120, check=False
+def _fresh(code: str) -> list[str]:
+    """Run in a new interpreter, in which warnings are errors; lines on standard error."""
+    before = f"import sys\ndef report(what): print(what, *({{*{HEAVY!r}}} & {{*sys.modules}}), sep='|', file=sys.stderr)\n"
+    ended = subprocess.run(
+        [sys.executable, "-W", "error", "-c", before + code], capture_output=True, text=True, timeout=240, check=False
     )
+    assert ended.returncode == 0, ended.stderr
+    return ended.stderr.splitlines()
 
 
-def _verb(*args: str) -> str:
-    return f"from fprf.cli import main\nassert main({list(args)!r}) in (0, 2)"
+@pytest.mark.parametrize("code", ["import fprf.config, fprf.methods\nreport('configs')", BUILT_INS])
+def test_configs_import_nothing_heavy(code: str) -> None:
+    lines = _fresh(code)
+    assert lines and not [line for line in lines if "|" in line]
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import fprf.config, fprf.methods",
-        "from fprf.plugins import registry\n"
-        "for g in registry.groups():\n"
-        "    for n in registry.installed(g):\n"
-        "        if registry.entry(g, n).package.startswith('fprf '):\n"
-        "            registry.load_object(g, n)()",
-        _verb("--help"),
-        _verb("plugins"),
-        _verb("plugins", "--help"),
-        _verb("doctor", "--help"),
-        _verb("train"),
-        _verb("train", "--help"),
-        _verb("train", "fprf", "--help"),
-        _verb("train", "fprf-lite", "--sampler", "uniform", "--help"),
-        _verb("train", "fprf", "--stpes", "3"),
-        *(_verb(verb, "--help") for verb in ("demo", "eval", "stylize", "render", "pretrain")),
-    ],
-)
-def test_nothing_heavy_is_imported(code: str) -> None:
-    ended = _fresh(code)
-    assert ended.stderr.splitlines()[-1] == "[]", ended.stderr
-    assert "Traceback" not in ended.stderr
+def test_help_and_parsing_import_nothing_heavy() -> None:
+    code = f"from fprf.cli import main\nfor args in {COMMANDS!r}:\n    report(f'{{args}} {{main(args)}}')"
+    lines = [line for line in _fresh(code) if line.startswith("[")]
+    codes = [2 if args in (["train"], ["train", "fprf", "--stpes", "3"]) else 0 for args in COMMANDS]
+    assert lines == [f"{args} {code}" for args, code in zip(COMMANDS, codes, strict=True)]
 
 
-def test_help_takes_little_processor_time() -> None:
-    for args, seconds in ((["--help"], 0.4), (["train", "fprf", "--help"], 1.5)):
-        code = f"import time\n{_verb(*args)}\nimport sys; print(f'{{time.process_time():.3f}}', file=sys.stderr)"
-        spent = min(float(_fresh(code).stderr.splitlines()[-2]) for _ in range(2))
-        assert spent < seconds, f"fprf {' '.join(args)}: {spent} s of processor time"
+@pytest.mark.parametrize(("args", "seconds"), [(["--help"], 0.4), (["train", "fprf", "--help"], 1.5)])
+def test_help_takes_little_processor_time(args: list[str], seconds: float) -> None:
+    code = f"import time\nfrom fprf.cli import main\nmain({args!r})\nreport(time.process_time())"
+    spent = [float(_fresh(code)[-1])]
+    if spent[0] >= seconds:  # the machine may have been busy
+        spent.append(float(_fresh(code)[-1]))
+    assert min(spent) < seconds, f"fprf {' '.join(args)}: {spent} s of processor time"
