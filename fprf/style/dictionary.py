@@ -118,7 +118,8 @@ def whole_style(d: StyleDictionary) -> tuple[Annotated[Tensor, "C"], Annotated[T
     """Mean and covariance of all pixels of all references by user weight, float64: what global AdaIN aims at.
 
     Blending draws the codes' means together and thereby takes b (1 - b) of the scatter between them out of the total
-    covariance, for blend b; it is given back, reference by reference, so that clusters and blend don't matter here.
+    covariance, for blend b; it is given back, reference by reference, so that clusters and blend don't matter here (but
+    for clusters below `min_members`, which hold too few pixels to show).
     """
     means, covariances, weights = [], [], []
     for i in range(len(d.names)):

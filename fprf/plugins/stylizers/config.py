@@ -64,7 +64,7 @@ class AdainConfig(StylizerConfig):
 class LocalAdainConfig(StylizerConfig):
     """Local AdaIN (paper, Eq. 5 and 6): every point mixes the style codes that its semantics resemble."""
 
-    temperature: float = 0.2
+    temperature: float = 0.4
     """Softness of the match, relative to the spread of the scores; above 0."""
     similarity: Literal["cosine", "dot"] = "cosine"
     """Score of a match: cosine of centred features, or the paper's dot product."""
@@ -83,7 +83,7 @@ class LocalAdainConfig(StylizerConfig):
 class RegionAdainConfig(StylizerConfig):
     """Two-sided AdaIN: points belong to scene regions, regions match style codes, channel by channel."""
 
-    temperature: float = 0.2
+    temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     blend: float = 0.3
     """Share of the whole scene's statistics in each region's, in [0, 1]; the dictionary's own blend matches it."""
@@ -106,7 +106,7 @@ class RegionAdainConfig(StylizerConfig):
 class RegionOtConfig(StylizerConfig):
     """Two-sided optimal transport (recommended): regions match style codes, all channels move together."""
 
-    temperature: float = 0.2
+    temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     blend: float = 0.3
     """Share of the whole scene's statistics in each region's, in [0, 1]; the dictionary's own blend matches it."""

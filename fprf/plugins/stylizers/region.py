@@ -12,6 +12,7 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
+from ...errors import DataError
 from ...interfaces import Stylizer
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import attention, full_precision, score_spread, share_mean, unit
@@ -166,6 +167,11 @@ def _plan(dictionary: StyleDictionary, scene: SceneStyle, temperature: float, bl
     own = own_style(scene, blend)
     same = _mixed(own, region_table(scene, own, temperature))
     if table is not None:
+        if table.shape != (len(scene.share), len(dictionary.share)):
+            raise DataError(
+                f"region table: {tuple(table.shape)}, but there are {len(scene.share)} regions and "
+                f"{len(dictionary.share)} style codes; edit the table of this scene and these references"
+            )
         return _Plan(double(table), same, _mixed(dictionary, double(table)))
     table = region_table(scene, dictionary, temperature)
     if len(table) > 1:

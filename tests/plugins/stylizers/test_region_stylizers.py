@@ -1,0 +1,200 @@
+"""Two-sided stylizers against their definition, written out in float64; identity and limits."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import DataError
+from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig
+from fprf.plugins.stylizers.region import RegionAdainStylizer, RegionOtStylizer, region_table
+from fprf.style.controls import edit_table
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
+from fprf.style.matching import score_spread, share_mean, unit
+from fprf.style.scene import SceneStyle, membership, own_style, region_units, scene_style
+from fprf.style.statistics import deviation
+from fprf.style.transport import monge
+from fprf.types import Want
+
+BOTH = (RegionAdainConfig, RegionOtConfig)
+Config = type[RegionAdainConfig] | type[RegionOtConfig]
+
+
+def points(n: int = 600, c: int = 6, d: int = 4, *, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    kind = torch.randint(0, 3, (n,), generator=g)
+    content = torch.randn(3, c, generator=g)[kind] * 2 + torch.randn(n, c, generator=g) * (kind[:, None] + 1) + 5
+    return content, torch.eye(3, d)[kind] * 3 + torch.randn(n, d, generator=g) * 0.5 + 1
+
+
+def setting(regions: int = 3, clusters: int = 3) -> tuple[torch.Tensor, torch.Tensor, SceneStyle, StyleDictionary]:
+    content, semantic = points()
+    scene = scene_style(content, semantic, torch.ones(len(content)), None, regions, 0)
+    d = build_dictionary([Reference(f"r{i}", *points(seed=5 + i)) for i in range(2)], clusters=clusters)
+    return content, semantic, scene, d
+
+
+def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float) -> torch.Tensor:
+    q, k = scene.keys.double(), d.keys.double()
+    q = unit(q, share_mean(q, scene.share.double()))
+    k = unit(k, share_mean(k, d.share.double()))
+    return torch.softmax(q @ k.T / (temperature * score_spread(q, k)), 1)
+
+
+@pytest.mark.parametrize("config", BOTH)
+@pytest.mark.parametrize("temperature", [0.1, 0.4, 5.0])
+def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
+    content, semantic, scene, d = setting()
+    stylizer = config(temperature=temperature).build(dictionary=d, scene=scene)
+    assert stylizer.needs == Want.CONTENT | Want.SEMANTIC
+    share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean)).double()
+    own = own_style(scene, 0.3)
+    here, there = plain_table(scene, own, temperature), plain_table(scene, d, temperature)
+    f, expected = content.double(), torch.zeros(600, 6, dtype=torch.float64)
+    for k in range(len(scene.keys)):
+        mean_c, mean_s = (t[k] @ x.mean.double() for t, x in ((here, own), (there, d)))
+        if config is RegionOtConfig:
+            cov_c, cov_s = (torch.einsum("t,tij->ij", t[k], x.covariance.double()) for t, x in ((here, own), (there, d)))
+            a = monge(cov_c, cov_s, gain=8.0)
+        else:
+            sigma_c, sigma_s = (
+                t[k] @ deviation(x.mean, x.covariance.diagonal(dim1=1, dim2=2)).double() for t, x in ((here, own), (there, d))
+            )
+            a = (sigma_s / sigma_c).diag()
+        expected += share[:, k, None] * ((f - mean_c) @ a + mean_s)
+    torch.testing.assert_close(stylizer(content, semantic).double(), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(stylizer.match(semantic).double(), share @ there, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("config", BOTH)
+@pytest.mark.parametrize("regions", [1, 3, 9])
+@pytest.mark.parametrize("temperature", [0.05, 0.4, 20.0])
+@pytest.mark.parametrize("blend", [0.0, 0.3, 1.0])
+def test_the_scenes_own_style_is_the_identity(config: Config, regions: int, temperature: float, blend: float) -> None:
+    content, semantic = points()
+    content[:, 1] *= 1e-3
+    content[:, 2] = 4.0
+    scene = scene_style(content, semantic, torch.ones(600), None, regions, 0)
+    made = config(temperature=temperature, blend=blend).build(dictionary=own_style(scene, blend), scene=scene)
+    out = made(content, semantic)
+    assert float((out - content).abs().max() / content.abs().max()) < 1e-5
+
+
+def test_one_region_that_meets_one_code_gets_its_statistics() -> None:
+    content, semantic, scene, _ = setting(regions=1)
+    other = points(seed=9)[0]
+    d = build_dictionary([Reference("s", other, semantic)], clusters=1)
+    out = RegionOtConfig(gain=1e6).build(dictionary=d, scene=scene)(content, None).double()
+    torch.testing.assert_close(out.mean(0), other.double().mean(0), rtol=1e-4, atol=1e-4)
+    reached, aim = torch.cov(out.T), torch.cov(other.double().T)
+    assert float((reached - aim).abs().max() / aim.abs().max()) < 2e-3
+
+
+def test_undivided_scenes_need_no_semantics_and_get_the_global_style() -> None:
+    content, _ = points()
+    scene = scene_style(content, None, torch.ones(600), None, 8, 0)
+    d = build_dictionary([Reference(f"r{i}", points(seed=5 + i)[0], torch.zeros(600, 0), i + 1.0) for i in range(2)])
+    made = RegionAdainConfig(gain=1e6).build(dictionary=d, scene=scene)
+    assert made.needs == Want.CONTENT
+    torch.testing.assert_close(
+        made(content, None), AdainConfig().build(dictionary=d, scene=scene)(content, None), rtol=1e-4, atol=1e-4
+    )
+    assert made.match(content[:5, :0]).shape == (5, 2)
+    assert bool(RegionOtConfig().build(dictionary=d, scene=scene)(content, None).isfinite().all())
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_high_temperatures_move_all_regions_alike(config: Config) -> None:
+    content, semantic, scene, d = setting()
+    out = config(temperature=1e6).build(dictionary=d, scene=scene)(content, semantic)
+    # One affine map for all: residuals of a least-squares fit vanish.
+    lifted = torch.cat([content, torch.ones(600, 1)], 1).double()
+    fit = lifted @ torch.linalg.lstsq(lifted, out.double()).solution
+    assert float((fit - out).abs().max()) < 1e-3
+
+
+def test_tables_are_read_edited_and_given_back() -> None:
+    content, semantic, scene, d = setting()
+    table = region_table(scene, d, 0.4)
+    torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))
+    for kind in (RegionAdainStylizer, RegionOtStylizer):
+        plain = kind(d, scene, temperature=0.4, blend=0.3, gain=8.0)
+        same = kind(d, scene, temperature=0.4, blend=0.3, gain=8.0, table=table)
+        assert torch.equal(plain(content, semantic), same(content, semantic))
+        pinned = edit_table(table, d.reference, pin={0: 1, 1: 1, 2: 1})
+        made = kind(d, scene, temperature=0.4, blend=0.3, gain=8.0, table=pinned)
+        assert float(made.match(semantic)[:, d.reference == 0].abs().max()) == 0.0
+
+
+def test_an_edited_table_of_another_shape_is_refused() -> None:
+    _, _, scene, d = setting()
+    with pytest.raises(DataError, match="table"):
+        RegionOtStylizer(d, scene, temperature=0.4, blend=0.3, gain=8.0, table=torch.ones(2, 2))
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_gain_bounds_what_noise_becomes(config: Config) -> None:
+    content, semantic, _, d = setting()
+    flat = scene_style(content * 0 + 3, semantic, torch.ones(600), None, 3, 0)
+    made = config(gain=2.0).build(dictionary=d, scene=flat)
+    base = made(torch.full((600, 6), 3.0), semantic)
+    noise = torch.randn(600, 6) * 0.01
+    moved = made(3 + noise, semantic) - base
+    assert bool((moved.norm(dim=1) <= 2.0 * noise.norm(dim=1) + 1e-5).all())
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(1, 25),
+    st.integers(1, 12),
+    st.integers(1, 12),
+    st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
+    st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
+    st.sampled_from(BOTH),
+)
+def test_never_nan_for_degenerate_scenes_and_styles(
+    n: int, regions: int, clusters: int, here: float, there: float, config: Config
+) -> None:
+    content, semantic = torch.randn(n, 4) * here + 3, torch.randn(n, 3) * here
+    d = build_dictionary([Reference("a", torch.randn(n, 4) * there, torch.randn(n, 3) * there)], clusters=clusters)
+    scene = scene_style(content, semantic, torch.ones(n), None, regions, 0)
+    made = config().build(dictionary=d, scene=scene)
+    for rows in (n, 1, 0):
+        out = made(content[:rows], semantic[:rows])
+        assert out.shape == (rows, 4) and bool(out.isfinite().all())
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_points_do_not_depend_on_their_neighbours(config: Config) -> None:
+    content, semantic, scene, d = setting()
+    made = config().build(dictionary=d, scene=scene)
+    whole = made(content, semantic)
+    order = torch.randperm(600)
+    parts = torch.cat([made(content[i], semantic[i]) for i in order.split(37)])
+    torch.testing.assert_close(parts, whole[order], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_float32_is_float64_within_the_bound(config: Config) -> None:
+    content, semantic, scene, d = setting()
+    made = config().build(dictionary=d, scene=scene)
+    single = made(content, semantic)
+    double = made.double()(content.double(), semantic.double())
+    assert float((single - double).abs().max() / double.abs().max()) < 1e-5
+
+
+def test_autocast_changes_nothing() -> None:
+    content, semantic, scene, d = setting()
+    for config in BOTH:
+        made = config().build(dictionary=d, scene=scene)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            out, match = made(content, semantic), made.match(semantic)
+        assert torch.equal(out, made(content, semantic)) and torch.equal(match, made.match(semantic))
+
+
+def test_every_knob_changes_something() -> None:
+    content, semantic, scene, d = setting()
+    for config in BOTH:
+        plain = config().build(dictionary=d, scene=scene)(content, semantic)
+        for other in (config(temperature=0.1), config(blend=0.9), config(gain=1.0)):
+            assert not torch.allclose(other.build(dictionary=d, scene=scene)(content, semantic), plain)
