@@ -138,7 +138,7 @@ class RegionOtStylizer(Stylizer):
             out = share @ self.bias
             for k in range(len(self.units)):
                 inside = share[:, k].nonzero().squeeze(1)
-                out = out.index_add(0, inside, (away[inside] * share[inside, k, None]) @ self.matrix[k])
+                out.index_add_(0, inside, (away[inside] * share[inside, k, None]) @ self.matrix[k])
             return out.to(content)
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
