@@ -13,7 +13,7 @@ from .parsing import parse
 __all__ = ["run"]
 
 KINDS = ("content", "semantic", "decoder")
-SEMANTIC = DistilConfig(minutes=12.0, batch=8, crops=2, size=256)
+SEMANTIC = DistilConfig(minutes=12.0, batch=8, rate=3e-3, crops=1, size=224)
 Report = dict[str, float | int | str]
 C = TypeVar("C", bound=PretrainConfig)
 

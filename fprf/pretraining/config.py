@@ -26,7 +26,7 @@ class PretrainConfig:
     steps: int | None = None
     """Optimiser steps instead of minutes."""
     batch: int = 32
-    """Crops per step (for the decoder: times 128 pixels)."""
+    """Examples per step."""
     rate: float = 2e-3
     """Learning rate at its height."""
     seed: int = 0
@@ -49,7 +49,11 @@ class DistilConfig(PretrainConfig):
 
     teachers: tuple[Path, ...] = ()
     """Weights of the teachers: VGG-19 for `content`; MobileNetV2, then DeepLab's backbone for `semantic`."""
-    crops: int = 8
+    batch: int = 4
+    """Crops per step."""
+    rate: float = 4e-3
+    """Learning rate at its height."""
+    crops: int = 4
     """Crops per photograph, prepared once."""
     size: int = 64
     """Pixels of a crop's side."""
@@ -66,6 +70,8 @@ class PretrainDecoderConfig(PretrainConfig):
 
     encoder: EncoderConfig = BundledContentConfig()
     """The encoder whose features are to be decoded."""
+    batch: int = 2048
+    """Pixels per step."""
     hidden: int = 128
     """Hidden units."""
     pixels: int = 2000

@@ -30,7 +30,7 @@ __all__ = ["content_report", "pretrain_content"]
 
 CHOICES = (24, 32, 48)
 ENERGY = 0.99
-BASIS_PHOTOS, BASIS_PIXELS = 120, 1000
+BASIS_PHOTOS, BASIS_PIXELS = 60, 1000
 SCALES = (0.6, 1.5)
 """Crops are that much larger or smaller than the photograph."""
 REPORT_PHOTOS = 16

@@ -20,8 +20,6 @@ from .photos import find_photos, load_photo, split
 
 __all__ = ["decoder_report", "pretrain_decoder"]
 
-PIXELS_PER_UNIT = 128
-"""Pixels of a step per unit of --batch."""
 REPORT_PHOTOS = 20
 LONGEST = 384
 Report = dict[str, float | int | str]
@@ -41,7 +39,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
     decoder = MlpDecoder(encoder.channels, config.hidden)
 
     def loss(generator: torch.Generator) -> Tensor:
-        index = torch.randint(0, len(features), (config.batch * PIXELS_PER_UNIT,), generator=generator)
+        index = torch.randint(0, len(features), (config.batch,), generator=generator)
         content = (features[index] - mean) / std
         noise = torch.randn(content.shape, generator=generator)
         return F.mse_loss(decoder(content + config.noise * noise), colours[index])

@@ -34,6 +34,8 @@ SCALES = (1.0, 1.8)
 TEACHER_SCALE = 1.25
 """Teachers see the crop enlarged, which makes their stride of 16 finer."""
 STRIDE = 8
+WINDOW = 0.75
+"""Share of a crop's side that the student sees at a time."""
 Report = dict[str, float | int | str]
 Teachers = Sequence[tuple[MobileNetTeacher, Basis]]
 
@@ -42,6 +44,8 @@ def pretrain_semantic(config: DistilConfig, output: Path, say: Callable[[str], N
     """Train, write `output`, and measure it on held-out photographs."""
     if not config.teachers:
         raise UsageError("--teachers: none; `semantic` takes the weights of MobileNetV2, of DeepLab's backbone, or both")
+    if config.size % STRIDE:
+        raise UsageError(f"--size: {config.size}; `semantic` takes multiples of {STRIDE}, its stride")
     names = [load_teacher(path) for path in config.teachers]
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
@@ -56,8 +60,8 @@ def pretrain_semantic(config: DistilConfig, output: Path, say: Callable[[str], N
 
     def loss(generator: torch.Generator) -> Tensor:
         index = torch.randint(0, len(images), (config.batch,), generator=generator).tolist()
-        seen = torch.stack([toned(images[i].float() / 255, generator) for i in index])
-        found, wanted = student(seen), targets[index].float()
+        views = [_view(images[i], targets[i], generator) for i in index]
+        found, wanted = student(torch.stack([seen for seen, _ in views])), torch.stack([right for _, right in views])
         return F.mse_loss(found, wanted) + (1 - F.cosine_similarity(found, wanted, dim=1).mean())
 
     steps = train(student, loss, config, output, say)
@@ -103,6 +107,21 @@ def semantic_report(student: Encoder, teachers: Teachers, photos: Sequence[Path]
         "teacher_cosine": round(cosines / len(images), 4),
         "night_cosine": round(nights / len(images), 4),
     }
+
+
+def _view(
+    image: Annotated[Tensor, "3 s s"], target: Annotated[Tensor, "C t t"], generator: torch.Generator
+) -> tuple[Annotated[Tensor, "3 v v"], Annotated[Tensor, "C u u"]]:
+    """A random part of a crop in a random light, mirrored half the time, and what the teachers said of it."""
+    cells = target.shape[-1]
+    side = max(1, round(WINDOW * cells))
+    top, left = torch.randint(0, cells - side + 1, (2,), generator=generator).tolist()
+    right = target[:, top : top + side, left : left + side].float()
+    rows, columns = (slice(STRIDE * first, STRIDE * (first + side)) for first in (top, left))
+    seen = toned(image[:, rows, columns].float() / 255, generator)
+    if torch.rand(1, generator=generator) < 0.5:
+        return seen.flip(-1), right.flip(-1)
+    return seen, right
 
 
 def _seen(teacher: MobileNetTeacher, images: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B F h w"]:

@@ -81,7 +81,7 @@ def test_a_decoder_learns_and_its_report_is_honest(photos: str, tmp_path: Path, 
     found = []
     for steps in ("1", "300"):
         args = ["--images", photos, "--output", str(tmp_path / "d.safetensors"), "--encoder", "random", "--rate", "0.02"]
-        assert run(["decoder", *args, "--steps", steps, "--batch", "4"]) == 0
+        assert run(["decoder", *args, "--steps", steps, "--batch", "512"]) == 0
         found.append(report_of(capsys)["psnr_db"])
     assert found[1] > found[0] + 5
 

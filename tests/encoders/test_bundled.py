@@ -1,0 +1,64 @@
+"""The encoders that ship: small, quick to load, and no file of another kind in their place."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from fprf.errors import WeightsError
+from fprf.plugins.decoders.mlp import FOLDER as DECODERS
+from fprf.plugins.encoders.bundled import CONTENT_KIND, FOLDER
+from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig
+from fprf.plugins.encoders.students import ContentStudent, SemanticStudent
+from fprf.plugins.weightfiles import read_weights, write_weights
+
+
+def test_everything_that_ships_stays_below_three_megabytes_and_says_what_it_is() -> None:
+    files = [*FOLDER.glob("*.safetensors"), *DECODERS.glob("*.safetensors")]
+    assert len(files) >= 4
+    assert sum(file.stat().st_size for file in files) < 3e6
+    for file in files:
+        metadata = read_weights(file)[1]
+        assert metadata["made_by"].startswith("fprf pretrain ")
+        assert "Apache-2.0" in metadata["licence"]
+
+
+def test_parameters() -> None:
+    assert sum(value.numel() for value in ContentStudent(48).parameters()) <= 60_000
+    assert sum(value.numel() for value in SemanticStudent(48).parameters()) <= 600_000
+
+
+@pytest.mark.parametrize(
+    ("config", "verb"), [(BundledContentConfig, "fprf pretrain content"), (BundledSemanticConfig, "fprf pretrain semantic")]
+)
+def test_other_files_are_refused_with_the_command_that_makes_the_right_one(
+    config: type[BundledContentConfig], verb: str, tmp_path: Path
+) -> None:
+    write_weights(tmp_path / "other.safetensors", {"project.weight": torch.zeros(3, 3, 1, 1)}, {"kind": "mlp-decoder"})
+    with pytest.raises(WeightsError, match=f"'mlp-decoder'.*{verb}"):
+        config(weights=tmp_path / "other.safetensors").build()
+    with pytest.raises(WeightsError, match="no such weights file"):
+        config(weights=tmp_path / "absent.safetensors").build()
+
+
+def test_a_network_of_another_shape_is_refused(tmp_path: Path) -> None:
+    write_weights(tmp_path / "c.safetensors", {"project.weight": torch.zeros(3, 3, 1, 1)}, {"kind": CONTENT_KIND})
+    with pytest.raises(WeightsError, match="does not fit this version's network"):
+        BundledContentConfig(weights=tmp_path / "c.safetensors").build()
+
+
+@pytest.mark.parametrize("config", [BundledContentConfig(), BundledSemanticConfig()])
+def test_features_are_of_order_one_on_smooth_noise(config: EncoderConfig) -> None:
+    small = torch.rand(2, 3, 12, 16)
+    image = torch.nn.functional.interpolate(small, (96, 128), mode="bicubic").clamp(0, 1)
+    features = config.build()(image)
+    assert 0.05 < float(features.std()) < 5
+    assert float(features.mean().abs()) < 2
+
+
+def test_the_semantic_encoder_sees_the_whole_image() -> None:
+    encoder = BundledSemanticConfig().build()
+    image = torch.full((1, 3, 256, 256), 0.4)
+    other = image.clone()
+    other[..., 200:] = torch.tensor([0.2, 0.6, 0.1]).view(1, 3, 1, 1)
+    assert not torch.allclose(encoder(image)[..., :4], encoder(other)[..., :4], atol=1e-3)
