@@ -8,7 +8,8 @@ __all__ = ["at_least", "between", "positive"]
 
 
 def _finite(name: str, value: float) -> None:
-    if not math.isfinite(value):
+    # math.isfinite would raise on an integer too large for a float.
+    if value != value or abs(value) == math.inf:
         raise ConfigError(f"{name}: {value} is not a finite number")
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from ..checks import at_least
+from ..checks import at_least, between
+from ..errors import ConfigError
 from ..plugins.config import PluginConfig
 
 if TYPE_CHECKING:
@@ -52,9 +53,9 @@ class PlanesConfig(ContentFieldConfig):
     """Spherical-harmonics degree of the viewing direction (1 = none)."""
 
     def __post_init__(self) -> None:
-        for r in self.resolutions:
-            at_least("content.field.resolutions", r, 2)
-        at_least("content.field.channels", self.channels, 1)
+        _check_planes("content.field", self.resolutions, self.channels)
+        _check_network("content.field", self.hidden, self.layers)
+        between("content.field.degree", self.degree, 1, 4)
 
     def build(self, *, channels: int, seed: int) -> ContentField:
         """The field."""
@@ -77,12 +78,24 @@ class SemanticPlanesConfig(SemanticFieldConfig):
     """Hidden layers of the semantic network."""
 
     def __post_init__(self) -> None:
-        for r in self.resolutions:
-            at_least("semantic.field.resolutions", r, 2)
-        at_least("semantic.field.channels", self.channels, 1)
+        _check_planes("semantic.field", self.resolutions, self.channels)
+        _check_network("semantic.field", self.hidden, self.layers)
 
     def build(self, *, channels: int, seed: int) -> SemanticField:
         """The field."""
         from .semantic import SemanticPlanes
 
         return SemanticPlanes(self, channels=channels, seed=seed)
+
+
+def _check_planes(name: str, resolutions: tuple[int, ...], channels: int) -> None:
+    if not resolutions:
+        raise ConfigError(f"{name}.resolutions: none given; name at least one")
+    for r in resolutions:
+        at_least(f"{name}.resolutions", r, 2)
+    at_least(f"{name}.channels", channels, 1)
+
+
+def _check_network(name: str, hidden: int, layers: int) -> None:
+    at_least(f"{name}.hidden", hidden, 1)
+    at_least(f"{name}.layers", layers, 0)

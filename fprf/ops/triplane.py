@@ -40,7 +40,8 @@ def lookup_reference(
     """The plain form: four gathers a plane, differentiable in the table by autograd."""
     scales = []
     for planes, r in zip(split(table, resolutions), resolutions, strict=True):
-        at = ((points + 1) * (0.5 * (r - 1))).clamp(0, r - 1)
+        # NaN falls on the lower border, as in the fused form: an index must never leave the table.
+        at = ((points + 1) * (0.5 * (r - 1))).clamp(0, r - 1).nan_to_num(0.0)
         low = at.floor().clamp(max=r - 2)
         part = at - low
         node = low.long()

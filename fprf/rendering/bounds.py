@@ -31,6 +31,11 @@ NEAR = 0.05
 MARGIN = 1.02
 """Bounds are this much wider than what the training rays span, so that no training point lies on a border."""
 
+DEPTHS = 1 << 22
+"""About how many depths of points are looked at; a large capture has billions, and quantile() takes 16 million."""
+ROUNDING = 1e-12
+"""Cameras closer together than this share of their coordinates stand in one place: the rest is float64's rounding."""
+
 
 def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
     """The point nearest to all optical axes, and how well it is determined: smallest over largest eigenvalue."""
@@ -76,7 +81,8 @@ def _depths(scene: Scene) -> Tensor | None:
     """Depths that the capture knows: of its sparse points in every camera, or the middle of its near and far."""
     if scene.points is not None and len(scene.points) >= 8:
         pose = scene.cameras.pose
-        z = -((scene.points[None] - pose[:, None, :, 3]) * pose[:, None, :, 2]).sum(-1)
+        points = scene.points[:: max(1, len(pose) * len(scene.points) // DEPTHS)]
+        z = -((points[None] - pose[:, None, :, 3]) * pose[:, None, :, 2]).sum(-1)
         z = z[z > 0]
         return z if len(z) else None
     if scene.depths is not None:
@@ -113,7 +119,7 @@ def _contraction(scene: Scene) -> Space:
     if scene.points is not None and len(scene.points) >= 8:
         spread = float(((scene.points - centre) @ rotation.T).abs().amax(-1).quantile(0.5))
         radius = max(radius, min(spread, 3 * radius if radius > 0 else spread))
-    if radius <= 0:
+    if radius <= ROUNDING * float(position.abs().amax()):
         raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
     depth = _depths(scene)
     near = NEAR if depth is None else min(NEAR, 0.5 * float(depth.quantile(_share(depth, 0.001))) / radius)
@@ -121,7 +127,7 @@ def _contraction(scene: Scene) -> Space:
 
 
 def _share(values: Tensor, share: float) -> float:
-    """quantile() takes up to 16 million values; fewer points than 1/share give their smallest."""
+    """Fewer values than 1/share give their smallest."""
     return share if len(values) * share >= 1 else 0.0
 
 
@@ -131,7 +137,7 @@ def _box(scene: Scene) -> Space:
     if certain < 1e-4:
         centre = position.mean(0)
     distance = float((position - centre).norm(dim=-1).median())
-    if distance <= 0:
+    if distance <= ROUNDING * float(position.abs().amax()):
         raise DataError(f"{scene.name}: all cameras stand in one place; capture from several places")
     return Space("box", _three(centre), _rows(torch.eye(3)), 1 / (BOX_SHARE * distance), 0.0, FAR)
 

@@ -94,8 +94,10 @@ class Space:
             return n + (f - n) * s
         g_near, g_far = torch.where(n < 1, n / 2, 1 - 0.5 / n), torch.where(f < 1, f / 2, 1 - 0.5 / f)
         c_near, c_far = torch.where(n < 1, 1 - n / 2, 0.5 / n), torch.where(f < 1, 1 - f / 2, 0.5 / f)
-        g, c = g_near + (g_far - g_near) * s, c_near + (c_far - c_near) * s
-        return torch.where(g < 0.5, 2 * g, 0.5 / c)
+        # The far form starts from its far end: c_near + (c_far - c_near) s would cancel there.
+        g, c = g_near + (g_far - g_near) * s, c_far + (c_near - c_far) * (1 - s)
+        # Both round: the clamp keeps them in order where they meet, since a negative step would be a negative weight.
+        return torch.where(g < 0.5, 2 * g, 0.5 / c.clamp(max=0.5))
 
     def metric(
         self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]

@@ -21,7 +21,7 @@ class _Weights(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, tau: Tensor) -> Tensor:
-        before = torch.exp(-(tau.cumsum(-1) - tau))
+        before = torch.exp(-_before(tau))
         w = before * -torch.expm1(-tau)
         ctx.save_for_backward(w, before * torch.exp(-tau))
         return w
@@ -30,10 +30,17 @@ class _Weights(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
         w, after = ctx.saved_tensors
         gw = grads[0] * w
-        # Suffix sums, excluding the sample itself: total minus prefix would cancel.
-        behind = gw.flip(-1).cumsum(-1).flip(-1) - gw
+        # Suffix sums of what lies behind; total minus prefix would cancel.
+        behind = _before(gw.flip(-1)).flip(-1)
         result: Tensor = after * grads[0] - behind
         return result
+
+
+def _before(x: Tensor) -> Tensor:
+    """Sum of all earlier entries. Taking an entry off the inclusive sum again would round by its own size: the fog in front
+    of a wall of optical depth 1e8 would be lost, and inf - inf is NaN.
+    """
+    return torch.nn.functional.pad(x[..., :-1], (1, 0)).cumsum(-1)
 
 
 def transmittance_weights(density: Annotated[Tensor, "R S"], t: Annotated[Tensor, "R E"]) -> Annotated[Tensor, "R S"]:

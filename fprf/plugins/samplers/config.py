@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from ...checks import at_least, between, positive
+from ...errors import ConfigError
 from ..config import PluginConfig
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class ProposalConfig(SamplerConfig):
     anneal_slope: float = 10.0
     """How fast they sharpen at first."""
     padding: float = 1e-3
-    """Total probability spread evenly over a ray, so that no place is ruled out."""
+    """Total probability spread evenly over a ray, so that no place is ruled out; above 0."""
     update_every: int = 5
     """After the warm-up the proposals learn every so many steps."""
     warm_up: int = 5000
@@ -68,11 +69,19 @@ class ProposalConfig(SamplerConfig):
     def __post_init__(self) -> None:
         at_least("sampler.final", self.final, 1)
         at_least("sampler.channels", self.channels, 1)
+        positive("sampler.padding", self.padding)
         between("sampler.padding", self.padding, 0.0, 1.0)
+        at_least("sampler.anneal_steps", self.anneal_steps, 0)
+        at_least("sampler.warm_up", self.warm_up, 0)
         positive("sampler.anneal_slope", self.anneal_slope)
         at_least("sampler.update_every", self.update_every, 1)
         for n in (*self.samples, *self.resolutions):
             at_least("sampler.samples and resolutions", n, 2)
+        if not 1 <= len(self.samples) == len(self.resolutions):
+            raise ConfigError(
+                f"sampler.samples: {len(self.samples)} levels but {len(self.resolutions)} in sampler.resolutions; "
+                "name as many of each, at least one"
+            )
 
     def build(self, *, seed: int) -> Sampler:
         """The sampler, its planes drawn from the seed."""

@@ -18,7 +18,7 @@ def even_edges(rays: Rays, samples: int, generator: torch.Generator | None) -> T
     if generator is None:
         return s
     shift = torch.rand((len(s), 1), generator=generator, dtype=s.dtype, device=s.device) - 0.5
-    return (s + shift / samples).clamp(0, 1)
+    return torch.cat([s[:, :1], s[:, 1:-1] + shift / samples, s[:, -1:]], 1)
 
 
 class UniformSampler(Sampler):
