@@ -6,7 +6,7 @@ from pathlib import Path
 from torch import Tensor
 
 from ..plugins.weightfiles import read_weights, write_weights
-from .config import PretrainConfig
+from .config import DistilConfig
 
 __all__ = ["prepared", "prepared_path"]
 
@@ -18,13 +18,18 @@ def prepared_path(output: Path) -> Path:
     return output.with_name(output.name + ".prepared")
 
 
-def prepared(make: Callable[[], Pair], config: PretrainConfig, output: Path) -> Pair:
-    """Inputs and targets: those of an interrupted run of the same config, or made anew and kept."""
+def prepared(make: Callable[[], Pair], config: DistilConfig, output: Path) -> Pair:
+    """Inputs and targets: those of an interrupted run that would prepare the same, or made anew and kept."""
     path = prepared_path(output)
     if path.is_file():
         tensors, metadata = read_weights(path)
-        if metadata.get("config") == repr(config):
+        if metadata.get("key") == _key(config):
             return tensors["inputs"], tensors["targets"]
     inputs, targets = make()
-    write_weights(path, {"inputs": inputs, "targets": targets}, {"config": repr(config)})
+    write_weights(path, {"inputs": inputs, "targets": targets}, {"key": _key(config)})
     return inputs, targets
+
+
+def _key(config: DistilConfig) -> str:
+    """What the crops depend on: a run may be made longer without preparing them again."""
+    return repr((config.images, config.photos, config.teachers, config.crops, config.size, config.seed))

@@ -30,11 +30,10 @@ def toned(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Anno
 def nightfall(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Annotated[Tensor, "3 H W"]:
     """Dark, bluish or orange, grainy: day as a night photograph shows it."""
     draw = torch.rand(4, generator=generator).tolist()
-    gain = 0.25 + 0.4 * draw[0]
     cold = torch.tensor([0.7, 0.85, 1.3]) if draw[1] < 0.6 else torch.tensor([1.3, 0.95, 0.6])
-    dark = gain * torch.pow(image, 1.2 + draw[2]) * cold.view(3, 1, 1)
+    dark = torch.pow(image, 1.2 + draw[2]) * (0.25 + 0.4 * draw[0]) * cold.view(3, 1, 1)
     grain = 0.03 * draw[3] * torch.randn(image.shape, generator=generator)
-    return (dark + grain).clamp(0, 1)
+    return torch.clamp(dark + grain, 0, 1)
 
 
 def _turned(image: Tensor, angle: float) -> Tensor:

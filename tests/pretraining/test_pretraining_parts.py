@@ -131,6 +131,8 @@ def test_crops_are_prepared_once_per_config(tmp_path: Path) -> None:
     assert len(made) == 1
     assert torch.equal(first[0], second[0])
     assert torch.equal(first[1].float(), second[1].float())
+    prepared(make, DistilConfig(steps=7, batch=1), output)
+    assert len(made) == 1
     prepared(make, DistilConfig(seed=1), output)
     assert len(made) == 2
     assert prepared_path(output).is_file()
