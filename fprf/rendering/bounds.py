@@ -30,7 +30,6 @@ NEAR = 0.05
 """Nearest distance in the contraction where nothing is known of depths, in units of the inner radius."""
 MARGIN = 1.02
 """Bounds are this much wider than what the training rays span, so that no training point lies on a border."""
-
 DEPTHS = 1 << 22
 """About how many depths of points are looked at; a large capture has billions, and quantile() takes 16 million."""
 ROUNDING = 1e-12
@@ -39,15 +38,16 @@ ROUNDING = 1e-12
 
 def focus(cameras: Cameras) -> tuple[Annotated[Tensor, "3"], float]:
     """The point nearest to all optical axes, and how well it is determined: smallest over largest eigenvalue."""
-    origin, axis = cameras.pose[:, :, 3], -cameras.pose[:, :, 2]
+    middle, axis = cameras.pose[:, :, 3].mean(0), -cameras.pose[:, :, 2]
+    origin = cameras.pose[:, :, 3] - middle
     axis = axis / axis.norm(dim=-1, keepdim=True)
     across = torch.eye(3, dtype=axis.dtype) - axis[:, :, None] * axis[:, None, :]
     matrix = across.sum(0)
     values = torch.linalg.eigvalsh(matrix)
     # A least-squares ridge of 1e-9 keeps parallel axes solvable: the answer is then the cameras' own centre.
     ridge = 1e-9 * values[-1].clamp_min(1e-12) * torch.eye(3, dtype=axis.dtype)
-    target = (across @ origin[:, :, None]).sum(0) + ridge @ origin.mean(0)[:, None]
-    return torch.linalg.solve(matrix + ridge, target)[:, 0], float(values[0] / values[-1].clamp_min(1e-12))
+    target = (across @ origin[:, :, None]).sum(0)
+    return middle + torch.linalg.solve(matrix + ridge, target)[:, 0], float(values[0] / values[-1].clamp_min(1e-12))
 
 
 def find_space(scene: Scene) -> Space:
