@@ -33,6 +33,8 @@ class ContentConfig:
     """Representation of density and content."""
     decoder: DecoderConfig = MlpDecoderConfig()
     """Frozen decoder from content features to colour."""
+    moves_density: bool = True
+    """Whether the feature loss also moves density, as in the paper; without, colour alone decides the geometry."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +69,8 @@ class LossConfig:
     """Total variation of the content planes."""
     proposal_variation: float = 1e-4
     """Total variation of the proposal planes."""
+    penalty_every: int = 1
+    """Steps between total-variation terms, which then weigh as many times more."""
     interlevel: float = 1.0
     """Proposals must bound the field's weights from above."""
     distortion: float = 1e-3
@@ -75,6 +79,7 @@ class LossConfig:
     def __post_init__(self) -> None:
         for name in ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion"):
             at_least(f"loss.{name}", getattr(self, name), 0.0)
+        at_least("loss.penalty_every", self.penalty_every, 1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ from ..rendering.stepfun import distortion, interlevel
 from ..types import Batch, Rendered, Want
 from .model import Facts, Model
 
-__all__ = ["terms", "wanted"]
+__all__ = ["terms", "total", "wanted"]
 
 
 def wanted(config: LossConfig, batch: Batch) -> Want:
@@ -24,8 +24,11 @@ def wanted(config: LossConfig, batch: Batch) -> Want:
     return want
 
 
-def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, model: Model) -> dict[str, Tensor]:
-    """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits any encoder."""
+def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, model: Model, *, step: int) -> dict[str, Tensor]:
+    """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits any encoder.
+
+    Penalties walk over every parameter of the planes, whatever the batch: they come every `penalty_every` steps.
+    """
     result: dict[str, Tensor] = {}
     if rendered.rgb is not None and config.rgb > 0:
         result["rgb"] = F.mse_loss(rendered.rgb, batch.rgb)
@@ -40,7 +43,8 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
         result["interlevel"] = torch.stack(parts).sum()
     if config.distortion > 0:
         result["distortion"] = distortion(sampled.s, weights)
-    penalties = model.penalties() if config.variation > 0 or config.proposal_variation > 0 else {}
+    due = step % config.penalty_every == 0 and (config.variation > 0 or config.proposal_variation > 0)
+    penalties = model.penalties() if due else {}
     for name, weight in (("variation", config.variation), ("proposal_variation", config.proposal_variation)):
         if weight > 0 and name in penalties:
             result[name] = penalties[name]
@@ -55,7 +59,7 @@ def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
         "semantic": config.semantic,
         "interlevel": config.interlevel,
         "distortion": config.distortion,
-        "variation": config.variation,
-        "proposal_variation": config.proposal_variation,
+        "variation": config.variation * config.penalty_every,
+        "proposal_variation": config.proposal_variation * config.penalty_every,
     }
     return torch.stack([weights[name] * value for name, value in parts.items()]).sum()

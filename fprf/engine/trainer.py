@@ -102,6 +102,7 @@ class _Loop:
         self.through = PixelRays(prepared.scene.cameras)
         self.background = background_of(prepared.facts, device)
         self.mean: dict[str, float] = {}
+        self.seen: dict[str, float] = {}
         self.steps = self.skipped = self.failed = 0
         self.rays = 0
         self.begun = time.perf_counter()
@@ -121,8 +122,9 @@ class _Loop:
             generator=step_generator(self.config.seed, step, self.device),
             semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
             semantic_samples=self.config.semantic.samples,
+            content_moves_density=self.config.content.moves_density,
         )
-        parts = terms(self.config.loss, self.facts, rendered, batch, self.model)
+        parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
         loss = total(self.config.loss, parts)
         self.optimizer.zero_grad(set_to_none=True)
         if torch.isfinite(loss):
@@ -136,17 +138,18 @@ class _Loop:
         return lambda share, seconds: self.summary(step + 1, share, seconds)
 
     def summary(self, step: int, share: float, seconds: float) -> Report:
-        """Running means, corrected for their start."""
-        scale = 1 / (1 - SMOOTHING**self.steps)
-        losses = {name: value * scale for name, value in self.mean.items() if name != "kept"}
+        """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
+        means = {name: value / self.seen[name] for name, value in self.mean.items()}
+        losses = {name: value for name, value in means.items() if name != "kept"}
         rgb = torch.tensor(losses.get("rgb", 1.0)).clamp_min(1e-10)
         speed = self.rays / (time.perf_counter() - self.begun)
-        return Report(step, share, seconds, float(-10 * rgb.log10()), speed, self.mean["kept"] * scale, losses, self.skipped)
+        return Report(step, share, seconds, float(-10 * rgb.log10()), speed, means.get("kept", 0.0), losses, self.skipped)
 
     def _remember(self, parts: dict[str, Tensor], kept: float) -> None:
         for name, value in {**{n: float(v.detach()) for n, v in parts.items()}, "kept": kept}.items():
             if value == value:
                 self.mean[name] = SMOOTHING * self.mean.get(name, 0.0) + (1 - SMOOTHING) * value
+                self.seen[name] = SMOOTHING * self.seen.get(name, 0.0) + (1 - SMOOTHING)
 
     def _skip(self, step: int, parts: dict[str, Tensor]) -> None:
         self.skipped, self.failed = self.skipped + 1, self.failed + 1
@@ -164,4 +167,3 @@ class _Loop:
         if self.device.type == "cpu":
             return batch
         return Batch(*(x.to(self.device, non_blocking=True) if x is not None else None for x in batch))
-

@@ -59,6 +59,8 @@ class March(NamedTuple):
     weights: Annotated[Tensor, "R S"]
     depth: Annotated[Tensor, "R"]
     opacity: Annotated[Tensor, "R"]
+    through: Annotated[Tensor, "R"]
+    """Share of the light from behind that reaches the eye. Density learns from it: a background is seen, or it is not."""
     kept: Kept
 
 
@@ -74,9 +76,10 @@ def march(
     sample = parts.field.density(located)
     density = sample.density.view(middle.shape)
     weights = transmittance_weights(density, sampled.t)
+    optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
+    # 1 - sum of weights would cancel where the ray is opaque.
+    through = torch.exp(-optical)
     with torch.no_grad():
-        optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
-        # 1 - sum of weights would cancel where the ray is opaque.
         opacity = -torch.expm1(-optical)
         depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
         index = keep_heaviest(weights, budget).view(-1).nonzero()[:, 0]
@@ -88,7 +91,7 @@ def march(
         sample.latent.index_select(0, index),
         rays.view.index_select(0, ray),
     )
-    return March(sampled, weights, depth, opacity, kept)
+    return March(sampled, weights, depth, opacity, through, kept)
 
 
 def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
@@ -108,11 +111,13 @@ def render_rays(
     generator: torch.Generator | None = None,
     semantic_rays: int | None = None,
     semantic_samples: int | None = None,
+    content_moves_density: bool = True,
 ) -> Rendered:
     """Render what is wanted. `step` is given in training alone.
 
     Semantics are rendered with detached weights (the semantic loss never moves density), for the first `semantic_rays` rays
-    from their `semantic_samples` heaviest samples, whose weights are scaled up to the ray's opacity.
+    from their `semantic_samples` heaviest samples, whose weights are scaled up to the ray's opacity. Content features are
+    composited with detached weights too unless they may move density.
     """
     marched = march(rays, parts, budget=budget, step=step, generator=generator)
     kept, count = marched.kept, len(rays.near)
@@ -120,13 +125,14 @@ def render_rays(
     if want & (Want.COLOUR | Want.CONTENT):
         features = parts.field.content(kept.latent, kept.view)
         if Want.CONTENT in want:
-            content = composite(kept, features, count)
+            still = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
+            content = composite(still, features, count)
         if Want.COLOUR in want:
             if restyle is not None and restyle.strength > 0:
                 features = _restyled(features, kept, parts, restyle)
             rgb = composite(kept, parts.decoder(features), count)
             if background is not None:
-                rgb = rgb + (1 - marched.opacity)[:, None] * background
+                rgb = rgb + marched.through[:, None] * background
     if Want.SEMANTIC in want and parts.semantic is not None:
         semantic = _semantics(marched, rays, parts, semantic_rays or count, semantic_samples)
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
