@@ -110,7 +110,7 @@ def _styles(
     from ..output.maps import match_image
 
     known, config = trained.known, trained.config.render
-    chosen = [(name, (path,)) for name, path in references.items()]
+    chosen: list[tuple[str, tuple[Path, ...]]] = [(name, (path,)) for name, path in references.items()]
     chosen.append((" + ".join(references), tuple(references.values())))
     views = known.test[:4]
     result, dictionary_seconds, view_seconds = [], 0.0, 0.0

@@ -10,11 +10,10 @@ __all__ = ["linear", "mlp"]
 
 def linear(inputs: int, outputs: int, *, generator: torch.Generator) -> nn.Linear:
     """A linear map without bias, uniform in +-sqrt(3 / inputs): unit variance out for unit variance in."""
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=False)
+    layer = nn.Linear(inputs, outputs, bias=False)
     bound = math.sqrt(3 / inputs)
     with torch.no_grad():
         layer.weight.uniform_(-bound, bound, generator=generator)
-    assert isinstance(layer, nn.Linear)
     return layer
 
 

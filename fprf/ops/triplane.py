@@ -30,7 +30,7 @@ def rows(resolutions: Sequence[int]) -> int:
 
 def split(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> list[Tensor]:
     """Views [3 r r F] of the table, one a scale."""
-    parts = table.split([len(AXES) * r * r for r in resolutions])
+    parts = torch.split(table, [len(AXES) * r * r for r in resolutions])
     return [p.view(len(AXES), r, r, table.shape[1]) for p, r in zip(parts, resolutions, strict=True)]
 
 
