@@ -5,6 +5,7 @@ from pathlib import Path
 
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
+from .errors import ConfigError
 from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
 from .fields.layouts import LayoutConfig, SingleConfig
 from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig
@@ -80,6 +81,8 @@ class LossConfig:
         for name in ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion"):
             at_least(f"loss.{name}", getattr(self, name), 0.0)
         at_least("loss.penalty_every", self.penalty_every, 1)
+        if self.rgb == self.content == self.semantic == 0:
+            raise ConfigError("loss: rgb, content and semantic are all 0, so nothing would be learnt; raise one of them")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +184,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         at_least("downscale", self.downscale, 1)
         at_least("steps", self.steps, 0)
+        between("seed", self.seed, 0, 2**31 - 1)
         if self.minutes is not None:
             positive("minutes", self.minutes)
         positive("checkpoint_minutes", self.checkpoint_minutes)

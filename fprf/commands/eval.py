@@ -36,6 +36,7 @@ def run(args: list[str]) -> int:
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
     from ..datamanagers.parsers.recognise import parse_scene
     from ..engine.loading import load_run
+    from ..engine.run import view_names
     from ..evaluation.judge import judge
     from ..output.atomic import write_json
     from ..output.images import to_uint8
@@ -44,10 +45,8 @@ def run(args: list[str]) -> int:
     trained = load_run(config.run, config.device)
     data = config.data or trained.config.data
     scene = parse_scene(data, trained.config.downscale, trained.config.datamanager.parser)
-    if tuple(p.stem for p in scene.paths) != trained.known.names:
-        raise UsageError(
-            f"{data}: its images are not those of the run; name the folder with --data"
-        )
+    if tuple(view_names(scene.paths)) != trained.known.names:
+        raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
     views = trained.known.split(config.split)
     with Display() as display:
         metrics, renders = judge(trained, scene, views, display.count)

@@ -54,10 +54,10 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
     folder = Run(output)
     with Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
-        prepared = prepare.prepare(config, display.features)
         _check_same(folder, config)
+        prepared = prepare.prepare(config, display.features)
         folder.root.mkdir(parents=True, exist_ok=True)
-        folder.save_config(config, method)
+        folder.save_config(replace(config, output=None), method)  # the folder may be moved
         folder.save_known(prepared.scene, config.data, prepared.facts)
         if prepared.basis is not None:
             folder.save_tensors("basis", prepared.basis.tensors())

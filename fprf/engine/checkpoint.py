@@ -5,6 +5,7 @@ A folder without a valid manifest was cut short and does not count. The two newe
 """
 
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,15 +68,14 @@ def load(root: Path, step: int) -> Saved:
     folder = _folder(root, step)
     try:
         manifest: dict[str, Any] = json.loads((folder / "manifest.json").read_text())
-        files, at, seconds = manifest["files"], int(manifest["step"]), float(manifest["seconds"])
-    except (OSError, ValueError, KeyError, TypeError) as e:
+        at, seconds = int(manifest["step"]), float(manifest["seconds"])
+        entries = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as e:
         raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
-    return Saved(
-        at,
-        seconds,
-        tensorfiles.load(folder / "model.safetensors", files["model"]),
-        tensorfiles.load(folder / "optimizer.safetensors", files["optimizer"]),
-    )
+    if at != step or not math.isfinite(seconds):
+        raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
+    model, optimizer = (tensorfiles.load(folder / f"{name}.safetensors", entries[name]) for name in entries)
+    return Saved(at, seconds, model, optimizer)
 
 
 def load_latest(root: Path) -> tuple[Saved | None, list[str]]:

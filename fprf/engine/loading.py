@@ -26,6 +26,8 @@ class Trained(NamedTuple):
     step: int
     seconds: float
     """How long it was trained."""
+    damaged: tuple[str, ...] = ()
+    """A line for each newer checkpoint that could not be used."""
 
 
 def load_run(root: Path, device: str = "auto") -> Trained:
@@ -33,13 +35,14 @@ def load_run(root: Path, device: str = "auto") -> Trained:
     run = Run(root)
     config, method = run.load_config()
     known = run.load_known()
-    saved, _ = checkpoint.load_latest(run.checkpoints)
+    saved, damaged = checkpoint.load_latest(run.checkpoints)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
     model = build_model(config, known.facts)
     checkpoint.restore(saved, model, None)
     model.requires_grad_(False)
-    return Trained(run, config, method, known, model.to(device_of(device)).eval(), saved.step, saved.seconds)
+    model = model.to(device_of(device)).eval()
+    return Trained(run, config, method, known, model, saved.step, saved.seconds, tuple(damaged))
 
 
 def load_style(run: Run) -> tuple[SceneStyle, Basis | None]:

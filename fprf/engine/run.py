@@ -13,6 +13,7 @@ It can be moved and shared: it holds no absolute path that matters and needs nei
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.space import Space
 from .model import Facts
 
-__all__ = ["Known", "Run"]
+__all__ = ["Known", "Run", "view_names"]
 
 FORMAT = 1
 _CAMERA = ("pose", "focal", "centre", "size", "distortion", "lens")
@@ -45,7 +46,7 @@ class Known:
     data: str
     """Where the images lay when it was trained: a hint for `eval`, not a need."""
     names: tuple[str, ...]
-    """Stem of each view's image."""
+    """Of each view: the stem of its image (see `view_names`)."""
     cameras: Cameras
     train: tuple[int, ...]
     test: tuple[int, ...]
@@ -88,7 +89,7 @@ class Run:
             "format": FORMAT,
             "name": scene.name,
             "data": str(data),
-            "names": [p.stem for p in scene.paths],
+            "names": view_names(scene.paths),
             "cameras": {key: getattr(scene.cameras, key).tolist() for key in _CAMERA},
             "train": scene.train.tolist(),
             "test": scene.test.tolist(),
@@ -101,6 +102,10 @@ class Run:
         path = self.root / "scene.json"
         try:
             document: dict[str, Any] = json.loads(path.read_text())
+            if document["format"] != FORMAT:
+                raise CheckpointError(
+                    f"{path}: is of format {document['format']!r}, this fprf reads {FORMAT}; use the one that wrote it"
+                )
             facts = dict(document["facts"])
             space = {k: _tupled(v) for k, v in facts.pop("space").items()}
             raw = document["cameras"]
@@ -116,7 +121,7 @@ class Run:
                 test=tuple(document["test"]),
                 facts=Facts(space=Space(**space), **{k: _tupled(v) for k, v in facts.items()}),
             )
-        except (OSError, ValueError, KeyError, TypeError) as e:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as e:
             raise CheckpointError(f"{path}: cannot be read ({e!r}); train the scene again") from e
 
     def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
@@ -138,6 +143,16 @@ class Run:
         """Append one line to events.jsonl."""
         with (self.root / "events.jsonl").open("a") as f:
             f.write(json.dumps(event, allow_nan=False) + "\n")
+
+
+def view_names(paths: Sequence[Path]) -> list[str]:
+    """The stems of images; where two agree (a folder per camera), with the folders above, then a number, before them."""
+    bare = [p.with_suffix("") for p in paths]
+    for depth in range(1, max((len(p.parts) for p in bare), default=0)):
+        names = ["-".join(p.parts[-depth:]) for p in bare]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{i:05d}-{p.name}" for i, p in enumerate(bare)]
 
 
 def _tupled(value: Any) -> Any:

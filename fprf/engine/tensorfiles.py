@@ -44,8 +44,9 @@ def load(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> dict[str, Ten
         odd = ", ".join(sorted(tensors.keys() ^ manifest.keys())[:3])
         raise CheckpointError(f"{path}: its tensors differ from its manifest ({odd}); use another checkpoint")
     for name, tensor in tensors.items():
-        if _checksum(tensor) != manifest[name]["crc32"]:
+        entry = dict(manifest[name]) if isinstance(manifest[name], Mapping) else {}
+        if _checksum(tensor) != entry.get("crc32"):
             raise CheckpointError(f"{path}: tensor {name} is damaged (checksum differs); use another checkpoint")
-        if not manifest[name]["finite"]:
+        if not entry.get("finite"):
             raise CheckpointError(f"{path}: tensor {name} was not finite when saved; use another checkpoint")
     return tensors

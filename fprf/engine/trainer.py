@@ -1,5 +1,6 @@
 """The training loop. Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -61,7 +62,9 @@ def train(config: TrainConfig, prepared: Prepared, run: Run, report: Callable[[R
     optimizer = torch.optim.Adam(
         model.learned(), lr=config.optimizer.rate, betas=(0.9, config.optimizer.beta2), eps=config.optimizer.eps, fused=True
     )
-    saved, _ = checkpoint.load_latest(run.checkpoints)
+    saved, damaged = checkpoint.load_latest(run.checkpoints)
+    for line in damaged:
+        run.log({"damaged": line})
     if saved is not None:
         checkpoint.restore(saved, model, optimizer)
     loop = _Loop(config, prepared, model, optimizer, device)
@@ -147,7 +150,7 @@ class _Loop:
 
     def _remember(self, parts: dict[str, Tensor], kept: float) -> None:
         for name, value in {**{n: float(v.detach()) for n, v in parts.items()}, "kept": kept}.items():
-            if value == value:
+            if math.isfinite(value):
                 self.mean[name] = SMOOTHING * self.mean.get(name, 0.0) + (1 - SMOOTHING) * value
                 self.seen[name] = SMOOTHING * self.seen.get(name, 0.0) + (1 - SMOOTHING)
 
@@ -166,4 +169,5 @@ class _Loop:
     def _to_device(self, batch: Batch) -> Batch:
         if self.device.type == "cpu":
             return batch
-        return Batch(*(x.to(self.device, non_blocking=True) if x is not None else None for x in batch))
+        content, semantic = (x.to(self.device) if x is not None else None for x in (batch.content, batch.semantic))
+        return Batch(batch.view, batch.pixel, batch.rgb.to(self.device), content, semantic)
