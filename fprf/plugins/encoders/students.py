@@ -6,30 +6,28 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .frozen import reflect_pad
+from .frozen import reflect_pad, replicate_to_multiple
 
 __all__ = ["ContentStudent", "SemanticStudent"]
 
 
 class ContentStudent(nn.Module):
-    """A slim VGG-19 up to relu2_1, then the projection on principal components: stride 2, receptive field 10 pixels."""
+    """2x2 pixels to channels, two 3x3 convolutions, a projection: stride 2, the 10 pixels that VGG-19 relu2_1 sees.
 
-    def __init__(self, channels: int, widths: tuple[int, int, int] = (24, 40, 96)) -> None:
+    Half the arithmetic of a slim VGG with its convolutions at full size, and as good after the same time of training.
+    """
+
+    def __init__(self, channels: int, widths: tuple[int, int] = (64, 72)) -> None:
         super().__init__()
-        self.first = nn.Conv2d(3, widths[0], 3)
+        self.first = nn.Conv2d(12, widths[0], 3)
         self.second = nn.Conv2d(widths[0], widths[1], 3)
-        self.third = nn.Conv2d(widths[1], widths[2], 3)
-        self.project = nn.Conv2d(widths[2], channels, 1)
+        self.project = nn.Conv2d(widths[1], channels, 1)
 
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features at half the size, rounded up."""
-        x = F.relu(self.first(reflect_pad(4 * image - 2)))
+        x = F.pixel_unshuffle(4 * replicate_to_multiple(image, 2) - 2, 2)
+        x = F.relu(self.first(reflect_pad(x)))
         x = F.relu(self.second(reflect_pad(x)))
-        x = F.max_pool2d(x, 2, ceil_mode=True)
-        x = F.relu(self.third(reflect_pad(x)))
-        return self._project(x)
-
-    def _project(self, x: Tensor) -> Tensor:
         result: Tensor = self.project(x)
         return result
 
