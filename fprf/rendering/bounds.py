@@ -102,6 +102,8 @@ def _axes(cameras: Cameras) -> Tensor:
     along = along - (along @ up) * up
     if along.norm() < 1e-6:
         along = torch.linalg.svd(up[None], full_matrices=True).Vh[1]
+    if (flat[-1] - flat[0]) @ along < 0:  # a singular vector has either sign: onwards through the capture is the same anywhere
+        along = -along
     along = along / along.norm()
     return torch.stack([along, torch.linalg.cross(up, along), up])
 

@@ -1,0 +1,262 @@
+"""Spaces found from cameras: which kind, where the centre is, and that the world's own origin, unit and axes don't matter."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.datamanagers.scene import Scene
+from fprf.errors import DataError
+from fprf.rendering import bounds
+from fprf.rendering.bounds import find_kind, find_space, focus
+from fprf.rendering.cameras import Cameras, rays_through
+from fprf.rendering.space import Space
+
+F64 = torch.float64
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=F64)
+
+
+def look(place: Tensor, direction: Tensor, up: Tensor = UP) -> Tensor:
+    """Camera-to-world poses [V 3 4] at places, along directions."""
+    back = -direction / direction.norm(dim=-1, keepdim=True)
+    right = torch.linalg.cross(up.expand_as(back), back)
+    right = right / right.norm(dim=-1, keepdim=True)
+    return torch.stack([right, torch.linalg.cross(back, right), back, place], -1)
+
+
+def scene_of(pose: Tensor, points: Tensor | None = None, depths: Tensor | None = None, alpha: bool = False) -> Scene:
+    count = len(pose)
+    cameras = Cameras(
+        pose=pose,
+        focal=torch.full((count, 2), 80.0, dtype=F64),
+        centre=torch.tensor([[50.0, 40.0]], dtype=F64).repeat(count, 1),
+        size=torch.tensor([[100, 80]]).repeat(count, 1),
+        distortion=torch.zeros(count, 6, dtype=F64),
+        lens=torch.zeros(count, dtype=torch.int64),
+    )
+    paths = tuple(Path(f"{i}.png") for i in range(count))
+    everything = torch.arange(count)
+    return Scene(
+        name="rig",
+        paths=paths,
+        cameras=cameras,
+        train=everything,
+        test=everything[:0],
+        points=points,
+        depths=depths,
+        alpha=alpha,
+    )
+
+
+def ring(count: int = 24, radius: float = 4.0) -> Scene:
+    """Cameras on an ellipse around (1, 2, 0.5), looking at it, and points on a ball there."""
+    angle = torch.arange(count, dtype=F64) * (2 * math.pi / count)
+    target = torch.tensor([1.0, 2.0, 0.5], dtype=F64)
+    offset = torch.stack([1.2 * angle.cos(), angle.sin(), torch.full_like(angle, 0.3)], -1) * radius
+    ball = torch.nn.functional.normalize(torch.randn(200, 3, dtype=F64, generator=torch.Generator().manual_seed(0)), dim=-1)
+    return scene_of(look(target + offset, -offset), target + ball)
+
+
+def forward(points: bool = True) -> Scene:
+    """A grid of cameras on a wall, all looking along +y at points 5 to 20 away."""
+    x, z = torch.meshgrid(torch.linspace(-1, 1, 4, dtype=F64), torch.linspace(-0.5, 0.5, 3, dtype=F64), indexing="ij")
+    place = torch.stack([x.flatten(), torch.zeros(12, dtype=F64), z.flatten()], -1)
+    ahead = torch.tensor([[0.0, 1.0, 0.0]], dtype=F64).repeat(12, 1)
+    draw = torch.rand(100, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+    cloud = torch.stack([draw[:, 0] * 6 - 3, 5 + 15 * draw[:, 1], draw[:, 2] * 4 - 2], -1)
+    return scene_of(look(place, ahead), cloud if points else None)
+
+
+def street() -> Scene:
+    """A drive along (1, 1, 0), looking ahead and to the sides; no points."""
+    along = torch.tensor([1.0, 1.0, 0.0], dtype=F64) / math.sqrt(2)
+    side = torch.tensor([-1.0, 1.0, 0.0], dtype=F64) / math.sqrt(2)
+    place = (torch.arange(30, dtype=F64) - 15)[:, None] * along * 5
+    turn = torch.tensor([0.0, 1.2, -1.2], dtype=F64).repeat(10)[:, None]
+    return scene_of(look(place, turn.cos() * along + turn.sin() * side))
+
+
+def thing() -> Scene:
+    return replace(ring(), alpha=True, points=None)
+
+
+RIGS = {"ring": ring, "forward": forward, "street": street, "thing": thing}
+
+
+def moved(scene: Scene, scale: float, shift: Tensor, turn: Tensor) -> Scene:
+    pose = scene.cameras.pose
+    place = (scale * pose[:, :, 3]) @ turn.T + shift
+    cameras = replace(scene.cameras, pose=torch.cat([turn @ pose[:, :, :3], place[:, :, None]], -1))
+    points = None if scene.points is None else scale * scene.points @ turn.T + shift
+    return replace(scene, cameras=cameras, points=points, depths=None if scene.depths is None else scene.depths * scale)
+
+
+def located(scene: Scene, space: Space) -> Tensor:
+    """Unit-cube coordinates along rays through all cameras' corners and middles."""
+    view = torch.arange(len(scene.cameras)).repeat_interleave(3)
+    pixel = torch.tensor([[0.5, 0.5], [50.0, 40.0], [99.5, 70.5]], dtype=F64).repeat(len(scene.cameras), 1)
+    rays = space.rays(*rays_through(scene.cameras, view, pixel))
+    s = torch.linspace(0, 1, 9).expand(len(view), -1)
+    t = space.distance(s, rays.near, rays.far)
+    return space.locate((rays.origin[:, None] + rays.direction[:, None] * t[..., None]).view(-1, 3))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("ring", "contraction"), ("forward", "ndc"), ("street", "contraction"), ("thing", "box")]
+)
+def test_the_kind_follows_from_the_capture(name: str, kind: str) -> None:
+    scene = RIGS[name]()
+    space = find_space(scene)
+    assert find_kind(scene) == space.kind == kind
+    turn = torch.tensor(space.rotation, dtype=F64)
+    assert (turn @ turn.T - torch.eye(3, dtype=F64)).abs().max() < 1e-12 and torch.linalg.det(turn) > 0
+    assert space.scale > 0 and space.near >= 0 and (kind == "ndc" or space.near < space.far)
+    inside = located(scene, space)
+    assert inside.isfinite().all()
+    # A ray that misses a box has its empty step where it passes; all others stay in the cube.
+    assert kind == "box" or inside.abs().max() <= 1 + 1e-5
+
+
+@pytest.mark.parametrize("name", list(RIGS))
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 1e6), (1e3, 0.0), (1e-3, 1.0), (1e3, 1e6)])
+def test_origin_and_unit_of_the_world_do_not_matter(name: str, scale: float, offset: float) -> None:
+    scene = RIGS[name]()
+    shift = torch.tensor([offset, -2 * offset, 0.3 * offset], dtype=F64)
+    other = moved(scene, scale, shift, torch.eye(3, dtype=F64))
+    one, two = find_space(scene), find_space(other)
+    assert two.kind == one.kind
+    assert (located(other, two) - located(scene, one)).abs().max() <= 1e-5
+
+
+@pytest.mark.parametrize("name", ["ring", "street", "forward"])
+def test_axes_of_the_world_do_not_matter(name: str) -> None:
+    """Those of the space turn with them: they come from the cameras."""
+    scene = RIGS[name]()
+    draw = torch.Generator().manual_seed(2)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=F64, generator=draw))
+    turn = turn * torch.linalg.det(turn)
+    one, two = find_space(scene), find_space(moved(scene, 1.0, torch.zeros(3, dtype=F64), turn))
+    assert two.kind == one.kind
+    assert torch.allclose(torch.tensor(two.centre, dtype=F64), turn @ torch.tensor(one.centre, dtype=F64), atol=1e-6)
+    assert two.scale == pytest.approx(one.scale, rel=1e-6) and two.near == pytest.approx(one.near, rel=1e-6)
+    relative = torch.tensor(two.rotation, dtype=F64) @ turn @ torch.tensor(one.rotation, dtype=F64).T
+    assert torch.allclose(relative, torch.eye(3, dtype=F64), atol=1e-6)
+
+
+def test_a_ring_looks_at_its_centre() -> None:
+    scene = ring()
+    point, certain = focus(scene.cameras)
+    assert torch.allclose(point, torch.tensor([1.0, 2.0, 0.5], dtype=F64), atol=1e-8) and certain > 0.1
+    space = find_space(scene)
+    assert space.centre == pytest.approx((1.0, 2.0, 0.5), abs=1e-8)
+    local = (scene.cameras.pose[:, :, 3] - point) @ torch.tensor(space.rotation, dtype=F64).T * space.scale
+    # Nine in ten cameras, and the scene, lie in the part that is not contracted.
+    assert (local.abs().amax(-1) <= 1 + 1e-9).double().mean() >= 0.9
+    assert space.rotation[2] == pytest.approx((0.0, 0.0, 1.0), abs=0.2)
+
+
+def test_a_street_lies_along_the_first_axis() -> None:
+    space = find_space(street())
+    assert abs(sum(space.rotation[0][:2])) == pytest.approx(math.sqrt(2), rel=1e-6)
+    assert space.rotation[2] == pytest.approx((0.0, 0.0, 1.0), abs=1e-9)
+    assert space.near == bounds.NEAR and space.far == bounds.FAR
+
+
+def test_axes_that_look_outwards_do_not_make_a_centre() -> None:
+    """Optical axes of a panorama also meet in a point, but behind the cameras."""
+    scene = ring()
+    pose = scene.cameras.pose
+    outward = scene_of(look(pose[:, :, 3], pose[:, :, 2]))
+    assert find_space(outward).centre == pytest.approx(tuple(pose[:, :, 3].mean(0).tolist()), abs=1e-9)
+
+
+def test_near_comes_from_what_is_seen() -> None:
+    scene, pose = ring(), ring().cameras.pose
+    assert scene.points is not None
+    close = torch.cat([scene.points, pose[:1, :, 3] - 0.02 * pose[:1, :, 2]])
+    assert find_space(replace(scene, points=close)).near <= find_space(scene).near <= bounds.NEAR
+    assert find_space(replace(scene, points=None)).near == bounds.NEAR
+
+
+def test_ndc_frames_all_rays_and_starts_before_the_nearest_point() -> None:
+    scene = forward()
+    assert scene.points is not None
+    space = find_space(scene)
+    nearest = float(scene.points[:, 1].min())
+    assert 0.8 * nearest < space.near < nearest
+    assert space.focal == pytest.approx((1.6, 2.0))
+    inside = located(scene, space)
+    assert 0.9 < float(inside[:, :2].abs().max()) <= 1.0
+    given = find_space(replace(forward(points=False), depths=torch.tensor([[4.0, 30.0]], dtype=F64).repeat(12, 1)))
+    assert given.kind == "ndc" and given.near == pytest.approx(3.6)
+
+
+def test_without_depths_nothing_is_forward_facing() -> None:
+    assert find_kind(forward(points=False)) == "contraction"
+    assert find_kind(replace(forward(), points=torch.zeros(3, 3, dtype=F64))) == "contraction"
+
+
+def test_cameras_far_apart_or_few_are_not_forward_facing() -> None:
+    scene = forward()
+    wide = scene.cameras.pose.clone()
+    wide[:, 0, 3] *= 20
+    assert find_kind(replace(scene, cameras=replace(scene.cameras, pose=wide))) == "contraction"
+    assert find_kind(replace(scene, cameras=scene.cameras.select(torch.arange(2)))) == "contraction"
+
+
+def test_points_behind_every_camera_say_nothing() -> None:
+    scene = forward()
+    assert scene.points is not None
+    behind = scene.points * torch.tensor([1.0, -1.0, 1.0], dtype=F64)
+    assert find_kind(replace(scene, points=behind)) == "contraction"
+
+
+def test_a_large_cloud_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views times points may be billions; some of them say the same."""
+    scene = forward()
+    assert scene.points is not None
+    many = replace(scene, points=scene.points.repeat(40, 1))
+    whole = find_space(many)
+    monkeypatch.setattr(bounds, "DEPTHS", 5000)
+    thin = find_space(many)
+    assert thin.kind == whole.kind and thin.near == pytest.approx(whole.near, rel=0.15)
+
+
+@pytest.mark.parametrize("offset", [0.0, 4.5e6])
+@pytest.mark.parametrize("alpha", [False, True])
+def test_cameras_in_one_place_are_refused(offset: float, alpha: bool) -> None:
+    angle = torch.arange(8, dtype=F64)
+    direction = torch.stack([angle.cos(), angle.sin(), 0.1 * angle], -1)
+    scene = scene_of(look(torch.full((8, 3), offset, dtype=F64), direction), alpha=alpha)
+    with pytest.raises(DataError, match="rig: all cameras stand in one place"):
+        find_space(scene)
+
+
+def test_one_place_with_points_is_enough() -> None:
+    angle = torch.arange(8, dtype=F64)
+    direction = torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
+    cloud = torch.randn(50, 3, dtype=F64, generator=torch.Generator().manual_seed(0)) * 3
+    space = find_space(scene_of(look(torch.zeros(8, 3, dtype=F64), direction), cloud))
+    assert space.kind == "contraction" and 0.05 < space.scale < 5
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 12), st.integers(0, 9999), st.booleans(), st.floats(-3, 6))
+def test_any_rig_has_a_space(count: int, seed: int, alpha: bool, exponent: float) -> None:
+    """Or a DataError; whatever is found maps rays into the cube."""
+    draw = torch.Generator().manual_seed(seed)
+    place, direction = (torch.randn(count, 3, dtype=F64, generator=draw) for _ in range(2))
+    cloud = torch.randn(seed % 20, 3, dtype=F64, generator=draw) * 10**exponent if seed % 3 else None
+    scene = scene_of(look(place * 10**exponent, direction), cloud, alpha=alpha)
+    try:
+        space = find_space(scene)
+    except DataError:
+        return
+    inside = located(scene, space)
+    assert inside.isfinite().all()
+    assert space.kind == "box" or inside.abs().max() <= 1 + 1e-5

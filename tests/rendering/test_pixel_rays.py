@@ -1,0 +1,79 @@
+"""The table of pixel rays is `rays_through`, looked up."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
+from fprf.rendering.lens import FISHEYE, OPENCV, PINHOLE
+from fprf.rendering.pixel_rays import LIMIT, PixelRays
+
+K = {PINHOLE: [0.0] * 6, OPENCV: [0.05, -0.08, 0.01, 0.0, -0.001, 0.0002], FISHEYE: [0.05, -0.01, 0.002, 0.0, 0.0, 0.0]}
+
+
+def rig(lenses: list[int], sizes: list[tuple[int, int]], offset: float = 0.0) -> Cameras:
+    count, draw = len(lenses), torch.Generator().manual_seed(0)
+    turn, _ = torch.linalg.qr(torch.randn(count, 3, 3, dtype=torch.float64, generator=draw))
+    turn = turn * torch.linalg.det(turn)[:, None, None]
+    place = torch.randn(count, 3, 1, dtype=torch.float64, generator=draw) + offset
+    size = torch.tensor(sizes)
+    return Cameras(
+        pose=torch.cat([turn, place], -1),
+        focal=torch.full((count, 2), 20.0, dtype=torch.float64),
+        centre=size.double() / 2,
+        size=size,
+        distortion=torch.tensor([K[lens] for lens in lenses], dtype=torch.float64),
+        lens=torch.tensor(lenses),
+    )
+
+
+def every_pixel(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    grids = [pixel_grid(cameras, v) for v in range(len(cameras))]
+    return torch.cat([torch.full((len(g),), v) for v, g in enumerate(grids)]), torch.cat(grids)
+
+
+MIXED = ([PINHOLE, OPENCV, FISHEYE, OPENCV, PINHOLE], [(9, 6), (12, 5), (7, 7), (12, 5), (6, 9)])
+
+
+@pytest.mark.parametrize("offset", [0.0, 4.5e6])
+@pytest.mark.parametrize("limit", [LIMIT, 0])
+def test_every_pixel_of_mixed_cameras(offset: float, limit: int) -> None:
+    cameras = rig(*MIXED, offset=offset)
+    rays = PixelRays(cameras, limit=limit)
+    view, pixel = every_pixel(cameras)
+    origin, direction = rays(view, pixel)
+    wanted_origin, wanted = rays_through(cameras, view, pixel)
+    assert origin.dtype == direction.dtype == torch.float64
+    assert torch.equal(origin, wanted_origin)
+    assert (direction - wanted).abs().max() <= 1e-14
+    assert (direction.norm(dim=-1) - 1).abs().max() <= 1e-14
+
+
+def test_views_of_one_camera_share_a_table_and_others_do_not() -> None:
+    cameras = rig(*MIXED)
+    rays = PixelRays(cameras)
+    # Views 1 and 3 are one lens in two places; 0 and 4 have the same area but not the same shape.
+    assert rays.table is not None and len(rays.table) == 9 * 6 + 12 * 5 + 7 * 7 + 6 * 9
+    assert rays.kind[1] == rays.kind[3] and len(rays.kind.unique()) == 4
+
+
+def test_above_the_limit_nothing_is_kept() -> None:
+    cameras = rig([OPENCV], [(10, 10)])
+    assert PixelRays(cameras, limit=2400).table is not None
+    assert PixelRays(cameras, limit=2399).table is None
+
+
+def test_a_focal_length_of_its_own_is_a_camera_of_its_own() -> None:
+    cameras = rig([OPENCV, OPENCV], [(8, 8), (8, 8)])
+    changed = replace(cameras, focal=cameras.focal * torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64))
+    assert len(PixelRays(changed).kind.unique()) == 2
+    view, pixel = every_pixel(changed)
+    assert (PixelRays(changed)(view, pixel)[1] - rays_through(changed, view, pixel)[1]).abs().max() <= 1e-14
+
+
+def test_no_pixels() -> None:
+    rays = PixelRays(rig([PINHOLE], [(4, 4)]))
+    origin, direction = rays(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2))
+    assert origin.shape == direction.shape == (0, 3)

@@ -1,0 +1,232 @@
+"""Spaces: contraction at any size, spacing at any distance, NDC against NeRF's formulas, boxes against slabs by hand."""
+
+import itertools
+import math
+from fractions import Fraction
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.rendering.space import Kind, Space, contract, uncontract
+
+QUICK = settings(max_examples=40, deadline=None)
+U = 2.0**-24
+"""Unit round-off of float32."""
+EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+coordinate = st.floats(-(2.0**100), 2.0**100, width=32)
+
+
+def space_of(kind: Kind, near: float = 0.05, far: float = 1e3, **more: object) -> Space:
+    return Space(kind, (0.0, 0.0, 0.0), EYE, 1.0, near, far, **more)  # type: ignore[arg-type]
+
+
+def rotation(seed: int) -> Tensor:
+    draw = torch.Generator().manual_seed(seed)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=draw))
+    return turn * torch.linalg.det(turn)
+
+
+def rows(matrix: Tensor) -> tuple[tuple[float, float, float], ...]:
+    return tuple((float(a), float(b), float(c)) for a, b, c in matrix)
+
+
+def contract_oracle(x: list[float]) -> list[float]:
+    m = max(abs(v) for v in x)
+    return [v / 2 if m <= 1 else (2 - 1 / m) * (v / m) / 2 for v in x]
+
+
+@QUICK
+@given(st.tuples(coordinate, coordinate, coordinate))
+def test_contraction_is_the_formula(x: tuple[float, ...]) -> None:
+    found = contract(torch.tensor([x]))[0]
+    exact = torch.tensor(contract_oracle(list(x)), dtype=torch.float64)
+    assert ((found - exact).abs() <= 4 * U * exact.abs() + 1e-38).all()
+    assert found.abs().max() <= 1
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-38, 0.5, 1.0, 1 + 2e-7, 1e10, 1e30, 3e38])
+def test_contraction_is_finite_and_keeps_direction(size: float) -> None:
+    x = torch.tensor(list(itertools.product((-1.0, -0.3, 0.0, 1.0), repeat=3))) * size
+    y = contract(x)
+    assert y.isfinite().all() and (y.abs() <= 1).all()
+    assert torch.equal(y.sign(), x.sign())
+    unit = x.double() / max(size, 1e-38)
+    assert (y.double()[:, :2] * unit[:, 1:] - y.double()[:, 1:] * unit[:, :2]).abs().max() <= 8 * U
+
+
+def test_contraction_is_continuous_and_monotone_along_an_axis() -> None:
+    x = torch.cat([torch.linspace(0, 1, 500), torch.linspace(1, 1.001, 500), torch.logspace(0.001, 30, 2000)])
+    y = contract(torch.stack([x, 0.2 * x, -x], -1))
+    assert (y[:, 0].diff() >= -U).all() and torch.equal(y[:, 0], -y[:, 2])
+    assert (y[999] - y[500]).abs().max() < 1e-3 and float(y[-1, 0]) == 1.0
+
+
+@QUICK
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(-6, 4))
+def test_uncontract_inverts(direction: tuple[float, ...], exponent: float) -> None:
+    """In fp64; the inverse magnifies rounding by m, the size of the point."""
+    x = torch.tensor([direction], dtype=torch.float64) * 10**exponent
+    m = max(1.0, float(x.abs().max()))
+    assert (uncontract(contract(x)) - x).abs().max() <= 16 * 2.0**-53 * m * m
+
+
+def spacing_oracle(s: float, near: float, far: float) -> float:
+    """g(t) = t/2 up to 1, 1 - 1/(2t) beyond, is linear in s. In fractions of integers there is nothing to cancel."""
+
+    def g(t: Fraction) -> Fraction:
+        return t / 2 if t < 1 else 1 - 1 / (2 * t)
+
+    n, f, at = Fraction(near), Fraction(far), Fraction(s)
+    y = g(n) + (g(f) - g(n)) * at
+    return float(2 * y if 2 * y < 1 else 1 / (2 * (1 - y)))
+
+
+RANGES = [(0.05, 1e3), (1e-3, 1e6), (0.9, 1e6), (2.0, 1e6), (1e-3, 0.5), (0.5, 1.0), (1.0, 2.0), (3.0, 3.0)]
+
+
+@pytest.mark.parametrize(("near", "far"), RANGES)
+def test_spacing_keeps_its_relative_accuracy_and_its_order(near: float, far: float) -> None:
+    draw = torch.Generator().manual_seed(0)
+    s = torch.cat([torch.linspace(0, 1, 400), torch.rand(300, generator=draw), 1 - torch.rand(300, generator=draw) * 1e-4])
+    s = s.clamp(0, 1).sort().values
+    n, f = torch.tensor([near]), torch.tensor([far])
+    t = space_of("contraction").distance(s[None], n, f)[0]
+    assert (t.diff() >= 0).all()
+    assert abs(float(t[0]) - float(n)) <= 4 * U * near and abs(float(t[-1]) - float(f)) <= 4 * U * far
+    for a, b in zip(s.tolist(), t.tolist(), strict=True):
+        exact = spacing_oracle(a, float(n), float(f))
+        # Relative 1e-6 from the middle outwards; near the eye g's own rounding, u of 1, is what is left.
+        assert abs(b - exact) <= 16 * U * exact + 4 * U * min(far, 1.0) * a
+
+
+@QUICK
+@given(st.floats(1e-3, 10.0), st.floats(1.0, 1e6), st.integers(0, 99))
+def test_spacing_is_sorted_for_any_bounds(near: float, ratio: float, seed: int) -> None:
+    s = torch.rand(1, 400, generator=torch.Generator().manual_seed(seed)).sort(-1).values
+    n = torch.tensor([near])
+    t = space_of("contraction").distance(s, n, n * ratio)
+    assert (t.diff(dim=-1) >= 0).all()
+    assert (t >= n * (1 - 4 * U)).all() and (t <= n * ratio * (1 + 4 * U)).all()
+
+
+@pytest.mark.parametrize("kind", ["box", "ndc"])
+def test_spacing_is_even_in_bounded_spaces(kind: Kind) -> None:
+    s = torch.linspace(0, 1, 5)[None].repeat(2, 1)
+    t = space_of(kind).distance(s, torch.tensor([1.0, 0.0]), torch.tensor([3.0, 1.0]))
+    assert torch.allclose(t, torch.tensor([[1.0, 1.5, 2.0, 2.5, 3.0], [0.0, 0.25, 0.5, 0.75, 1.0]]))
+
+
+def forward_rays(count: int, seed: int, origin: float = 0.3, spread: float = 0.4) -> tuple[Tensor, Tensor]:
+    draw = torch.Generator().manual_seed(seed)
+    o = torch.randn(count, 3, dtype=torch.float64, generator=draw) * origin
+    d = torch.randn(count, 3, dtype=torch.float64, generator=draw) * spread
+    d[:, 2] = -1
+    return o, d / d.norm(dim=-1, keepdim=True)
+
+
+def ndc_point(x: Tensor, near: float, focal: tuple[float, float]) -> Tensor:
+    """NeRF, appendix C, for a far plane at infinity: a projected point, fp64."""
+    return torch.stack([-focal[0] * x[:, 0] / x[:, 2], -focal[1] * x[:, 1] / x[:, 2], 1 + 2 * near / x[:, 2]], -1)
+
+
+@pytest.mark.parametrize("offset", [0.0, 4.5e6])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_ndc_is_nerfs_projection(offset: float, seed: int) -> None:
+    """Points of a ray project to points of its NDC ray; t = 0 is the near plane, and `metric` gives the distance back."""
+    near, focal, turn = 1.3, (1.7, 2.1), rotation(seed)
+    centre = torch.tensor([offset, -offset, 0.5 * offset], dtype=torch.float64)
+    space = Space("ndc", (float(centre[0]), float(centre[1]), float(centre[2])), rows(turn), 1.0, near, 1.0, focal=focal)
+    local_o, local_d = forward_rays(50, seed)
+    origin, direction = local_o @ turn + centre, local_d @ turn
+    rays = space.rays(origin, direction)
+    assert rays.origin.dtype == torch.float32 and torch.equal(rays.view, direction.float())
+    assert (rays.near == 0).all() and (rays.far == 1).all()
+    assert torch.allclose(rays.origin[:, 2], torch.tensor(-1.0), atol=1e-6)
+    assert torch.allclose(rays.origin[:, 2] + rays.direction[:, 2], torch.tensor(1.0), atol=1e-6)
+    slack = 1e-6 + offset * 1e-15 * 100
+    for z in (1.3, 1.5, 3.0, 40.0, 1e4):
+        along = -(local_o[:, 2] + z) / local_d[:, 2]
+        wanted = ndc_point(local_o + along[:, None] * local_d, near, focal)
+        t = 1 - near / z  # the share of the way to the far plane
+        found = rays.origin.double() + t * rays.direction.double()
+        assert (found - wanted).abs().max() <= slack * 5
+        back = space.metric(origin, direction, torch.full((50,), t, dtype=torch.float64))
+        assert ((back - along) / along.abs()).abs().max() <= 1e-9 + offset * 1e-14
+
+
+def test_ndc_bends_rays_that_look_backwards() -> None:
+    space = space_of("ndc", near=1.0)
+    direction = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.6, 0.0, -0.8]], dtype=torch.float64)
+    rays = space.rays(torch.zeros(3, 3, dtype=torch.float64), direction)
+    assert all(x.isfinite().all() for x in rays)
+    assert (rays.direction[:, 2] > 0).all()
+
+
+def test_ndc_locates_its_bounds_on_the_cube() -> None:
+    space = space_of("ndc", low=(-2.0, -1.0, -1.0), high=(4.0, 1.0, 1.0))
+    corner = torch.tensor([[-2.0, -1.0, -1.0], [4.0, 1.0, 1.0], [1.0, 0.0, 0.0]])
+    assert torch.equal(space.locate(corner), torch.tensor([[-1.0] * 3, [1.0] * 3, [0.0] * 3]))
+
+
+@pytest.mark.parametrize("kind", ["box", "contraction"])
+@pytest.mark.parametrize("offset", [0.0, 4.5e6])
+def test_world_rays_are_recentred_turned_and_scaled_in_float64(kind: Kind, offset: float) -> None:
+    turn, scale = rotation(3), 0.25
+    centre = torch.tensor([offset, offset, 1.0], dtype=torch.float64)
+    space = Space(kind, (offset, offset, 1.0), rows(turn), scale, 0.05, 1e3)
+    origin, direction = forward_rays(40, 0)
+    rays = space.rays(origin + centre, direction)
+    assert (rays.origin - (origin @ turn.T) * scale).abs().max() <= 4 * U + offset * 2.0**-52
+    assert (rays.direction - direction @ turn.T).abs().max() <= 4 * U
+    assert torch.equal(rays.view, direction.float())
+    if kind == "contraction":
+        assert (rays.near == torch.tensor(0.05)).all() and (rays.far == 1e3).all()
+        point = rays.origin + rays.direction * 7
+        assert torch.equal(space.locate(point), contract(point))
+    t = torch.tensor([0.3, 2.0])
+    world = space.metric(origin[:2], direction[:2], t)
+    assert torch.allclose(world, t / scale)
+
+
+def slab_oracle(o: list[float], d: list[float], least: float) -> tuple[float, float] | None:
+    near, far = least, math.inf
+    for a, b in zip(o, d, strict=True):
+        if b == 0:
+            if abs(a) > 1:
+                return None
+            continue
+        one, two = (-1 - a) / b, (1 - a) / b
+        near, far = max(near, min(one, two)), min(far, max(one, two))
+    return (near, far) if near < far else None
+
+
+@QUICK
+@given(st.integers(0, 9999), st.booleans())
+def test_box_rays_enter_and_leave_where_slabs_say(seed: int, axis_aligned: bool) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    origin = torch.randn(20, 3, dtype=torch.float64, generator=draw) * 2
+    direction = torch.randn(20, 3, dtype=torch.float64, generator=draw)
+    if axis_aligned:
+        direction = torch.nn.functional.one_hot(torch.randint(3, (20,), generator=draw), 3).double()
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    rays = space_of("box", near=0.1).rays(origin, direction)
+    for k in range(20):
+        expected = slab_oracle(origin[k].tolist(), direction[k].tolist(), 0.1)
+        near, far = float(rays.near[k]), float(rays.far[k])
+        if expected is None:
+            assert near == far
+        else:
+            assert near == pytest.approx(expected[0], rel=1e-6) and far == pytest.approx(expected[1], rel=1e-6)
+            ends = origin[k] + torch.tensor([[near], [far]], dtype=torch.float64) * direction[k]
+            assert ends.abs().max() <= 1 + 1e-5
+
+
+@pytest.mark.parametrize("kind", ["box", "contraction", "ndc"])
+def test_no_rays(kind: Kind) -> None:
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    rays = space_of(kind).rays(none, none)
+    assert all(len(x) == 0 for x in rays)
+    assert space_of(kind).locate(torch.zeros(0, 3)).shape == (0, 3)
