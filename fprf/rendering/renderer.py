@@ -134,7 +134,7 @@ def render_rays(
             if background is not None:
                 rgb = rgb + marched.through[:, None] * background
     if Want.SEMANTIC in want and parts.semantic is not None:
-        semantic = _semantics(marched, rays, parts, semantic_rays or count, semantic_samples)
+        semantic = _semantics(marched, rays, parts, count if semantic_rays is None else semantic_rays, semantic_samples)
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
     return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts)
 
@@ -155,4 +155,4 @@ def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: in
     t = midpoints(marched.sampled.t[:count]).gather(1, index)
     points = rays.origin[:count, None] + rays.direction[:count, None] * t[..., None]
     features: Tensor = parts.semantic(parts.space.locate(points.reshape(-1, 3)))
-    return (features.view(count, s, -1) * (heaviest * scale)[..., None]).sum(1)
+    return (features.view(count, s, features.shape[-1]) * (heaviest * scale)[..., None]).sum(1)
