@@ -24,7 +24,7 @@ from .prepared import prepared, prepared_path
 from .teachers import MobileNetTeacher, load_teacher
 from .toning import nightfall, toned
 
-__all__ = ["pretrain_semantic", "semantic_report"]
+__all__ = ["pretrain_semantic", "semantic_bases", "semantic_report", "view"]
 
 COMPONENTS = 24
 """Principal components kept of each teacher."""
@@ -60,7 +60,7 @@ def pretrain_semantic(config: DistilConfig, output: Path, say: Callable[[str], N
 
     def loss(generator: torch.Generator) -> Tensor:
         index = torch.randint(0, len(images), (config.batch,), generator=generator).tolist()
-        views = [_view(images[i], targets[i], generator) for i in index]
+        views = [view(images[i], targets[i], generator) for i in index]
         found, wanted = student(torch.stack([seen for seen, _ in views])), torch.stack([right for _, right in views])
         return F.mse_loss(found, wanted) + (1 - F.cosine_similarity(found, wanted, dim=1).mean())
 
@@ -109,7 +109,7 @@ def semantic_report(student: Encoder, teachers: Teachers, photos: Sequence[Path]
     }
 
 
-def _view(
+def view(
     image: Annotated[Tensor, "3 s s"], target: Annotated[Tensor, "C t t"], generator: torch.Generator
 ) -> tuple[Annotated[Tensor, "3 v v"], Annotated[Tensor, "C u u"]]:
     """A random part of a crop in a random light, mirrored half the time, and what the teachers said of it."""
