@@ -1,9 +1,14 @@
 """Fixtures for every test."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
+
+if TYPE_CHECKING:
+    from tiny_world import World
 
 
 @pytest.fixture(scope="session")
@@ -18,3 +23,20 @@ def shared() -> Path:
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def _world(tmp_path_factory: pytest.TempPathFactory) -> Iterator["World"]:
+    from tiny_world import make_world  # imports the engine, which few tests need
+
+    folder = tmp_path_factory.mktemp("world")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        yield make_world(folder)
+
+
+@pytest.fixture
+def world(_world: "World", monkeypatch: pytest.MonkeyPatch) -> "World":
+    """The tiny trained scene, its features in a cache of its own; read it, don't write to it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(_world.folder / "cache"))
+    return _world

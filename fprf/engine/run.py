@@ -146,13 +146,12 @@ class Run:
 
 
 def view_names(paths: Sequence[Path]) -> list[str]:
-    """The stems of images; where two agree (a folder per camera), with the folders above, then a number, before them."""
-    bare = [p.with_suffix("") for p in paths]
-    for depth in range(1, max((len(p.parts) for p in bare), default=0)):
-        names = ["-".join(p.parts[-depth:]) for p in bare]
+    """The stems of images; where two agree (a folder per camera), with one or two folders above, else a number, before them."""
+    for folders in range(3):
+        names = ["-".join([*(f.name for f in p.parents[:folders][::-1]), p.stem]) for p in paths]
         if len(set(names)) == len(names):
             return names
-    return [f"{i:05d}-{p.name}" for i, p in enumerate(bare)]
+    return [f"{i:05d}-{p.stem}" for i, p in enumerate(paths)]
 
 
 def _tupled(value: Any) -> Any:

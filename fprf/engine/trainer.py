@@ -1,5 +1,6 @@
 """The training loop. Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped."""
 
+import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -48,8 +49,9 @@ class Report(NamedTuple):
 
 
 def step_generator(seed: int, step: int, device: torch.device) -> torch.Generator:
-    """Draws of one step: the seed in the upper bits, the step in the lower ones."""
-    return torch.Generator(device).manual_seed((seed << 32) ^ step)
+    """Draws of one step: a hash of seed and step, since the CPU's generator looks at 32 bits of its seed alone."""
+    name = f"fprf draws {seed} {step}".encode()
+    return torch.Generator(device).manual_seed(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1)
 
 
 def train(config: TrainConfig, prepared: Prepared, run: Run, report: Callable[[Report], None], *, spent: float = 0.0) -> Model:

@@ -1,0 +1,128 @@
+"""A town of ten pictures of 32 x 24 pixels and a model of a few thousand numbers, trained for 15 steps: made once a session."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from fprf.commands.train import train_scene
+from fprf.config import StatisticsConfig, TrainConfig
+from fprf.datamanagers.config import RayBatchesConfig
+from fprf.engine.loading import Trained, load_run
+from fprf.engine.prepare import Prepared, prepare
+from fprf.engine.run import Run
+from fprf.engine.trainer import Report, train
+from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.interfaces import DataManager
+from fprf.methods import fprf_lite
+from fprf.output.images import write_image
+from fprf.plugins.samplers.config import ProposalConfig
+from fprf.rendering.pixel_rays import PixelRays
+from fprf.town.write import write_town
+from fprf.types import Batch, Rays
+
+__all__ = ["Altered", "World", "flags", "make_world", "parameters", "rays_of", "trained_for"]
+
+
+@dataclass(frozen=True)
+class World:
+    """What tests may read, and never write to."""
+
+    folder: Path
+    town: Path
+    run: Path
+    references: tuple[Path, Path]
+    config: TrainConfig
+    prepared: Prepared
+
+    def load(self) -> Trained:
+        return load_run(self.run, "cpu")
+
+
+class Altered(DataManager):
+    """A data manager whose batches somebody meddles with."""
+
+    def __init__(self, inner: DataManager, change: Callable[[int, Batch], Batch]) -> None:
+        self.inner, self.change = inner, change
+        self.content_store, self.semantic_store = inner.content_store, inner.semantic_store
+
+    def batch(self, step: int) -> Batch:
+        return self.change(step, self.inner.batch(step))
+
+    def image(self, view: int) -> torch.Tensor:
+        return self.inner.image(view)
+
+
+def tiny(data: Path, output: Path) -> TrainConfig:
+    lite = fprf_lite()
+    return replace(
+        lite,
+        data=data,
+        output=output,
+        steps=15,
+        device="cpu",
+        datamanager=RayBatchesConfig(rays=256, semantic_share=0.5),
+        sampler=ProposalConfig(samples=(16,), final=8, resolutions=(8,), anneal_steps=10),
+        content=replace(lite.content, field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)),
+        semantic=replace(lite.semantic, field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=8),
+        loss=replace(lite.loss, penalty_every=2),
+        optimizer=replace(lite.optimizer, warm_up=5),
+        statistics=StatisticsConfig(rays=2048, regions=4),
+    )
+
+
+def flags(world: World, output: Path) -> list[str]:
+    """The same config on the command line, from the method `fprf-lite`."""
+    words = f"""--data {world.town} --output {output} --steps 15 --device cpu --datamanager.rays 256
+        --datamanager.semantic-share 0.5 --sampler.samples 16 --sampler.final 8 --sampler.resolutions 8
+        --sampler.anneal-steps 10 --content.field.resolutions 8 16 --content.field.channels 8 --content.field.hidden 32
+        --content.field.layers 1 --semantic.field.resolutions 8 --semantic.field.channels 8 --semantic.field.hidden 16
+        --semantic.field.layers 1 --semantic.dim 8 --loss.penalty-every 2 --optimizer.warm-up 5 --statistics.rays 2048
+        --statistics.regions 4"""
+    return words.split()
+
+
+def make_world(folder: Path) -> World:
+    town = folder / "town"
+    write_town(town, seed=0, palette="day", views=10, width=32, height=24)
+    drawn = np.random.default_rng(0)
+    references = (folder / "dusk.png", folder / "snow.png")
+    for path, base in zip(references, ((200, 90, 20), (170, 190, 230)), strict=True):
+        noise = drawn.normal(0, 25, (40, 56, 1)) + np.linspace(-60, 40, 40)[:, None, None]
+        write_image(path, (np.asarray(base) + noise).clip(0, 255).astype(np.uint8))
+    config = tiny(town, folder / "run")
+    train_scene(config, "fprf-lite", quiet=True)
+    return World(folder, town, folder / "run", references, config, prepare(config))
+
+
+def trained_for(
+    world: World,
+    folder: Path,
+    config: TrainConfig,
+    *,
+    change: Callable[[int, Batch], Batch] | None = None,
+    report: Callable[[Report], None] = lambda event: None,
+) -> Run:
+    """Train in a folder without preparing anything anew."""
+    prepared = world.prepared
+    if change is not None:
+        prepared = prepared._replace(manager=Altered(prepared.manager, change))
+    folder.mkdir(exist_ok=True)
+    run = Run(folder)
+    train(config, prepared, run, report)
+    return run
+
+
+def parameters(run: Run, step: int) -> dict[str, torch.Tensor]:
+    """Everything a checkpoint holds, by name."""
+    from fprf.engine.checkpoint import load
+
+    saved = load(run.checkpoints, step)
+    named = {**{f"model.{k}": v for k, v in saved.model.items()}, **{f"adam.{k}": v for k, v in saved.optimizer.items()}}
+    return {name: tensor.clone() for name, tensor in named.items()}  # else they are maps of files that tests spoil
+
+
+def rays_of(world: World, trained: Trained, batch: Batch) -> Rays:
+    return trained.model.space.rays(*PixelRays(world.prepared.scene.cameras)(batch.view, batch.pixel))
