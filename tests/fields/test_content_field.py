@@ -1,0 +1,91 @@
+"""The content field: the contract, what moves what, and that ranges are checked."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from fprf.errors import ConfigError
+from fprf.fields.config import PlanesConfig
+from fprf.fields.content import PlanesField
+from fprf.fields.density import density
+from fprf.fields.harmonics import harmonics
+from fprf.testing import check_content_field
+
+SMALL = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16)
+
+
+def cloud(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    draw = torch.Generator().manual_seed(seed)
+    view = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=-1)
+    return torch.empty(count, 3).uniform_(-1, 1, generator=draw), view
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SMALL,
+        PlanesConfig(resolutions=(5,), channels=3, hidden=4, layers=0, degree=1),
+        PlanesConfig(resolutions=(3, 4, 6), channels=24, hidden=8, layers=3, degree=2),
+    ],
+)
+def test_the_contract(config: PlanesConfig) -> None:
+    check_content_field(config)
+
+
+def test_it_is_planes_then_a_linear_density_and_a_network() -> None:
+    field = SMALL.build(channels=6, seed=0)
+    assert isinstance(field, PlanesField)
+    points, view = cloud(20)
+    sample = field.density(points)
+    assert torch.equal(sample.latent, field.planes(points)) and sample.latent.shape == (20, 16)
+    assert torch.equal(sample.density, density(sample.latent @ field.to_density.weight[0]))
+    with torch.no_grad():
+        field.offset.copy_(torch.arange(6.0))
+    found = field.content(sample.latent, view)
+    network = field.to_content(torch.cat([sample.latent, harmonics(view, 4)], -1))
+    assert torch.equal(found, network + torch.arange(6.0))
+    assert list(field.penalties()) == ["variation"]
+    assert torch.equal(field.penalties()["variation"], field.planes.variation())
+
+
+def test_direction_changes_content_unless_there_is_none() -> None:
+    points, view = cloud(20)
+    for degree, changes in ((1, False), (2, True), (4, True)):
+        field = PlanesConfig(resolutions=(4,), channels=8, hidden=16, degree=degree).build(channels=5, seed=0)
+        latent = field.density(points).latent
+        assert torch.equal(field.content(latent, view), field.content(latent, -view)) != changes
+
+
+def test_density_does_not_meet_the_network() -> None:
+    field = SMALL.build(channels=6, seed=0)
+    assert isinstance(field, PlanesField)
+    field.density(cloud(30)[0]).density.sum().backward()
+    assert all(p.grad is None for p in field.to_content.parameters()) and field.offset.grad is None
+    assert field.planes.table.grad is not None and field.to_density.weight.grad is not None
+
+
+def test_the_start_is_thin_and_different_for_each_seed() -> None:
+    points, _ = cloud(2000)
+    thickness = [
+        PlanesConfig(channels=8, resolutions=(8, 16)).build(channels=4, seed=s).density(points).density for s in range(5)
+    ]
+    for values in thickness:
+        assert 0.2 < values.detach().mean().item() < 0.8
+    assert not torch.equal(thickness[0], thickness[1])
+
+
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        ({"resolutions": ()}, "resolutions"),
+        ({"resolutions": (64, 1)}, "resolutions: 1 must be at least 2"),
+        ({"channels": 0}, "channels"),
+        ({"hidden": 0}, "hidden"),
+        ({"layers": -1}, "layers"),
+        ({"degree": 0}, "degree"),
+        ({"degree": 5}, "degree"),
+    ],
+)
+def test_values_out_of_range_are_refused(value: dict[str, object], name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"content\.field\.{name}"):
+        PlanesConfig(**value)  # type: ignore[arg-type]

@@ -1,0 +1,42 @@
+"""The semantic field: the contract, no direction, no penalty."""
+
+import inspect
+
+import pytest
+import torch
+
+from fprf.errors import ConfigError
+from fprf.fields.config import SemanticPlanesConfig
+from fprf.fields.semantic import SemanticPlanes
+from fprf.testing import check_semantic_field
+
+SMALL = SemanticPlanesConfig(resolutions=(4, 9), channels=8, hidden=16)
+
+
+@pytest.mark.parametrize("config", [SMALL, SemanticPlanesConfig(resolutions=(3,), channels=5, hidden=4, layers=0)])
+def test_the_contract(config: SemanticPlanesConfig) -> None:
+    check_semantic_field(config)
+
+
+def test_it_is_planes_then_a_network() -> None:
+    field = SMALL.build(channels=7, seed=0)
+    assert isinstance(field, SemanticPlanes)
+    points = torch.empty(20, 3).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(field(points), field.network(field.planes(points))) and field(points).shape == (20, 7)
+    assert field.penalties() == {}
+    assert list(inspect.signature(field.forward).parameters) == ["points"]
+
+
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        ({"resolutions": ()}, "resolutions"),
+        ({"resolutions": (1,)}, "resolutions"),
+        ({"channels": 0}, "channels"),
+        ({"hidden": 0}, "hidden"),
+        ({"layers": -1}, "layers"),
+    ],
+)
+def test_values_out_of_range_are_refused(value: dict[str, object], name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"semantic\.field\.{name}"):
+        SemanticPlanesConfig(**value)  # type: ignore[arg-type]

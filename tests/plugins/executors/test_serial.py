@@ -1,0 +1,35 @@
+"""The serial executor."""
+
+import pytest
+
+from fprf.plugins.executors.config import SerialConfig
+from fprf.plugins.executors.serial import SerialExecutor
+from fprf.testing import check_executor
+
+
+def test_the_contract() -> None:
+    check_executor(SerialConfig())
+    assert isinstance(SerialConfig().build(), SerialExecutor)
+
+
+def test_tasks_run_one_after_the_other_in_this_process() -> None:
+    seen: list[int] = []
+
+    def work(task: int) -> int:
+        seen.append(task)
+        return -task
+
+    assert SerialExecutor().map(work, range(5)) == [0, -1, -2, -3, -4]
+    assert seen == [0, 1, 2, 3, 4]
+
+
+def test_the_first_error_stops_the_rest() -> None:
+    seen: list[int] = []
+
+    def work(task: int) -> float:
+        seen.append(task)
+        return 1 / task
+
+    with pytest.raises(ZeroDivisionError):
+        SerialExecutor().map(work, [2, 0, 1])
+    assert seen == [2, 0]

@@ -1,0 +1,215 @@
+"""Samplers: the contract, spacing, annealing, when proposals learn, and what they find."""
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.errors import ConfigError
+from fprf.interfaces import Sampler
+from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
+from fprf.plugins.samplers.proposal import ProposalSampler
+from fprf.plugins.samplers.uniform import even_edges
+from fprf.rendering.space import Space
+from fprf.rendering.stepfun import interlevel
+from fprf.testing import check_sampler
+from fprf.types import Rays, Sampled
+
+EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+SPACE = Space("contraction", (0.0, 0.0, 0.0), EYE, 1.0, 0.05, 1e3)
+SMALL = ProposalConfig(samples=(16, 12), final=9, resolutions=(6, 8))
+
+
+def rays_of(count: int, seed: int = 0) -> Rays:
+    draw = torch.Generator().manual_seed(seed)
+    origin, direction = (torch.randn(count, 3, dtype=torch.float64, generator=draw) for _ in range(2))
+    return SPACE.rays(origin * 0.2, torch.nn.functional.normalize(direction, dim=-1))
+
+
+def sample(sampler: Sampler, rays: Rays, step: int | None = None, seed: int | None = None) -> Sampled:
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    sampled: Sampled = sampler(rays, locate=SPACE.locate, distance=SPACE.distance, step=step, generator=generator)
+    return sampled
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        UniformConfig(samples=1),
+        UniformConfig(samples=33),
+        SMALL,
+        ProposalConfig(samples=(5,), final=1, resolutions=(4,), channels=3),
+        ProposalConfig(samples=(20, 10, 6), final=4, resolutions=(4, 4, 9), padding=1.0),
+    ],
+)
+def test_the_contract(config: SamplerConfig) -> None:
+    check_sampler(config)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 50), st.one_of(st.none(), st.integers(0, 99)))
+def test_even_edges_pin_their_ends_and_move_together(samples: int, seed: int | None) -> None:
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    s = even_edges(rays_of(7), samples, generator)
+    assert s.shape == (7, samples + 1)
+    assert (s[:, 0] == 0).all() and (s[:, -1] == 1).all() and (s.diff(dim=-1) >= 0).all()
+    shift = s - torch.linspace(0, 1, samples + 1)
+    assert shift.abs().max() <= 0.5 / samples + 1e-6
+    if seed is None:
+        assert not shift.any()
+    elif samples > 2:
+        inner = shift[:, 1:-1]
+        assert (inner - inner[:, :1]).abs().max() <= 1e-6 and inner[:, 0].std() > 0
+
+
+@pytest.mark.parametrize("config", [UniformConfig(samples=8), SMALL])
+def test_edges_are_spaced_by_the_space(config: SamplerConfig) -> None:
+    rays = rays_of(5)
+    found = sample(config.build(seed=0), rays)
+    assert torch.equal(found.t, SPACE.distance(found.s, rays.near, rays.far))
+    assert (found.t >= 0.05 * (1 - 1e-6)).all() and (found.t <= 1e3 * (1 + 1e-6)).all()
+    assert found.levels == ()
+
+
+@pytest.mark.parametrize("config", [UniformConfig(samples=8), SMALL])
+def test_draws_follow_the_generator_alone(config: SamplerConfig) -> None:
+    sampler, rays = config.build(seed=0), rays_of(6)
+    one = sample(sampler, rays, step=3, seed=1)
+    torch.rand(5)
+    assert torch.equal(one.t, sample(sampler, rays, step=3, seed=1).t)
+    assert not torch.equal(one.t, sample(sampler, rays, step=3, seed=2).t)
+    assert torch.equal(sample(sampler, rays).t, sample(sampler, rays).t)
+
+
+def test_every_ray_stands_alone() -> None:
+    sampler, rays = SMALL.build(seed=0), rays_of(6)
+    whole = sample(sampler, rays)
+    for k in range(6):
+        one = sample(sampler, Rays(*(x[k : k + 1] for x in rays)))
+        assert torch.allclose(one.s, whole.s[k : k + 1], atol=1e-5)
+
+
+def test_the_seed_draws_the_planes() -> None:
+    one, same, other = (SMALL.build(seed=seed).state_dict() for seed in (1, 1, 2))
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not any(torch.equal(one[name], other[name]) for name in one)
+    levels = [value for name, value in one.items() if "to_density" in name]
+    assert not torch.equal(levels[0], levels[1])
+
+
+def wall(sampler: Sampler, rays: Rays, at: float) -> None:
+    """Bend the proposals to a wall: dense where the first coordinate is beyond `at`, thin before."""
+    assert isinstance(sampler, ProposalSampler)
+    for level in sampler.levels:
+        level.forward = lambda points: torch.where(points[:, 0] > at, 200.0, 1e-4)  # type: ignore[method-assign]
+
+
+def test_samples_go_where_the_density_is() -> None:
+    """A wall at x = 1 seen from the origin: all but the padding's share of the samples land about its surface."""
+    sampler = ProposalConfig(samples=(128, 64), final=32, resolutions=(4, 4)).build(seed=0)
+    rays = SPACE.rays(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
+    wall(sampler, rays, 0.5)
+    found = sample(sampler, rays)
+    near = (found.t > 0.9) & (found.t < 1.15)
+    assert int(near.sum()) >= 32
+    untrusting = sample(sampler, rays, step=0)
+    assert int(((untrusting.t > 0.9) & (untrusting.t < 1.15)).sum()) < 20
+
+
+def test_annealing_rises_from_even_to_trusted() -> None:
+    sampler = ProposalConfig(anneal_steps=100, anneal_slope=10.0).build(seed=0)
+    assert isinstance(sampler, ProposalSampler)
+    sharp = [sampler.sharpness(step) for step in range(120)]
+    assert all(0 < a <= b <= 1 for a, b in itertools.pairwise(sharp))
+    assert sharp[0] == pytest.approx(10 * 0.01 / (9 * 0.01 + 1)) and sharp[99] == sharp[119] == 1.0
+    # mip-NeRF 360's bias curve: b x / ((b - 1) x + 1).
+    assert sharp[9] == pytest.approx(1.0 / 1.9)
+    at_once = ProposalConfig(anneal_steps=0).build(seed=0)
+    assert isinstance(at_once, ProposalSampler) and at_once.sharpness(0) == 1.0
+
+
+def test_proposals_learn_at_every_step_then_ever_more_rarely() -> None:
+    sampler = ProposalConfig(update_every=5, warm_up=100).build(seed=0)
+    assert isinstance(sampler, ProposalSampler)
+    learns = [sampler.learns(step) for step in range(400)]
+    assert all(learns[:10])
+    shares = [sum(learns[a : a + 50]) / 50 for a in range(0, 400, 50)]
+    assert all(a >= b for a, b in itertools.pairwise(shares))
+    assert learns[100:] == [step % 5 == 0 for step in range(100, 400)]
+    always = ProposalConfig(update_every=1, warm_up=0).build(seed=0)
+    assert isinstance(always, ProposalSampler) and all(always.learns(step) for step in range(20))
+
+
+def test_levels_come_only_in_steps_that_learn() -> None:
+    sampler, rays = (
+        ProposalConfig(samples=(16, 12), final=9, resolutions=(6, 8), update_every=2, warm_up=0).build(seed=0),
+        rays_of(4),
+    )
+    learning, resting, shown = (sample(sampler, rays, step=step, seed=0) for step in (4, 5, None))
+    assert [level.weights.shape for level in learning.levels] == [(4, 16), (4, 12)]
+    assert [level.s.shape for level in learning.levels] == [(4, 17), (4, 13)]
+    assert all(level.weights.requires_grad and not level.s.requires_grad for level in learning.levels)
+    assert resting.levels == shown.levels == ()
+    assert not learning.t.requires_grad and not resting.t.requires_grad
+
+
+def test_the_interlevel_loss_reaches_every_level_and_lowers() -> None:
+    """A few steps against a wall's weights: the proposals learn to bound them."""
+    sampler, rays = SMALL.build(seed=0), rays_of(64)
+    optimizer = torch.optim.Adam(sampler.parameters(), lr=0.05)
+
+    def loss() -> Tensor:
+        found = sample(sampler, rays, step=0)
+        points = SPACE.locate((rays.origin[:, None] + rays.direction[:, None] * found.t[:, 1:, None]).view(-1, 3))
+        weights = (points[:, 0].view(64, -1).abs() > 0.5).float() / 9
+        return torch.stack([interlevel(found.s, weights, level.s, level.weights) for level in found.levels]).sum()
+
+    first = loss()
+    reached = torch.autograd.grad(first, list(sampler.parameters()))
+    assert all(g.isfinite().all() and g.any() for g in reached)
+    for _ in range(15):
+        optimizer.zero_grad()
+        loss().backward()
+        optimizer.step()
+    assert loss().item() < 0.5 * first.item()
+
+
+def test_penalties() -> None:
+    assert UniformConfig().build(seed=0).penalties() == {}
+    sampler = SMALL.build(seed=0)
+    (name, value), *rest = sampler.penalties().items()
+    assert name == "proposal_variation" and not rest and value.item() > 0
+    value.backward()
+    assert all(p.grad is not None for n, p in sampler.named_parameters() if n.endswith("table"))
+
+
+@pytest.mark.parametrize("value", [{"samples": 0}, {"samples": -3}])
+def test_uniform_refuses(value: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=r"sampler\.samples"):
+        UniformConfig(**value)
+
+
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        ({"final": 0}, "final"),
+        ({"channels": 0}, "channels"),
+        ({"padding": 0.0}, "padding"),
+        ({"padding": 1.5}, "padding"),
+        ({"anneal_slope": 0.0}, "anneal_slope"),
+        ({"anneal_slope": float("nan")}, "anneal_slope"),
+        ({"anneal_steps": -1}, "anneal_steps"),
+        ({"update_every": 0}, "update_every"),
+        ({"warm_up": -1}, "warm_up"),
+        ({"samples": (1,), "resolutions": (8,)}, "samples"),
+        ({"samples": (8,), "resolutions": (1,)}, "resolutions"),
+        ({"samples": (8,)}, "1 levels but 2"),
+        ({"samples": (), "resolutions": ()}, "0 levels"),
+    ],
+)
+def test_proposal_refuses(value: dict[str, object], name: str) -> None:
+    with pytest.raises(ConfigError, match=name):
+        ProposalConfig(**value)  # type: ignore[arg-type]
