@@ -17,7 +17,7 @@ from ..interfaces import ContentField, Decoder, Sampler, SemanticField, Stylizer
 from ..style.controls import blend_strength
 from ..types import Rays, Rendered, Sampled, Want
 from .space import Space
-from .stepfun import keep_heaviest, midpoints, transmittance_weights
+from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
 
 __all__ = ["Kept", "Parts", "Restyle", "march", "render_rays"]
 
@@ -50,6 +50,8 @@ class Kept(NamedTuple):
     """In the unit cube."""
     latent: Annotated[Tensor, "M L"]
     view: Annotated[Tensor, "M 3"]
+    fair: Annotated[Tensor, "M"] | None = None
+    """What gradients of their features are multiplied by in training; None = nothing."""
 
 
 class March(NamedTuple):
@@ -75,6 +77,13 @@ def march(
     located = space.locate(points.view(-1, 3))
     sample = parts.field.density(located)
     density = sample.density.view(middle.shape)
+    fair = None
+    if step is not None and space.kind == "contraction":
+        # A camera samples what is near it far more densely than any other camera does, and could explain its own image
+        # by a veil there. Weighing gradients by the square of the distance, up to the scene's inner radius, makes every
+        # piece of space count alike (Philip and Deschaintre 2023).
+        fair = middle.square().clamp(max=1)
+        density = scale_gradient(density, fair)
     weights = transmittance_weights(density, sampled.t)
     optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
     # 1 - sum of weights would cancel where the ray is opaque.
@@ -90,6 +99,7 @@ def march(
         located.index_select(0, index),
         sample.latent.index_select(0, index),
         rays.view.index_select(0, ray),
+        None if fair is None else fair.view(-1).index_select(0, index),
     )
     return March(sampled, weights, depth, opacity, through, kept)
 
@@ -124,6 +134,8 @@ def render_rays(
     rgb = content = semantic = None
     if want & (Want.COLOUR | Want.CONTENT):
         features = parts.field.content(kept.latent, kept.view)
+        if kept.fair is not None:
+            features = scale_gradient(features, kept.fair[:, None])
         if Want.CONTENT in want:
             still = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
             content = composite(still, features, count)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-__all__ = ["distortion", "interlevel", "keep_heaviest", "midpoints", "resample", "transmittance_weights"]
+__all__ = ["distortion", "interlevel", "keep_heaviest", "midpoints", "resample", "scale_gradient", "transmittance_weights"]
 
 
 class _Weights(torch.autograd.Function):
@@ -47,6 +47,24 @@ def transmittance_weights(density: Annotated[Tensor, "R S"], t: Annotated[Tensor
     """Rendering weights (paper, Eq. 2) of densities >= 0 between edges t; relative error <= 4u (1 + tau)."""
     weights: Tensor = _Weights.apply(density * (t[:, 1:] - t[:, :-1]))  # type: ignore[no-untyped-call]
     return weights
+
+
+class _Scaled(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, scale: Tensor) -> Tensor:
+        ctx.save_for_backward(scale)
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        (scale,) = ctx.saved_tensors
+        return grads[0] * scale, None
+
+
+def scale_gradient(x: Annotated[Tensor, "..."], scale: Annotated[Tensor, "..."]) -> Annotated[Tensor, "..."]:
+    """The value x, with its gradient multiplied by `scale` (broadcast)."""
+    result: Tensor = _Scaled.apply(x, scale)  # type: ignore[no-untyped-call]
+    return result
 
 
 def midpoints(t: Annotated[Tensor, "R E"]) -> Annotated[Tensor, "R S"]:
