@@ -48,6 +48,8 @@ def run(args: list[str]) -> int:
     if tuple(view_names(scene.paths)) != trained.known.names:
         raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
     views = trained.known.split(config.split)
+    if not views:
+        raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
     with Display() as display:
         metrics, renders = judge(trained, scene, views, display.count)
     metrics = {"method": trained.method, "scene": trained.known.name, "split": config.split, **metrics}

@@ -85,21 +85,20 @@ def camera_path(trained: "Trained", config: RenderVerbConfig) -> tuple["Cameras"
 
     known = trained.known
     views = torch.tensor(known.split(config.split))
-    numbers = [f"{i:05d}" for i in range(10 * config.frames + 1)]
     if config.path == "dataset":
         return paths.dataset(known.cameras, views), [known.names[v] for v in views.tolist()]
     if config.path in ("spiral", "orbit"):
         move = paths.spiral if config.path == "spiral" else paths.orbit
-        return move(known.cameras, config.frames), numbers
-    if config.path == "interpolate":
+        cameras = move(known.cameras, config.frames)
+    elif config.path == "interpolate":
         order = paths.tour(known.cameras, views)
         between = max(0, round((config.frames - 1) / max(1, len(order) - 1)) - 1)
         cameras = paths.interpolate(known.cameras, order, between)
-        return cameras, [f"{i:05d}" for i in range(len(cameras))]
-    file = Path(config.path)
-    if not file.is_file():
-        raise UsageError(f"--path {config.path}: neither a file nor one of {', '.join(MOTIONS)}")
-    cameras, _ = read_camera_path(file)
+    else:
+        file = Path(config.path)
+        if not file.is_file():
+            raise UsageError(f"--path {config.path}: neither a file nor one of {', '.join(MOTIONS)}")
+        cameras, _ = read_camera_path(file)
     return cameras, [f"{i:05d}" for i in range(len(cameras))]
 
 

@@ -33,11 +33,11 @@ class StyleConfig:
     """Share of a reference's overall style in each of its local ones."""
 
     def __post_init__(self) -> None:
-        between("style.strength", self.strength, 0.0, 1.0)
-        between("style.blend", self.blend, 0.0, 1.0)
-        at_least("style.clusters", self.clusters, 1)
+        between("strength", self.strength, 0.0, 1.0)
+        between("blend", self.blend, 0.0, 1.0)
+        at_least("clusters", self.clusters, 1)
         for weight in self.weights:
-            at_least("style.weights", weight, 1e-6)
+            at_least("weights", weight, 1e-6)
 
 
 @dataclass(frozen=True, kw_only=True)
