@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numba
 import pytest
 import torch
 
@@ -23,6 +24,12 @@ def shared() -> Path:
 @pytest.fixture(autouse=True)
 def _seeded() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _one_kernel_thread() -> None:
+    """Kernels here take a millisecond; on a busy machine waiting for their second thread takes a hundred."""
+    numba.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

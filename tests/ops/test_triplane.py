@@ -1,7 +1,7 @@
 """Tri-plane lookup: the fused and the plain form against fp64 loops, at the documented bound, at production sizes."""
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -17,15 +17,6 @@ from fprf.ops.triplane import AXES, lookup, lookup_reference, rows, split, varia
 QUICK = settings(max_examples=20, deadline=None)
 U = 2.0**-24
 """Unit round-off of float32."""
-
-
-@pytest.fixture(autouse=True)
-def threads() -> Iterator[Callable[[int], None]]:
-    """One thread unless a test asks for more: on a busy machine a barrier of two costs more than these sizes do."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield numba.set_num_threads
-    numba.set_num_threads(before)
 
 
 def table_of(resolutions: Sequence[int], channels: int, seed: int = 0, smooth: bool = False) -> Tensor:
@@ -220,12 +211,12 @@ def test_points_are_constants() -> None:
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
-def test_one_thread_and_two_give_the_same_bits(threads: Callable[[int], None]) -> None:
+def test_one_thread_and_two_give_the_same_bits() -> None:
     resolutions = (16, 64, 182)
     table, points = table_of(resolutions, 24).requires_grad_(True), points_of(4001)
     results = []
     for count in (1, 2, 2):
-        threads(count)
+        numba.set_num_threads(count)
         found = lookup(points, table, resolutions)
         (gradient,) = torch.autograd.grad(found.square().sum(), table)
         (smooth,) = torch.autograd.grad(variation(table, resolutions), table)
