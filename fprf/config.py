@@ -95,6 +95,9 @@ class OptimizerConfig:
     """Share of the rate that is left at the end."""
     warm_up: int = 512
     """Steps of linear warm-up."""
+    hold: int | None = None
+    """Step from which the rate also falls as 1 / sqrt(step); none = only the cosine. Keeps long runs of small batches
+    stable."""
     beta2: float = 0.99
     """Decay of the squared-gradient average."""
     eps: float = 1e-12
@@ -102,6 +105,8 @@ class OptimizerConfig:
 
     def __post_init__(self) -> None:
         positive("optimizer.rate", self.rate)
+        if self.hold is not None:
+            at_least("optimizer.hold", self.hold, 1)
         between("optimizer.final", self.final, 0.0, 1.0)
         between("optimizer.beta2", self.beta2, 0.0, 1.0)
         positive("optimizer.eps", self.eps)

@@ -16,7 +16,8 @@ def progress(config: TrainConfig, step: int, seconds: float) -> float:
 
 
 def rate(config: OptimizerConfig, step: int, share: float) -> float:
-    """Linear warm-up, then a cosine from `rate` to `final * rate`."""
+    """Linear warm-up, then a cosine from `rate` to `final * rate`, and 1 / sqrt(step) from `hold` on."""
+    late = 1.0 if config.hold is None else math.sqrt(config.hold / max(config.hold, step))
     warm = min(1.0, (step + 1) / max(1, config.warm_up))
     cosine = 0.5 * (1 + math.cos(math.pi * share))
-    return config.rate * warm * (config.final + (1 - config.final) * cosine)
+    return config.rate * warm * late * (config.final + (1 - config.final) * cosine)
