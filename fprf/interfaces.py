@@ -61,9 +61,7 @@ class ContentField(nn.Module, ABC):
         """Density per space unit and a latent for `content`, at points of the unit cube [-1, 1]^3."""
 
     @abstractmethod
-    def content(
-        self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]
-    ) -> Annotated[Tensor, "M C"]:
+    def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
         """Content features of some of the points, by their latents and unit viewing directions."""
 
     @abstractmethod
@@ -120,9 +118,7 @@ class Stylizer(nn.Module, ABC):
         """`Want.CONTENT`, with `Want.SEMANTIC` if it reads semantic features."""
 
     @abstractmethod
-    def forward(
-        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
-    ) -> Annotated[Tensor, "N C"]:
+    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """The features in the new style, at full strength."""
 
     @abstractmethod
