@@ -44,7 +44,7 @@ def judge(
         rows[trained.known.names[view]] = image_metrics(render.rgb, truth)
     progress(len(views), len(views), "rendering")
     pixels = sum(v.rgb.shape[0] * v.rgb.shape[1] for v in renders)
-    chosen = cameras.select(torch.tensor(list(views)))
+    chosen = cameras.select(torch.tensor(list(views), dtype=torch.int64))
     pairs = [(i, i + 1) for i in range(len(views) - 1)]
     warped = consistency([v.rgb for v in renders], [v.depth for v in renders], chosen, pairs)
     means = mean_metrics(rows.values())

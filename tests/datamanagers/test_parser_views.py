@@ -46,7 +46,7 @@ def test_a_last_row_is_accepted_and_checked() -> None:
         (lambda p: p * [[1], [1], [-1]], "reflection"),
         (lambda p: p * 0, "no rotation"),
         (lambda p: p * 1e200, "no rotation"),
-        (lambda p: p + [[0, 0, 0, 1e13]], "position .* lies beyond"),
+        (lambda p: p + np.array([0, 0, 0, 1e13]), "position .* lies beyond"),
         (lambda p: p * np.nan, "no finite"),
         (lambda p: p + np.inf, "no finite"),
         (lambda p: p[:2], "no finite 3x4"),

@@ -1,0 +1,241 @@
+"""Every leaf of the knob tree: a second value is another config, survives JSON and the command line, and changes something.
+
+What it changes is named beside it; a field without an entry fails the test, so that no dead knob can be added.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_world import World, trained_for
+
+from fprf.commands.parsing import parse
+from fprf.config import TrainConfig
+from fprf.datamanagers.batches import RayBatches
+from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.engine import checkpoint
+from fprf.engine.model import build_model
+from fprf.engine.prepare import device_of, prepare
+from fprf.engine.schedule import progress
+from fprf.engine.style_pass import measure_style
+from fprf.engine.views import render_view
+from fprf.methods import fprf_lite
+from fprf.plugins.codec import from_json, to_json
+
+SECOND: dict[str, tuple[Any, str]] = {
+    "data": (Path("other"), "scene"),
+    "output": (Path("run"), "command"),
+    "downscale": (2, "scene"),
+    "steps": (7, "training"),
+    "minutes": (0.25, "schedule"),
+    "seed": (1, "model"),
+    "device": ("tpu", "device"),
+    "checkpoint_minutes": (1e-9, "saving"),
+    "datamanager.rays": (128, "training"),
+    "datamanager.semantic_share": (0.75, "training"),
+    "datamanager.guided.radius": (0.3, "targets"),
+    "datamanager.guided.eps": (0.1, "targets"),
+    "datamanager.guided.stride": (2, "targets"),
+    "sampler.samples": ((24,), "training"),
+    "sampler.final": (6, "training"),
+    "sampler.resolutions": ((16,), "model"),
+    "sampler.channels": (16, "model"),
+    "sampler.anneal_steps": (2, "training"),
+    "sampler.anneal_slope": (2.0, "training"),
+    "sampler.padding": (0.5, "training"),
+    "sampler.update_every": (2, "training"),
+    "sampler.warm_up": (1, "training"),
+    "content.moves_density": (True, "training"),
+    "content.field.resolutions": ((8,), "model"),
+    "content.field.channels": (24, "model"),
+    "content.field.hidden": (16, "model"),
+    "content.field.layers": (2, "model"),
+    "content.field.degree": (2, "model"),
+    "content.encoder.weights": (Path("w.safetensors"), "file"),
+    "content.decoder.weights": (Path("w.safetensors"), "file"),
+    "semantic.encoder.weights": (Path("w.safetensors"), "file"),
+    "semantic.field.resolutions": ((8, 16), "model"),
+    "semantic.field.channels": (24, "model"),
+    "semantic.field.hidden": (32, "model"),
+    "semantic.field.layers": (2, "model"),
+    "semantic.dim": (4, "targets"),
+    "semantic.samples": (4, "training"),
+    "loss.rgb": (0.5, "training"),
+    "loss.content": (0.5, "training"),
+    "loss.semantic": (0.0, "training"),
+    "loss.variation": (0.5, "training"),
+    "loss.proposal_variation": (0.5, "training"),
+    "loss.penalty_every": (3, "training"),
+    "loss.interlevel": (0.25, "training"),
+    "loss.distortion": (0.5, "training"),
+    "optimizer.rate": (1e-3, "training"),
+    "optimizer.hold": (2, "training"),
+    "optimizer.final": (0.5, "training"),
+    "optimizer.warm_up": (1, "training"),
+    "optimizer.beta2": (0.9, "training"),
+    "optimizer.eps": (1e-3, "training"),
+    "render.budget": (0.4, "render"),
+    "render.train_budget": (0.4, "training"),
+    "render.chunk": (100, "chunks"),
+    "render.background": ((1.0, 0.0, 1.0), "background"),
+    "statistics.rays": (64, "style"),
+    "statistics.regions": (1, "style"),
+}
+"""A second value of every field of `fprf-lite`, valid for the tiny config too, and where it shows."""
+
+
+def leaves(config: Any, path: str = "") -> Iterator[str]:
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if is_dataclass(value):
+            yield from leaves(value, f"{path}{field.name}.")
+        else:
+            yield f"{path}{field.name}"
+
+
+def changed(config: Any, path: str, value: Any) -> Any:
+    name, _, rest = path.partition(".")
+    return replace(config, **{name: changed(getattr(config, name), rest, value) if rest else value})
+
+
+def differ(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() != b.keys() or any(a[name].shape != b[name].shape or not torch.equal(a[name], b[name]) for name in a)
+
+
+def spelled(value: Any) -> list[str]:
+    return [str(each) for each in value] if isinstance(value, tuple) else [str(value)]
+
+
+def shown(where: str) -> list[str]:
+    return [path for path, (_, place) in SECOND.items() if place == where]
+
+
+def test_every_leaf_has_a_second_value() -> None:
+    slots = {"datamanager.parser", "executor", "blocks"}
+    assert set(leaves(fprf_lite())) - slots == set(SECOND)
+
+
+@pytest.mark.parametrize("path", list(SECOND))
+def test_a_second_value_is_another_config_and_survives_json(path: str) -> None:
+    value, _ = SECOND[path]
+    first = fprf_lite()
+    second = changed(first, path, value)
+    assert second != first
+    assert from_json(json.loads(json.dumps(to_json(second))), TrainConfig) == second != first
+
+
+def test_all_second_values_at_once_on_the_command_line() -> None:
+    wanted, args = fprf_lite(), []
+    for path, (value, _) in SECOND.items():
+        wanted = changed(wanted, path, value)
+        args += [f"--{path.replace('_', '-')}", *spelled(value)]
+    assert parse(fprf_lite(), args, prog="x", description="") == wanted
+
+
+@pytest.mark.parametrize("path", shown("model"))
+def test_it_changes_the_model(path: str, world: World) -> None:
+    def start(config: TrainConfig) -> dict[str, torch.Tensor]:
+        return build_model(config, world.prepared.facts).state_dict()
+
+    assert differ(start(world.config), start(changed(world.config, path, SECOND[path][0])))
+
+
+@pytest.fixture(scope="module")
+def _trained() -> dict[int, dict[str, torch.Tensor]]:
+    return {}
+
+
+@pytest.mark.parametrize("path", shown("training"))
+def test_it_changes_the_training(path: str, world: World, tmp_path: Path, _trained: dict[int, dict[str, torch.Tensor]]) -> None:
+    """Parameters after a few steps differ."""
+
+    def after(config: TrainConfig, folder: Path) -> dict[str, torch.Tensor]:
+        run = trained_for(world, folder, config)
+        return checkpoint.load(run.checkpoints, config.steps).model
+
+    base = replace(world.config, steps=5)
+    soon = 1 if path == "sampler.update_every" else 5000
+    base = changed(base, "sampler.warm_up", soon)  # until then the proposals learn at every step
+    if soon not in _trained:
+        _trained[soon] = after(base, tmp_path / "base")
+    config = changed(base, path, SECOND[path][0])
+    if path.startswith("datamanager."):
+        made = config.datamanager
+        assert isinstance(made, type(world.config.datamanager)) and isinstance(world.prepared.manager, RayBatches)
+        world = replace(world, prepared=prepare(config))
+    assert differ(_trained[soon], after(config, tmp_path / "other"))
+
+
+@pytest.mark.parametrize("path", shown("targets"))
+def test_it_changes_the_targets(path: str, world: World) -> None:
+    def of(config: TrainConfig) -> dict[str, torch.Tensor]:
+        batch = prepare(config).manager.batch(0)
+        assert batch.content is not None and batch.semantic is not None
+        return {"content": batch.content, "semantic": batch.semantic}
+
+    # On so small a picture the window would otherwise be narrower than a stride.
+    base = changed(world.config, "datamanager.guided.radius", 0.9 if path.endswith("stride") else 0.08)
+    assert differ(of(base), of(changed(base, path, SECOND[path][0])))
+
+
+@pytest.mark.parametrize("path", shown("style"))
+def test_it_changes_the_style(path: str, world: World) -> None:
+    trained, scene = world.load(), world.prepared.scene
+    first, second = (
+        measure_style(config, trained.model, scene.cameras, scene.train)._asdict()
+        for config in (world.config, changed(world.config, path, SECOND[path][0]))
+    )
+    assert differ(first, second)
+
+
+@pytest.mark.parametrize("path", shown("file"))
+def test_it_names_a_file(path: str, world: World) -> None:
+    """What does not exist is missed, so it is looked for."""
+    config = changed(world.config, path, SECOND[path][0])
+    builds: dict[str, Callable[[], object]] = {
+        "content.encoder.weights": lambda: config.content.encoder.build(),
+        "content.decoder.weights": lambda: build_model(config, world.prepared.facts),
+        "semantic.encoder.weights": lambda: config.semantic.encoder.build() if config.semantic.encoder else None,
+    }
+    with pytest.raises(Exception, match=r"w\.safetensors"):
+        builds[path]()
+
+
+def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def second(path: str) -> TrainConfig:
+        seen.append(path)
+        return changed(world.config, path, SECOND[path][0])
+
+    with pytest.raises(Exception, match="other: no such folder"):
+        parse_scene(second("data").data, 1, None)
+    assert second("output").output != world.config.output
+    half = parse_scene(world.town, second("downscale").downscale, None)
+    assert half.cameras.size.tolist()[0] == [16, 12]
+    assert progress(second("minutes"), 0, 15.0) == 1 > progress(world.config, 0, 15.0)
+    with pytest.raises(Exception, match="tpu"):
+        device_of(second("device").device)
+    run = trained_for(world, tmp_path / "a", replace(second("checkpoint_minutes"), steps=3))
+    assert checkpoint.steps(run.checkpoints) == [2, 3]
+    trained = world.load()
+    known, plain = trained.known, world.config.render
+
+    def view(config: TrainConfig) -> torch.Tensor:
+        return render_view(trained.model, known.facts, known.cameras, 0, config.render).rgb
+
+    assert not torch.equal(view(world.config), view(second("render.budget")))
+    calls: list[int] = []
+    whole = trained.model.field.density
+    monkeypatch.setattr(trained.model.field, "density", lambda points: calls.append(len(points)) or whole(points))
+    view(world.config)
+    assert (len(calls), plain.chunk) == (1, 8192)
+    view(second("render.chunk"))
+    assert len(calls) == 1 + 8, "768 rays a hundred at a time"
+    assert prepare(second("render.background")).facts.background == (1.0, 0.0, 1.0)
+    places = ("scene", "command", "schedule", "device", "saving", "render", "chunks", "background")
+    assert set(seen) == {path for place in places for path in shown(place)}
