@@ -19,7 +19,11 @@ from ..types import Rays, Rendered, Sampled, Want
 from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
 
-__all__ = ["Kept", "Parts", "Restyle", "march", "render_rays"]
+__all__ = ["VEIL", "Kept", "Parts", "Restyle", "march", "render_rays"]
+
+
+VEIL = 4.0
+"""Within so many times the nearest distance of a ray, gradients are weighed down in training."""
 
 
 class Parts(NamedTuple):
@@ -80,9 +84,9 @@ def march(
     fair = None
     if step is not None and space.kind == "contraction":
         # A camera samples what is near it far more densely than any other camera does, and could explain its own image
-        # by a veil there. Weighing gradients by the square of the distance, up to the scene's inner radius, makes every
-        # piece of space count alike (Philip and Deschaintre 2023).
-        fair = middle.square().clamp(max=1)
+        # by a veil there. Weighing gradients by the square of the distance makes every piece of space count alike
+        # (Philip and Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
+        fair = (middle / (VEIL * rays.near[:, None])).square().clamp(max=1)
         density = scale_gradient(density, fair)
     weights = transmittance_weights(density, sampled.t)
     optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
