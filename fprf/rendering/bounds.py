@@ -82,9 +82,11 @@ def _depths(scene: Scene) -> Tensor | None:
     if scene.points is not None and len(scene.points) >= 8:
         pose = scene.cameras.pose
         points = scene.points[:: max(1, len(pose) * len(scene.points) // DEPTHS)]
-        z = -((points[None] - pose[:, None, :, 3]) * pose[:, None, :, 2]).sum(-1)
-        z = z[z > 0]
-        return z if len(z) else None
+        x, y, z = ((points[None] - pose[:, None, :, 3]) @ pose[:, :, :3]).unbind(-1)
+        # Only what a view sees: a street passes points at no distance at all, beside its cameras.
+        reach = (scene.cameras.size / scene.cameras.focal / 2)[:, :, None]
+        seen = (z < 0) & (x.abs() < -z * reach[:, 0]) & (y.abs() < -z * reach[:, 1])
+        return -z[seen] if bool(seen.any()) else None
     if scene.depths is not None:
         return scene.depths.prod(-1).sqrt()
     return None
@@ -124,7 +126,11 @@ def _contraction(scene: Scene) -> Space:
     if radius <= ROUNDING * float(position.abs().amax()):
         raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
     depth = _depths(scene)
-    near = NEAR if depth is None else min(NEAR, 0.5 * float(depth.quantile(_share(depth, 0.001))) / radius)
+    near = NEAR
+    if scene.depths is not None:
+        near = min(NEAR, 0.5 * float(scene.depths[:, 0].amin()) / radius)
+    elif depth is not None:
+        near = min(NEAR, 0.5 * float(depth.quantile(_share(depth, 0.001))) / radius)
     return Space("contraction", _three(centre), _rows(rotation), 1 / radius, max(near, 1e-3), FAR)
 
 
