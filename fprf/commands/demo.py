@@ -22,6 +22,8 @@ __all__ = ["LOOKS", "DemoConfig", "run"]
 
 LOOKS = {"autumn": (3, 9), "winter": (5, 14), "night": (2, 4)}
 """Palette of each reference, with the seed of the other town that it shows and the view of it."""
+SHOWN = 3
+"""Test views in the gallery: a row of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +114,7 @@ def _styles(
     known, config = trained.known, trained.config.render
     chosen: list[tuple[str, tuple[Path, ...]]] = [(name, (path,)) for name, path in references.items()]
     chosen.append((" + ".join(references), tuple(references.values())))
-    views = known.test[:4]
+    views = known.test[:SHOWN]
     result, dictionary_seconds, view_seconds = [], 0.0, 0.0
     for i, (name, paths) in enumerate(chosen):
         display.count(i, len(chosen), "restyling")
