@@ -43,6 +43,8 @@ class DataManagerConfig(PluginConfig):
 
     parser: DataParserConfig | None = None
     """Format of the scene folder; none = recognised from what lies in it."""
+    guided: GuidedConfig = GuidedConfig()
+    """Edge-aware upsampling of the targets, and of references alike."""
 
     def build(
         self,
@@ -68,8 +70,6 @@ class RayBatchesConfig(DataManagerConfig):
     """Rays per step."""
     semantic_share: float = 1.0
     """Share of the rays that also carry a semantic target."""
-    guided: GuidedConfig = GuidedConfig()
-    """Edge-aware upsampling of the targets."""
 
     def __post_init__(self) -> None:
         at_least("datamanager.rays", self.rays, 1)

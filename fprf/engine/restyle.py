@@ -66,6 +66,7 @@ def restyle(
                 basis=basis,
                 longest=max(longest, _SHORTEST),
                 weight=weights[i] if weights else 1.0,
+                guided=config.datamanager.guided,
             )
             for i, path in enumerate(references)
         ],
