@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 __all__ = ["StyleConfig", "StylizeConfig", "build_style", "run"]
 
+_LONGEST = 80
+"""Characters of a style's default name."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class StyleConfig:
@@ -88,7 +91,7 @@ def run(args: list[str]) -> int:
     start = time.perf_counter()
     styled = build_style(trained, config.references, config)
     dictionary_seconds = time.perf_counter() - start
-    output = config.output or config.run / "styles" / "+".join(p.stem for p in config.references)
+    output = config.output or config.run / "styles" / _name(config.references)
     views, known, render = trained.known.split(config.split), trained.known, trained.config.render
     summaries, seconds = {}, 0.0
     with Display() as display:
@@ -118,3 +121,9 @@ def run(args: list[str]) -> int:
     )
     print(f"{len(views)} views in {output}  (style {dictionary_seconds:.2f} s, {seconds / max(1, len(views)):.2f} s a view)")
     return 0
+
+
+def _name(references: tuple[Path, ...]) -> str:
+    """The stems joined, cut to what every file system takes."""
+    joined = "+".join(p.stem for p in references)
+    return joined if len(joined) <= _LONGEST else f"{joined[:_LONGEST]}+{len(references)}"

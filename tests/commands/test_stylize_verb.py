@@ -95,3 +95,12 @@ def test_a_scene_without_measured_style_says_what_to_do(run: Path, world: World,
     (run / "style.safetensors").unlink()
     assert stylize(run, world) == 2
     assert "style.safetensors: not written yet; finish training with `fprf train" in capsys.readouterr().err
+
+
+def test_default_names_are_bounded() -> None:
+    from fprf.commands.stylize import _name
+
+    few = (Path("a/autumn.jpg"), Path("night.png"))
+    assert _name(few) == "autumn+night"
+    many = tuple(Path(f"reference_with_a_long_name_{i}.jpg") for i in range(100))
+    assert len(_name(many).encode()) < 100
