@@ -11,6 +11,8 @@ from fprf.errors import ConfigError, DataError, UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 
+LAST = fprf_lite().steps
+
 
 def _by_name(findings: Iterator[Finding]) -> dict[str, Finding]:
     return {finding.what: finding for finding in findings}
@@ -59,7 +61,7 @@ def trained(tmp_path: Path) -> Path:
     folder = tmp_path / "a run"
     folder.mkdir()
     save_config(folder / "config.json", fprf_lite(), "fprf-lite")
-    for step, whole in ((100, True), (6000, True), (7000, False)):
+    for step, whole in ((100, True), (LAST, True), (LAST + 1000, False)):
         place = folder / "checkpoints" / f"step-{step:07d}"
         place.mkdir(parents=True)
         if whole:
@@ -72,16 +74,16 @@ def trained(tmp_path: Path) -> Path:
 def test_a_finished_run_is_well(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run([str(trained)]) == 0
     text = capsys.readouterr().out
-    assert "method fprf-lite" in text and "step 6000 of 6000" in text
+    assert "method fprf-lite" in text and f"step {LAST} of {LAST}" in text
     assert "problem" not in text and "optional" not in text
 
 
 def test_an_unfinished_run_says_how_to_go_on(trained: Path) -> None:
-    (trained / "checkpoints" / "step-0006000" / "manifest.json").unlink()
+    (trained / "checkpoints" / f"step-{LAST:07d}" / "manifest.json").unlink()
     (trained / "style.safetensors").unlink()
     found = _by_name(run_folder(trained))
     remedy = f"fprf train '{trained}/config.json' --output '{trained}'"
-    assert found["checkpoints"] == Finding("checkpoints", "step 100 of 6000", remedy, optional=True)
+    assert found["checkpoints"] == Finding("checkpoints", f"step 100 of {LAST}", remedy, optional=True)
     assert found["style.safetensors"].remedy == remedy and not found["style.safetensors"].optional
     (trained / "checkpoints" / "step-0000100" / "manifest.json").unlink()
     assert _by_name(run_folder(trained))["checkpoints"] == Finding("checkpoints", "none is complete", remedy)
