@@ -282,14 +282,6 @@ def test_nothing_is_computed_that_nobody_wants() -> None:
     assert found.rgb is not None
 
 
-@torch.no_grad()
-def test_no_rays() -> None:
-    found = render_rays(rays_of("contraction", 0), parts_of(), want=ALL, budget=0.1, background=torch.ones(3))
-    assert found.rgb is not None and found.semantic is not None
-    assert found.rgb.shape == (0, 3) and found.semantic.shape == (0, D)
-    assert found.counts == {"rays": 0, "samples": 0, "kept": 0}
-
-
 def test_a_training_step_draws_and_learns_its_proposals() -> None:
     parts, rays = parts_of(proposal=True), rays_of("contraction", 7)
 

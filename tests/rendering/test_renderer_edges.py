@@ -1,0 +1,85 @@
+"""The renderer at its edges: no rays, and gradients near the camera."""
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from fprf.interfaces import ContentField, Decoder
+from fprf.plugins.samplers.config import UniformConfig
+from fprf.rendering.renderer import VEIL, Parts, march, render_rays
+from fprf.rendering.space import Kind, Space
+from fprf.rendering.stepfun import midpoints, scale_gradient
+from fprf.types import FieldSample, Rays, Want
+
+EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+NEAR = 0.1
+
+
+class Told(ContentField):
+    """The densities that it was given, sample by sample."""
+
+    def __init__(self, values: Tensor) -> None:
+        super().__init__()
+        self.values = nn.Parameter(values)
+
+    def density(self, points: Tensor) -> FieldSample:
+        return FieldSample(self.values[: len(points)], points)
+
+    def content(self, latent: Tensor, view: Tensor) -> Tensor:
+        return latent
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {}
+
+
+class Plain(Decoder):
+    def forward(self, content: Tensor) -> Tensor:
+        return content.sigmoid()
+
+
+def parts_of(kind: Kind, samples: int) -> Parts:
+    values = torch.rand(4 * samples, generator=torch.Generator().manual_seed(0))
+    space = Space(kind, (0.0, 0.0, 0.0), EYE, 1.0, NEAR, 1e3)
+    return Parts(space, UniformConfig(samples=samples).build(seed=0), Told(values), None, Plain())
+
+
+def rays_of(parts: Parts, count: int) -> Rays:
+    origin = torch.zeros(count, 3, dtype=torch.float64)
+    direction = torch.tensor([[0.0, 0.6, 0.8]], dtype=torch.float64).expand(count, 3)
+    return parts.space.rays(origin, direction)
+
+
+@torch.no_grad()
+def test_no_rays() -> None:
+    parts = parts_of("contraction", 8)
+    found = render_rays(rays_of(parts, 0), parts, want=Want.COLOUR, budget=0.1, background=torch.ones(3))
+    assert found.rgb is not None and found.rgb.shape == (0, 3)
+    assert found.counts == {"rays": 0, "samples": 0, "kept": 0}
+
+
+def test_scaled_gradients_leave_values_alone() -> None:
+    x = torch.randn(5, 3, dtype=torch.float64, requires_grad=True)
+    scale = torch.rand(5, 1, dtype=torch.float64)
+    y = scale_gradient(x, scale)
+    assert torch.equal(y, x)
+    (grad,) = torch.autograd.grad((y * y).sum(), x)
+    torch.testing.assert_close(grad, 2 * x.detach() * scale)
+
+
+@pytest.mark.parametrize("kind", ["contraction", "box"])
+def test_near_densities_learn_by_the_square_of_their_distance(kind: Kind) -> None:
+    parts = parts_of(kind, 64)
+    rays = rays_of(parts, 4)
+    assert isinstance(parts.field, Told)
+
+    def gradient(step: int | None) -> Tensor:
+        marched = march(rays, parts, budget=0.0, step=step)
+        assert isinstance(parts.field, Told)
+        (grad,) = torch.autograd.grad(marched.weights.square().sum(), parts.field.values)
+        return grad.view(4, -1)
+
+    plain, training = gradient(None), gradient(0)
+    middle = midpoints(march(rays, parts, budget=0.0).sampled.t)
+    share = (middle / (VEIL * rays.near[:, None])).square().clamp(max=1) if kind == "contraction" else torch.ones(4, 64)
+    assert bool((share < 0.5).any()) == (kind == "contraction")
+    torch.testing.assert_close(training, plain * share, rtol=1e-5, atol=1e-9)
