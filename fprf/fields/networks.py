@@ -3,9 +3,9 @@
 import math
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-__all__ = ["linear", "mlp"]
+__all__ = ["linear", "mlp", "weights"]
 
 
 def linear(inputs: int, outputs: int, *, generator: torch.Generator) -> nn.Linear:
@@ -28,3 +28,8 @@ def mlp(inputs: int, hidden: int, layers: int, outputs: int, *, generator: torch
         inputs = hidden
     parts.append(linear(inputs, outputs, generator=generator))
     return nn.Sequential(*parts)
+
+
+def weights(network: nn.Sequential) -> list[Tensor]:
+    """Of each linear map, [outputs, inputs]."""
+    return [layer.weight for layer in network if isinstance(layer, nn.Linear)]

@@ -5,7 +5,6 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
-from .density import density
 from .networks import linear
 from .planes import Planes
 
@@ -23,4 +22,4 @@ class ProposalField(nn.Module):
 
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """Density per space unit at points of the unit cube."""
-        return density(self.to_density(self.planes(points))[:, 0])
+        return self.planes.density(points, self.to_density.weight[0])[0]

@@ -16,10 +16,13 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["LANES", "ViewArrays", "gather_views"]
+__all__ = ["LANES", "ViewArrays", "ViewTable", "gather_views"]
 
 LANES = 8
 """One AVX register of float32; narrower machines split it."""
+
+PIXELS = 64
+"""Pixels of a task."""
 
 Floats: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
@@ -37,14 +40,26 @@ class ViewArrays(NamedTuple):
     centre: Floats
 
 
+class ViewTable:
+    """Views side by side: where each one's coefficients lie, and what else is known of it."""
+
+    def __init__(self, views: Sequence[ViewArrays]) -> None:
+        self._kept = [view.bits for view in views]  # the addresses below must stay good
+        self.address = np.array([bits.ctypes.data for bits in self._kept], dtype=np.int64)
+        self.shape = np.array([(v.rows, v.columns, v.height, v.width) for v in views], dtype=np.int64)
+        self.scale = np.stack([view.scale for view in views]).astype(np.float32)
+        self.centre = np.stack([view.centre for view in views]).astype(np.float32)
+        self.run = self._kept[0].shape[1] // 4
+
+
 _WIDE = ir.VectorType(ir.IntType(32), LANES)
 _HALVES = ir.VectorType(ir.IntType(16), LANES)
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 
 
 @intrinsic
-def _add_halves(typingctx, total, at, bits, first, weight):
-    """total[at : at + LANES] += weight * 2^-112 * the float16 whose bits are bits[first : first + LANES].
+def _add_halves(typingctx, total, at, address, weight):
+    """total[at : at + LANES] += weight * 2^-112 * the LANES float16 whose bits lie at an address.
 
     A half's exponent and mantissa, moved to a float's place, are 2^112 too small; subnormals come out right as well.
     """
@@ -63,18 +78,18 @@ def _add_halves(typingctx, total, at, bits, first, weight):
             return ir.Constant(_WIDE, [value] * LANES)
 
         target = vector(0, arguments[1], _FLOATS)
-        half = build.zext(load(vector(2, arguments[3], _HALVES), 2), _WIDE)
+        half = build.zext(load(build.inttoptr(arguments[2], _HALVES.as_pointer()), 2), _WIDE)
         sign = build.shl(build.and_(half, mask(0x8000)), mask(16))
         rest = build.shl(build.and_(half, mask(0x7FFF)), mask(13))
         single = build.bitcast(build.or_(sign, rest), _FLOATS)
         undefined = ir.Constant(_FLOATS, ir.Undefined)
-        lane = build.insert_element(undefined, arguments[4], ir.Constant(ir.IntType(32), 0))
+        lane = build.insert_element(undefined, arguments[3], ir.Constant(ir.IntType(32), 0))
         splat = build.shuffle_vector(lane, undefined, mask(0))
         product = build.fmul(single, splat, flags=("contract",))
         build.store(build.fadd(load(target, 4), product, flags=("contract",)), target).align = 4
         return context.get_dummy_value()
 
-    return types.void(total, at, bits, first, weight), generate
+    return types.void(total, at, types.int64, weight), generate
 
 
 @numba.njit(inline="always", cache=True)
@@ -86,36 +101,31 @@ def _corner(position, cells):
     return low, min(low + 1, cells - 1), at - np.float32(low)
 
 
-_jit = numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def gather_views(table: ViewTable, slot: np.ndarray, pixel: Floats, rgb: Floats, out: Floats) -> None:
+    """out[i] = F at pixel[i] [R 2] with colour rgb[i] [R 3] of the table's view slot[i]."""
+    _gather(slot, table.address, table.shape, table.scale, table.centre, table.run, pixel, rgb, out)
 
 
-def gather_views(views: Sequence[ViewArrays], groups: Sequence[np.ndarray], pixel: Floats, rgb: Floats, out: Floats) -> None:
-    """out[i] = F at pixel[i] [R 2] with colour rgb[i] [R 3], for i in groups[n], from views[n]."""
-    for view, group in zip(views, groups, strict=True):
-        _gather(*view, group, pixel, rgb, out)
-
-
-@_jit
-def _gather(bits, rows, columns, height, width, scale, centre, order, pixel, rgb, out):
-    """The pixels of one view."""
-    channels = len(scale)
-    run = bits.shape[1] // 4
-    flat = bits.ravel()
-    vertical, horizontal = np.float32(rows / height), np.float32(columns / width)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract"})
+def _gather(slot, address, shape, scale, centre, run, pixel, rgb, out):
+    channels = scale.shape[1]
     exponent = np.float32(2.0**112)
-    total = np.empty(run, dtype=np.float32)
-    for n in range(len(order)):
-        i = order[n]
-        top, bottom, v = _corner(pixel[i, 1] * vertical, rows)
-        left, right, u = _corner(pixel[i, 0] * horizontal, columns)
-        total[:] = np.float32(0)
-        for corner in range(4):
-            y, x = (bottom if corner & 2 else top), (right if corner & 1 else left)
-            share = (v if corner & 2 else np.float32(1) - v) * (u if corner & 1 else np.float32(1) - u) * exponent
-            row = (y * columns + x) * 4 * run
-            for k in range(4):
-                weight = share * rgb[i, k] if k < 3 else share
-                for s in range(0, run, LANES):
-                    _add_halves(total, s, flat, row + k * run + s, weight)
-        for c in range(channels):
-            out[i, c] = total[c] * scale[c] + centre[c]
+    for task in numba.prange((len(slot) + PIXELS - 1) // PIXELS):
+        total = np.empty(run, dtype=np.float32)
+        for i in range(task * PIXELS, min(len(slot), task * PIXELS + PIXELS)):
+            view = slot[i]
+            rows, columns = shape[view, 0], shape[view, 1]
+            vertical, horizontal = np.float32(rows / shape[view, 2]), np.float32(columns / shape[view, 3])
+            top, bottom, v = _corner(pixel[i, 1] * vertical, rows)
+            left, right, u = _corner(pixel[i, 0] * horizontal, columns)
+            total[:] = np.float32(0)
+            for corner in range(4):
+                y, x = (bottom if corner & 2 else top), (right if corner & 1 else left)
+                share = (v if corner & 2 else np.float32(1) - v) * (u if corner & 1 else np.float32(1) - u) * exponent
+                row = address[view] + (y * columns + x) * 4 * run * 2
+                for k in range(4):
+                    weight = share * rgb[i, k] if k < 3 else share
+                    for s in range(0, run, LANES):
+                        _add_halves(total, s, row + (k * run + s) * 2, weight)
+            for c in range(channels):
+                out[i, c] = total[c] * scale[view, c] + centre[view, c]

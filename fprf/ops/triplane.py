@@ -10,6 +10,7 @@ over. Both keep coordinates and arithmetic in the dtype of the points, never hal
 feature at 512 nodes). Gradients go to the table; points are constants, since samplers do not learn through them.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -18,7 +19,17 @@ from torch import Tensor
 
 from . import triplane_numba as fused
 
-__all__ = ["AXES", "lookup", "lookup_reference", "rows", "split", "variation", "variation_reference"]
+__all__ = [
+    "AXES",
+    "density",
+    "density_alone",
+    "lookup",
+    "lookup_reference",
+    "rows",
+    "split",
+    "variation",
+    "variation_reference",
+]
 
 AXES = ((0, 1), (0, 2), (1, 2))
 
@@ -79,6 +90,31 @@ class _Lookup(torch.autograd.Function):
         return None, fused.backward(points, table, ctx.resolutions, grads[0].contiguous()), None
 
 
+class _Density(torch.autograd.Function):
+    """Density and features together: neither the features' gradient nor its sum with the density's is ever written."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], weight: Tensor, limit: float
+    ) -> tuple[Tensor, Tensor]:
+        density, latent = fused.density(points, table, resolutions, weight, limit, keep=True)
+        ctx.save_for_backward(points, table, weight, density, latent)
+        ctx.resolutions, ctx.limit = resolutions, limit
+        ctx.set_materialize_grads(False)
+        return density, latent
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[None, Tensor | None, None, Tensor | None, None]:
+        points, table, weight, density, latent = ctx.saved_tensors
+        thick, feature = grads
+        if thick is None and feature is None:
+            return None, None, None, None, None
+        # As `exp_gradient`: no gradient explodes or dies where the density is cut off.
+        raw = None if thick is None else thick * density.clamp_min(math.exp(-ctx.limit))
+        found = fused.backward(points, table, ctx.resolutions, feature, raw, weight)
+        return None, found, None, None if raw is None else fused.summed(raw, latent), None
+
+
 class _Variation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
@@ -100,6 +136,33 @@ def lookup(
         return lookup_reference(points, table, resolutions)
     result: Tensor = _Lookup.apply(points.detach().contiguous(), table, tuple(resolutions))  # type: ignore[no-untyped-call]
     return result
+
+
+def density(
+    points: Annotated[Tensor, "N 3"],
+    table: Annotated[Tensor, "rows F"],
+    resolutions: Sequence[int],
+    weight: Annotated[Tensor, "scales*F"],
+    limit: float,
+) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N scales*F"]]:
+    """exp(min(feature . weight - 1, limit)), and the features of `lookup`, for the CPU in float32.
+
+    The gradient of the density is that of exp between -limit and limit, and the one at the nearer of them beyond.
+    """
+    given = points.detach().contiguous()
+    found: tuple[Tensor, Tensor] = _Density.apply(given, table, tuple(resolutions), weight, limit)  # type: ignore[no-untyped-call]
+    return found
+
+
+def density_alone(
+    points: Annotated[Tensor, "N 3"],
+    table: Annotated[Tensor, "rows F"],
+    resolutions: Sequence[int],
+    weight: Annotated[Tensor, "scales*F"],
+    limit: float,
+) -> Annotated[Tensor, "N"]:
+    """The density of `density` without gradients: features are summed up as they are found."""
+    return fused.density(points.detach().contiguous(), table, resolutions, weight, limit, keep=False)[0]
 
 
 def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:

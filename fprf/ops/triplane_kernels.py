@@ -6,12 +6,16 @@
 import numba
 import numpy as np
 
-from .vector import LANES, product_backward, product_forward
+from .exponential import exp_lanes
+from .lanes import BLOCK, WIDE
+from .vector import LANES, dot, product_backward, product_backward_wide, product_forward, product_forward_wide, scaled
 
-__all__ = ["GROUP", "backward", "forward", "variation", "variation_gradient"]
+__all__ = ["GROUP", "PARTS", "backward", "cells", "density", "features", "forward", "summed", "variation", "variation_gradient"]
 
 GROUP = 16
 """Channels of one backward task: a cache line of float32."""
+PARTS = 8
+"""Ranges of points that are summed up by themselves: the order of sums is fixed for any number of threads."""
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 # Differences of neighbours may be summed in any order inside a row: the sum is a regulariser, kept in float64.
@@ -19,55 +23,136 @@ _jit_sum = numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract
 
 
 @numba.njit(inline="always", cache=True)
-def _cell(x, size):
-    """Node at or below a coordinate in [-1, 1], and the share of the next one; outside counts as the border.
+def cells(points, first, count, apart, across, size, start, channels, corner, part):
+    """For `count` <= BLOCK points: first number of the lower corner's vector in each plane, share of the next node per axis.
 
-    The comparison is written so that NaN falls on the lower border: an index must never leave the table.
+    Points lie `apart` numbers apart, their coordinates `across`. Outside counts as the border; the comparison is written so
+    that NaN falls on the lower one: an index must never leave the table.
     """
-    last = np.float32(size - 1)
-    at = (x + np.float32(1)) * (np.float32(0.5) * last)
-    at = min(at, last) if at > np.float32(0) else np.float32(0)
-    low = min(int(at), size - 2)
-    return low, at - np.float32(low)
+    last, plane = np.float32(size - 1), size * size
+    half, top = np.float32(0.5) * last, np.float32(size - 2)
+    for axis in range(3):
+        for n in range(count):
+            at = (points[(first + n) * apart + axis * across] + np.float32(1)) * half
+            at = min(at, last) if at > np.float32(0) else np.float32(0)
+            low = min(np.floor(at), top)
+            part[axis * BLOCK + n] = at - low
+            corner[axis * BLOCK + n] = np.int64(low)
+    for n in range(count):
+        i, j, k = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
+        corner[n] = (start + j * size + i) * channels
+        corner[BLOCK + n] = (start + plane + k * size + i) * channels
+        corner[2 * BLOCK + n] = (start + 2 * plane + k * size + j) * channels
+
+
+@numba.njit(inline="always", cache=True)
+def features(points, first, count, table, channels, sizes, starts, corner, part, out, to):
+    """For `count` <= BLOCK points [3] the products of their samples, scales side by side, to out[to :]."""
+    scales = len(sizes)
+    for scale in range(scales):
+        size = sizes[scale]
+        cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+        for n in range(count):
+            a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
+            u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+            o = to + (n * scales + scale) * channels
+            if channels % WIDE == 0:
+                for s in range(0, channels, WIDE):
+                    product_forward_wide(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w)
+            else:
+                for s in range(0, channels, LANES):
+                    product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w)
 
 
 @_jit
 def forward(points, table, channels, sizes, starts, out):
     """out[n, scale, c] = product over the planes of the bilinear sample at point n."""
-    scales = len(sizes)
-    for n in numba.prange(len(points)):
-        for scale in range(scales):
-            size = sizes[scale]
-            i, u = _cell(points[n, 0], size)
-            j, v = _cell(points[n, 1], size)
-            k, w = _cell(points[n, 2], size)
-            a = (starts[scale] + j * size + i) * channels
-            b = (starts[scale] + size * size + k * size + i) * channels
-            c = (starts[scale] + 2 * size * size + k * size + j) * channels
-            o = (n * scales + scale) * channels
-            for s in range(0, channels, LANES):
-                product_forward(table, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w)
+    total = len(points) // 3
+    for task in numba.prange((total + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
+        count = min(BLOCK, total - first)
+        features(points, first, count, table, channels, sizes, starts, corner, part, out, first * len(sizes) * channels)
 
 
 @_jit
-def backward(points, table, channels, sizes, starts, grad, out):
-    """Add the table's gradient to `out`; one task a scale and group of channels, finest scales first."""
-    scales = len(sizes)
-    groups = (channels + GROUP - 1) // GROUP
-    for task in numba.prange(scales * groups):
-        scale, first = scales - 1 - task // groups, task % groups * GROUP
-        last = min(first + GROUP, channels)
-        size = sizes[scale]
-        for n in range(len(points)):
-            i, u = _cell(points[n, 0], size)
-            j, v = _cell(points[n, 1], size)
-            k, w = _cell(points[n, 2], size)
-            a = (starts[scale] + j * size + i) * channels
-            b = (starts[scale] + size * size + k * size + i) * channels
-            c = (starts[scale] + 2 * size * size + k * size + j) * channels
-            o = (n * scales + scale) * channels
-            for s in range(first, last, LANES):
-                product_backward(table, grad, out, a + s, b + s, c + s, o + s, channels, size * channels, u, v, w)
+def density(points, table, channels, sizes, starts, weight, limit, latent, out):
+    """out[n] = exp(min(feature . weight - 1, limit)) at point n. The features go to `latent`, or nowhere if that is empty."""
+    total, width = len(points) // 3, len(sizes) * channels
+    for task in numba.prange((total + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
+        count = min(BLOCK, total - first)
+        raw = np.zeros(BLOCK, np.float32)
+        feature, to = latent, first * width
+        if len(latent) == 0:
+            feature, to = np.empty(BLOCK * width, np.float32), 0
+        features(points, first, count, table, channels, sizes, starts, corner, part, feature, to)
+        for n in range(count):
+            raw[n] = min(dot(feature, to + n * width, weight, 0, width) - np.float32(1), limit)
+        for n in range(0, BLOCK, WIDE):
+            exp_lanes(raw, n, raw, n)
+        out[first : first + count] = raw[:count]
+
+
+@_jit
+def summed(raw, latent, width, out):
+    """out[part] = sum of raw[n] latent[n] over the points n of each of the PARTS ranges."""
+    total = len(raw)
+    for part in numba.prange(PARTS):
+        at = part * width
+        for n in range(part * total // PARTS, (part + 1) * total // PARTS):
+            for c in range(width):
+                out[at + c] += raw[n] * latent[n * width + c]
+
+
+@numba.njit(inline="always", cache=True)
+def _slopes(grad, raw, weight, first, count, width, at, size, none, out):
+    """Gradients of `size` of the features of some points: grad, if it is not empty, plus raw[n] * weight."""
+    for n in range(count):
+        for s in range(0, size, LANES):
+            if len(grad) > 0:
+                scaled(weight, at + s, raw[first + n], grad, (first + n) * width + at + s, out, n * size + s)
+            else:
+                scaled(weight, at + s, raw[first + n], none, 0, out, n * size + s)
+
+
+@_jit
+def backward(points, table, channels, sizes, starts, grad, raw, weight, slices, out):
+    """Add the table's gradient to `out` [slices ...]; one task a slice of the points, scale (finest first) and channel group.
+
+    The gradient of feature c of point n is grad[n, c] + raw[n] weight[c]; what is empty is not added.
+    """
+    scales, total = len(sizes), len(points) // 3
+    groups, blocks = (channels + GROUP - 1) // GROUP, (len(points) // 3 + BLOCK - 1) // BLOCK
+    for task in numba.prange(slices * scales * groups):
+        part_of, rest = task % slices, task // slices
+        scale, here = scales - 1 - rest // groups, rest % groups * GROUP
+        wide = min(here + GROUP, channels) - here
+        size, mine = sizes[scale], part_of * len(table)
+        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
+        mixed, none = np.empty(BLOCK * GROUP, np.float32), np.zeros(LANES, np.float32)
+        for block in range(part_of * blocks // slices, (part_of + 1) * blocks // slices):
+            first = block * BLOCK
+            count = min(BLOCK, total - first)
+            cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+            slope, o, apart = grad, (first * scales + scale) * channels + here, scales * channels
+            if len(raw) > 0:
+                _slopes(grad, raw, weight, first, count, scales * channels, scale * channels + here, wide, none, mixed)
+                slope, o, apart = mixed, 0, wide
+            for n in range(count):
+                a, b, c = corner[n] + here, corner[BLOCK + n] + here, corner[2 * BLOCK + n] + here
+                u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+                if wide % WIDE == 0:
+                    for s in range(0, wide, WIDE):
+                        product_backward_wide(
+                            table, slope, out, a + s, b + s, c + s, o + n * apart + s, mine, channels, size * channels, u, v, w
+                        )
+                else:
+                    for s in range(0, wide, LANES):
+                        product_backward(
+                            table, slope, out, a + s, b + s, c + s, o + n * apart + s, mine, channels, size * channels, u, v, w
+                        )
 
 
 @_jit_sum

@@ -38,14 +38,31 @@ def test_it_is_planes_then_a_linear_density_and_a_network() -> None:
     points, view = cloud(20)
     sample = field.density(points)
     assert torch.equal(sample.latent, field.planes(points)) and sample.latent.shape == (20, 16)
-    assert torch.equal(sample.density, density(sample.latent @ field.to_density.weight[0]))
+    assert torch.allclose(sample.density, density(sample.latent @ field.to_density.weight[0]), rtol=1e-6)
     with torch.no_grad():
         field.offset.copy_(torch.arange(6.0))
     found = field.content(sample.latent, view)
     network = field.to_content(torch.cat([sample.latent, harmonics(view, 4)], -1))
-    assert torch.equal(found, network + torch.arange(6.0))
+    assert torch.allclose(found, network + torch.arange(6.0), atol=1e-5)
     assert list(field.penalties()) == ["variation"]
     assert torch.equal(field.penalties()["variation"], field.planes.variation())
+
+
+def test_without_gradients_the_latent_is_the_point_and_everything_else_the_same() -> None:
+    field = SMALL.build(channels=6, seed=0)
+    points, view = cloud(200)
+    view = view[::5].repeat_interleave(5, 0)
+    learnt = field.density(points)
+    with torch.no_grad():
+        sample = field.density(points)
+        assert torch.equal(sample.latent, points) and torch.equal(sample.density, learnt.density)
+        assert torch.equal(field.content(sample.latent, view), field.content(learnt.latent, view))
+        assert field.content(sample.latent[:0], view[:0]).shape == (0, 6)
+        wide = field.double()
+        plain = wide.density(points.double())
+        assert plain.latent.shape == (200, 16)
+        content = wide.content(plain.latent, view.double())
+    assert torch.allclose(field.float().content(learnt.latent, view).double(), content, atol=1e-5)
 
 
 def test_direction_changes_content_unless_there_is_none() -> None:
@@ -89,3 +106,13 @@ def test_the_start_is_thin_and_different_for_each_seed() -> None:
 def test_values_out_of_range_are_refused(value: dict[str, object], name: str) -> None:
     with pytest.raises(ConfigError, match=rf"content\.field\.{name}"):
         PlanesConfig(**value)  # type: ignore[arg-type]
+
+
+def test_nothing_kept_has_no_features() -> None:
+    """Rays through thin air may keep no sample at all, with kernels (no gradients) and without."""
+    field = SMALL.build(channels=6, seed=0)
+    points, view = cloud(12)
+    for quiet in (True, False):
+        with torch.set_grad_enabled(not quiet):
+            latent = field.density(points).latent
+            assert field.content(latent[:0], view[:0]).shape == (0, 6)

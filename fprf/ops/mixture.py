@@ -1,0 +1,143 @@
+"""Styles at points without gradients: which of several each takes, and what the mixture makes of its features.
+
+Each has a plain form, the reference for every device and dtype, and one compiled for float32 on the CPU.
+"""
+
+# The checker takes compiled functions to have one argument.
+# mypy: disable-error-code="call-arg"
+
+from typing import Annotated
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .dense import usable
+
+__all__ = ["affine", "affine_reference", "attention", "scaled", "scaled_reference"]
+
+
+def affine_reference(
+    x: Annotated[Tensor, "N C"],
+    share: Annotated[Tensor, "N K"],
+    matrix: Annotated[Tensor, "K C C"],
+    bias: Annotated[Tensor, "K C"],
+    *,
+    centre: Annotated[Tensor, "C"],
+) -> Annotated[Tensor, "N C"]:
+    """sum_k share_k ((x - centre) matrix_k + bias_k); maps that a point has no share in are not computed."""
+    x = x - centre
+    if len(matrix) == 1:
+        return x @ matrix[0] + bias[0]
+    out = share @ bias
+    for k in range(len(matrix)):
+        inside = share[:, k].nonzero().squeeze(1)
+        out.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
+    return out
+
+
+def affine(
+    x: Annotated[Tensor, "N C"],
+    share: Annotated[Tensor, "N K"],
+    matrix: Annotated[Tensor, "K C C"],
+    bias: Annotated[Tensor, "K C"],
+    *,
+    centre: Annotated[Tensor, "C"],
+) -> Annotated[Tensor, "N C"]:
+    """`affine_reference`, within (C + K + 3) u sum_k share_k (|x - centre| |matrix_k| + |bias_k|), u = 2^-24."""
+    if not usable(x) or len(x) == 0:
+        return affine_reference(x, share, matrix, bias, centre=centre)
+    from . import mixture_kernels as kernels
+
+    channels = x.shape[1]
+    out = torch.empty(len(x), channels)
+    padded = [_whole(part).contiguous().view(-1).numpy() for part in (matrix, bias)]
+    kernels.affine(
+        *(_flat(part) for part in (x, centre, share)), *padded, channels, len(padded[1]) // len(bias), out.view(-1).numpy()
+    )
+    return out
+
+
+def scaled_reference(
+    x: Annotated[Tensor, "N C"],
+    share: Annotated[Tensor, "N K"],
+    gain: Annotated[Tensor, "K C"],
+    bias: Annotated[Tensor, "K C"],
+    *,
+    centre: Annotated[Tensor, "C"],
+) -> Annotated[Tensor, "N C"]:
+    """(x - centre) (share gain) + share bias, channel by channel: the mixture's gains and biases."""
+    return (x - centre) * (share @ gain) + share @ bias
+
+
+def scaled(
+    x: Annotated[Tensor, "N C"],
+    share: Annotated[Tensor, "N K"],
+    gain: Annotated[Tensor, "K C"],
+    bias: Annotated[Tensor, "K C"],
+    *,
+    centre: Annotated[Tensor, "C"],
+) -> Annotated[Tensor, "N C"]:
+    """`scaled_reference`, within (K + 2) u (|x - centre| share |gain| + share |bias|)."""
+    if not usable(x) or len(x) == 0:
+        return scaled_reference(x, share, gain, bias, centre=centre)
+    from . import mixture_kernels as kernels
+
+    channels = x.shape[1]
+    out = torch.empty(len(x), channels)
+    padded = [_whole(part) for part in (gain, bias)]
+    width = padded[0].shape[1]
+    kernels.scaled(
+        *(_flat(part) for part in (x, centre, share, *padded)),
+        channels,
+        width,
+        np.zeros(width, np.float32),
+        out.view(-1).numpy(),
+    )
+    return out
+
+
+def attention(
+    x: Annotated[Tensor, "N D"],
+    keys: Annotated[Tensor, "T D"],
+    temperature: float,
+    *,
+    centre: Annotated[Tensor, "D"] | None = None,
+    flat: float = 0.0,
+    prior: Annotated[Tensor, "T"] | None = None,
+    faint: float = 0.0,
+) -> Annotated[Tensor, "N T"]:
+    """Softmax of x keys^T / temperature, odds multiplied by the prior; the compiled form alone (see `style.matching`).
+
+    With a centre, x are the directions from it, and 0 within `flat` of it. Shares below `faint` of the largest are dropped.
+    """
+    from . import mixture_kernels as kernels
+    from .lanes import BLOCK
+
+    out = torch.empty(len(x), len(keys))
+    rows = torch.nn.functional.pad(keys, (0, 0, 0, -len(keys) % BLOCK))
+    odds = torch.zeros(len(keys)) if prior is None else prior.log()
+    kernels.attention(
+        _flat(x),
+        _flat(torch.zeros(x.shape[1]) if centre is None else centre),
+        np.float32(-1.0 if centre is None else flat),
+        _flat(rows),
+        np.float32(1 / max(temperature, torch.finfo(torch.float32).tiny)),
+        _flat(odds),
+        np.float32(faint),
+        np.zeros(BLOCK, np.float32),
+        out.view(-1).numpy(),
+    )
+    return out
+
+
+def _flat(x: Tensor) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+    flat: np.ndarray[tuple[int], np.dtype[np.float32]] = x.detach().contiguous().view(-1).numpy()
+    return flat
+
+
+def _whole(x: Tensor) -> Tensor:
+    """The last axis padded with zeros to whole vectors."""
+    from .lanes import WIDE
+
+    return torch.nn.functional.pad(x, (0, -x.shape[-1] % WIDE))

@@ -1,0 +1,192 @@
+"""The compiled loops behind `mixture`: a block of points at a time, nothing between the steps leaves the cache.
+
+Arrays are flat, contiguous float32; `width` is a number of outputs rounded up to whole vectors, the padding zeros.
+"""
+
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, call-arg"
+
+import numba
+import numpy as np
+
+from .dense_kernels import product
+from .exponential import exp_lanes
+from .lanes import BLOCK, WIDE
+from .rows import copy_lanes
+from .tile import (
+    ROWS_1,
+    ROWS_2,
+    ROWS_3,
+    ROWS_4,
+    accumulate_1,
+    accumulate_2,
+    accumulate_3,
+    accumulate_4,
+)
+
+__all__ = ["affine", "attention", "scaled"]
+
+_jit = numba.njit(parallel=True, cache=True, nogil=True)
+_0, _1, _LEAST = np.float32(0), np.float32(1), np.float32(-np.inf)
+
+
+@numba.njit(inline="always", cache=True)
+def _directions(query, least, factor):
+    """Of each column of query [depth BLOCK] one by its length, 0 within `least`; NaN stays."""
+    depth, block = query.shape
+    for r in range(block):
+        factor[r] = _0
+    for c in range(depth):
+        for r in range(block):
+            factor[r] += query[c, r] * query[c, r]
+    for r in range(block):
+        norm = np.sqrt(factor[r])
+        factor[r] = _1 / norm if norm > least else _0 * norm
+
+
+@numba.njit(inline="always", cache=True)
+def _softmax(score, count, factor, sharpness, odds, faint, best, total):
+    """Shares of each column of score [rows BLOCK] times its factor, in place; those below `faint` of the best become 0."""
+    block = score.shape[1]
+    for r in range(block):
+        best[r] = _LEAST
+    for k in range(count):
+        for r in range(block):
+            score[k, r] *= factor[r]
+            best[r] = max(best[r], score[k, r])
+    for r in range(block):
+        total[r] = _LEAST
+    for k in range(count):
+        for r in range(block):
+            score[k, r] = (score[k, r] - best[r]) * sharpness + odds[k]
+            total[r] = max(total[r], score[k, r])
+    for k in range(count):
+        for r in range(block):
+            score[k, r] -= total[r]
+    flat = score.reshape(-1)
+    for i in range(0, count * block, WIDE):
+        exp_lanes(flat, i, flat, i)
+    for r in range(block):
+        total[r] = _0
+    for k in range(count):
+        for r in range(block):
+            # The best has exp(0) = 1, so this is a share of it. A NaN is not below and stays.
+            score[k, r] = _0 if score[k, r] < faint else score[k, r]
+            total[r] += score[k, r]
+    for k in range(count):
+        for r in range(block):
+            score[k, r] /= total[r]
+
+
+@_jit
+def attention(x, centre, least, keys, sharpness, odds, faint, none, out):
+    """out [N count] = softmax of the scores of points x [N depth] with keys [rows depth], rows >= count = len(odds).
+
+    least >= 0: points are directions from the centre, and none within `least` of it. least < 0: points as they are.
+    """
+    count, depth = len(odds), len(centre)
+    rows, total = len(keys) // depth, len(out) // count
+    for task in numba.prange((total + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        points = min(BLOCK, total - first)
+        # Points side by side: a vector holds one number of several points.
+        query, score = np.zeros((depth, BLOCK), np.float32), np.empty((rows, BLOCK), np.float32)
+        factor, best, sums = np.ones(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+        for r in range(points):
+            mine = x[(first + r) * depth : (first + r + 1) * depth]
+            for c in range(depth):
+                query[c, r] = mine[c] - centre[c]
+        if least >= _0:
+            _directions(query, least, factor)
+        product(keys, 0, depth, 1, rows, query.reshape(-1), 0, BLOCK, none, 0, 0, score.reshape(-1), 0, BLOCK, depth, _LEAST)
+        _softmax(score, count, factor, sharpness, odds, faint, best, sums)
+        for r in range(points):
+            mine = out[(first + r) * count : (first + r + 1) * count]
+            for k in range(count):
+                mine[k] = score[k, r]
+
+
+@numba.njit(inline="always", cache=True)
+def _any(share, at, step, rows):
+    found = False
+    for r in range(rows):
+        found |= share[at + r * step] != _0
+    return found
+
+
+@numba.njit(inline="always", cache=True)
+def _add_scaled(x, x_at, channels, rows, w, w_at, width, bias, b_at, out, share, s_at, count):
+    """out[r] += share[r] (bias + x[r] w), tile by tile; tiles without a share are passed over."""
+    c = 0
+    while c < width:
+        left = (width - c) // WIDE
+        step = ROWS_4 if left >= 4 else ROWS_3 if left == 3 else ROWS_2 if left == 2 else ROWS_1
+        for r in range(0, rows, step):
+            if not _any(share, s_at + r * count, count, step):
+                continue
+            if left >= 4:
+                accumulate_4(
+                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
+                    out, r * width + c, width, channels, share, s_at + r * count, count,
+                )  # fmt: skip
+            elif left == 3:
+                accumulate_3(
+                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
+                    out, r * width + c, width, channels, share, s_at + r * count, count,
+                )  # fmt: skip
+            elif left == 2:
+                accumulate_2(
+                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
+                    out, r * width + c, width, channels, share, s_at + r * count, count,
+                )  # fmt: skip
+            else:
+                accumulate_1(
+                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
+                    out, r * width + c, width, channels, share, s_at + r * count, count,
+                )  # fmt: skip
+        c += min(4, left) * WIDE
+
+
+@_jit
+def affine(x, centre, share, matrix, bias, channels, width, out):
+    """out [N channels] = sum_k share[n, k] ((x[n] - centre) matrix[k] + bias[k]); what nobody has a share in costs nothing."""
+    total = len(x) // channels
+    count = len(share) // total
+    for task in numba.prange((total + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        rows = min(BLOCK, total - first)
+        sums, belongs = np.zeros(BLOCK * width, np.float32), np.zeros(BLOCK * count, np.float32)
+        belongs[: rows * count] = share[first * count : (first + rows) * count]
+        away = np.zeros(BLOCK * channels, np.float32)
+        for r in range(rows):
+            mine, goal = x[(first + r) * channels : (first + r + 1) * channels], away[r * channels : (r + 1) * channels]
+            for c in range(channels):
+                goal[c] = mine[c] - centre[c]
+        for k in range(count):
+            _add_scaled(away, 0, channels, BLOCK, matrix, k * channels * width, width, bias, k * width, sums, belongs, k, count)
+        if width == channels:
+            for i in range(0, rows * channels, WIDE):
+                copy_lanes(sums, i, out, first * channels + i)
+        else:
+            for r in range(rows):
+                for c in range(channels):
+                    out[(first + r) * channels + c] = sums[r * width + c]
+
+
+@_jit
+def scaled(x, centre, share, gain, bias, channels, width, none, out):
+    """out [N channels] = (x - centre) (share gain) + share bias, channel by channel; gain and bias [K width], none zeros."""
+    total = len(x) // channels
+    count = len(share) // total
+    for task in numba.prange((total + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        rows = min(BLOCK, total - first)
+        shares = np.zeros(BLOCK * count, np.float32)
+        gains, shift = np.empty(BLOCK * width, np.float32), np.empty(BLOCK * width, np.float32)
+        shares[: rows * count] = share[first * count : (first + rows) * count]
+        product(shares, 0, count, 1, rows, gain, 0, width, none, 0, 0, gains, 0, width, count, _LEAST)
+        product(shares, 0, count, 1, rows, bias, 0, width, none, 0, 0, shift, 0, width, count, _LEAST)
+        for r in range(rows):
+            mine, goal = x[(first + r) * channels : (first + r + 1) * channels], out[(first + r) * channels :]
+            factor, more = gains[r * width :], shift[r * width :]
+            for c in range(channels):
+                goal[c] = (mine[c] - centre[c]) * factor[c] + more[c]

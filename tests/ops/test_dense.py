@@ -1,0 +1,262 @@
+"""Small networks: the compiled form against fp64 at the documented bound, at block borders and production sizes."""
+
+import itertools
+from collections.abc import Callable, Sequence
+
+import numba
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.ops import dense, triplane
+from fprf.ops.dense import Last, network, network_reference, plane_network, runs
+from fprf.ops.lanes import BLOCK
+
+QUICK = settings(max_examples=25, deadline=None)
+U = 2.0**-24
+"""Unit round-off of float32."""
+KINDS: tuple[Last, ...] = ("linear", "relu")
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def layers_of(sizes: Sequence[int], seed: int = 0, biased: bool = True) -> tuple[list[Tensor], list[Tensor | None]]:
+    weights = [draw(o, i, seed=seed + k) / i**0.5 for k, (i, o) in enumerate(itertools.pairwise(sizes))]
+    biases = [draw(o, seed=seed + 50 + k) if biased else None for k, o in enumerate(sizes[1:])]
+    return weights, biases
+
+
+def oracle(
+    x: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    shared: Tensor | None = None,
+    row: Tensor | None = None,
+    last: Last = "linear",
+) -> tuple[Tensor, Tensor]:
+    """Values in fp64 and a bound of the error: (I + 3) u of each layer's magnitudes, carried through the next ones."""
+    value = x.double() if shared is None else torch.cat([x, shared[row]], 1).double()
+    error = torch.zeros_like(value)
+    for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        value = value.relu() if k > 0 else value
+        size = value.abs() @ weight.double().abs().T
+        error = error @ weight.double().abs().T
+        value = value @ weight.double().T
+        if bias is not None:
+            value, size = value + bias.double(), size + bias.double().abs()
+        error = error + (weight.shape[1] + 3) * U * size
+    return value.relu() if last == "relu" else value, error
+
+
+def check(found: Tensor, value: Tensor, bound: Tensor) -> None:
+    assert found.dtype == torch.float32 and found.shape == value.shape
+    assert ((found.double() - value).abs() <= bound + 1e-30).all()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("sizes", [(80, 64, 48), (48, 128, 3), (33, 64, 10), (5, 7, 3), (48, 48), (1, 1, 1, 1), (64, 200, 17)])
+@pytest.mark.parametrize("last", KINDS)
+def test_both_forms_stay_within_the_bound(sizes: tuple[int, ...], last: Last) -> None:
+    weights, biases = layers_of(sizes)
+    x = draw(101, sizes[0], seed=9)
+    value, bound = oracle(x, weights, biases, last=last)
+    for form in (network, network_reference):
+        check(form(x, weights, biases, last=last), value, bound)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("count", [0, 1, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK, 1000])
+def test_any_number_of_points(count: int) -> None:
+    weights, biases = layers_of((20, 32, 6))
+    x = draw(count, 20)
+    found = network(x, weights, biases)
+    assert found.shape == (count, 6)
+    check(found, *oracle(x, weights, biases))
+
+
+@QUICK
+@given(st.lists(st.integers(1, 70), min_size=2, max_size=4), st.integers(1, 60), st.booleans(), st.integers(0, 99))
+def test_any_sizes(sizes: list[int], count: int, biased: bool, seed: int) -> None:
+    weights, biases = layers_of(sizes, seed, biased)
+    x = draw(count, sizes[0], seed=seed + 7)
+    with torch.no_grad():
+        check(network(x, weights, biases), *oracle(x, weights, biases))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("last", KINDS)
+@pytest.mark.parametrize("hidden", [16, 21])
+def test_some_inputs_are_shared_by_several_points(last: Last, hidden: int) -> None:
+    weights, biases = layers_of((15, hidden, 5))
+    x, shared = draw(130, 12), draw(9, 3, seed=3)
+    row = torch.randint(9, (130,), generator=torch.Generator().manual_seed(1))
+    value, bound = oracle(x, weights, biases, shared, row, last)
+    for form in (network, network_reference):
+        check(form(x, weights, biases, shared=shared, row=row, last=last), value, bound)
+
+
+@torch.no_grad()
+def test_each_point_stands_alone() -> None:
+    """Bitwise the same in any batch and from any memory layout: sums run over the inputs in order."""
+    weights, biases = layers_of((24, 40, 7))
+    x = draw(111, 24)
+    whole = network(x, weights, biases)
+    assert torch.equal(torch.cat([network(p[None], weights, biases) for p in x]), whole)
+    assert torch.equal(network(x.flip(0), weights, biases).flip(0), whole)
+    assert torch.equal(network(x.T.contiguous().T, [w.T.contiguous().T for w in weights], biases), whole)
+
+
+@torch.no_grad()
+def test_what_is_not_finite_stays_in_its_row() -> None:
+    weights, biases = layers_of((24, 40, 7))
+    x = draw(60, 24)
+    clean = network(x, weights, biases)
+    x[13, 5], x[59, 0] = float("nan"), float("inf")
+    found = network(x, weights, biases)
+    assert not found[13].isfinite().any() and not found[59].isfinite().all()
+    others = torch.tensor([n for n in range(60) if n not in (13, 59)])
+    assert torch.equal(found[others], clean[others])
+
+
+@torch.no_grad()
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
+def test_one_thread_and_two_give_the_same_bits() -> None:
+    weights, biases = layers_of((24, 40, 7))
+    x, results = draw(5000, 24), []
+    for count in (1, 2):
+        numba.set_num_threads(count)
+        results.append(network(x, weights, biases))
+    assert torch.equal(*results)
+
+
+Gradients = tuple[Tensor, ...]
+
+
+def gradients(
+    form: Callable[..., Tensor],
+    x: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor | None],
+    grad: Tensor,
+    wanted: Sequence[Tensor],
+    **given: object,
+) -> Gradients:
+    found: Gradients = torch.autograd.grad(form(x, weights, biases, **given), wanted, grad)
+    return found
+
+
+def close(found: Gradients, exact: Gradients) -> None:
+    """As gsplat compares them: relative L2, cosine and signed bias."""
+    for a, b in zip(found, exact, strict=True):
+        assert a.shape == b.shape and a.dtype == torch.float32
+        error = a.double() - b
+        assert error.norm() <= 3e-6 * b.norm() + 1e-30
+        assert (a.double() * b).sum() >= (1 - 1e-9) * a.double().norm() * b.norm()
+        assert error.sum().abs() <= 1e-6 * b.abs().sum() + 1e-30
+
+
+@pytest.mark.parametrize("sizes", [(64, 64, 48), (7, 5), (12, 33, 20, 3), (48, 128, 3)])
+@pytest.mark.parametrize("last", KINDS)
+@pytest.mark.parametrize("across", [0, 16, 3])
+@pytest.mark.parametrize("count", [1, BLOCK, 1000])
+def test_gradients_are_those_of_fp64(sizes: tuple[int, ...], last: Last, across: int, count: int) -> None:
+    """Of inputs, weights and biases; ReLUs that rounding opens or shuts are left out by keeping away from zero."""
+    weights, biases = layers_of((sizes[0] + across, *sizes[1:]))
+    x, grad = draw(count, sizes[0], seed=9), draw(count, sizes[-1], seed=8)
+    given: dict[str, Tensor] = {}
+    if across:
+        given = {"shared": draw(count // 4 + 1, across, seed=7), "row": torch.arange(count) // 4}
+    doubles = {name: v.double() if v.is_floating_point() else v for name, v in given.items()}
+    inputs = [x, *weights, *(b for b in biases if b is not None)]
+    exact_inputs = [v.double().requires_grad_(True) for v in inputs]
+    for v in inputs:
+        v.requires_grad_(True)
+    layers = len(weights)
+    exact = gradients(
+        network_reference, exact_inputs[0], exact_inputs[1 : 1 + layers], exact_inputs[1 + layers :], grad.double(),
+        exact_inputs, last=last, **doubles,
+    )  # fmt: skip
+    close(gradients(network, x, weights, biases, grad, inputs, last=last, **given), exact)
+
+
+@pytest.mark.parametrize("learns", [(True, False), (False, True)])
+def test_only_what_is_wanted_gets_a_gradient(learns: tuple[bool, bool]) -> None:
+    """A frozen network passes gradients through; one behind constants learns alone; without biases as well."""
+    weights, _ = layers_of((10, 16, 4))
+    x = draw(70, 10).requires_grad_(learns[0])
+    for weight in weights:
+        weight.requires_grad_(learns[1])
+    network(x, weights, [None, None]).square().sum().backward()
+    assert (x.grad is not None) == learns[0] and all((w.grad is not None) == learns[1] for w in weights)
+    again = x.detach().double().requires_grad_(True)
+    doubles = [w.detach().double().requires_grad_(True) for w in weights]
+    network_reference(again, doubles, [None, None]).square().sum().backward()
+    pairs = zip([x, *weights], [again, *doubles], strict=True)
+    close(*zip(*((a.grad, b.grad) for a, b in pairs if a.grad is not None and b.grad is not None), strict=True))
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
+def test_gradients_are_the_same_bits_with_any_threads() -> None:
+    weights, biases = layers_of((40, 64, 20))
+    inputs = [draw(5000, 24).requires_grad_(True), *(w.requires_grad_(True) for w in weights)]
+    shared, row, results = draw(1250, 16), torch.arange(5000) // 4, []
+    for count in (1, 2):
+        numba.set_num_threads(count)
+        grad = draw(5000, 20, seed=5)
+        results.append(gradients(network, inputs[0], weights, biases, grad, inputs, shared=shared, row=row))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_a_nan_reaches_the_gradients_of_what_it_meets() -> None:
+    weights, biases = layers_of((10, 16, 4))
+    x = draw(60, 10)
+    x[7, 2] = float("nan")
+    x.requires_grad_(True)
+    weights[0].requires_grad_(True)
+    network(x, weights, biases).sum().backward()
+    assert x.grad is not None and weights[0].grad is not None
+    others = torch.arange(60) != 7
+    assert x.grad[others].isfinite().all()
+
+
+def test_other_types_take_the_plain_form() -> None:
+    weights, biases = layers_of((6, 9, 2))
+    x = draw(10, 6)
+    assert not dense.usable(x)
+    with torch.no_grad():
+        assert dense.usable(x) and not dense.usable(x.double())
+    found = network(x.double(), [w.double() for w in weights], [None if b is None else b.double() for b in biases])
+    assert found.dtype == torch.float64
+    double = [w.double().requires_grad_(True) for w in weights]
+    assert torch.autograd.gradcheck(lambda a, b: network(x[:3].double(), [a, b], [None, None]), tuple(double))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("resolutions", "channels"), [((4, 9), 8), ((16,), 16), ((5, 6, 7), 24), ((4,), 5)])
+@pytest.mark.parametrize("count", [0, 1, 47, 200])
+def test_a_network_of_planes_is_the_network_of_the_features(resolutions: tuple[int, ...], channels: int, count: int) -> None:
+    table = draw(triplane.rows(resolutions), channels)
+    points = draw(count, 3).clamp(-1, 1)
+    weights, biases = layers_of((len(resolutions) * channels, 32, 6))
+    features = triplane.lookup(points, table, resolutions)
+    assert torch.equal(plane_network(points, table, resolutions, weights, biases), network(features, weights, biases))
+    weights, biases = layers_of((len(resolutions) * channels + 4, 32, 6))
+    shared, row = draw(4, 4), torch.arange(count) % 4
+    found = plane_network(points, table, resolutions, weights, biases, shared=shared, row=row, last="relu")
+    assert torch.equal(found, network(features, weights, biases, shared=shared, row=row, last="relu"))
+
+
+@QUICK
+@given(st.lists(st.sampled_from([0.0, 1.0, -0.0, float("nan")]), max_size=30))
+def test_runs_of_equal_rows(values: list[float]) -> None:
+    """-0 equals 0, and a NaN equals nothing. Where nothing is compiled each row stands for itself."""
+    x = torch.tensor([[v, 2.0] for v in values]).view(-1, 2)
+    first, run = runs(x)
+    assert run.shape == (len(x),) and len(first) == (int(run[-1]) + 1 if len(x) else 0)
+    assert all(torch.equal(each, torch.arange(len(x))) for each in runs(x.double()))
+    assert torch.equal(x[first][run].nan_to_num(7.0), x.nan_to_num(7.0))
+    assert all(not torch.equal(x[a - 1], x[a]) for a in first.tolist() if a > 0)

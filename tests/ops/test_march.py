@@ -1,0 +1,333 @@
+"""What happens along rays, compiled, against the plain form in fp64: distances, places, weights, proposals, what is kept."""
+
+import math
+from dataclasses import replace
+
+import numba
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.fields.proposal import ProposalField
+from fprf.ops import march
+from fprf.rendering.space import Kind, Space
+from fprf.rendering.stepfun import keep_heaviest, midpoints, resample, shifts, transmittance_weights
+from fprf.types import Rays
+
+QUICK = settings(max_examples=25, deadline=None)
+U = 2.0**-24
+"""Unit round-off of float32."""
+EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+KINDS: tuple[Kind, ...] = ("contraction", "box", "ndc")
+
+
+def space_of(kind: Kind) -> Space:
+    space = Space(kind, (0.0, 0.0, 0.0), EYE, 1.0, 0.05, 1e3, focal=(1.5, 1.5))
+    return replace(space, low=(-1.0, -2.0, -0.5), high=(1.5, 1.0, 2.0)) if kind == "box" else space
+
+
+def rays_of(kind: Kind, count: int, seed: int = 0) -> Rays:
+    draw = torch.Generator().manual_seed(seed)
+    origin = torch.randn(count, 3, dtype=torch.float64, generator=draw) * 0.3
+    direction = torch.randn(count, 3, dtype=torch.float64, generator=draw)
+    if kind == "ndc":
+        direction = direction * 0.2 - torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return space_of(kind).rays(origin, direction / direction.norm(dim=-1, keepdim=True))
+
+
+def double(rays: Rays) -> Rays:
+    return Rays(*(x.double() for x in rays))
+
+
+def edges(count: int, steps: int, seed: int = 0) -> Tensor:
+    s = torch.rand(count, steps + 1, generator=torch.Generator().manual_seed(seed)).sort(-1).values
+    s[:, 0], s[:, -1] = 0, 1
+    return s
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("count", [1, 16, 37])
+def test_distances_and_places_are_those_of_the_space(kind: Kind, count: int) -> None:
+    space, rays, s = space_of(kind), rays_of(kind, count), edges(count, 21)
+    exact, wide = space.distance(s.double(), rays.near.double(), rays.far.double()), double(rays)
+    t = march.distances(s, rays.near, rays.far, space.warp)
+    # s itself is given to u; in the far half t = 1 / (2c) carries c's error of a few u of 1/2 on to t^2.
+    assert ((t - exact).abs() <= 8 * U * (exact + (exact.square() if kind == "contraction" else 1))).all()
+    point = march.place(rays, t, space.warp)
+    at = wide.origin[:, None] + wide.direction[:, None] * midpoints(t.double())[..., None]
+    size = wide.origin.abs()[:, None] + wide.direction.abs()[:, None] * midpoints(t.double())[..., None]
+    located = space.locate(at.view(-1, 3)).view(point.shape)
+    # Contraction has slope 1/2 at most near the origin and 1 / |x| far out; a box one of 2 / (high - low).
+    slope = size / at.abs().amax(-1, keepdim=True).clamp_min(1) if kind == "contraction" else 2 * size + 2
+    assert ((point - located).abs() <= 8 * U * (1 + slope)).all()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_plain_forms_say_the_same(kind: Kind) -> None:
+    """Where somebody wants the gradient of edges the space computes in torch: the compiled form differs by rounding alone."""
+    space, rays, s = space_of(kind), rays_of(kind, 40), edges(40, 30)
+    compiled = space.distance(s, rays.near, rays.far)
+    with torch.enable_grad():
+        plain = space.distance(s.clone().requires_grad_(True), rays.near, rays.far)
+    assert plain.requires_grad and not compiled.requires_grad
+    assert torch.allclose(compiled, plain, rtol=1e-6, atol=1e-6) and compiled.shape == plain.shape
+
+
+@torch.no_grad()
+def test_far_ends_and_empty_intervals() -> None:
+    space = space_of("contraction")
+    s = torch.linspace(0, 1, 65).repeat(4, 1)
+    near, far = torch.tensor([0.05, 1.0, 3.0, 2.0]), torch.tensor([1e30, 1e6, 3.0, 0.5])
+    t = march.distances(s, near, far, space.warp)
+    assert t.isfinite().all() and (t[:3].diff(dim=-1) >= 0).all()
+    assert torch.allclose(t[:, 0], near) and torch.allclose(t[:, -1], far)
+    rays = Rays(torch.zeros(4, 3), torch.eye(3)[[0, 1, 2, 0]], torch.eye(3)[[0, 1, 2, 0]], near, far)
+    assert (march.place(rays, t, space.warp).abs() <= 1).all()
+
+
+def check_weights(density: Tensor, t: Tensor, found: march.Weighed) -> None:
+    tau = density.double() * t.double().diff(dim=-1)
+    before = torch.nn.functional.pad(tau[:, :-1], (1, 0)).cumsum(-1)
+    exact = torch.exp(-before) * -torch.expm1(-tau)
+    # As in `stepfun`, and 2u of each exponential; below exp(-87) weights are 0.
+    assert ((found.weights - exact).abs() <= 4 * U * (2 + before.clamp(max=100)) * exact + 1e-37).all()
+    total = tau.sum(-1)
+    assert ((found.opacity + torch.expm1(-total)).abs() <= 8 * U * (1 + total) * -torch.expm1(-total) + 1e-37).all()
+    assert ((found.through - torch.exp(-total)).abs() <= 8 * U * (1 + total) * torch.exp(-total) + 1e-37).all()
+    mass = exact.sum(-1)
+    seen = mass > 1e-8
+    depth = (exact * midpoints(t.double())).sum(-1) / mass
+    assert torch.allclose(found.depth.double()[seen], depth[seen], rtol=1e-4 * 1e-1)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("samples", [1, 10, 16, 48, 100])
+@pytest.mark.parametrize("thickness", [1e-9, 1e-3, 1.0, 50.0, 1e8])
+def test_weights_are_those_of_fp64(samples: int, thickness: float) -> None:
+    draw = torch.Generator().manual_seed(samples)
+    density = torch.rand(37, samples, generator=draw) * thickness
+    t = torch.nn.functional.pad(torch.rand(37, samples, generator=draw).cumsum(-1), (1, 0))
+    check_weights(density, t, march.weigh(density, t, 0.0))
+
+
+@QUICK
+@given(st.integers(1, 40), st.sampled_from([0.0, 1e-4, 1 / 512, 0.02, 0.3]), st.integers(0, 999))
+def test_the_heaviest_are_kept(samples: int, budget: float, seed: int) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    density = torch.rand(20, samples, generator=draw).pow(4) * 30 / samples
+    t = torch.arange(samples + 1.0).repeat(20, 1)
+    with torch.no_grad():
+        found = march.weigh(density, t, budget)
+    left = found.weights.masked_fill(found.keep, 0.0)
+    assert (left.double().sum(-1) <= budget * (1 + 1e-6)).all()
+    assert found.start[0] == 0 and torch.equal(found.start.diff(), found.keep.sum(-1))
+    # No fewer would do: the lightest that is kept does not fit any more, and none that is left out is heavier.
+    lightest = found.weights.masked_fill(~found.keep, math.inf).amin(-1)
+    assert (left.amax(-1) <= lightest).all()
+    assert ((left.sum(-1) + lightest > budget * (1 - 1e-6)) | ~found.keep.any(-1)).all()
+    plain = keep_heaviest(found.weights, budget)
+    assert torch.equal(found.keep.sum(-1), plain.sum(-1))
+
+
+@torch.no_grad()
+def test_a_nan_is_kept_to_be_seen() -> None:
+    density = torch.full((2, 5), 0.1)
+    density[0, 3] = float("nan")
+    found = march.weigh(density, torch.arange(6.0).repeat(2, 1), 0.3)
+    assert found.weights[0, 3:].isnan().all() and found.keep[0, 3:].all() and found.weights[1].isfinite().all()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("latents", [0, 3, 64])
+def test_what_is_kept_is_gathered_in_order(latents: int) -> None:
+    draw = torch.Generator().manual_seed(0)
+    density, t = torch.rand(29, 8, generator=draw), torch.arange(9.0).repeat(29, 1)
+    weighed = march.weigh(density, t, 0.1)
+    point, latent = torch.rand(29, 8, 3, generator=draw), torch.rand(29 * 8, latents, generator=draw)
+    view = torch.rand(29, 3, generator=draw)
+    found = march.gather(weighed, point, latent, view)
+    index = weighed.keep.view(-1).nonzero()[:, 0]
+    assert torch.equal(found.ray, index // 8) and torch.equal(found.weight, weighed.weights.view(-1)[index])
+    assert torch.equal(found.point, point.view(-1, 3)[index]) and torch.equal(found.latent, latent[index])
+    assert torch.equal(found.view, view[index // 8])
+
+
+@torch.no_grad()
+def test_nothing_is_kept_where_nothing_is() -> None:
+    weighed = march.weigh(torch.zeros(3, 4), torch.arange(5.0).repeat(3, 1), 0.0)
+    assert not weighed.keep.any() and not weighed.opacity.any() and (weighed.through == 1).all()
+    assert len(march.gather(weighed, torch.zeros(3, 4, 3), torch.zeros(12, 3), torch.zeros(3, 3)).ray) == 0
+
+
+def proposal(seed: int = 0, thickness: float = 4.0, resolution: int = 9, channels: int = 8) -> ProposalField:
+    field = ProposalField(resolution, channels, seed=seed)
+    with torch.no_grad():
+        field.planes.table.mul_(thickness)
+    return field.requires_grad_(False)
+
+
+def proposed(field: ProposalField, rays: Rays, s: Tensor, space: Space, count: int, shift: Tensor) -> Tensor:
+    return march.propose(
+        rays,
+        s,
+        space.warp,
+        field.planes.table,
+        field.planes.resolutions[0],
+        field.to_density.weight[0],
+        limit=15.0,
+        padding=1e-3,
+        count=count,
+        shift=shift,
+    )
+
+
+def plain_proposal(
+    field: ProposalField, rays: Rays, s: Tensor, space: Space, count: int, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor]:
+    """New edges of the plain form, and how much an edge moves per share of probability where it lies."""
+    with torch.enable_grad():
+        t = space.distance(s, rays.near, rays.far)
+        points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
+        w = transmittance_weights(field(space.locate(points.view(-1, 3))).view(points.shape[:2]), t)
+        found = resample(s, w, count, padding=1e-3, generator=generator)
+    p = (w + 1e-3 / w.shape[1]) / (w + 1e-3 / w.shape[1]).sum(-1, keepdim=True)
+    slope = s.diff(dim=-1) / p
+    at = (torch.searchsorted(s.contiguous(), found.contiguous(), right=True) - 1).clamp(0, w.shape[1] - 1)
+    around = torch.stack([slope.gather(1, (at + k).clamp(0, w.shape[1] - 1)) for k in (-1, 0, 1)])
+    return found, around.amax(0)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("samples", [5, 16, 48, 50])
+@pytest.mark.parametrize("thickness", [1.0, 4.0, 7.0])
+def test_proposals_are_those_of_the_plain_form(kind: Kind, samples: int, thickness: float) -> None:
+    """A cumulative weight errs by some units of the densities' rounding, an edge by that times its step's slope."""
+    space, rays, field = space_of(kind), rays_of(kind, 50), proposal(thickness=thickness)
+    s = torch.linspace(0, 1, samples + 1).expand(50, -1)
+    draws = [torch.Generator().manual_seed(3) for _ in range(2)]
+    for one, other in ((None, None), draws):
+        found = proposed(field, rays, s, space, 12, shifts(s, one))
+        wanted, slope = plain_proposal(field, rays, s, space, 12, other)
+        assert found.shape == wanted.shape == (50, 13) and (found.diff(dim=-1) >= 0).all()
+        assert ((found - wanted).abs() <= 5e-5 * (1 + 0.1 * slope)).all()
+        assert (found - wanted).abs().mean() <= 2e-5
+
+
+@torch.no_grad()
+def test_behind_a_wall_nothing_is_looked_up() -> None:
+    """Planes that are NaN behind x = 0 (in the unit cube) and a wall before it: a ray along x never meets the NaN."""
+    field, space = proposal(resolution=33), space_of("box")
+    space = replace(space, low=(-1.0, -1.0, -1.0), high=(1.0, 1.0, 1.0))
+    grid = field.planes.table.view(3, 33, 33, -1)
+    grid.fill_(1.0)
+    field.to_density.weight.fill_(1.0)
+    grid[:2, :, 20:] = float("nan")
+    rays = Rays(*(torch.tensor(v) for v in ([[-1.0, 0, 0]], [[1.0, 0, 0]], [[1.0, 0, 0]], [0.0], [2.0])))
+    s = torch.linspace(0, 1, 97)[None]
+    found = proposed(field, rays, s, space, 8, torch.full((1, 1), 0.5))
+    assert found.isfinite().all() and float(found[0, -2]) < 0.1
+
+
+@torch.no_grad()
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
+def test_one_thread_and_two_give_the_same_bits() -> None:
+    space, rays, field = space_of("contraction"), rays_of("contraction", 333), proposal()
+    s, results = torch.linspace(0, 1, 49).expand(333, -1), []
+    for count in (1, 2):
+        numba.set_num_threads(count)
+        new = proposed(field, rays, s, space, 12, shifts(s, None))
+        t = march.distances(new, rays.near, rays.far, space.warp)
+        weighed = march.weigh(torch.rand(333, 12, generator=torch.Generator().manual_seed(0)), t, 0.01)
+        results.append((new, t, march.place(rays, t, space.warp), *weighed))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_what_is_compiled() -> None:
+    x = torch.zeros(4, 3)
+    assert march.fit(x) and not march.fit(x, x.double()) and not march.fit(x[:0])
+    wanted = x.clone().requires_grad_(True)
+    assert march.still(x) and not march.still(x, wanted)
+    with torch.no_grad():
+        assert march.still(wanted)
+
+
+@pytest.mark.parametrize("samples", [1, 10, 33])
+@pytest.mark.parametrize("fair", [False, True])
+@pytest.mark.parametrize("thickness", [1e-6, 1.0, 1e4])
+def test_gradients_of_weights_and_of_what_passes(samples: int, fair: bool, thickness: float) -> None:
+    """Within 1e-5 of the largest incoming gradient times the step, as `stepfun`'s own."""
+    draw = torch.Generator().manual_seed(samples)
+    density = (torch.rand(21, samples, generator=draw) * thickness).requires_grad_(True)
+    t = torch.nn.functional.pad(torch.rand(21, samples, generator=draw).cumsum(-1), (1, 0))
+    scale = torch.rand(21, samples, generator=draw) if fair else None
+    g, h = torch.randn(21, samples, generator=draw), torch.randn(21, generator=draw)
+    exact_density = density.detach().double().requires_grad_(True)
+    exact = transmittance_weights(exact_density, t.double())
+    through = torch.exp(-(exact_density * t.double().diff(dim=-1)).sum(-1))
+    for parts in ((True, True), (True, False), (False, True)):
+        found = march.weigh(density, t, 0.01, fair=scale)
+        assert not found.depth.requires_grad and not found.opacity.requires_grad
+        ours = (found.weights * g).sum() * parts[0] + (found.through * h).sum() * parts[1]
+        theirs = (exact * g).sum() * parts[0] + (through * h).sum() * parts[1]
+        (got,) = torch.autograd.grad(ours, density)
+        (want,) = torch.autograd.grad(theirs, exact_density, retain_graph=True)
+        want = want if scale is None else want * scale
+        bound = 1e-5 * t.diff(dim=-1) * (g.abs().amax(-1) + h.abs())[:, None]
+        assert ((got - want).abs() <= bound).all()
+
+
+def test_only_one_of_both_may_be_asked_for() -> None:
+    density = torch.rand(3, 4).requires_grad_(True)
+    t = torch.arange(5.0).repeat(3, 1)
+    found = march.weigh(density, t, 0.0)
+    (alone,) = torch.autograd.grad(found.through.sum(), density)
+    assert torch.allclose(alone, -found.through[:, None].expand(3, 4))
+
+
+@pytest.mark.parametrize("latents", [3, 64])
+def test_gradients_go_back_to_the_kept_samples(latents: int) -> None:
+    draw = torch.Generator().manual_seed(0)
+    density, t = torch.rand(29, 8, generator=draw).requires_grad_(True), torch.arange(9.0).repeat(29, 1)
+    weighed = march.weigh(density, t, 0.1)
+    point, latent = torch.rand(29, 8, 3, generator=draw), torch.rand(29 * 8, latents, generator=draw).requires_grad_(True)
+    fair = torch.rand(29, 8, generator=draw)
+    found = march.gather(weighed, point, latent, point[:, 0], fair)
+    index = weighed.keep.view(-1).nonzero()[:, 0]
+    assert found.fair is not None and torch.equal(found.fair, fair.view(-1)[index])
+    g, h = torch.randn(len(index), generator=draw), torch.randn(len(index), latents, generator=draw)
+    loss = (found.weight * g).sum() + (found.latent * h).sum()
+    got = torch.autograd.grad(loss, (weighed.weights, latent), retain_graph=True)
+    assert torch.equal(got[0].view(-1), torch.zeros(29 * 8).index_copy(0, index, g))
+    assert torch.equal(got[1], torch.zeros(29 * 8, latents).index_copy(0, index, h))
+    (alone,) = torch.autograd.grad((found.weight * g).sum(), weighed.weights, retain_graph=True)
+    assert torch.equal(alone, got[0])
+
+
+@pytest.mark.parametrize("width", [1, 3, 48])
+def test_composites_are_sums_over_each_ray(width: int) -> None:
+    draw = torch.Generator().manual_seed(0)
+    start = torch.tensor([0, 0, 5, 6, 6, 40, 41])
+    ray = torch.repeat_interleave(torch.arange(6), start.diff())
+    weight, values = torch.rand(41, generator=draw), torch.randn(41, width, generator=draw)
+    inputs = [x.requires_grad_(True) for x in (weight, values)]
+    doubles = [x.detach().double().requires_grad_(True) for x in inputs]
+    exact = torch.zeros(6, width, dtype=torch.float64).index_add(0, ray, doubles[1] * doubles[0][:, None])
+    found = march.composite(weight, values, start)
+    assert ((found - exact).abs() <= 40 * U * 10).all() and torch.equal(found[[0, 3]], torch.zeros(2, width))
+    g = torch.randn(6, width, generator=draw)
+    for wanted in ([0, 1], [0], [1]):
+        given = [x if k in wanted else x.detach() for k, x in enumerate(inputs)]
+        got = torch.autograd.grad((march.composite(given[0], given[1], start) * g).sum(), [inputs[k] for k in wanted])
+        want = torch.autograd.grad((exact * g).sum(), [doubles[k] for k in wanted], retain_graph=True)
+        assert all(torch.allclose(a.double(), b, atol=width * 1e-6) for a, b in zip(got, want, strict=True))
+
+
+def test_nothing_kept_is_no_colour() -> None:
+    weight, values = torch.zeros(0, requires_grad=True), torch.zeros(0, 3)
+    found = march.composite(weight, values, torch.zeros(4, dtype=torch.int64))
+    assert torch.equal(found, torch.zeros(3, 3))

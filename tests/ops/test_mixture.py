@@ -1,0 +1,161 @@
+"""Mixtures of styles at points: compiled forms against fp64 at their bounds."""
+
+import numba
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.ops.lanes import BLOCK
+from fprf.ops.mixture import affine, affine_reference, attention, scaled, scaled_reference
+
+QUICK = settings(max_examples=25, deadline=None)
+U = 2.0**-24
+"""Unit round-off of float32."""
+
+
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def shares(count: int, regions: int, seed: int = 0) -> Tensor:
+    """Rows that sum to 1, most entries 0."""
+    odds = (draw(count, regions, seed=seed) * 4).exp()
+    odds = torch.where(odds < 0.1 * odds.amax(1, keepdim=True), 0.0, odds)
+    return odds / odds.sum(1, keepdim=True)
+
+
+def affine_oracle(x: Tensor, share: Tensor, matrix: Tensor, bias: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+    away, a = (x.double() - centre.double()), share.double()
+    value = torch.einsum("nk,nc,kcd->nd", a, away, matrix.double()) + a @ bias.double()
+    # Subtracting the centre errs by u of the difference, which the products carry on.
+    size = torch.einsum("nk,nc,kcd->nd", a, away.abs(), matrix.double().abs()) + a @ bias.double().abs()
+    return value, (x.shape[1] + share.shape[1] + 4) * U * size
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 3), (5, 4), (16, 1), (33, 20)])
+@pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
+def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: int) -> None:
+    x, centre = draw(count, channels) + 3, draw(channels, seed=1) + 3
+    matrix, bias, share = draw(regions, channels, channels, seed=2), draw(regions, channels, seed=3), shares(count, regions)
+    value, bound = affine_oracle(x, share, matrix, bias, centre)
+    for form in (affine, affine_reference):
+        found = form(x, share, matrix, bias, centre=centre)
+        assert found.shape == x.shape and ((found.double() - value).abs() <= bound).all()
+
+
+@QUICK
+@given(st.integers(1, 60), st.integers(1, 5), st.integers(1, 40), st.integers(0, 99))
+def test_any_affine_maps(channels: int, regions: int, count: int, seed: int) -> None:
+    x, centre, bias = draw(count, channels, seed=seed), draw(channels, seed=seed + 1), draw(regions, channels, seed=seed + 2)
+    matrix, share = draw(regions, channels, channels, seed=seed + 3), shares(count, regions, seed)
+    value, bound = affine_oracle(x, share, matrix, bias, centre)
+    with torch.no_grad():
+        assert ((affine(x, share, matrix, bias, centre=centre).double() - value).abs() <= bound).all()
+
+
+@torch.no_grad()
+def test_nothing_of_a_region_without_a_share_is_seen() -> None:
+    x, share = draw(100, 16), shares(100, 3)
+    share[:, 1] = 0
+    matrix, bias = draw(3, 16, 16), draw(3, 16)
+    clean = affine(x, share, matrix, bias, centre=x[0])
+    matrix[1], bias[1] = float("nan"), float("inf")
+    assert torch.equal(affine(x, share, matrix, bias, centre=x[0]), clean)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 10), (5, 4), (16, 1)])
+@pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
+def test_gains_and_biases_stay_within_the_bound(channels: int, regions: int, count: int) -> None:
+    x, centre, share = draw(count, channels) + 3, draw(channels, seed=1) + 3, shares(count, regions)
+    gain, bias = draw(regions, channels, seed=2), draw(regions, channels, seed=3)
+    away, a = x.double() - centre.double(), share.double()
+    value = away * (a @ gain.double()) + a @ bias.double()
+    bound = (regions + 4) * U * (away.abs() * (a @ gain.double().abs()) + a @ bias.double().abs())
+    for form in (scaled, scaled_reference):
+        found = form(x, share, gain, bias, centre=centre)
+        assert found.shape == x.shape and ((found.double() - value).abs() <= bound).all()
+
+
+def attention_oracle(x: Tensor, keys: Tensor, temperature: float, centre: Tensor | None, prior: Tensor | None) -> Tensor:
+    query = x.double() if centre is None else x.double() - centre.double()
+    query = query if centre is None else query / query.norm(dim=1, keepdim=True)
+    logits = query @ keys.double().T / temperature
+    return torch.softmax(logits if prior is None else logits + prior.double().log(), 1)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("depth", "count"), [(32, 8), (64, 10), (3, 1), (7, 20), (384, 17)])
+@pytest.mark.parametrize("points", [1, BLOCK, 2 * BLOCK + 7])
+@pytest.mark.parametrize("directed", [False, True])
+def test_attention_is_the_softmax_of_the_scores(depth: int, count: int, points: int, directed: bool) -> None:
+    """A score errs by (D + 4) u of its magnitudes, a share by twice that over the temperature."""
+    x, keys, prior = draw(points, depth), draw(count, depth, seed=1) / depth**0.5, draw(count, seed=2).exp()
+    centre = draw(depth, seed=3) * 0.1 if directed else None
+    for temperature in (0.05, 0.4, 5.0):
+        for weights in (None, prior):
+            found = attention(x, keys, temperature, centre=centre, prior=weights)
+            size = float((x.abs().double() @ keys.double().abs().T).max())
+            wanted = attention_oracle(x, keys, temperature, centre, weights)
+            assert ((found.double() - wanted).abs() <= 2 * (depth + 8) * U * size / temperature + 8 * U).all()
+            assert ((found.double().sum(1) - 1).abs() <= (count + 4) * U).all()
+
+
+@torch.no_grad()
+def test_faint_shares_are_dropped_and_the_rest_sums_to_one() -> None:
+    x, keys = draw(300, 16), draw(8, 16, seed=1)
+    whole = attention(x, keys, 1.0)
+    found = attention(x, keys, 1.0, faint=0.05)
+    dropped = whole < 0.05 * whole.amax(1, keepdim=True) * (1 - 1e-5)
+    kept = whole > 0.05 * whole.amax(1, keepdim=True) * (1 + 1e-5)
+    assert dropped.any() and not found[dropped].any() and found[kept].all()
+    assert torch.allclose(found.sum(1), torch.ones(300), atol=1e-6)
+
+
+@torch.no_grad()
+def test_a_point_at_the_centre_matches_everything_alike() -> None:
+    keys, centre = draw(4, 16, seed=1), draw(16, seed=2)
+    x = torch.stack([centre, centre * (1 + 1e-9), centre + 1])
+    found = attention(x, keys, 0.1, centre=centre, flat=1e-6 * float(centre.norm()))
+    assert torch.allclose(found[:2], torch.full((2, 4), 0.25))
+    assert found[2].max() > 0.3
+    at_zero = attention(torch.zeros(1, 16), keys, 0.1, centre=torch.zeros(16))
+    assert torch.allclose(at_zero, torch.full((1, 4), 0.25))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("temperature", [1e-30, 1e-45, 1e6, 3e38])
+def test_extreme_temperatures_stay_finite(temperature: float) -> None:
+    x, keys = draw(50, 16) * 1e4, draw(6, 16, seed=1) * 1e4
+    found = attention(x, keys, temperature)
+    assert found.isfinite().all() and torch.allclose(found.sum(1), torch.ones(50), atol=1e-6)
+    if temperature < 1:
+        assert torch.equal(found.argmax(1), (x.double() @ keys.double().T).argmax(1))
+
+
+@torch.no_grad()
+def test_a_nan_stays_in_its_row() -> None:
+    x, keys = draw(60, 16), draw(6, 16, seed=1)
+    clean = attention(x, keys, 1.0, centre=keys[0], faint=0.01)
+    x[7, 3] = float("nan")
+    found = attention(x, keys, 1.0, centre=keys[0], faint=0.01)
+    assert found[7].isnan().all()
+    others = torch.arange(60) != 7
+    assert torch.equal(found[others], clean[others])
+
+
+@torch.no_grad()
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
+def test_one_thread_and_two_and_any_batch_give_the_same_bits() -> None:
+    x, share, keys = draw(2000, 48), shares(2000, 8), draw(8, 48, seed=1)
+    matrix, bias = draw(8, 48, 48), draw(8, 48)
+    results = []
+    for count in (1, 2):
+        numba.set_num_threads(count)
+        results.append((affine(x, share, matrix, bias, centre=bias[0]), attention(x, keys, 1.0, faint=0.01)))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+    some = torch.cat([affine(x[a : a + 77], share[a : a + 77], matrix, bias, centre=bias[0]) for a in range(0, 2000, 77)])
+    assert torch.equal(some, results[0][0])
