@@ -7,28 +7,59 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from network_files import deeplab_file, espnet_file, mobilenet_file
 from vgg_files import vgg_file
 
 from fprf.interfaces import Encoder
-from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig, Vgg19Config
+from fprf.plugins.encoders.composed_config import AveragedConfig, ConcatConfig
+from fprf.plugins.encoders.config import (
+    BundledContentConfig,
+    BundledSemanticConfig,
+    EncoderConfig,
+    RandomConfig,
+    Vgg16Config,
+    Vgg19Config,
+)
+from fprf.plugins.encoders.segmenter_config import DeepLabConfig, EspNetConfig, MobileNetV2Config
+from fprf.testing import check_encoder
 
-Build = Callable[[Path], Encoder]
-ENCODERS: dict[str, tuple[Build, int]] = {
-    "random": (lambda _: RandomConfig(stride=3).build(), 3),
-    "bundled-content": (lambda _: BundledContentConfig().build(), 2),
-    "bundled-semantic": (lambda _: BundledSemanticConfig().build(), 8),
-    "vgg19-normalised": (lambda folder: Vgg19Config(weights=vgg_file(folder)).build(), 2),
-    "vgg19-plain": (lambda folder: Vgg19Config(weights=vgg_file(folder), normalise=False, layer="conv3_1").build(), 4),
+Make = Callable[[Path], EncoderConfig]
+ENCODERS: dict[str, tuple[Make, int]] = {
+    "random": (lambda _: RandomConfig(stride=3), 3),
+    "bundled-content": (lambda _: BundledContentConfig(), 2),
+    "bundled-semantic": (lambda _: BundledSemanticConfig(), 8),
+    "vgg16": (lambda folder: Vgg16Config(weights=vgg_file(folder), layer="relu2_2"), 2),
+    "vgg19-normalised": (lambda folder: Vgg19Config(weights=vgg_file(folder)), 2),
+    "vgg19-plain": (lambda folder: Vgg19Config(weights=vgg_file(folder), normalise=False, layer="conv3_1"), 4),
+    "mobilenet-torchvision": (lambda folder: MobileNetV2Config(weights=mobilenet_file(folder, tensorflow=False)), 16),
+    "mobilenet-keras": (
+        lambda folder: MobileNetV2Config(weights=mobilenet_file(folder, tensorflow=True), layer="features.18"),
+        32,
+    ),
+    "deeplab": (lambda folder: DeepLabConfig(weights=deeplab_file(folder)), 16),
+    "deeplab-logits": (lambda folder: DeepLabConfig(weights=deeplab_file(folder), layer="logits"), 16),
+    "espnet": (lambda folder: EspNetConfig(weights=espnet_file(folder)), 16),
+    "averaged": (lambda _: AveragedConfig(inner=RandomConfig(stride=4), scales=(1.0, 2.0)), 2),
+    "concat": (lambda _: ConcatConfig(first=RandomConfig(stride=8), second=RandomConfig(stride=4, channels=3)), 4),
 }
 
 
 @pytest.fixture(scope="module", params=ENCODERS)
-def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Encoder, int]:
-    build, stride = ENCODERS[request.param]
-    return build(tmp_path_factory.mktemp("weights")), stride
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[EncoderConfig, int]:
+    make, stride = ENCODERS[request.param]
+    return make(tmp_path_factory.mktemp("weights")), stride
 
 
-@settings(max_examples=12, deadline=None)
+@pytest.fixture(scope="module")
+def built(made: tuple[EncoderConfig, int]) -> tuple[Encoder, int]:
+    return made[0].build(), made[1]
+
+
+def test_the_contract_that_strangers_sign(made: tuple[EncoderConfig, int]) -> None:
+    check_encoder(made[0])
+
+
+@settings(max_examples=8, deadline=None)
 @given(height=st.integers(1, 45), width=st.integers(1, 45))
 def test_any_size(built: tuple[Encoder, int], height: int, width: int) -> None:
     encoder, stride = built
@@ -64,18 +95,17 @@ def test_the_image_is_not_changed(built: tuple[Encoder, int]) -> None:
     assert torch.equal(image, before)
 
 
-def test_mirrored_images_have_mirrored_cells_in_the_right_place(built: tuple[Encoder, int]) -> None:
-    """A bright spot answers in the cell that covers it."""
+def test_a_bright_spot_answers_where_it_is(built: tuple[Encoder, int]) -> None:
+    """The centre of the squared changes lies in its cell or beside it; deep networks with random weights look far around."""
     encoder, stride = built
-    side = 8 * stride
-    image = torch.full((1, 3, side, side), 0.5)
+    image = torch.full((1, 3, 12 * stride, 12 * stride), 0.5)
     spot = image.clone()
-    spot[:, :, 2 * stride : 3 * stride, 5 * stride : 6 * stride] = 1
-    change = (encoder(spot) - encoder(image)).square().sum(1)[0]
-    centred = change - change.mean()  # a network may also look at the whole image
-    row, column = divmod(int(centred.argmax()), change.shape[1])
-    assert abs(row - 2) <= 1
-    assert abs(column - 5) <= 1
+    spot[:, :, 4 * stride : 5 * stride, 7 * stride : 8 * stride] = 1
+    energy = (encoder(spot) - encoder(image)).square().sum(1)[0].square()
+    share = energy / energy.sum()
+    cells = torch.arange(12.0)
+    assert abs(float(share.sum(1) @ cells) - 4) < 1.5
+    assert abs(float(share.sum(0) @ cells) - 7) < 1.5
 
 
 def test_identities_differ_with_settings(tmp_path: Path) -> None:
@@ -87,10 +117,26 @@ def test_identities_differ_with_settings(tmp_path: Path) -> None:
         RandomConfig(channels=3),
         BundledContentConfig(),
         BundledSemanticConfig(),
+        Vgg16Config(weights=file),
         Vgg19Config(weights=file),
         Vgg19Config(weights=file, normalise=False),
         Vgg19Config(weights=file, layer="conv2_1"),
         Vgg19Config(weights=other),
+        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=False)),
+        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=True)),
+        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=True), layer="features.12"),
+        DeepLabConfig(weights=deeplab_file(tmp_path)),
+        DeepLabConfig(weights=deeplab_file(tmp_path), layer="logits"),
+        EspNetConfig(weights=espnet_file(tmp_path)),
+        EspNetConfig(weights=espnet_file(tmp_path), layer="level3"),
+        AveragedConfig(inner=RandomConfig()),
+        AveragedConfig(inner=RandomConfig(seed=1)),
+        AveragedConfig(inner=RandomConfig(), flip=False),
+        AveragedConfig(inner=RandomConfig(), scales=(1.0, 2.0)),
+        ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1)),
+        ConcatConfig(first=RandomConfig(seed=1), second=RandomConfig()),
+        ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1), weights=(0.5,)),
+        ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1), third=RandomConfig(seed=2)),
     ]
     identities = [config.build().identity for config in configs]
     assert len(set(identities)) == len(configs)

@@ -2,19 +2,31 @@
 
 import subprocess
 import sys
+from dataclasses import fields
+from typing import Any
 
 import pytest
 
 from fprf.errors import ConfigError
-from fprf.plugins.encoders import config as configs
-from fprf.plugins.encoders.config import Dinov2Config, EncoderConfig, RandomConfig, Vgg19Config
+from fprf.plugins import registry
+from fprf.plugins.encoders import composed_config, config, segmenter_config
+from fprf.plugins.encoders.composed_config import AveragedConfig, ConcatConfig
+from fprf.plugins.encoders.config import Dinov2Config, Dinov3Config, EncoderConfig, RandomConfig, Vgg16Config, Vgg19Config
+from fprf.plugins.encoders.segmenter_config import DeepLabConfig, MobileNetV2Config
 
-ALL = [getattr(configs, name) for name in configs.__all__ if name != "EncoderConfig"]
+MODULES = (config, segmenter_config, composed_config)
+ALL = [getattr(module, name) for module in MODULES for name in module.__all__ if name != "EncoderConfig"]
 
 
 def test_importing_the_configs_imports_no_torch() -> None:
-    code = "import sys, fprf.plugins.encoders.config; assert not {'torch', 'numpy', 'cv2'} & set(sys.modules)"
+    imports = ", ".join(module.__name__ for module in MODULES)
+    code = f"import sys, {imports}; assert not {{'torch', 'numpy', 'cv2'}} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_every_config_is_an_entry_point() -> None:
+    names = {registry.name_of("fprf.encoders", kind) for kind in ALL}
+    assert {"vgg16", "vgg19", "mobilenet-v2", "deeplab", "espnet", "dino", "dinov2", "dinov3", "averaged", "concat"} < names
 
 
 @pytest.mark.parametrize("kind", ALL)
@@ -32,6 +44,32 @@ def test_a_layer_that_vgg_lacks_is_refused(layer: str) -> None:
 @pytest.mark.parametrize("layer", ["conv1_1", "relu1_2", "relu3_4", "relu5_4"])
 def test_layers_of_vgg_are_taken(layer: str) -> None:
     assert Vgg19Config(layer=layer).layer == layer
+    if layer.endswith("_4"):
+        with pytest.raises(ConfigError, match="relu5_3"):
+            Vgg16Config(layer=layer)
+
+
+@pytest.mark.parametrize(
+    ("kind", "taken", "refused"),
+    [
+        (MobileNetV2Config, ["features.0", "features.9", "features.18"], ["features.19", "features.", "13", "features.013"]),
+        (DeepLabConfig, ["backbone.0", "backbone.17", "logits"], ["backbone.18", "head", "logits2", "features.3"]),
+    ],
+)
+def test_layers_of_the_others(kind: Any, taken: list[str], refused: list[str]) -> None:
+    for layer in taken:
+        assert kind(layer=layer).layer == layer
+    for layer in refused:
+        with pytest.raises(ConfigError, match=r"^layer: .*allowed are"):
+            kind(layer=layer)
+
+
+def test_parts_default_to_what_ships() -> None:
+    """Composed encoders build without a file or a network."""
+    for kind in (AveragedConfig, ConcatConfig):
+        parts = [getattr(kind(), field.name) for field in fields(kind)]
+        shipped = [part for part in parts if isinstance(part, EncoderConfig)]
+        assert shipped and all(part.build().channels > 0 for part in shipped)
 
 
 def test_ranges() -> None:
@@ -40,6 +78,8 @@ def test_ranges() -> None:
             RandomConfig(**wrong)
     with pytest.raises(ConfigError, match="layer: 0"):
         Dinov2Config(layer=0)
+    with pytest.raises(ConfigError, match="layer: 0"):
+        Dinov3Config(layer=0)
     with pytest.raises(ConfigError, match="stride"):
         Dinov2Config(stride=0)
 

@@ -1,4 +1,4 @@
-"""VGG-19 against plain loops in float64, and where its weights come from."""
+"""VGG against plain loops in float64, and where its weights come from."""
 
 import io
 import math
@@ -7,15 +7,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import save_file
-from torch import Tensor
-from vgg_files import LAYERS, vgg_file, vgg_tensors
+import torch.nn.functional as F
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from vgg_files import LAYERS, deep_vgg_file, vgg_file, vgg_tensors
 
 from fprf.errors import WeightsError
-from fprf.plugins.encoders import vgg_weights
-from fprf.plugins.encoders.config import Vgg19Config
-from fprf.plugins.encoders.vgg import CONVOLUTIONS, reaches, vgg19_activations
-from fprf.plugins.encoders.vgg_weights import pink_noise
+from fprf.plugins.encoders import weight_sources
+from fprf.plugins.encoders.calibration import street
+from fprf.plugins.encoders.config import Vgg16Config, Vgg19Config
+from fprf.plugins.encoders.vgg import CONVOLUTIONS, reaches, vgg_activations
+from fprf.plugins.encoders.vgg_weights import SOURCES
 
 Grid = list[list[list[float]]]
 
@@ -25,7 +28,7 @@ def _no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise urllib.error.URLError("no network in tests")
 
-    monkeypatch.setattr(vgg_weights.urllib.request, "urlopen", refuse)
+    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", refuse)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
 
 
@@ -84,11 +87,12 @@ def oracle(image: Tensor, layer: str, *, normalise: bool) -> Tensor:
     return result / tensors[f"mean_activation.conv{layer[4:]}"].double().view(-1, 1, 1) if normalise else result
 
 
+@pytest.mark.parametrize("kind", [Vgg16Config, Vgg19Config])  # up to conv3_1 they are one
 @pytest.mark.parametrize("normalise", [True, False])
 @pytest.mark.parametrize("layer", ["relu1_1", "conv1_2", "relu2_1", "conv3_1"])
-def test_against_plain_loops(tmp_path: Path, layer: str, normalise: bool) -> None:
+def test_against_plain_loops(tmp_path: Path, layer: str, normalise: bool, kind: type[Vgg19Config]) -> None:
     image = torch.rand(3, 7, 5)
-    encoder = Vgg19Config(layer=layer, weights=vgg_file(tmp_path), normalise=normalise).build()
+    encoder = kind(layer=layer, weights=vgg_file(tmp_path), normalise=normalise).build()
     expected = oracle(image, layer, normalise=normalise)
     found = encoder(image[None])[0].double()
     assert found.shape == expected.shape
@@ -104,23 +108,71 @@ def test_files_of_torchvision_take_imagenets_mean_and_std(tmp_path: Path) -> Non
     torch.testing.assert_close(pth.get_buffer("std"), torch.tensor([0.229, 0.224, 0.225]))
 
 
-def test_without_mean_activations_noise_gives_them(tmp_path: Path) -> None:
+def test_without_mean_activations_the_town_gives_them(tmp_path: Path) -> None:
     config = Vgg19Config(weights=vgg_file(tmp_path, means=False))
     encoder = config.build()
-    means = vgg19_activations(encoder, pink_noise())
-    alive = means > 0
-    torch.testing.assert_close(means[alive], torch.ones_like(means[alive]), rtol=1e-3, atol=1e-3)
+    means = vgg_activations(encoder, street())
+    assert (means <= 1 + 1e-3).all()
+    assert int(means.isclose(torch.ones_like(means), rtol=1e-3).sum()) >= 4  # the rest hardly ever fires
     assert encoder.identity == config.build().identity
+    scale = encoder.get_buffer("scale")
+    assert float(scale.min()) >= 0.04 * float(scale.mean())
 
 
-def test_pink_noise_looks_like_photographs() -> None:
-    noise = pink_noise(2, 64)
-    assert noise.min() >= 0 <= 1 - noise.max()
-    assert torch.equal(noise, pink_noise(2, 64))
-    neighbours = torch.corrcoef(torch.stack([noise[:, 0, :, 1:].flatten(), noise[:, 0, :, :-1].flatten()]))[0, 1]
-    channels = torch.corrcoef(torch.stack([noise[:, 0].flatten(), noise[:, 2].flatten()]))[0, 1]
-    assert neighbours > 0.7
-    assert channels > 0.7
+def test_deeper_layers_of_the_two_networks_lie_elsewhere(tmp_path: Path) -> None:
+    """conv4_1 is a convolution further on in VGG-19; conv3_4 it alone has."""
+    file = deep_vgg_file(tmp_path)
+    sixteen, nineteen = (kind(layer="relu4_1", weights=file, normalise=False).build() for kind in (Vgg16Config, Vgg19Config))
+    image = torch.rand(1, 3, 32, 24)
+    assert sixteen(image).shape == nineteen(image).shape == (1, 3, 4, 3)
+    assert sixteen.identity.startswith("vgg16:relu4_1:plain:")
+    assert len([name for name, _ in nineteen.named_buffers() if name.startswith("weight")]) == 9
+    assert len([name for name, _ in sixteen.named_buffers() if name.startswith("weight")]) == 8
+
+
+def test_caffes_files_are_turned_to_rgb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(weight_sources, "_expected", lambda _: None)
+    tensors = vgg_tensors(means=True)
+    torch.save(tensors, tmp_path / "vgg16-00b39a1b.pth")
+    found = Vgg16Config(layer="conv1_1", weights=tmp_path / "vgg16-00b39a1b.pth", normalise=False).build()
+    image = torch.rand(1, 3, 6, 7)
+    bgr = 255 * image.flip(1) - torch.tensor([103.939, 116.779, 123.68]).view(1, 3, 1, 1)
+    expected = F.conv2d(bgr.double(), tensors["features.0.weight"].double(), tensors["features.0.bias"].double(), padding=1)
+    torch.testing.assert_close(found(image).double(), expected, rtol=1e-4, atol=1e-3)
+
+
+def adain_network() -> nn.Sequential:
+    """As AdaIN lists its layers, with few channels: an even one changes colour, then padding, convolution, ReLU."""
+    layers: list[nn.Module] = [nn.Conv2d(3, 3, 1)]
+    inputs = 3
+    for block, depth in enumerate((2, 2, 4, 4)):
+        for _ in range(depth):
+            layers += [nn.ReflectionPad2d(1), nn.Conv2d(inputs, 4 + block, 3), nn.ReLU()]
+            inputs = 4 + block
+        layers.append(nn.MaxPool2d(2, ceil_mode=True))
+    return nn.Sequential(*layers)
+
+
+@pytest.mark.parametrize(
+    ("layer", "upto"), [("relu1_1", 4), ("relu2_1", 11), ("relu3_1", 18), ("relu4_1", 31), ("conv2_2", 13)]
+)
+def test_adains_files_give_adains_features(tmp_path: Path, layer: str, upto: int) -> None:
+    network = adain_network().double()
+    torch.save(network.float().state_dict(), tmp_path / "vgg_normalised.pth")
+    encoder = Vgg19Config(layer=layer, weights=tmp_path / "vgg_normalised.pth").build()
+    image = torch.rand(2, 3, 33, 46)
+    with torch.no_grad():
+        expected = network.double()[:upto](image.double())
+    torch.testing.assert_close(encoder(image).double(), expected, rtol=1e-4, atol=1e-5)
+    assert ":normalised:" in encoder.identity
+
+
+def test_adains_files_are_never_plain(tmp_path: Path) -> None:
+    torch.save(adain_network().state_dict(), tmp_path / "vgg_normalised.pth")
+    with pytest.raises(WeightsError, match=r"normalised VGG-19 of AdaIN, which cannot be made plain.*normalise on"):
+        Vgg19Config(weights=tmp_path / "vgg_normalised.pth", normalise=False).build()
+    with pytest.raises(WeightsError, match=r"holds no conv5_1"):
+        Vgg19Config(weights=tmp_path / "vgg_normalised.pth", layer="relu5_1").build()
 
 
 def test_a_layer_beyond_the_file_names_those_it_has(tmp_path: Path) -> None:
@@ -128,16 +180,17 @@ def test_a_layer_beyond_the_file_names_those_it_has(tmp_path: Path) -> None:
         Vgg19Config(layer="relu4_1", weights=vgg_file(tmp_path)).build()
 
 
-def test_absent_weights_say_what_to_put_where(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "file"), [(Vgg16Config, "vgg16-397923af.pth"), (Vgg19Config, "vgg19-dcbb9e9d.pth")])
+def test_absent_weights_say_what_to_put_where(tmp_path: Path, kind: type[Vgg19Config], file: str) -> None:
     with pytest.raises(WeightsError) as raised:
-        Vgg19Config().build()
-    for part in ("https://download.pytorch.org/models/vgg19-dcbb9e9d.pth", "dcbb9e9d", ".cache/fprf/weights", "--content.en"):
+        kind().build()
+    for part in (f"https://download.pytorch.org/models/{file}", file[6:14], ".cache/fprf/weights", "--content.en"):
         assert part in str(raised.value)
     assert not list((tmp_path / "home/.cache/fprf/weights").iterdir())
 
 
 def test_a_download_of_another_hash_is_refused_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(vgg_weights.urllib.request, "urlopen", lambda *_, **__: io.BytesIO(b"not the weights"))
+    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", lambda *_, **__: io.BytesIO(b"not the weights"))
     with pytest.raises(WeightsError, match="promises dcbb9e9d"):
         Vgg19Config().build()
     assert not list((tmp_path / "home/.cache/fprf/weights").iterdir())
@@ -152,11 +205,11 @@ def test_a_download_is_kept_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
         calls.append(url)
         return io.BytesIO(buffer.getvalue())
 
-    monkeypatch.setattr(vgg_weights.urllib.request, "urlopen", serve)
-    monkeypatch.setattr(vgg_weights, "_expected", lambda _: None)
+    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", serve)
+    monkeypatch.setattr(weight_sources, "_expected", lambda _: None)
     assert Vgg19Config().build().identity == Vgg19Config().build().identity
-    assert calls == [vgg_weights.URL]
-    assert [file.name for file in (tmp_path / "home/.cache/fprf/weights").iterdir()] == [vgg_weights.FILE]
+    assert calls == [SOURCES["vgg19"].origin]
+    assert [file.name for file in (tmp_path / "home/.cache/fprf/weights").iterdir()] == [SOURCES["vgg19"].file]
 
 
 def damaged(folder: Path) -> list[tuple[Path, str]]:
@@ -186,24 +239,39 @@ def test_damaged_files_are_one_clear_error_each(tmp_path: Path) -> None:
 
 def test_places_are_those_of_torchvision() -> None:
     """Convolution and ReLU take two places, a pool one after each block."""
-    place = 0
-    for name, found in CONVOLUTIONS.items():
-        if name.endswith("_1") and name != "1_1":
-            place += 1
-        assert found == place
-        place += 2
+    for network, last in (("vgg16", 28), ("vgg19", 34)):
+        place = 0
+        for name, found in CONVOLUTIONS[network].items():
+            if name.endswith("_1") and name != "1_1":
+                place += 1
+            assert found == place
+            place += 2
+        assert list(CONVOLUTIONS[network].values())[-1] == last
 
 
 def test_reaches_stops_at_the_first_gap() -> None:
     tensors = vgg_tensors(means=False)
     del tensors["features.5.bias"]
-    assert reaches(tensors) == ["relu1_1", "relu1_2"]
+    assert reaches(tensors, "vgg19") == ["relu1_1", "relu1_2"]
 
 
-def test_the_caffe_weights_have_unit_mean_activation_on_a_photograph(shared: Path) -> None:
+def test_normalised_filters_fire_alike_on_a_photograph(shared: Path) -> None:
+    """VGG-19's file brings means over photographs, VGG-16's none: the town's take their place."""
     from fprf.pretraining.photos import load_photo
 
     photo = load_photo(next(iter(sorted((shared / "data/pretrain/bsds500").glob("*.jpg")))), 256).permute(2, 0, 1)[None]
-    encoder = Vgg19Config(weights=shared / "weights/vgg19_imagenet.safetensors").build()
-    assert encoder.channels == 128
-    assert math.isclose(float(encoder(photo).mean()), 1, abs_tol=0.5)
+    for kind, name in ((Vgg16Config, "vgg16"), (Vgg19Config, "vgg19")):
+        encoder = kind(weights=shared / f"weights/{name}_imagenet.safetensors").build()
+        assert encoder.channels == 128
+        assert math.isclose(float(encoder(photo).mean()), 1, abs_tol=0.5)
+
+
+def test_the_towns_means_are_nearly_those_of_photographs(shared: Path, tmp_path: Path) -> None:
+    file = shared / "weights/vgg19_imagenet.safetensors"
+    stated = Vgg19Config(weights=file).build().get_buffer("scale")
+    bare = {name: value for name, value in load_file(file).items() if not name.startswith("mean_activation")}
+    with safe_open(file, framework="pt") as opened:
+        save_file(bare, tmp_path / "bare.safetensors", opened.metadata())
+    ratio = (Vgg19Config(weights=tmp_path / "bare.safetensors").build().get_buffer("scale") / stated).log()
+    assert float(ratio.std()) < 0.3
+    assert float(ratio.abs().max()) < math.log(4)

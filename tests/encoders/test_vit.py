@@ -1,4 +1,4 @@
-"""DINO and DINOv2: on small random models where transformers is installed; without it, one clear line."""
+"""DINO, DINOv2 and DINOv3: on small random models where transformers is installed; without it, one clear line."""
 
 import sys
 from pathlib import Path
@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from fprf.errors import WeightsError
-from fprf.plugins.encoders.config import DinoConfig, Dinov2Config
+from fprf.plugins.encoders.config import DinoConfig, Dinov2Config, Dinov3Config
 from fprf.plugins.encoders.vit import VitEncoder
+from fprf.testing import check_encoder
 
 
 class Patches(nn.Module):
@@ -52,7 +53,7 @@ def test_the_pooler_is_no_part_of_the_identity() -> None:
     assert stand_in(2).identity != one.identity
 
 
-@pytest.mark.parametrize("config", [DinoConfig(), Dinov2Config()])
+@pytest.mark.parametrize("config", [DinoConfig(), Dinov2Config(), Dinov3Config()])
 def test_without_transformers_one_line_says_what_to_do(config: DinoConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(WeightsError, match=r"pip install 'fprf\[encoders\]'.*bundled-semantic"):
@@ -69,12 +70,17 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     vit = transformers.ViTConfig(**sizes, intermediate_size=64, image_size=32, patch_size=8)
     transformers.ViTModel(vit).save_pretrained(folder / "dino")
     transformers.Dinov2Model(transformers.Dinov2Config(**sizes, image_size=28, patch_size=14)).save_pretrained(folder / "v2")
-    return {"dino": folder / "dino", "dinov2": folder / "v2"}
+    third = transformers.DINOv3ViTConfig(**sizes, intermediate_size=64, image_size=32, patch_size=16, num_register_tokens=4)
+    transformers.DINOv3ViTModel(third).save_pretrained(folder / "v3")
+    return {"dino": folder / "dino", "dinov2": folder / "v2", "dinov3": folder / "v3"}
 
 
-@pytest.mark.parametrize("kind", [DinoConfig, Dinov2Config])
-def test_real_models(models: dict[str, Path], kind: type[DinoConfig]) -> None:
-    folder = str(models["dino" if kind is DinoConfig else "dinov2"])
+KINDS: dict[str, type[DinoConfig]] = {"dino": DinoConfig, "dinov2": Dinov2Config, "dinov3": Dinov3Config}
+
+
+@pytest.mark.parametrize("family", KINDS)
+def test_real_models(models: dict[str, Path], family: str) -> None:
+    folder, kind = str(models[family]), KINDS[family]
     image = torch.rand(2, 3, 45, 70)
     last, third, second = (kind(model=folder, layer=layer).build() for layer in (-1, 3, 2))
     assert last(image).shape == (2, 32, 6, 9)
@@ -86,6 +92,28 @@ def test_real_models(models: dict[str, Path], kind: type[DinoConfig]) -> None:
     torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0.1, atol=0.1)  # tokens pass the final norm
     with pytest.raises(WeightsError, match="allowed are 1 to 3"):
         kind(model=folder, layer=4).build()
+
+
+@pytest.mark.parametrize("family", KINDS)
+def test_real_models_keep_to_the_contract(models: dict[str, Path], family: str) -> None:
+    check_encoder(KINDS[family](model=str(models[family])))
+
+
+def test_register_tokens_are_no_patches(models: dict[str, Path]) -> None:
+    """A change in one corner shows most in that corner's cell, so cells are in their order and none is a register."""
+    encoder = Dinov3Config(model=str(models["dinov3"]), layer=1).build()
+    image = torch.full((1, 3, 32, 48), 0.5)
+    for row, column in ((0, 0), (3, 5), (2, 1)):
+        spot = image.clone()
+        spot[..., 8 * row : 8 * row + 8, 8 * column : 8 * column + 8] = torch.rand(1, 3, 8, 8)
+        change = (encoder(spot) - encoder(image)).square().sum(1)[0]
+        assert divmod(int(change.argmax()), 6) == (row, column)
+
+
+@pytest.mark.parametrize(("family", "other"), [("dino", "dinov3"), ("dinov2", "dino"), ("dinov3", "dinov2")])
+def test_a_model_of_another_family_is_told(models: dict[str, Path], family: str, other: str) -> None:
+    with pytest.raises(WeightsError, match=rf"{family}: .* cannot be loaded \(it is of type \w+, not "):
+        KINDS[family](model=str(models[other])).build()
 
 
 def test_an_absent_model_says_where_to_put_it(tmp_path: Path) -> None:

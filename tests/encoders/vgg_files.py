@@ -1,4 +1,4 @@
-"""Small files in the shape of VGG-19's, with random weights."""
+"""Small files in the shape of VGG's, with random weights."""
 
 import json
 from pathlib import Path
@@ -29,3 +29,14 @@ def vgg_file(folder: Path, *, means: bool = True, normalisation: bool = True) ->
     metadata = {"mean": json.dumps([0.485, 0.458, 0.408]), "std": json.dumps([0.5, 0.5, 0.25])}
     save_file(vgg_tensors(means=means), path, metadata if normalisation else {})
     return path
+
+
+def deep_vgg_file(folder: Path) -> Path:
+    """Three channels at every place where one of the two networks has a convolution, up to its conv4_1."""
+    generator = torch.Generator().manual_seed(4)
+    tensors = {}
+    for place in (0, 2, 5, 7, 10, 12, 14, 16, 17, 19):
+        tensors[f"features.{place}.weight"] = torch.randn(3, 3, 3, 3, generator=generator) / 5
+        tensors[f"features.{place}.bias"] = 0.1 * torch.randn(3, generator=generator)
+    save_file(tensors, folder / "deep.safetensors")
+    return folder / "deep.safetensors"

@@ -54,14 +54,19 @@ def load_content_encoder(path: Path | None) -> BundledEncoder:
     path = path or FOLDER / "content.safetensors"
     tensors, channels = _read(path, CONTENT_KIND, "content")
     # At stride 2 an odd border is better mirrored than the whole image blurred by resizing it.
-    return _loaded(CONTENT_KIND, ContentStudent(channels), tensors, path, channels=channels, multiple=1)
+    student = ContentStudent(channels, (_outputs(tensors, "first.weight"), _outputs(tensors, "second.weight")))
+    return _loaded(CONTENT_KIND, student, tensors, path, channels=channels, multiple=1)
 
 
 def load_semantic_encoder(path: Path | None) -> BundledEncoder:
     """Stride 8. Raises WeightsError where the file is absent or of another kind."""
     path = path or FOLDER / "semantic.safetensors"
     tensors, channels = _read(path, SEMANTIC_KIND, "semantic")
-    return _loaded(SEMANTIC_KIND, SemanticStudent(channels), tensors, path, channels=channels, multiple=8)
+    stages = ("stem.0", "stem.1", "fine.0", "coarse.0")
+    half, quarter, fine, coarse = (_outputs(tensors, f"{stage}.conv.weight") for stage in stages)
+    residuals = sum(name.startswith("coarse.") and name.endswith(".narrow.weight") for name in tensors)
+    student = SemanticStudent(channels, (half, quarter, fine, coarse), rounds=residuals // 3)
+    return _loaded(SEMANTIC_KIND, student, tensors, path, channels=channels, multiple=8)
 
 
 def _read(path: Path, kind: str, verb: str) -> tuple[dict[str, Tensor], int]:
@@ -72,6 +77,11 @@ def _read(path: Path, kind: str, verb: str) -> tuple[dict[str, Tensor], int]:
             f"make one with `fprf pretrain {verb} --images DIR --teachers FILE --output {path.name}`"
         )
     return tensors, int(tensors["project.weight"].shape[0])
+
+
+def _outputs(tensors: dict[str, Tensor], name: str) -> int:
+    """Width of a layer of the file; 1 where it is missing, which no network fits."""
+    return len(tensors[name]) if name in tensors else 1
 
 
 def _loaded(

@@ -19,8 +19,10 @@ __all__ = [
     "BundledSemanticConfig",
     "DinoConfig",
     "Dinov2Config",
+    "Dinov3Config",
     "EncoderConfig",
     "RandomConfig",
+    "Vgg16Config",
     "Vgg19Config",
 ]
 
@@ -65,13 +67,37 @@ class BundledSemanticConfig(EncoderConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Vgg16Config(EncoderConfig):
+    """VGG-16 of ImageNet. torchvision's weights are downloaded once, unless named."""
+
+    layer: str = "relu2_1"
+    """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
+    weights: Path | None = None
+    """torchvision's vgg16-397923af.pth, Caffe's vgg16-00b39a1b.pth, or a safetensors file with their keys. By default the
+    download cache."""
+    normalise: bool = True
+    """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-3])", self.layer):
+            raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-16; allowed are conv1_1, relu1_1 ... relu5_3")
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where weights are missing or end before the layer."""
+        from .vgg_weights import build_vgg16
+
+        return build_vgg16(self.layer, weights=self.weights, normalise=self.normalise)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Vgg19Config(EncoderConfig):
     """VGG-19 of ImageNet, the paper's content encoder. torchvision's weights are downloaded once, unless named."""
 
     layer: str = "relu2_1"
     """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
     weights: Path | None = None
-    """torchvision's vgg19-dcbb9e9d.pth, or a safetensors file with its keys. By default the download cache."""
+    """torchvision's vgg19-dcbb9e9d.pth, Caffe's vgg19-d01eb7cb.pth, AdaIN's vgg_normalised.pth, or a safetensors file with
+    torchvision's keys. By default the download cache."""
     normalise: bool = True
     """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
 
@@ -126,6 +152,27 @@ class Dinov2Config(EncoderConfig):
         from .vit import build_vit
 
         return build_vit("dinov2", self.model, layer=self.layer, stride=self.stride)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dinov3Config(EncoderConfig):
+    """DINOv3: the third of them, for dense features. Needs the extra `encoders`; its licence is accepted on the hub."""
+
+    model: str = "facebook/dinov3-vits16-pretrain-lvd1689m"
+    """A vision transformer of the Hugging Face hub, or a folder that holds one."""
+    layer: int = -1
+    """Block whose tokens are taken, from 1; negative counts from the last."""
+    stride: int = 8
+    """Pixels of the image per feature: the image is resized until one patch covers that many."""
+
+    def __post_init__(self) -> None:
+        _check_transformer(self.layer, self.stride)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where transformers or the model is absent."""
+        from .vit import build_vit
+
+        return build_vit("dinov3", self.model, layer=self.layer, stride=self.stride)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ class ContentStudent(nn.Module):
     Half the arithmetic of a slim VGG with its convolutions at full size, and as good after the same time of training.
     """
 
-    def __init__(self, channels: int, widths: tuple[int, int] = (64, 72)) -> None:
+    def __init__(self, channels: int, widths: tuple[int, int] = (80, 96)) -> None:
         super().__init__()
         self.first = nn.Conv2d(12, widths[0], 3)
         self.second = nn.Conv2d(widths[0], widths[1], 3)
@@ -35,13 +35,13 @@ class ContentStudent(nn.Module):
 class SemanticStudent(nn.Module):
     """Inverted residuals at strides 8 and 16 with wide dilations and a view of the whole image, merged at stride 8."""
 
-    def __init__(self, channels: int, widths: tuple[int, int, int, int] = (24, 48, 96, 128)) -> None:
+    def __init__(self, channels: int, widths: tuple[int, int, int, int] = (24, 48, 96, 160), rounds: int = 2) -> None:
         super().__init__()
         half, quarter, fine, coarse = widths
         self.stem = nn.Sequential(_ConvNorm(3, half, 3, stride=2), _ConvNorm(half, quarter, 3, stride=2))
         self.fine = nn.Sequential(_ConvNorm(quarter, fine, 3, stride=2), _Residual(fine, 1), _Residual(fine, 2))
         self.coarse = nn.Sequential(
-            _ConvNorm(fine, coarse, 3, stride=2), _Residual(coarse, 1), _Residual(coarse, 2), _Residual(coarse, 4)
+            _ConvNorm(fine, coarse, 3, stride=2), *(_Residual(coarse, dilation) for dilation in rounds * (1, 2, 4))
         )
         self.whole = nn.Linear(coarse, coarse)
         self.merge = nn.Sequential(_ConvNorm(fine + coarse, fine, 1), _Residual(fine, 1))

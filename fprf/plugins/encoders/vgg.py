@@ -1,11 +1,11 @@
-"""VGG-19 (Simonyan and Zisserman) up to any layer, plain or normalised as AdaIN and FPRF use it.
+"""VGG-16 and VGG-19 (Simonyan and Zisserman) up to any layer, plain or normalised as AdaIN and FPRF use them.
 
 Normalised: every filter is divided by its mean activation on photographs, borders are mirrored; features are then O(1).
 Pools round up, so that no pixel is lost: the last cell of an odd axis covers what is left.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import torch
@@ -17,23 +17,25 @@ from ...interfaces import Encoder
 from ..weightfiles import tensors_hash
 from .frozen import freeze, reflect_pad
 
-__all__ = ["CONVOLUTIONS", "Vgg19Encoder", "reaches", "vgg19_activations"]
-
-CONVOLUTIONS: Mapping[str, int] = {
-    "1_1": 0, "1_2": 2,
-    "2_1": 5, "2_2": 7,
-    "3_1": 10, "3_2": 12, "3_3": 14, "3_4": 16,
-    "4_1": 19, "4_2": 21, "4_3": 23, "4_4": 25,
-    "5_1": 28, "5_2": 30, "5_3": 32, "5_4": 34,
-}  # fmt: skip
-"""Place of each convolution in torchvision's `features`."""
+__all__ = ["CONVOLUTIONS", "VggEncoder", "reaches", "vgg_activations"]
 
 
-class Vgg19Encoder(Encoder):
-    """One layer of VGG-19. `scale` [C] divides the features where they are normalised, None leaves them plain."""
+def _places(depths: Sequence[int]) -> Mapping[str, int]:
+    """Convolution and ReLU take two places, a pool one after each block."""
+    names = [(block, index) for block, depth in enumerate(depths) for index in range(depth)]
+    return {f"{block + 1}_{index + 1}": 2 * at + block for at, (block, index) in enumerate(names)}
+
+
+CONVOLUTIONS: Mapping[str, Mapping[str, int]] = {"vgg16": _places((2, 2, 3, 3, 3)), "vgg19": _places((2, 2, 4, 4, 4))}
+"""Place of each convolution in torchvision's `features`, by network."""
+
+
+class VggEncoder(Encoder):
+    """One layer of a VGG. `scale` [C] divides the features where they are normalised, None leaves them plain."""
 
     def __init__(
         self,
+        network: str,
         layer: str,
         tensors: Mapping[str, Tensor],
         *,
@@ -43,11 +45,12 @@ class Vgg19Encoder(Encoder):
         source: str,
     ) -> None:
         super().__init__()
-        self._layer, self._normalised = layer, scale is not None
-        self._names = _names_up_to(layer[4:])
+        self._network, self._layer, self._normalised = network, layer, scale is not None
+        names = list(CONVOLUTIONS[network])
+        self._names = names[: names.index(layer[4:]) + 1]
         for index, name in enumerate(self._names):
-            self.register_buffer(f"weight{index}", _tensor(tensors, name, "weight", source))
-            self.register_buffer(f"bias{index}", _tensor(tensors, name, "bias", source))
+            self.register_buffer(f"weight{index}", _tensor(tensors, network, name, "weight", source))
+            self.register_buffer(f"bias{index}", _tensor(tensors, network, name, "bias", source))
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float())
         self.register_buffer("scale", torch.ones(self.channels) if scale is None else scale.float())
@@ -56,8 +59,8 @@ class Vgg19Encoder(Encoder):
 
     @property
     def identity(self) -> str:
-        """Layer, normalisation and a hash of every tensor that is used."""
-        return f"vgg19:{self._layer}:{'normalised' if self._normalised else 'plain'}:{self._hash}"
+        """Network, layer, normalisation and a hash of every tensor that is used."""
+        return f"{self._network}:{self._layer}:{'normalised' if self._normalised else 'plain'}:{self._hash}"
 
     @property
     def channels(self) -> int:
@@ -81,35 +84,31 @@ class Vgg19Encoder(Encoder):
         return self.get_buffer(name).to(like).view(1, -1, 1, 1)
 
 
-def vgg19_activations(encoder: Vgg19Encoder, images: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "C"]:
+def vgg_activations(encoder: VggEncoder, images: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "C"]:
     """Mean of each filter's ReLU output over images, in float64: what `scale` is made of."""
     return F.relu(encoder(images)).double().mean(dim=(0, 2, 3))
 
 
-def reaches(tensors: Mapping[str, Tensor]) -> list[str]:
+def reaches(tensors: Mapping[str, Tensor], network: str) -> list[str]:
     """Layers whose convolutions, and all before them, are there."""
     found = []
-    for name, place in CONVOLUTIONS.items():
+    for name, place in CONVOLUTIONS[network].items():
         if f"features.{place}.weight" not in tensors or f"features.{place}.bias" not in tensors:
             break
         found.append(f"relu{name}")
     return found
 
 
-def _names_up_to(last: str) -> list[str]:
-    names = list(CONVOLUTIONS)
-    return names[: names.index(last) + 1]
-
-
-def _tensor(tensors: Mapping[str, Tensor], name: str, part: str, source: str) -> Tensor:
-    key = f"features.{CONVOLUTIONS[name]}.{part}"
+def _tensor(tensors: Mapping[str, Tensor], network: str, name: str, part: str, source: str) -> Tensor:
+    key = f"features.{CONVOLUTIONS[network][name]}.{part}"
+    shown = network.upper().replace("VGG", "VGG-")
     if key not in tensors:
-        held = reaches(tensors)
+        held = reaches(tensors, network)
         raise WeightsError(
-            f"{source}: holds no conv{name} ({key} is missing); its layers are {', '.join(held) or 'none of VGG-19'}; "
+            f"{source}: holds no conv{name} ({key} is missing); its layers are {', '.join(held) or f'none of {shown}'}; "
             "choose one of these, or name a file that reaches further with --content.encoder.weights FILE"
         )
     value = tensors[key].float()
     if part == "weight" and (value.ndim != 4 or value.shape[2:] != (3, 3) or not math.isfinite(float(value.sum()))):
-        raise WeightsError(f"{source}: {key} has shape {tuple(value.shape)}, not that of a 3x3 convolution of VGG-19")
+        raise WeightsError(f"{source}: {key} has shape {tuple(value.shape)}, not that of a 3x3 convolution of {shown}")
     return value

@@ -1,125 +1,104 @@
-"""Where VGG-19's weights come from: a named file, a cache, or torchvision's server, checked by hash."""
+"""VGG's weights as the various files hold them: torchvision's, Caffe's and Keras's, and the normalised ones of AdaIN."""
 
-import hashlib
-import json
-import os
 import re
-import urllib.error
-import urllib.request
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ...errors import WeightsError
-from ..weightfiles import read_weights
-from .vgg import Vgg19Encoder, vgg19_activations
+from .calibration import street
+from .vgg import CONVOLUTIONS, VggEncoder, vgg_activations
+from .weight_sources import IMAGENET_MEAN, IMAGENET_STD, find_weights, read_tensors, stated_triple, torchvision_file
 
-__all__ = ["build_vgg19", "pink_noise"]
+__all__ = ["build_vgg16", "build_vgg19"]
 
-FILE = "vgg19-dcbb9e9d.pth"
-URL = f"https://download.pytorch.org/models/{FILE}"
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-CHUNK = 1 << 20
-TIMEOUT_SECONDS = 30
+FLAG = "--content.encoder.weights"
+SOURCES = {
+    "vgg16": torchvision_file("VGG-16", "vgg16-397923af.pth", FLAG),
+    "vgg19": torchvision_file("VGG-19", "vgg19-dcbb9e9d.pth", FLAG),
+}
+CAFFE_FILES = r"vgg16-00b39a1b\.pth|vgg19-d01eb7cb\.pth"
+"""The original networks under torchvision's names: BGR from 0 to 255 less the mean, which these files do not say."""
+RAREST = 0.05
+"""Mean activation of the rarest filters, as a share of the mean over all: on photographs none of VGG-19 is below that."""
+CAFFE_MEAN = (123.68 / 255, 116.779 / 255, 103.939 / 255)
 
 
-def build_vgg19(layer: str, *, weights: Path | None, normalise: bool) -> Vgg19Encoder:
+class _Held(NamedTuple):
+    """A file's tensors for RGB input under torchvision's names, and what they want of the input."""
+
+    tensors: Mapping[str, Tensor]
+    mean: Annotated[Tensor, "3"]
+    std: Annotated[Tensor, "3"]
+    normalised: bool
+    """Each filter is divided by its mean activation already."""
+
+
+def build_vgg16(layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
     """The encoder from a file, the cache or the download. Raises WeightsError where none of them serves."""
-    path = weights if weights is not None else _cached() or _download()
-    tensors, metadata = read_weights(path) if path.suffix == ".safetensors" else (_read_pth(path), {})
-    mean, std = (_triple(metadata, key, path) for key in ("mean", "std"))
+    return _build("vgg16", layer, weights=weights, normalise=normalise)
+
+
+def build_vgg19(layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
+    """The encoder from a file, the cache or the download. Raises WeightsError where none of them serves."""
+    return _build("vgg19", layer, weights=weights, normalise=normalise)
+
+
+def _build(network: str, layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
+    path = find_weights(SOURCES[network], weights)
+    held = _read(network, path)
+
+    def encoder(scale: Tensor | None) -> VggEncoder:
+        return VggEncoder(network, layer, held.tensors, mean=held.mean, std=held.std, scale=scale, source=str(path))
+
     if not normalise:
-        return Vgg19Encoder(layer, tensors, mean=mean, std=std, scale=None, source=str(path))
-    scale = tensors.get(f"mean_activation.conv{layer[4:]}")
-    if scale is None:
-        # Few files bring their own means; noise with the spectrum of photographs estimates those of the others.
-        unscaled = Vgg19Encoder(layer, tensors, mean=mean, std=std, scale=torch.ones(1), source=str(path))
-        scale = vgg19_activations(unscaled, pink_noise()).float()
-    scale = scale.clamp_min(1e-3 * float(scale.mean()))  # a filter that hardly ever fires must not be blown up
-    return Vgg19Encoder(layer, tensors, mean=mean, std=std, scale=scale, source=str(path))
+        if held.normalised:
+            raise WeightsError(
+                f"{path}: holds the normalised VGG-19 of AdaIN, which cannot be made plain again; "
+                f"leave normalise on, or name a file of plain weights with {FLAG} FILE"
+            )
+        return encoder(None)
+    if held.normalised:
+        return encoder(torch.ones(1))
+    scale = held.tensors.get(f"mean_activation.conv{layer[4:]}")
+    if scale is not None:
+        return encoder(scale.clamp_min(1e-3 * float(scale.mean())))
+    # Few files bring their own means. On the town each filter's is within a factor of two of that on photographs (VGG-19,
+    # standard deviation of the log 0.19 at relu2_1, 0.35 at relu3_1), but for filters that find nothing there to answer to.
+    scale = vgg_activations(encoder(torch.ones(1)), street()).float()
+    return encoder(scale.clamp_min(RAREST * float(scale.mean())))
 
 
-def pink_noise(images: int = 8, size: int = 128) -> Annotated[Tensor, "B 3 H W"]:
-    """Images with the 1/f spectrum, contrast and grey axis of photographs; always the same ones."""
-    generator = torch.Generator().manual_seed(0)
-    frequency = torch.hypot(torch.fft.fftfreq(size)[:, None], torch.fft.rfftfreq(size)[None]).clamp_min(1 / size)
-    spectrum = torch.fft.rfft2(torch.randn(images, 3, size, size, generator=generator)) / frequency
-    noise = torch.fft.irfft2(spectrum, s=(size, size))
-    noise = noise / noise.std(dim=(2, 3), keepdim=True)
-    grey, warm, green = noise.unbind(1)
-    # Opponent axes with the spread that photographs have: light 0.22, yellow-blue 0.06, red-green 0.03.
-    rgb = torch.stack([grey * 0.22 + warm * 0.06 + green * 0.03, grey * 0.22 - green * 0.03, grey * 0.22 - warm * 0.06], 1)
-    return (0.45 + rgb).clamp(0, 1)
+def _read(network: str, path: Path) -> _Held:
+    tensors, metadata = read_tensors(path, SOURCES[network])
+    if tensors.get("0.weight", torch.empty(0)).shape == (3, 3, 1, 1):
+        return _Held(_from_adain(tensors), torch.zeros(3), torch.ones(3), normalised=True)
+    if re.search(CAFFE_FILES, path.name) and "features.0.weight" in tensors:
+        turned = {**tensors, "features.0.weight": tensors["features.0.weight"].flip(1)}
+        return _Held(turned, torch.tensor(CAFFE_MEAN), torch.full((3,), 1 / 255), normalised=False)
+    mean, std = (
+        stated_triple(metadata, key, default, path) for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD))
+    )
+    return _Held(tensors, mean, std, normalised=False)
 
 
-def _cached() -> Path | None:
-    for folder in (_cache_folder(), Path.home() / ".cache/torch/hub/checkpoints"):
-        if (folder / FILE).is_file():
-            return folder / FILE
-    return None
+def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """VGG-19 from AdaIN's list of layers: padding, convolution and ReLU take three places, a pool one after each block.
 
-
-def _cache_folder() -> Path:
-    return Path.home() / ".cache/fprf/weights"
-
-
-def _download() -> Path:
-    target = _cache_folder() / FILE
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f"{FILE}.{os.getpid()}.partial")
-    try:
-        with urllib.request.urlopen(URL, timeout=TIMEOUT_SECONDS) as response, partial.open("wb") as file:
-            while piece := response.read(CHUNK):
-                file.write(piece)
-        _check_hash(partial, FILE)
-        partial.replace(target)
-    except (urllib.error.URLError, OSError, TimeoutError) as error:
-        raise WeightsError(
-            f"VGG-19's weights are not here and cannot be downloaded ({error}): put {URL} (SHA-256 begins with "
-            f"{_expected(FILE)}) into {target.parent}, or name a file with --content.encoder.weights FILE"
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)
-    return target
-
-
-def _read_pth(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such weights file; torchvision's is {URL}")
-    _check_hash(path, path.name)
-    try:
-        tensors = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the unpickler raises whatever the bytes lead it to
-        raise WeightsError(f"{path}: not a file of tensors ({type(error).__name__}); torchvision's is {URL}") from error
-    if not isinstance(tensors, dict):
-        raise WeightsError(f"{path}: holds a {type(tensors).__name__}, not named tensors; torchvision's is {URL}")
-    return {name: value for name, value in tensors.items() if isinstance(value, Tensor)}
-
-
-def _expected(name: str) -> str | None:
-    """torchvision's file names carry the beginning of their own SHA-256."""
-    match = re.search(r"-([0-9a-f]{8,})\.pth$", name)
-    return match.group(1) if match else None
-
-
-def _check_hash(path: Path, name: str) -> None:
-    expected = _expected(name)
-    if expected is None:
-        return
-    with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if not found.startswith(expected):
-        raise WeightsError(
-            f"{path}: SHA-256 begins with {found[:8]}, its name promises {expected}; delete it and fetch {URL} again"
-        )
-
-
-def _triple(metadata: dict[str, str], key: str, path: Path) -> Annotated[Tensor, "3"]:
-    if key not in metadata:
-        return torch.tensor(IMAGENET_MEAN if key == "mean" else IMAGENET_STD)
-    try:
-        return torch.tensor(json.loads(metadata[key]), dtype=torch.float32).view(3)
-    except (ValueError, RuntimeError, TypeError) as error:
-        raise WeightsError(f"{path}: metadata {key!r} is {metadata[key]!r}, not three numbers such as [0.5,0.5,0.5]") from error
+    The 1x1 convolution at its start turns colours; it goes into the first 3x3 one, which mirrored borders leave exact.
+    """
+    found = {}
+    for at, (name, place) in enumerate(CONVOLUTIONS["vgg19"].items()):
+        theirs = 2 + 3 * at + int(name[0]) - 1
+        for part in ("weight", "bias"):
+            if f"{theirs}.{part}" in tensors:
+                found[f"features.{place}.{part}"] = tensors[f"{theirs}.{part}"]
+    if {"features.0.weight", "features.0.bias"} <= found.keys() and "0.bias" in tensors:
+        first = found["features.0.weight"].double()
+        turn, shift = tensors["0.weight"][:, :, 0, 0].double(), tensors["0.bias"].double()
+        found["features.0.weight"] = torch.einsum("okyx,ki->oiyx", first, turn).float()
+        found["features.0.bias"] = (found["features.0.bias"] + torch.einsum("okyx,k->o", first, shift)).float()
+    return found

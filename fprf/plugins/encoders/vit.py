@@ -1,4 +1,4 @@
-"""DINO and DINOv2 through `transformers` (extra `encoders`): final-norm tokens of any block, at any stride.
+"""DINO, DINOv2 and DINOv3 through `transformers` (extra `encoders`): final-norm tokens of any block, at any stride.
 
 The stride is reached by resizing: one patch of the resized image covers `stride` pixels of the one given. Blocks after
 the chosen one are never loaded.
@@ -19,8 +19,14 @@ from .frozen import freeze
 __all__ = ["VitEncoder", "build_vit"]
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# ViT interpolates its position table on demand, DINOv2 always does.
-CALLS: Mapping[str, Mapping[str, bool]] = {"dino": {"interpolate_pos_encoding": True}, "dinov2": {}}
+# ViT interpolates its position table on demand, DINOv2 always does, DINOv3 turns its tokens by where they lie.
+CALLS: Mapping[str, Mapping[str, bool]] = {"dino": {"interpolate_pos_encoding": True}, "dinov2": {}, "dinov3": {}}
+TYPES: Mapping[str, tuple[str, ...]] = {
+    "dino": ("vit",),
+    "dinov2": ("dinov2", "dinov2_with_registers"),
+    "dinov3": ("dinov3_vit",),
+}
+"""What transformers calls the models of each family."""
 
 
 class VitEncoder(Encoder):
@@ -71,6 +77,8 @@ def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
     logging.set_verbosity_error()  # else it lists the blocks that are left out
     try:
         config = AutoConfig.from_pretrained(name)
+        if config.model_type not in TYPES[family]:
+            raise ValueError(f"it is of type {config.model_type}, not {' or '.join(TYPES[family])}")
         blocks = int(config.num_hidden_layers)
         config.num_hidden_layers = _block(layer, blocks, name)
         model = AutoModel.from_pretrained(name, config=config)

@@ -1,0 +1,135 @@
+"""Where an encoder's weights come from: a named file, the caches, or the public server, checked by hash."""
+
+import hashlib
+import json
+import os
+import re
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...errors import WeightsError
+from ..weightfiles import read_weights
+
+__all__ = ["IMAGENET_MEAN", "IMAGENET_STD", "WeightSource", "find_weights", "read_tensors", "stated_triple", "torchvision_file"]
+
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+CHUNK = 1 << 20
+TIMEOUT_SECONDS = 30
+
+
+class WeightSource(NamedTuple):
+    """The public file of a network's weights."""
+
+    network: str
+    """Whose weights they are, for messages."""
+    file: str
+    """Name that the caches are searched for."""
+    origin: str
+    """Where the file is to be had: its URL if `pinned`."""
+    flag: str
+    """What names another file on the command line."""
+    pinned: bool = False
+    """The file's name carries its hash, so that it may be downloaded."""
+
+
+def torchvision_file(network: str, file: str, flag: str) -> WeightSource:
+    """One of torchvision's files: their names carry the beginning of their own SHA-256."""
+    return WeightSource(network, file, f"https://download.pytorch.org/models/{file}", flag, pinned=True)
+
+
+def find_weights(source: WeightSource, path: Path | None) -> Path:
+    """The named file, else the cached one, else the download. Raises WeightsError where none of them is to be had."""
+    if path is not None:
+        return path
+    folders = (_cache_folder(), Path.home() / ".cache/torch/hub/checkpoints")
+    for folder in folders:
+        if (folder / source.file).is_file():
+            return folder / source.file
+    if source.pinned:
+        return _download(source)
+    raise WeightsError(
+        f"{source.network}: {source.file} is not in {folders[0]} nor in {folders[1]}; put it there ({source.origin}), "
+        f"or name a file with {source.flag} FILE"
+    )
+
+
+def read_tensors(path: Path, source: WeightSource) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file, or of a file of `torch.save` (which has no metadata), hash checked.
+
+    Raises WeightsError where the file is absent, damaged, or another than its name promises.
+    """
+    if path.suffix == ".safetensors":
+        return read_weights(path)
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such weights file; {source.network}'s is {source.origin}")
+    _check_hash(path, path.name, source)
+    try:
+        tensors = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # the unpickler raises whatever the bytes lead it to
+        raise WeightsError(
+            f"{path}: not a file of tensors ({type(error).__name__}); {source.network}'s is {source.origin}"
+        ) from error
+    if not isinstance(tensors, dict):
+        raise WeightsError(
+            f"{path}: holds a {type(tensors).__name__}, not named tensors; {source.network}'s is {source.origin}"
+        )
+    return {name: value.float() for name, value in tensors.items() if isinstance(value, Tensor)}, {}
+
+
+def stated_triple(
+    metadata: dict[str, str], key: str, default: tuple[float, float, float], path: Path
+) -> Annotated[Tensor, "3"]:
+    """Three numbers of a file's metadata, such as the mean of its input's channels; the default where it says nothing."""
+    if key not in metadata:
+        return torch.tensor(default)
+    try:
+        return torch.tensor(json.loads(metadata[key]), dtype=torch.float32).view(3)
+    except (ValueError, RuntimeError, TypeError) as error:
+        raise WeightsError(f"{path}: metadata {key!r} is {metadata[key]!r}, not three numbers such as [0.5,0.5,0.5]") from error
+
+
+def _cache_folder() -> Path:
+    return Path.home() / ".cache/fprf/weights"
+
+
+def _download(source: WeightSource) -> Path:
+    target = _cache_folder() / source.file
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f"{source.file}.{os.getpid()}.partial")
+    try:
+        with urllib.request.urlopen(source.origin, timeout=TIMEOUT_SECONDS) as response, partial.open("wb") as file:
+            while piece := response.read(CHUNK):
+                file.write(piece)
+        _check_hash(partial, source.file, source)
+        partial.replace(target)
+    except (urllib.error.URLError, OSError, TimeoutError) as error:
+        raise WeightsError(
+            f"{source.network}'s weights are not here and cannot be downloaded ({error}): put {source.origin} (SHA-256 begins "
+            f"with {_expected(source.file)}) into {target.parent}, or name a file with {source.flag} FILE"
+        ) from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return target
+
+
+def _expected(name: str) -> str | None:
+    """Public files of weights carry the beginning of their own SHA-256 in their names."""
+    match = re.search(r"-([0-9a-f]{8,})\.pth$", name)
+    return match.group(1) if match else None
+
+
+def _check_hash(path: Path, name: str, source: WeightSource) -> None:
+    expected = _expected(name)
+    if expected is None:
+        return
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if not found.startswith(expected):
+        raise WeightsError(
+            f"{path}: SHA-256 begins with {found[:8]}, its name promises {expected}; delete it and fetch {source.origin} again"
+        )

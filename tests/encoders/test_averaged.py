@@ -1,0 +1,77 @@
+"""Averages over mirrored and resized images."""
+
+from typing import Annotated
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.errors import ConfigError
+from fprf.interfaces import Encoder
+from fprf.plugins.encoders.averaged import AveragedEncoder
+from fprf.plugins.encoders.composed_config import AveragedConfig
+from fprf.plugins.encoders.config import RandomConfig
+
+
+class Slope(Encoder):
+    """Brightness of every fourth pixel, plus how far to the left its cell lies: as one-sided as can be."""
+
+    @property
+    def identity(self) -> str:
+        return "slope"
+
+    @property
+    def channels(self) -> int:
+        return 1
+
+    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
+        cells = image.mean(1, keepdim=True)[..., ::4, ::4]
+        return cells + torch.arange(cells.shape[-1]).to(cells)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([(1.0,), (1.0, 1.5), (0.5, 2.0)]))
+def test_a_mirrored_image_has_mirrored_features(height: int, width: int, scales: tuple[float, ...]) -> None:
+    encoder = AveragedConfig(inner=RandomConfig(stride=3), scales=scales).build()
+    image = torch.rand(1, 3, height, width)
+    torch.testing.assert_close(encoder(image.flip(-1)), encoder(image).flip(-1))
+
+
+def test_a_flip_is_the_mean_of_both_looks() -> None:
+    image, inner = torch.rand(2, 3, 8, 12), Slope()
+    encoder = AveragedEncoder(inner, flip=True, scales=(1.0,))
+    brightness = (image[..., ::4, ::4].mean(1, keepdim=True) + image.flip(-1)[..., ::4, ::4].mean(1, keepdim=True).flip(-1)) / 2
+    torch.testing.assert_close(encoder(image), brightness + 1)  # cells lie at 0, 1, 2: at 1 on average
+    plain = AveragedEncoder(inner, flip=False, scales=(1.0,))
+    assert torch.equal(plain(image), inner(image))
+
+
+def test_one_larger_size_is_a_finer_stride() -> None:
+    image, inner = torch.rand(1, 3, 24, 36), RandomConfig(stride=4).build()
+    encoder = AveragedEncoder(inner, flip=False, scales=(2.0,))
+    assert encoder(image).shape == (1, 16, 12, 18)
+    larger = F.interpolate(image, (48, 72), mode="bilinear", antialias=True)
+    torch.testing.assert_close(encoder(image), inner(larger))
+
+
+def test_sizes_meet_on_the_finest_ones_cells() -> None:
+    image, inner = torch.rand(1, 3, 32, 48), RandomConfig(stride=4).build()
+    both = AveragedEncoder(inner, flip=False, scales=(0.5, 1.0))(image)
+    small = F.interpolate(image, (16, 24), mode="bilinear", antialias=True)
+    coarse = F.interpolate(inner(small), (8, 12), mode="bilinear")
+    torch.testing.assert_close(both, (coarse + inner(image)) / 2)
+
+
+def test_the_identity_holds_the_inner_one() -> None:
+    inner = RandomConfig().build()
+    assert AveragedConfig(inner=RandomConfig()).build().identity == f"averaged:flip:1.0:[{inner.identity}]"
+    assert AveragedConfig(inner=AveragedConfig(inner=RandomConfig())).build().identity.count("averaged") == 2
+
+
+@pytest.mark.parametrize("scales", [(), (0.0,), (1.0, -1.0), (float("nan"),)])
+def test_ranges(scales: tuple[float, ...]) -> None:
+    with pytest.raises(ConfigError, match=r"^scales"):
+        AveragedConfig(scales=scales)

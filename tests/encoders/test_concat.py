@@ -1,0 +1,109 @@
+"""Encoders side by side: weights, units, strides, and the command line that nests them."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from network_files import deeplab_file
+from torch import Tensor
+
+from fprf.commands.parsing import parse
+from fprf.errors import ConfigError, WeightsError
+from fprf.methods import fprf_lite
+from fprf.plugins.codec import from_json, to_json
+from fprf.plugins.encoders.calibration import street
+from fprf.plugins.encoders.composed_config import AveragedConfig, ConcatConfig
+from fprf.plugins.encoders.concat import ConcatEncoder, unit_of
+from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, RandomConfig
+from fprf.plugins.encoders.segmenter_config import DeepLabConfig
+
+
+def length(features: Tensor) -> Tensor:
+    """Root mean square length about the mean."""
+    return (features - features.mean((0, 2, 3), keepdim=True)).square().sum(1).mean().sqrt()
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(0.05, 20), st.floats(0.05, 20), st.integers(1, 40), st.integers(1, 40))
+def test_each_part_has_the_length_of_its_weight(first: float, second: float, few: int, many: int) -> None:
+    parts = (RandomConfig(channels=few, stride=8), RandomConfig(channels=many, seed=1))
+    encoder = ConcatConfig(first=parts[0], second=parts[1], weights=(first, second)).build()
+    assert encoder.channels == few + many
+    found = encoder(street())
+    # The unit is kept to three digits, and the coarser part loses a little where it is interpolated.
+    torch.testing.assert_close(length(found[:, few:]), torch.tensor(second), rtol=6e-3, atol=0)
+    assert 0.6 * first < float(length(found[:, :few])) <= first * 1.01
+
+
+def test_parts_are_their_encoders_to_a_factor() -> None:
+    image = torch.rand(2, 3, 40, 56)
+    parts = [RandomConfig(stride=8).build(), RandomConfig(stride=4, seed=1).build()]
+    found = ConcatEncoder(parts, (3.0, 0.5), (2.0, 4.0))(image)
+    coarse = F.interpolate(parts[0](image), (10, 14), mode="bilinear") * 1.5
+    torch.testing.assert_close(found, torch.cat([coarse, parts[1](image) * 0.125], dim=1))
+
+
+def test_the_finest_of_each_axis_counts() -> None:
+    """Cells of 6 and 5 pixels on a strip: neither part decides both axes alone."""
+    encoder = ConcatConfig(first=RandomConfig(stride=6), second=RandomConfig(stride=5), third=RandomConfig(stride=30)).build()
+    assert encoder(torch.rand(1, 3, 31, 7)).shape[2:] == (7, 2)
+
+
+def test_an_image_depends_on_itself_alone() -> None:
+    encoder = ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1)).build()
+    images = torch.rand(2, 3, 24, 24)
+    torch.testing.assert_close(encoder(images)[:1], encoder(images[:1]))
+
+
+def test_units_are_rounded_and_never_0() -> None:
+    images = street()
+    assert images.shape[1] == 3 and 0 <= float(images.min()) < float(images.max()) <= 1
+    unit = unit_of(RandomConfig().build(), images)
+    assert unit == float(f"{unit:.3g}") > 0
+    assert unit_of(RandomConfig().build(), torch.full((1, 3, 16, 16), 0.5)) == 1
+
+
+def test_weights_left_out_are_1_and_more_than_parts_are_refused() -> None:
+    parts = {"first": RandomConfig(), "second": RandomConfig(seed=1)}
+    assert ConcatConfig(**parts).build().identity == ConcatConfig(**parts, weights=(1.0, 1.0)).build().identity
+    with pytest.raises(ConfigError, match=r"^weights: 3 for 2 encoders"):
+        ConcatConfig(**parts, weights=(1, 2, 3)).build()
+    for wrong in ((0.0,), (1.0, -1.0), (float("inf"),)):
+        with pytest.raises(ConfigError, match=r"^weights"):
+            ConcatConfig(**parts, weights=wrong)
+
+
+def test_a_missing_parts_weights_are_told(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
+        ConcatConfig(first=DeepLabConfig(weights=tmp_path / "absent.safetensors")).build()
+
+
+def test_nested_on_the_command_line(tmp_path: Path) -> None:
+    file = deeplab_file(tmp_path)
+    line = (
+        f"--semantic.encoder concat --semantic.encoder.first deeplab --semantic.encoder.first.weights {file} "
+        "--semantic.encoder.first.layer backbone.13 --semantic.encoder.second averaged "
+        "--semantic.encoder.second.inner bundled-semantic --semantic.encoder.third random "
+        "--semantic.encoder.weights 1 0.5 --semantic.encoder.third.channels 3"
+    ).split()
+    encoder = parse(fprf_lite(), line, prog="x", description="").semantic.encoder
+    assert encoder == ConcatConfig(
+        first=DeepLabConfig(weights=file, layer="backbone.13"),
+        second=AveragedConfig(inner=BundledSemanticConfig()),
+        third=RandomConfig(channels=3),
+        weights=(1.0, 0.5),
+    )
+    assert from_json(to_json(encoder), ConcatConfig) == encoder
+    built = encoder.build()
+    for part in (encoder.first, encoder.second, encoder.third):
+        assert part.build().identity in built.identity
+    assert built(torch.rand(1, 3, 48, 64)).shape == (1, built.channels, 12, 16)
+
+
+@pytest.mark.parametrize("second", [BundledContentConfig(), ConcatConfig(second=RandomConfig())])
+def test_any_encoder_is_a_part(second: EncoderConfig) -> None:
+    encoder = ConcatConfig(first=RandomConfig(), second=second).build()
+    assert encoder.channels == 16 + second.build().channels

@@ -1,0 +1,91 @@
+"""Where weights are looked for, and what is said where they are not."""
+
+import shutil
+import urllib.error
+from pathlib import Path
+
+import pytest
+import torch
+from network_files import deeplab_file, mobilenet_tensors
+from safetensors.torch import save_file
+
+from fprf.errors import WeightsError
+from fprf.plugins.encoders import weight_sources
+from fprf.plugins.encoders.config import EncoderConfig
+from fprf.plugins.encoders.deeplab import SOURCE as DEEPLAB
+from fprf.plugins.encoders.segmenter_config import DeepLabConfig, EspNetConfig, MobileNetV2Config
+from fprf.plugins.encoders.weight_sources import WeightSource, find_weights, read_tensors, stated_triple, torchvision_file
+
+
+@pytest.fixture(autouse=True)
+def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A home of its own, and no network."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise urllib.error.URLError("no network in tests")
+
+    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", refuse)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+@pytest.mark.parametrize(
+    ("config", "file"),
+    [
+        (MobileNetV2Config(), "mobilenet_v2-b0353104.pth"),
+        (DeepLabConfig(), "deeplabv3_mobilenetv2_pascal.safetensors"),
+        (EspNetConfig(), "espnetv2_s_2.0_pascal_384x384.pth"),
+    ],
+)
+def test_missing_weights_name_file_folder_and_flag(config: EncoderConfig, file: str, home: Path) -> None:
+    with pytest.raises(WeightsError) as raised:
+        config.build()
+    for part in (file, str(home / ".cache/fprf/weights"), "--semantic.encoder.weights FILE"):
+        assert part in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("folder", [".cache/fprf/weights", ".cache/torch/hub/checkpoints"])
+def test_both_caches_are_searched(folder: str, home: Path, tmp_path: Path) -> None:
+    (home / folder).mkdir(parents=True)
+    file = deeplab_file(tmp_path)
+    shutil.copy(file, home / folder / DEEPLAB.file)
+    assert find_weights(DEEPLAB, None) == home / folder / DEEPLAB.file
+    assert DeepLabConfig().build().identity == DeepLabConfig(weights=file).build().identity
+
+
+def test_a_named_file_is_taken_as_it_is(tmp_path: Path) -> None:
+    assert find_weights(DEEPLAB, tmp_path / "any") == tmp_path / "any"
+
+
+def test_the_hash_in_a_name_is_a_promise(home: Path) -> None:
+    cache = home / ".cache/fprf/weights"
+    cache.mkdir(parents=True)
+    torch.save(mobilenet_tensors(folded=False), cache / "mobilenet_v2-b0353104.pth")
+    with pytest.raises(WeightsError, match="promises b0353104; delete it and fetch https"):
+        MobileNetV2Config().build()
+
+
+def test_pinned_files_alone_are_downloaded() -> None:
+    pinned = torchvision_file("Net", "net-0123abcd.pth", "--flag")
+    assert pinned.pinned and pinned.origin == "https://download.pytorch.org/models/net-0123abcd.pth"
+    with pytest.raises(WeightsError, match=r"Net's weights.*no network.*SHA-256 begins with 0123abcd.*--flag FILE"):
+        find_weights(pinned, None)
+    with pytest.raises(WeightsError, match=r"Net: net.pth is not in .*fprf/weights nor in .*torch.*\(somewhere\)"):
+        find_weights(WeightSource("Net", "net.pth", "somewhere", "--flag"), None)
+
+
+def test_metadata_of_safetensors_alone(tmp_path: Path) -> None:
+    save_file({"a": torch.ones(1)}, tmp_path / "a.safetensors", {"mean": "[1,2,3]"})
+    torch.save({"a": torch.ones(1).half(), "note": "text"}, tmp_path / "a.pth")
+    assert read_tensors(tmp_path / "a.safetensors", DEEPLAB)[1] == {"mean": "[1,2,3]"}
+    tensors, metadata = read_tensors(tmp_path / "a.pth", DEEPLAB)
+    assert metadata == {} and list(tensors) == ["a"] and tensors["a"].dtype == torch.float32
+
+
+def test_three_numbers(tmp_path: Path) -> None:
+    assert stated_triple({}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [1, 2, 3]
+    assert stated_triple({"mean": "[4,5,6]"}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [4, 5, 6]
+    for wrong in ("[1,2]", "1", "null", "grey", '["a","b","c"]'):
+        with pytest.raises(WeightsError, match="not three numbers"):
+            stated_triple({"mean": wrong}, "mean", (1.0, 2.0, 3.0), tmp_path)
