@@ -8,7 +8,7 @@ from pathlib import Path
 from ..checks import at_least, positive
 from ..plugins.encoders.config import BundledContentConfig, EncoderConfig
 
-__all__ = ["DistilConfig", "PretrainConfig", "PretrainDecoderConfig"]
+__all__ = ["DistilConfig", "PretrainConfig", "PretrainDecoderConfig", "SemanticDistilConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +31,8 @@ class PretrainConfig:
     """Learning rate at its height."""
     seed: int = 0
     """Every draw is a function of it."""
+    samples: float = 60.0
+    """Seconds between sample pictures, in a folder beside the output; 0 = none."""
 
     def __post_init__(self) -> None:
         if self.photos is not None:
@@ -41,6 +43,7 @@ class PretrainConfig:
         at_least("batch", self.batch, 1)
         positive("rate", self.rate)
         at_least("seed", self.seed, 0)
+        at_least("samples", self.samples, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +68,30 @@ class DistilConfig(PretrainConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SemanticDistilConfig(DistilConfig):
+    """The semantic encoder: whole photographs count here, and streets that differ in their light alone."""
+
+    minutes: float = 40.0
+    """Training time, preparation not included; the learning rate falls to zero at its end."""
+    batch: int = 6
+    """Views per step."""
+    rate: float = 3e-3
+    """Learning rate at its height."""
+    crops: int = 1
+    """Crops per photograph, prepared once."""
+    size: int = 320
+    """Pixels of a crop's side."""
+    towns: int = 10
+    """Streets that are rendered for it, each in every palette; 0 = photographs alone."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("towns", self.towns, 0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class PretrainDecoderConfig(PretrainConfig):
-    """D_VGG of the paper for one encoder, trained for identity."""
+    """D_VGG of the paper for one encoder: identity and, where asked for, the paper's content and style losses."""
 
     encoder: EncoderConfig = BundledContentConfig()
     """The encoder whose features are to be decoded."""
@@ -78,9 +103,33 @@ class PretrainDecoderConfig(PretrainConfig):
     """Pixels per photograph, prepared once."""
     noise: float = 0.02
     """Gaussian noise on the features, in units of their standard deviation: makes the decoder smooth."""
+    style: float = 0.0
+    """Weight of the style loss (paper, lambda_s) on AdaIN between photographs, beside the identity's squared error:
+    distance of VGG-19's means and deviations at relu1_1, relu2_1, relu3_1, relu4_1 (relu3_4 where the weights end before).
+    0 = not computed."""
+    content: float = 0.0
+    """Weight of the content loss (paper) on the same pictures, at relu2_1; 0 = not computed."""
+    style_weights: Path | None = None
+    """VGG-19's weights for both losses. With a file the report measures them even where they do not count; none = the
+    download that the encoder `vgg19` uses."""
+    crops: int = 64
+    """Photographs whose crops are restyled by one another; memory grows with them."""
+    size: int = 96
+    """Pixels of such a crop's side."""
+    pairs: int = 2
+    """Pairs of crops at a time."""
+    every: int = 4
+    """Pairs are restyled in one step of so many, drawn by the seed, and then weigh as many times more: steps without them
+    take a fraction of the time."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least("hidden", self.hidden, 1)
         at_least("pixels", self.pixels, 1)
         at_least("noise", self.noise, 0.0)
+        at_least("style", self.style, 0.0)
+        at_least("content", self.content, 0.0)
+        at_least("crops", self.crops, 2)
+        at_least("size", self.size, 16)
+        at_least("pairs", self.pairs, 1)
+        at_least("every", self.every, 1)

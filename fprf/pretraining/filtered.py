@@ -9,7 +9,7 @@ from ..datamanagers.config import GuidedConfig
 from ..interfaces import Encoder
 from ..ops.guided import apply, coefficients, upsample
 
-__all__ = ["filtered_at", "filtered_whole", "random_pixels"]
+__all__ = ["filtered_at", "filtered_crop", "filtered_whole", "random_pixels"]
 
 
 def random_pixels(photo: Annotated[Tensor, "H W 3"], count: int, generator: torch.Generator) -> Annotated[Tensor, "N 2"]:
@@ -29,6 +29,16 @@ def filtered_at(
     coefs = coefficients(features, photo, radius=_radius(photo, guided), eps=guided.eps, stride=guided.stride)
     rgb = photo[pixels[:, 0], pixels[:, 1]]
     return apply(coefs, pixels.flip(1) + 0.5, rgb, (height, width)), rgb
+
+
+@torch.no_grad()
+def filtered_crop(
+    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], side: int, guided: GuidedConfig, generator: torch.Generator
+) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
+    """Features and colours of a random square of the photograph, row by row; the whole of it was encoded."""
+    top, left = (int(torch.randint(0, size - side + 1, (), generator=generator)) for size in photo.shape[:2])
+    rows, columns = torch.meshgrid(top + torch.arange(side), left + torch.arange(side), indexing="ij")
+    return filtered_at(encoder, photo, torch.stack([rows.flatten(), columns.flatten()], 1), guided)
 
 
 @torch.no_grad()

@@ -7,14 +7,17 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
 
+from ..output.images import to_uint8, write_image
 from ..plugins.weightfiles import read_weights, write_weights
 from .config import PretrainConfig
+from .report import samples_folder
 
 __all__ = ["checkpoint_path", "generator_of", "train"]
 
@@ -46,14 +49,26 @@ def checkpoint_path(output: Path) -> Path:
     return output.with_name(output.name + ".checkpoint")
 
 
-def train(network: nn.Module, loss: Callable[[torch.Generator], Tensor], config: PretrainConfig, output: Path, say: Say) -> int:
-    """Train in place until the budget is spent; the number of steps. `loss` draws its batch from the generator."""
+def train(
+    network: nn.Module,
+    loss: Callable[[torch.Generator], Tensor],
+    config: PretrainConfig,
+    output: Path,
+    say: Say,
+    picture: Callable[[], Annotated[Tensor, "H W 3"]] | None = None,
+) -> int:
+    """Train in place until the budget is spent; the number of steps. `loss` draws its batch from the generator.
+
+    `picture` shows what the network can do, in [0, 1]: it is written to `samples_folder` every `config.samples` seconds and
+    at the end.
+    """
     optimizer = torch.optim.Adam(network.parameters(), config.rate)
     progress = _resume(network, optimizer, config, output)
     if progress.step:
         say(f"resumed at step {progress.step}")
     network.train()
     started, saved, spoken = time.monotonic() - progress.seconds, time.monotonic(), 0.0
+    shown = saved
     while (done := progress.done(config)) < 1:
         optimizer.param_groups[0]["lr"] = config.rate * min(1.0, done / WARM_UP + 0.01) * 0.5 * (1 + math.cos(math.pi * done))
         value = loss(generator_of(config.seed, progress.step))
@@ -69,13 +84,23 @@ def train(network: nn.Module, loss: Callable[[torch.Generator], Tensor], config:
         if now - saved > EVERY_SECONDS:
             _save(network, optimizer, config, output, progress)
             saved = now
+        if picture is not None and config.samples > 0 and now - shown > config.samples and progress.done(config) < 1:
+            _show(picture, output, progress.step)
+            shown = now
     network.eval()
+    if picture is not None and config.samples > 0:
+        _show(picture, output, progress.step)
     checkpoint_path(output).unlink(missing_ok=True)
     return progress.step
 
 
+@torch.no_grad()
+def _show(picture: Callable[[], Tensor], output: Path, step: int) -> None:
+    write_image(samples_folder(output) / f"step-{step:07d}.png", to_uint8(picture()))
+
+
 def _key(config: PretrainConfig) -> str:
-    return repr(config)
+    return repr(replace(config, samples=0.0))
 
 
 def _save(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path, progress: _Progress) -> None:

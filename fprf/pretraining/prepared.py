@@ -1,6 +1,7 @@
 """Crops and targets that are made once: kept beside the output until the run is finished, so that resuming is quick."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -32,4 +33,5 @@ def prepared(make: Callable[[], Pair], config: DistilConfig, output: Path) -> Pa
 
 def _key(config: DistilConfig) -> str:
     """What the crops depend on: a run may be made longer without preparing them again."""
-    return repr((config.images, config.photos, config.teachers, config.crops, config.size, config.seed))
+    free = replace(config, output=None, minutes=1.0, steps=None, batch=1, rate=1.0, samples=0.0)
+    return repr(free)

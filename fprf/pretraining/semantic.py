@@ -1,4 +1,4 @@
-"""Distils the semantic encoder: one small network learns the principal components of two large ones, in any light.
+"""Distils the semantic encoder: one small network learns what several large ones say together, in any light.
 
 The student sees a photograph in a random light, the teachers saw it as it is: so day and night agree.
 """
@@ -16,81 +16,91 @@ from ..interfaces import Encoder
 from ..plugins.encoders.bundled import SEMANTIC_KIND, load_semantic_encoder
 from ..plugins.encoders.students import SemanticStudent
 from ..plugins.weightfiles import write_weights
-from .basis import Basis, fit_basis
-from .config import DistilConfig
+from .config import SemanticDistilConfig
+from .ensemble import COMPONENTS, Ensemble, semantic_ensemble, taught
 from .loop import generator_of, train
 from .photos import crop, find_photos, load_photo, split
 from .prepared import prepared, prepared_path
-from .teachers import MobileNetTeacher, load_teacher
+from .teachers import load_teacher
 from .toning import nightfall, toned
+from .towns import render_streets, street_targets
 
-__all__ = ["pretrain_semantic", "semantic_bases", "semantic_report", "view"]
+__all__ = ["pretrain_semantic", "relations", "semantic_report", "view"]
 
-COMPONENTS = 24
-"""Principal components kept of each teacher."""
-BASIS_CROPS = 200
-SCALES = (1.0, 1.8)
+BASIS_CROPS = 100
+SCALES = (1.0, 1.5)
 """Photographs to learn from are small: scene images show the same things larger."""
-TEACHER_SCALE = 1.25
-"""Teachers see the crop enlarged, which makes their stride of 16 finer."""
 STRIDE = 8
-WINDOW = 0.75
-"""Share of a crop's side that the student sees at a time."""
+WINDOW = (0.5, 0.95)
+"""Share of a crop's side that the student sees at a time; it sees all of them at one size."""
+SEEN = 0.6
+"""That size, as a share of the crop's side."""
+RELATED = 512
+"""Cells of a batch that are compared with each other."""
+RELATIONS = 2.0
+"""Weight of that comparison."""
 Report = dict[str, float | int | str]
-Teachers = Sequence[tuple[MobileNetTeacher, Basis]]
 
 
-def pretrain_semantic(config: DistilConfig, output: Path, say: Callable[[str], None]) -> Report:
+def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[[str], None]) -> Report:
     """Train, write `output`, and measure it on held-out photographs."""
     if not config.teachers:
         raise UsageError("--teachers: none; `semantic` takes the weights of MobileNetV2, of DeepLab's backbone, or both")
     if config.size % STRIDE:
         raise UsageError(f"--size: {config.size}; `semantic` takes multiples of {STRIDE}, its stride")
-    names = [load_teacher(path) for path in config.teachers]
+    teachers = [load_teacher(path) for path in config.teachers]
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
-    teachers = semantic_bases(names, photos[:BASIS_CROPS], config)
-    kept = ", ".join(f"{100 * basis.kept:.1f} %" for _, basis in teachers)
+    samples = [
+        crop(load_photo(p), config.size, SCALES, generator_of(config.seed + 2, i)) for i, p in enumerate(photos[:BASIS_CROPS])
+    ]
+    ensemble = semantic_ensemble(teachers, samples, STRIDE)
+    kept = ", ".join(f"{100 * basis.kept:.1f} %" for _, basis in ensemble)
     say(f"{COMPONENTS} components of each teacher keep {kept} of its energy")
-    images, targets = prepared(lambda: _crops(teachers, photos, config, config.seed + 1), config, output)
+    images, targets = prepared(lambda: _examples(ensemble, photos, config), config, output)
     say(f"{len(images)} crops prepared")
 
     torch.manual_seed(config.seed)
-    student = SemanticStudent(sum(len(basis.axes) for _, basis in teachers))
+    student = SemanticStudent(sum(len(basis.axes) for _, basis in ensemble))
 
     def loss(generator: torch.Generator) -> Tensor:
         index = torch.randint(0, len(images), (config.batch,), generator=generator).tolist()
         views = [view(images[i], targets[i], generator) for i in index]
         found, wanted = student(torch.stack([seen for seen, _ in views])), torch.stack([right for _, right in views])
-        return F.mse_loss(found, wanted) + (1 - F.cosine_similarity(found, wanted, dim=1).mean())
+        own = F.mse_loss(found, wanted) + (1 - F.cosine_similarity(found, wanted, dim=1).mean())
+        return own + RELATIONS * relations(found, wanted, RELATED, generator)
 
     steps = train(student, loss, config, output, say)
     metadata = {
         "kind": SEMANTIC_KIND,
-        "imitates": f"{COMPONENTS} principal components each of {', '.join(teacher.name for teacher in names)}",
-        "made_by": f"fprf pretrain semantic, {steps} steps on {len(photos)} photographs, seed {config.seed}",
+        "imitates": f"{COMPONENTS} principal components each of {', '.join(teacher.name for teacher in teachers)}",
+        "made_by": f"fprf pretrain semantic, {steps} steps on {len(photos)} photographs and {config.towns} rendered streets, "
+        f"seed {config.seed}",
         "licence": "Apache-2.0; trained by this project, holds no weights of its teachers",
     }
     write_weights(output, {name: _stored(value) for name, value in student.state_dict().items()}, metadata)
-    report = semantic_report(load_semantic_encoder(output), teachers, held, config)
+    report = semantic_report(load_semantic_encoder(output), ensemble, held, config)
     prepared_path(output).unlink(missing_ok=True)
     return {"steps": steps, **report}
 
 
-def semantic_bases(names: Sequence[MobileNetTeacher], photos: Sequence[Path], config: DistilConfig) -> Teachers:
-    """The principal components of each teacher; each is scaled to unit variance per channel, so that both weigh the same."""
-    samples: list[list[Tensor]] = [[] for _ in names]
-    for index, path in enumerate(photos):
-        image = crop(load_photo(path), config.size, SCALES, generator_of(config.seed + 2, index))[None]
-        for place, teacher in enumerate(names):
-            samples[place].append(_seen(teacher, image).flatten(2)[0].T)
-    return [(teacher, fit_basis(torch.cat(found), (COMPONENTS,), 1.0)) for teacher, found in zip(names, samples, strict=True)]
+def relations(
+    found: Annotated[Tensor, "B C h w"], wanted: Annotated[Tensor, "B C h w"], cells: int, generator: torch.Generator
+) -> Annotated[Tensor, ""]:
+    """Mean square difference of the cosines between `cells` random cells of a batch: what matching goes by.
+
+    Each side is centred on its own mean, as the matching of scenes and references is.
+    """
+    index = torch.randint(0, found[:, 0].numel(), (cells,), generator=generator)
+    sides = [side.permute(0, 2, 3, 1).flatten(0, 2)[index] for side in (found, wanted)]
+    unit = [F.normalize(side - side.mean(0), dim=1) for side in sides]
+    return F.mse_loss(unit[0] @ unit[0].T, unit[1] @ unit[1].T)
 
 
 @torch.no_grad()
-def semantic_report(student: Encoder, teachers: Teachers, photos: Sequence[Path], config: DistilConfig) -> Report:
+def semantic_report(student: Encoder, ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig) -> Report:
     """Agreement with the teachers on held-out crops, and of each crop with itself at night; mean cosines."""
-    images, wanted = _crops(teachers, photos, config, config.seed + 3)
+    images, wanted = _crops(ensemble, photos, config, config.seed + 3)
     generator = generator_of(config.seed + 4, 0)
     cosines, nights, error, energy = 0.0, 0.0, 0.0, 0.0
     for image, target in zip(images, wanted.float(), strict=True):
@@ -112,38 +122,48 @@ def semantic_report(student: Encoder, teachers: Teachers, photos: Sequence[Path]
 def view(
     image: Annotated[Tensor, "3 s s"], target: Annotated[Tensor, "C t t"], generator: torch.Generator
 ) -> tuple[Annotated[Tensor, "3 v v"], Annotated[Tensor, "C u u"]]:
-    """A random part of a crop in a random light, mirrored half the time, and what the teachers said of it."""
+    """A random part of a crop in a random light, mirrored half the time, and what the teachers said of it.
+
+    Parts differ in size and are shown at one: near and far must look alike.
+    """
     cells = target.shape[-1]
-    side = max(1, round(WINDOW * cells))
+    least, most = (max(1, round(share * cells)) for share in WINDOW)
+    side = int(torch.randint(least, most + 1, (), generator=generator))
     top, left = torch.randint(0, cells - side + 1, (2,), generator=generator).tolist()
     right = target[:, top : top + side, left : left + side].float()
     rows, columns = (slice(STRIDE * first, STRIDE * (first + side)) for first in (top, left))
     seen = toned(image[:, rows, columns].float() / 255, generator)
+    shown = max(1, round(SEEN * cells))
+    seen = F.interpolate(seen[None], (STRIDE * shown,) * 2, mode="bilinear", align_corners=False, antialias=shown < side)[0]
+    right = F.interpolate(right[None], (shown, shown), mode="bilinear", align_corners=False, antialias=shown < side)[0]
     if torch.rand(1, generator=generator) < 0.5:
         return seen.flip(-1), right.flip(-1)
     return seen, right
 
 
-def _seen(teacher: MobileNetTeacher, images: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B F h w"]:
-    size = [round(n * TEACHER_SCALE) for n in images.shape[-2:]]
-    return teacher(F.interpolate(images, size, mode="bilinear", align_corners=False))
+def _examples(ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig) -> tuple[Tensor, Tensor]:
+    """Crops of photographs, then streets: every palette of a view with the same target."""
+    images, targets = _crops(ensemble, photos, config, config.seed + 1)
+    if config.towns == 0:
+        return images, targets
+    streets = render_streets(config.towns, config.size, STRIDE)
+    palettes = streets.images.shape[1]
+    said = street_targets(ensemble, streets, STRIDE).half().repeat_interleave(palettes, 0)
+    return torch.cat([images, streets.images.flatten(0, 1)]), torch.cat([targets, said])
 
 
 @torch.no_grad()
 def _crops(
-    teachers: Teachers, photos: Sequence[Path], config: DistilConfig, seed: int
+    ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig, seed: int
 ) -> tuple[Annotated[Tensor, "N 3 s s"], Annotated[Tensor, "N C t t"]]:
     """Crops as bytes and their targets in half precision."""
     images, targets = [], []
-    cells = -(-config.size // STRIDE)
     for index, path in enumerate(photos):
         generator, photo = generator_of(seed, index), load_photo(path)
         batch = torch.stack([crop(photo, config.size, SCALES, generator) for _ in range(config.crops)])
         batch = (batch * 255).round()
-        maps = [basis.project(_seen(teacher, batch / 255)) for teacher, basis in teachers]
-        maps = [F.interpolate(each, (cells, cells), mode="bilinear", align_corners=False) for each in maps]
         images.append(batch.byte())
-        targets.append(torch.cat(maps, dim=1).half())
+        targets.append(taught(ensemble, batch / 255, STRIDE).half())
     return torch.cat(images), torch.cat(targets)
 
 

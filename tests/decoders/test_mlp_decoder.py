@@ -8,13 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
-from fprf.commands.parsing import parse
 from fprf.errors import WeightsError
 from fprf.plugins.decoders.config import MlpDecoderConfig
-from fprf.plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder, pretrain_line
+from fprf.plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder
 from fprf.plugins.encoders.config import BundledContentConfig, Vgg19Config
 from fprf.plugins.weightfiles import write_weights
-from fprf.pretraining.config import PretrainDecoderConfig
 
 
 def file_of(path: Path, encoder: str, channels: int = 6, hidden: int = 4) -> Path:
@@ -46,42 +44,20 @@ def test_gradients_reach_the_features_but_not_the_weights(tmp_path: Path) -> Non
     assert not decoder.training
 
 
-def test_another_encoder_is_refused_with_the_line_that_helps(tmp_path: Path) -> None:
+def test_another_encoder_is_refused(tmp_path: Path) -> None:
     path = file_of(tmp_path / "d.safetensors", "vgg19:relu2_1:normalised:aaaa")
     with pytest.raises(WeightsError) as raised:
         load_decoder(path, encoder="vgg19:relu3_1:plain:bbbb", channels=6)
     text = str(raised.value)
     assert "vgg19:relu2_1:normalised:aaaa" in text
     assert "vgg19:relu3_1:plain:bbbb" in text
-    assert "fprf pretrain decoder --encoder vgg19 --encoder.layer relu3_1" in text
     with pytest.raises(WeightsError, match="6 channels"):
         load_decoder(path, encoder="vgg19:relu2_1:normalised:aaaa", channels=7)
 
 
 def test_no_shipped_decoder_names_those_that_ship() -> None:
-    with pytest.raises(WeightsError, match=r"bundled-content:.*--encoder dinov2 .*--content\.decoder\.weights FILE"):
+    with pytest.raises(WeightsError, match=r"encoder dinov2:.* those of .*bundled-content:"):
         MlpDecoderConfig().build(encoder="dinov2:dinov2-small:block12:stride8:0", channels=384)
-
-
-@pytest.mark.parametrize(
-    "identity",
-    [
-        "vgg19:relu3_1:plain:0",
-        "vgg19:relu2_1:normalised:0",
-        "bundled-content:0",
-        "random:7:stride3:seed2",
-        "dinov2:a:block3:stride8:0",
-    ],
-)
-def test_the_line_is_one_that_the_command_line_takes(identity: str) -> None:
-    words = pretrain_line(identity).split()
-    assert words[:3] == ["fprf", "pretrain", "decoder"]
-    config = parse(PretrainDecoderConfig(), words[3:], prog="fprf pretrain decoder", description="")
-    assert config.output == Path("decoder.safetensors")
-    if identity.startswith("vgg19:relu3_1"):
-        assert config.encoder == Vgg19Config(layer="relu3_1", normalise=False, weights=Path("FILE"))
-    if identity.startswith("random"):
-        assert config.encoder.build().identity == identity
 
 
 def test_the_bundled_encoder_has_its_decoder() -> None:

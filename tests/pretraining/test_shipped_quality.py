@@ -36,8 +36,8 @@ def test_the_content_encoder_follows_its_teacher(shared: Path, photos: tuple[lis
     teacher = Vgg19Config(weights=shared / "weights/vgg19_imagenet.safetensors").build()
     basis = content_basis(teacher, photos[0][:60], 0)
     report = content_report(BundledContentConfig().build(), teacher, basis, photos[1][:8])
-    assert float(report["relative_l2_filtered"]) < 0.15
-    assert float(report["relative_l2"]) < 0.25
+    assert float(report["relative_l2_filtered"]) < 0.10
+    assert float(report["relative_l2"]) < 0.20
 
 
 def test_day_and_night_agree_better_than_their_colours_do(photos: tuple[list[Path], list[Path]]) -> None:

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from ...checks import at_least, positive
 from ..config import PluginConfig
 
 if TYPE_CHECKING:
     from ...interfaces import Decoder
 
-__all__ = ["DecoderConfig", "MlpDecoderConfig"]
+__all__ = ["DecoderConfig", "MlpDecoderConfig", "ResidualDecoderConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +21,11 @@ class DecoderConfig(PluginConfig):
 
     group: ClassVar[str] = "fprf.decoders"
 
-    def build(self, *, encoder: str, channels: int) -> Decoder:
-        """The frozen decoder of that encoder (its `identity`). Raises WeightsError where none fits."""
+    def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
+        """The decoder of that encoder (its `identity`). What a scene adds starts from the seed; the rest comes frozen.
+
+        Raises WeightsError where none fits.
+        """
         raise NotImplementedError
 
 
@@ -32,8 +36,35 @@ class MlpDecoderConfig(DecoderConfig):
     weights: Path | None = None
     """A decoder made by `fprf pretrain decoder`. By default the one that ships for the chosen encoder."""
 
-    def build(self, *, encoder: str, channels: int) -> Decoder:
+    def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         """The decoder whose file names this encoder."""
         from .mlp import load_decoder
 
         return load_decoder(self.weights, encoder=encoder, channels=channels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResidualDecoderConfig(DecoderConfig):
+    """The frozen decoder and a small colour head that every scene trains for itself; a style fades the head out."""
+
+    weights: Path | None = None
+    """A decoder made by `fprf pretrain decoder`. By default the one that ships for the chosen encoder."""
+    hidden: int = 32
+    """Hidden units of the head."""
+    fade: float = 0.5
+    """Change of the decoded colour, in logits, at which a full style leaves 1/e of the head's share."""
+
+    def __post_init__(self) -> None:
+        at_least("hidden", self.hidden, 1)
+        positive("fade", self.fade)
+
+    def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
+        """The decoder whose file names this encoder, with a head that changes nothing yet."""
+        import torch
+
+        from .mlp import load_decoder
+        from .residual import ResidualDecoder
+
+        frozen = load_decoder(self.weights, encoder=encoder, channels=channels)
+        generator = torch.Generator().manual_seed(seed)
+        return ResidualDecoder(frozen, hidden=self.hidden, fade=self.fade, generator=generator)

@@ -8,9 +8,10 @@ from torch import Tensor, nn
 
 from ...errors import WeightsError
 from ...interfaces import Decoder
+from ...ops import dense
 from ..weightfiles import read_weights
 
-__all__ = ["DECODER_KIND", "MlpDecoder", "load_decoder", "pretrain_line"]
+__all__ = ["DECODER_KIND", "MlpDecoder", "load_decoder"]
 
 DECODER_KIND = "mlp-decoder"
 FOLDER = Path(__file__).parent / "weights"
@@ -27,7 +28,29 @@ class MlpDecoder(Decoder):
 
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         """sRGB in [0, 1]."""
-        return torch.sigmoid(self.second(torch.relu(self.first(content))))
+        maps = (self.first, self.second)
+        return torch.sigmoid(dense.network(content, [m.weight for m in maps], [m.bias for m in maps]))
+
+    def hidden(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N H"]:
+        """The hidden units: of about unit scale for features like those it was trained on."""
+        return dense.network(content, [self.first.weight], [self.first.bias], last="relu")
+
+    def logit(self, hidden: Annotated[Tensor, "N H"]) -> Annotated[Tensor, "N 3"]:
+        """The colour that hidden units give, before its sigmoid."""
+        return dense.network(hidden, [self.second.weight], [self.second.bias])
+
+    def restyled(
+        self,
+        content: Annotated[Tensor, "N C"],
+        styled: Annotated[Tensor, "N C"],
+        strength: float | Annotated[Tensor, "N 1"],
+    ) -> Annotated[Tensor, "N 3"]:
+        """The decoded style: there is nothing of the scene's own to be kept."""
+        colour: Tensor = self(styled)
+        return colour
+
+    def unaided(self, content: Annotated[Tensor, "N C"]) -> None:
+        """None: it has no parameters of a scene."""
 
 
 def load_decoder(path: Path | None, *, encoder: str, channels: int) -> MlpDecoder:
@@ -44,28 +67,8 @@ def load_decoder(path: Path | None, *, encoder: str, channels: int) -> MlpDecode
             return _loaded(file, tensors, metadata, encoder=encoder, channels=channels)
         shipped[file.stem] = metadata["encoder"]
     raise WeightsError(
-        f"no decoder ships for the encoder {encoder} (there are: {', '.join(shipped.values()) or 'none'}); make one with "
-        f"`{pretrain_line(encoder)}` and name it with --content.decoder.weights FILE"
+        f"no decoder ships for the encoder {encoder}; there are those of {', '.join(shipped.values()) or 'none'}"
     )
-
-
-def pretrain_line(encoder: str, output: str = "decoder.safetensors") -> str:
-    """The command that makes the decoder of an encoder, as far as its identity tells the settings."""
-    name, *settings = encoder.split(":")
-    flags = f"--encoder {name}"
-    if name == "vgg19":
-        layer, kind = settings[:2]
-        flags += f" --encoder.layer {layer}" + (" --encoder.no-normalise" if kind == "plain" else "")
-        flags += " --encoder.weights FILE"
-    elif name == "random":
-        channels, stride, seed = settings
-        flags += f" --encoder.channels {channels}"
-        flags += f" --encoder.stride {stride.removeprefix('stride')} --encoder.seed {seed.removeprefix('seed')}"
-    elif name in ("dino", "dinov2"):
-        model, block, stride = settings[:3]
-        flags += f" --encoder.model {model} --encoder.layer {block.removeprefix('block')}"
-        flags += f" --encoder.stride {stride.removeprefix('stride')}"
-    return f"fprf pretrain decoder {flags} --images DIR --output {output}"
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -80,7 +83,7 @@ def _loaded(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *,
     if metadata["encoder"] != encoder or inputs != channels:
         raise WeightsError(
             f"{path}: decodes {inputs} channels of {metadata['encoder']}, but the encoder is {encoder} with {channels}; "
-            f"choose that encoder, or make the right decoder with `{pretrain_line(encoder)}`"
+            "choose that encoder, or the decoder of this one"
         )
     decoder = MlpDecoder(int(inputs), int(hidden))
     decoder.load_state_dict(tensors)

@@ -1,0 +1,89 @@
+"""A pair that does not fit is refused with the line that makes the right decoder: one that the command line takes."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from tiny_world import World
+
+from fprf.commands.parsing import parse
+from fprf.config import TrainConfig
+from fprf.engine.decoder import build_decoder
+from fprf.engine.prepare import prepare
+from fprf.errors import WeightsError
+from fprf.methods import fprf_lite
+from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
+from fprf.plugins.decoders.mlp import DECODER_KIND, MlpDecoder
+from fprf.plugins.decoders.remedy import pretrain_line
+from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, EncoderConfig, RandomConfig, Vgg19Config
+from fprf.plugins.typed_json import Missing
+from fprf.plugins.weightfiles import write_weights
+from fprf.pretraining.config import PretrainDecoderConfig
+
+ENCODERS = [
+    BundledContentConfig(),
+    BundledContentConfig(weights=Path("own content.safetensors")),
+    Vgg19Config(layer="relu3_1", weights=Path("/a folder/vgg's.safetensors"), normalise=False),
+    RandomConfig(channels=7, stride=3, seed=2),
+    Dinov2Config(model="somebody/vits14-$x", layer=3, stride=4),
+]
+
+
+def with_encoder(encoder: EncoderConfig, decoder: DecoderConfig) -> TrainConfig:
+    lite = fprf_lite()
+    return replace(lite, content=replace(lite.content, encoder=encoder, decoder=decoder))
+
+
+@pytest.mark.parametrize("encoder", ENCODERS, ids=lambda each: type(each).__name__)
+def test_the_line_is_one_that_the_command_line_takes(encoder: EncoderConfig) -> None:
+    words = shlex.split(pretrain_line(encoder, Path("my own.safetensors")))
+    assert words[:3] == ["fprf", "pretrain", "decoder"]
+    found = parse(PretrainDecoderConfig(), words[3:], prog="fprf pretrain decoder", description="")
+    assert found == replace(PretrainDecoderConfig(), encoder=encoder, images=(Path("DIR"),), output=Path("my own.safetensors"))
+
+
+def test_defaults_are_left_out() -> None:
+    expected = "fprf pretrain decoder --encoder random --images DIR --output decoder.safetensors"
+    assert pretrain_line(RandomConfig()) == expected
+
+
+def test_encoders_within_encoders() -> None:
+    composed = pytest.importorskip("fprf.plugins.encoders.composed_config")
+    inner = Vgg19Config(layer="relu1_2", weights=Path("w"))
+    encoder = composed.ConcatConfig(first=inner, third=composed.AveragedConfig(flip=False), weights=(1.0, 0.5))
+    words = shlex.split(pretrain_line(encoder))
+    found = parse(PretrainDecoderConfig(), words[3:], prog="fprf pretrain decoder", description="")
+    assert found.encoder == encoder
+
+
+def test_an_encoder_that_is_not_installed_is_still_named() -> None:
+    missing = Missing(
+        slot="content.encoder", kind="fprf.encoders", name="foreign", data='{"depth": 3, "inner": {"type": "x"}}',
+        package="foreign 1.0", reason="absent",
+    )  # fmt: skip
+    assert "--encoder foreign --encoder.depth 3 --images" in pretrain_line(missing)
+
+
+@pytest.mark.parametrize("decoder", [MlpDecoderConfig(), ResidualDecoderConfig()])
+def test_an_encoder_without_a_decoder_is_refused_before_its_features_are_made(decoder: DecoderConfig, world: World) -> None:
+    config = replace(with_encoder(RandomConfig(channels=5), decoder), data=world.town)
+
+    def never(done: int, total: int, what: str) -> None:
+        raise AssertionError(f"{what} must not be computed")
+
+    with pytest.raises(WeightsError) as raised:
+        prepare(config, never)
+    text = str(raised.value)
+    assert "no decoder ships for the encoder random:5:" in text
+    assert f"`{pretrain_line(RandomConfig(channels=5))}` makes its decoder" in text
+    assert "\n" not in text
+
+
+def test_a_decoder_of_another_encoder_is_refused_with_the_line(tmp_path: Path) -> None:
+    file = tmp_path / "d.safetensors"
+    write_weights(file, MlpDecoder(5, 4).state_dict(), {"kind": DECODER_KIND, "encoder": "random:5:stride4:seed9"})
+    encoder = RandomConfig(channels=5)
+    config = with_encoder(encoder, MlpDecoderConfig(weights=file))
+    with pytest.raises(WeightsError, match=r"random:5:stride4:seed9.*--encoder random --encoder\.channels 5"):
+        build_decoder(config, encoder=encoder.build().identity, channels=5)

@@ -1,0 +1,296 @@
+"""The colour head of a scene: nothing at first, trained with the scene, and gone where a style changes the colour."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_world import World, parameters, rays_of, trained_for
+
+from fprf.config import TrainConfig
+from fprf.engine.loading import Trained, load_run
+from fprf.engine.losses import terms, total
+from fprf.engine.model import build_model
+from fprf.engine.style_pass import measure_style
+from fprf.engine.views import render_view
+from fprf.errors import ConfigError
+from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
+from fprf.plugins.decoders.mlp import MlpDecoder
+from fprf.plugins.decoders.residual import ResidualDecoder, residual_share
+from fprf.plugins.encoders.config import BundledContentConfig
+from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
+from fprf.rendering.renderer import Parts, Restyle, render_rays
+from fprf.style.scene import own_style
+from fprf.testing import check_decoder
+from fprf.types import Batch, Rendered, Sampled, Want
+
+C = 6
+
+
+def decoder_of(fade: float = 0.5, trained: bool = True) -> ResidualDecoder:
+    draw = torch.Generator().manual_seed(3)
+    frozen = MlpDecoder(C, 9).requires_grad_(False)
+    made = ResidualDecoder(frozen, hidden=7, fade=fade, generator=draw)
+    if trained:
+        with torch.no_grad():
+            made.head.second.normal_(std=2.5, generator=draw)
+    return made
+
+
+def residual_config(world: World, **knobs: float) -> TrainConfig:
+    decoder = ResidualDecoderConfig(**knobs)  # type: ignore[arg-type]
+    return replace(world.config, content=replace(world.config.content, decoder=decoder))
+
+
+def exaggerated(trained: Trained) -> Trained:
+    """A head that shows: a few steps hardly move it."""
+    decoder = trained.model.decoder
+    assert isinstance(decoder, ResidualDecoder)
+    with torch.no_grad():
+        decoder.head.second.normal_(std=2.0, generator=torch.Generator().manual_seed(0))
+    return trained
+
+
+@pytest.fixture(scope="module")
+def _runs() -> dict[str, Path]:
+    return {}
+
+
+@pytest.fixture
+def trained(world: World, tmp_path_factory: pytest.TempPathFactory, _runs: dict[str, Path]) -> Trained:
+    if "run" not in _runs:
+        config, folder = residual_config(world), tmp_path_factory.mktemp("residual") / "run"
+        run = trained_for(world, folder, config)
+        run.save_config(replace(config, output=None), "fprf-lite")
+        run.save_known(world.prepared.scene, world.town, world.prepared.facts)
+        _runs["run"] = folder
+    return load_run(_runs["run"], "cpu")
+
+
+def test_it_keeps_the_contract() -> None:
+    encoder = BundledContentConfig().build()
+    check_decoder(ResidualDecoderConfig(), encoder=encoder.identity, channels=encoder.channels)
+    check_decoder(MlpDecoderConfig(), encoder=encoder.identity, channels=encoder.channels)
+
+
+def test_a_new_head_changes_nothing_and_is_all_that_learns() -> None:
+    made, content = decoder_of(trained=False), torch.randn(50, C)
+    assert torch.equal(made(content), made.frozen(content))
+    assert {name.partition(".")[0] for name, p in made.named_parameters() if p.requires_grad} == {"head"}
+    made(content).square().sum().backward()  # type: ignore[no-untyped-call]
+    assert made.head.second.grad is not None and float(made.head.second.grad.abs().sum()) > 0
+
+
+def test_a_head_learns_at_the_rate_of_the_planes_without_saturating() -> None:
+    """Wide, at once and from random colours, as a field gives them at first: plain weights ran off and died there."""
+    torch.manual_seed(0)
+    made = ResidualDecoder(
+        MlpDecoder(32, 128).requires_grad_(False), hidden=32, fade=0.5, generator=torch.Generator().manual_seed(0)
+    )
+    optimizer = torch.optim.Adam([p for p in made.parameters() if p.requires_grad], 1e-2, betas=(0.9, 0.99), eps=1e-12)
+    losses, moves = [], []
+    for _ in range(80):
+        content = torch.randn(256, 32)
+        target = torch.sigmoid(3 * content[:, :3])
+        before = made.head(made.frozen.hidden(content)).detach()
+        loss = (made(content) - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        losses.append(float(loss.detach()))
+        moves.append(float((made.head(made.frozen.hidden(content)).detach() - before).abs().max()))
+    assert max(moves) < 0.3
+    assert max(losses) < 1.1 * losses[0]
+    assert losses[-1] < 0.7 * losses[0]
+
+
+@settings(max_examples=25, deadline=None)
+@given(strength=st.floats(0, 1), fade=st.floats(0.05, 5), shift=st.floats(0, 3), seed=st.integers(0, 99))
+def test_the_formula_in_float64(strength: float, fade: float, shift: float, seed: int) -> None:
+    made = decoder_of(fade)
+    draw = torch.Generator().manual_seed(seed)
+    content = torch.randn(8, C, generator=draw)
+    styled = content + shift * torch.randn(8, C, generator=draw)
+    found = made.restyled(content, styled, strength)
+    exact = decoder_of(fade).double()
+    exact.load_state_dict(made.state_dict())
+
+    def logit(features: torch.Tensor) -> torch.Tensor:
+        return exact.frozen.second(torch.relu(exact.frozen.first(features.double())))
+
+    change = (logit(styled) - logit(content)).square().mean(1, keepdim=True)
+    share = (1 - strength) + strength * torch.exp(-change / fade**2)
+    inner = torch.relu(torch.relu(exact.frozen.first(content.double())) @ exact.head.first.T / 3 + exact.head.first_bias)
+    residual = inner @ exact.head.second.T / 7**0.5 + exact.head.second_bias
+    # Rounding of a change grows with 1 / fade^2 in the exponent.
+    expected = torch.sigmoid(logit(styled) + share * residual)
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5 / min(fade, 1.0))
+
+
+@settings(max_examples=30, deadline=None)
+@given(strength=st.floats(0, 1), fade=st.floats(0.05, 5), change=st.floats(0, 10))
+def test_the_share_falls_with_the_change_and_with_the_strength(strength: float, fade: float, change: float) -> None:
+    changes = torch.tensor([[0.0], [change], [change + 1]]).expand(3, 3)
+    share = residual_share(changes, strength, fade)[:, 0].tolist()
+    assert share[0] == 1
+    assert 1 >= share[1] >= share[2] >= 1 - strength - 1e-6
+    assert residual_share(changes, 0.0, fade).tolist() == [[1.0]] * 3
+    at_fade = residual_share(torch.full((1, 3), fade), 1.0, fade)
+    assert float(at_fade) == pytest.approx(1 / math.e, rel=1e-5)
+
+
+def test_strengths_may_differ_from_point_to_point() -> None:
+    made, content, styled = decoder_of(), torch.randn(5, C), torch.randn(5, C)
+    strength = torch.tensor([[0.0], [0.25], [0.5], [0.75], [1.0]])
+    found = made.restyled(content, styled, strength)
+    for i, each in enumerate(strength[:, 0].tolist()):
+        torch.testing.assert_close(found[i : i + 1], made.restyled(content[i : i + 1], styled[i : i + 1], each))
+
+
+@torch.no_grad()
+def test_saturated_colours_of_the_scene_do_not_leak() -> None:
+    """A head that turns a grey scene green: a full style that changes the colour shows the style's colour alone."""
+    made, content = decoder_of(), torch.zeros(1, C)
+    made.head.second.zero_()
+    made.head.second_bias.copy_(torch.tensor([-3.0, 3.0, -3.0]))
+    styled = content.clone()
+    while (made.frozen(styled) - made.frozen(content)).abs().max() < 0.3:
+        styled += 0.5
+    own = float((made(content) - made.frozen(content)).abs().max())
+    leak = float((made.restyled(content, styled, 1.0) - made.frozen(styled)).abs().max())
+    assert leak < 0.05 * own
+    assert own > 0.3
+
+
+def test_the_start_of_the_head_is_a_function_of_the_seed(world: World) -> None:
+    config, facts = residual_config(world), world.prepared.facts
+    first, again = (build_model(config, facts).decoder.state_dict() for _ in range(2))
+    other = build_model(replace(config, seed=9), facts).decoder.state_dict()
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["head.first"], other["head.first"])
+    assert torch.equal(first["frozen.first.weight"], other["frozen.first.weight"])
+
+
+def test_training_moves_the_head_and_nothing_frozen(world: World, trained: Trained) -> None:
+    start = build_model(trained.config, world.prepared.facts).state_dict()
+    end = trained.model.state_dict()
+    moved = {name for name in start if name.startswith("decoder.") and not torch.equal(start[name], end[name])}
+    assert moved == {name for name in start if name.startswith("decoder.head.")}
+
+
+@pytest.mark.parametrize(
+    ("knob", "where"), [({"hidden": 5}, "training"), ({"fade": 2.0}, "restyling"), ({"weights": Path("absent")}, "file")]
+)
+def test_every_knob_changes_something(knob: dict[str, float], where: str, world: World) -> None:
+    config = residual_config(world, **knob)
+    if where == "file":
+        with pytest.raises(Exception, match="absent: no such weights file"):
+            build_model(config, world.prepared.facts)
+        return
+    decoders = [build_model(each, world.prepared.facts).decoder for each in (residual_config(world), config)]
+    shapes = [{name: value.shape for name, value in each.state_dict().items()} for each in decoders]
+    assert (shapes[0] != shapes[1]) == (where == "training")
+    if where == "restyling":
+        content = torch.randn(4, world.prepared.facts.channels)
+        for each in decoders:
+            with torch.no_grad():
+                each.head.second_bias.fill_(1.0)  # type: ignore[union-attr]
+        one, other = (each.restyled(content, content + 0.1, 1.0) for each in decoders)
+        assert not torch.equal(one, other)
+
+
+@pytest.mark.parametrize(("knob", "value"), [("hidden", 0), ("fade", 0.0), ("fade", -1.0)])
+def test_ranges(knob: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=knob):
+        ResidualDecoderConfig(**{knob: value})  # type: ignore[arg-type]
+
+
+def test_a_resumed_run_is_the_one_that_never_stopped(world: World, tmp_path: Path) -> None:
+    config = replace(residual_config(world), steps=6)
+    whole = trained_for(world, tmp_path / "whole", config)
+
+    def broken(step: int, batch: Batch) -> Batch:
+        if step == 4:
+            raise KeyboardInterrupt
+        return batch
+
+    with pytest.raises(KeyboardInterrupt):
+        trained_for(world, tmp_path / "broken", config, change=broken)
+    resumed = trained_for(world, tmp_path / "broken", config)
+    expected, found = parameters(whole, 6), parameters(resumed, 6)
+    assert expected.keys() == found.keys()
+    assert any("decoder.head" in name for name in expected)
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+
+
+@pytest.mark.parametrize("stylizer", [AdainConfig(), RegionAdainConfig(), RegionOtConfig()])
+def test_the_scenes_own_style_gives_the_scene_back(stylizer: StylizerConfig, world: World, trained: Trained) -> None:
+    scene, known, model = world.prepared.scene, trained.known, exaggerated(trained).model
+    style = measure_style(trained.config, model, scene.cameras, scene.train)
+    built = stylizer.build(dictionary=own_style(style), scene=style)
+
+    def view(restyle: Restyle | None) -> torch.Tensor:
+        return render_view(model, known.facts, known.cameras, 0, trained.config.render, restyle).rgb
+
+    plain = view(None)
+    assert float((plain - view_without_head(trained)).abs().max()) > 0.02
+    assert torch.equal(view(Restyle(built, 0.0)), plain)
+    for strength in (0.4, 1.0):
+        error = (view(Restyle(built, strength)) - plain).double().square().mean()
+        assert -10 * math.log10(max(float(error), 1e-12)) >= 40
+
+
+def view_without_head(trained: Trained) -> torch.Tensor:
+    model, known = trained.model, trained.known
+    whole, model.decoder = model.decoder, model.decoder.frozen  # type: ignore[assignment]
+    found = render_view(model, known.facts, known.cameras, 0, trained.config.render).rgb
+    model.decoder = whole
+    return found
+
+
+@pytest.mark.parametrize("background", [None, torch.tensor([0.2, 0.5, 0.9])])
+def test_training_sees_both_colours_and_rendering_one(background: torch.Tensor | None, world: World, trained: Trained) -> None:
+    parts = exaggerated(trained).model.parts
+    rays = rays_of(world, trained, world.prepared.manager.batch(0))
+
+    def render(parts: Parts, step: int | None) -> Rendered:
+        return render_rays(rays, parts, want=Want.COLOUR, budget=0.0, background=background, step=step)
+
+    both, shown = render(parts, 0), render(parts, None)
+    assert shown.unaided is None
+    assert both.rgb is not None and both.unaided is not None
+    decoder = parts.decoder
+    assert isinstance(decoder, ResidualDecoder)
+    alone = render(parts._replace(decoder=decoder.frozen), 0)
+    assert alone.rgb is not None and alone.unaided is None
+    assert torch.equal(both.unaided, alone.rgb)
+    assert float((both.rgb - both.unaided).abs().max()) > 0.02
+
+
+def rendered_of(rgb: float, unaided: float | None) -> Rendered:
+    """One ray, whose colours are given."""
+    edges = torch.tensor([[0.0, 1.0]])
+    colour: Callable[[float], torch.Tensor] = lambda value: torch.full((1, 3), value)  # noqa: E731
+    return Rendered(
+        torch.ones(1),
+        torch.ones(1),
+        rgb=colour(rgb),
+        weights=torch.ones(1, 1),
+        sampled=Sampled(edges, edges),
+        unaided=None if unaided is None else colour(unaided),
+    )
+
+
+@pytest.mark.parametrize("unaided", [None, 0.9])
+def test_the_frozen_part_is_taught_as_well(unaided: float | None, world: World) -> None:
+    config = replace(world.config.loss, rgb=0.5, distortion=0.0, interlevel=0.0, variation=0.0, proposal_variation=0.0)
+    batch = Batch(torch.zeros(1, dtype=torch.int64), torch.zeros(1, 2), torch.full((1, 3), 0.4))
+    facts = world.prepared.facts
+    found = terms(config, facts, rendered_of(0.5, unaided), batch, build_model(world.config, facts), step=0)
+    assert set(found) == {"rgb"} | ({"unaided"} if unaided else set())
+    mean = (0.1**2 + 0.5**2) / 2 if unaided else 0.1**2
+    assert float(total(config, found)) == pytest.approx(0.5 * mean, rel=1e-5)

@@ -1,0 +1,141 @@
+"""`fprf pretrain decoder` with the paper's losses, its sample pictures, its report, and the line that users are told."""
+
+import json
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from photo_folder import photo_folder
+from safetensors.torch import save_file
+
+from fprf.commands.pretrain import run
+from fprf.engine.decoder import build_decoder
+from fprf.errors import ConfigError, WeightsError
+from fprf.methods import fprf_lite
+from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
+from fprf.plugins.encoders.config import RandomConfig
+from fprf.plugins.weightfiles import read_weights
+from fprf.pretraining.config import PretrainDecoderConfig
+from fprf.pretraining.report import report_path, samples_folder
+
+ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
+QUICK = ["--pixels", "60", "--batch", "64", "--size", "24", "--pairs", "1"]
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(photo_folder(tmp_path_factory.mktemp("photos") / "all", 5))
+
+
+@pytest.fixture(scope="module")
+def vgg(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """VGG-19's shape up to conv3_4, a few filters wide, random."""
+    draw = torch.Generator().manual_seed(0)
+    tensors, inputs = {}, 3
+    for place, outputs in {0: 4, 2: 4, 5: 6, 7: 6, 10: 8, 12: 8, 14: 8, 16: 8}.items():
+        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3, generator=draw) / (3 * inputs**0.5)
+        tensors[f"features.{place}.bias"] = torch.zeros(outputs)
+        inputs = outputs
+    file = tmp_path_factory.mktemp("vgg") / "vgg.safetensors"
+    save_file(tensors, file)
+    return str(file)
+
+
+def made(photos: str, output: Path, *more: str) -> dict[str, float]:
+    assert run(["decoder", "--images", photos, "--output", str(output), *ENCODER, *QUICK, *more]) == 0
+    report: dict[str, float] = json.loads(report_path(output).read_text())
+    return report
+
+
+def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: Path) -> None:
+    photos = str(photo_folder(tmp_path / "photos", 30))  # two of them are held out: one in the style of the other
+    steps = ["--steps", "300", "--rate", "0.005", "--samples", "0", "--style-weights", vgg, "--every", "1"]
+    plain = made(photos, tmp_path / "plain.safetensors", *steps)
+    styled = made(photos, tmp_path / "styled.safetensors", *steps, "--style", "0.03")
+    assert styled["style_loss"] < 0.6 * plain["style_loss"]
+    assert styled["psnr_db"] < plain["psnr_db"] - 3, "what the style gains, the identity pays"
+
+
+@pytest.mark.parametrize(
+    "second", [["--crops", "3"], ["--size", "20"], ["--pairs", "2"], ["--every", "1"], ["--content", "0.1"], ["--style", "0.5"]]
+)
+def test_every_knob_of_the_losses_changes_the_weights(second: list[str], photos: str, vgg: str, tmp_path: Path) -> None:
+    base = ["--steps", "6", "--samples", "0", "--style-weights", vgg, "--style", "0.1", "--every", "2"]
+    made(photos, tmp_path / "a.safetensors", *base)
+    made(photos, tmp_path / "b.safetensors", *base, *second)
+    first, other = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
+    assert any(not torch.equal(first[name], other[name]) for name in first)
+
+
+def test_runs_with_a_style_repeat_exactly(photos: str, vgg: str, tmp_path: Path) -> None:
+    for name in "ab":
+        made(
+            photos, tmp_path / f"{name}.safetensors", "--steps", "5", "--samples", "0", "--style", "0.1", "--style-weights", vgg
+        )
+    first, second = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_without_weights_for_it_no_style_is_measured(photos: str, vgg: str, tmp_path: Path) -> None:
+    steps = ["--steps", "3", "--samples", "0"]
+    assert "style_loss" not in made(photos, tmp_path / "a.safetensors", *steps)
+    measured = made(photos, tmp_path / "b.safetensors", *steps, "--style-weights", vgg)
+    assert measured["style_loss"] > 0
+    first, second = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
+    assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
+
+
+def test_absent_style_weights_are_named(photos: str, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
+        made(photos, tmp_path / "d.safetensors", "--style", "1", "--style-weights", "absent.safetensors")
+
+
+def test_the_report_says_what_was_done(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "deeper" / "decoder.safetensors"
+    report = made(photos, output, "--steps", "4", "--seed", "3")
+    shown = json.loads(capsys.readouterr().out)
+    assert shown | {"weights": "decoder.safetensors", "kind": "decoder"} == report
+    assert report_path(output) == output.parent / "decoder.report.json"
+    assert (report["steps"], report["seed"], report["learned_photos"], report["photos"]) == (4, 3, 4, 1)
+    assert report["psnr_worst_db"] <= report["psnr_db"]
+    assert report["seconds"] >= 0
+    assert str(tmp_path) not in report_path(output).read_text()
+
+
+def test_samples_are_pictures_of_photo_decoded_and_restyled(photos: str, tmp_path: Path) -> None:
+    output = tmp_path / "decoder.safetensors"
+    made(photos, output, "--steps", "3", "--samples", "1e-9")
+    files = sorted(samples_folder(output).iterdir())
+    assert [file.name for file in files] == [f"step-{step:07d}.png" for step in (1, 2, 3)]
+    pictures = [cv2.imread(str(file)) for file in files]
+    assert len({picture.shape for picture in pictures}) == 1
+    assert pictures[0].shape[1] > 3 * 60
+    assert (pictures[0] != pictures[-1]).any()
+
+
+def test_no_samples_where_nobody_wants_them(photos: str, tmp_path: Path) -> None:
+    output = tmp_path / "decoder.safetensors"
+    made(photos, output, "--steps", "2", "--samples", "0")
+    assert {file.name for file in tmp_path.iterdir()} == {"decoder.safetensors", "decoder.report.json"}
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"style": -1}, {"content": -0.1}, {"crops": 1}, {"size": 4}, {"pairs": 0}, {"every": 0}, {"samples": -1}]
+)
+def test_ranges(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        PretrainDecoderConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: str, tmp_path: Path) -> None:
+    encoder, output, lite = RandomConfig(channels=4, seed=3), tmp_path / "made.safetensors", fprf_lite()
+    config = replace(lite, content=replace(lite.content, encoder=encoder, decoder=MlpDecoderConfig()))
+    with pytest.raises(WeightsError) as raised:
+        build_decoder(config, encoder=encoder.build().identity, channels=4)
+    line = str(raised.value).split("`")[1].replace("DIR", photos).replace("decoder.safetensors", str(output))
+    assert run([*shlex.split(line)[2:], "--steps", "1", "--pixels", "20", "--samples", "0"]) == 0
+    fitting = replace(config, content=replace(config.content, decoder=ResidualDecoderConfig(weights=output)))
+    build_decoder(fitting, encoder=encoder.build().identity, channels=4)

@@ -1,0 +1,193 @@
+"""The paper's losses against their formulas, and what they are 0 for."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from photo_folder import photo_folder
+from safetensors.torch import save_file
+
+from fprf.datamanagers.config import GuidedConfig
+from fprf.errors import WeightsError
+from fprf.plugins.encoders.config import RandomConfig
+from fprf.pretraining.filtered import filtered_crop, filtered_whole
+from fprf.pretraining.perceptual import CONTENT, StyleNetwork, load_style_network, style_distance, style_statistics
+from fprf.pretraining.photos import find_photos, load_photo
+from fprf.pretraining.report import GAP, sheet
+from fprf.pretraining.restyling import adain, prepare_crops, restyling_losses
+
+WIDTHS = (3, 4, 4, 6, 6, 8, 8, 8, 8, 10)
+
+
+def network(layers: int = 8) -> StyleNetwork:
+    draw = torch.Generator().manual_seed(1)
+    tensors = [
+        (torch.randn(WIDTHS[i + 1], WIDTHS[i], 3, 3, generator=draw) / (3 * WIDTHS[i] ** 0.5), torch.zeros(WIDTHS[i + 1]))
+        for i in range(layers)
+    ]
+    return StyleNetwork(tensors, torch.full((3,), 0.45), torch.full((3,), 0.25))
+
+
+def test_layers_end_where_the_weights_do(tmp_path: Path) -> None:
+    places = (0, 2, 5, 7, 10, 12, 14, 16, 19)
+    for count, last in ((8, "relu3_4"), (9, "relu4_1")):
+        tensors = {}
+        for i, place in enumerate(places[:count]):
+            tensors[f"features.{place}.weight"] = torch.randn(WIDTHS[i + 1], WIDTHS[i], 3, 3)
+            tensors[f"features.{place}.bias"] = torch.zeros(WIDTHS[i + 1])
+        save_file(tensors, tmp_path / "vgg.safetensors")
+        found = load_style_network(tmp_path / "vgg.safetensors")
+        assert found.layers == ["relu1_1", "relu2_1", "relu3_1", last]
+        assert found.layers[CONTENT] == "relu2_1"
+        assert not list(found.parameters())
+    del tensors["features.16.weight"]
+    save_file(tensors, tmp_path / "short.safetensors")
+    with pytest.raises(WeightsError, match="short"):
+        load_style_network(tmp_path / "short.safetensors")
+
+
+def test_activations_are_the_convolutions_in_float64() -> None:
+    net, image = network(), torch.rand(2, 3, 18, 22)
+    x = (image.double() - 0.45) / 0.25
+    expected = []
+    for i, name in enumerate(("1_1", "1_2", "2_1", "2_2", "3_1", "3_2", "3_3", "3_4")):
+        if name in ("2_1", "3_1"):
+            x = F.max_pool2d(x, 2, ceil_mode=True)
+        padded = F.pad(x, (1, 1, 1, 1), mode="reflect")
+        x = F.conv2d(padded, net.get_buffer(f"weight{name}").double()).clamp_min(0)
+        if i in (0, 2, 4, 7):
+            expected.append(x)
+    for found, wanted in zip(net(image), expected, strict=True):
+        torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_units_are_the_filters_own_deviations() -> None:
+    net = network()
+    images = [torch.rand(3, 20, 24) for _ in range(4)]
+    plain = [net(image[None]) for image in images]
+    net.measure(images)
+    again = [net(image[None]) for image in images]
+    for layer in range(4):
+        deviation = torch.stack([each[layer][0].double().std((1, 2), correction=0) for each in plain]).mean(0)
+        unit = deviation.clamp_min(0.01 * float(deviation.mean()))
+        torch.testing.assert_close(again[0][layer][0].double(), plain[0][layer][0].double() / unit[:, None, None])
+    before = {name: value.clone() for name, value in net.named_buffers()}
+    net.measure(images)
+    for name, value in net.named_buffers():
+        torch.testing.assert_close(value, before[name], msg=f"{name}: measuring again must change nothing")
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 99), shift=st.floats(-2, 2), gain=st.floats(0.2, 4))
+def test_style_statistics_and_their_distance(seed: int, shift: float, gain: float) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    x = torch.randn(2, 5, 6, 7, generator=draw)
+    (own,), (moved,) = style_statistics([x]), style_statistics([gain * x + shift])
+    flat = x.double().flatten(2)
+    torch.testing.assert_close(own[:, :5].double(), flat.mean(2), rtol=0, atol=1e-5)
+    torch.testing.assert_close(own[:, 5:].double(), (flat.var(2, correction=0) + 1e-4).sqrt(), rtol=1e-5, atol=0)
+    expected = float((moved - own).double().square().mean())
+    assert float(style_distance([own], [moved])) == pytest.approx(expected, rel=1e-5, abs=1e-12)
+    assert float(style_distance([own, own], [own, own])) == 0
+
+
+def test_a_constant_filter_has_a_finite_gradient() -> None:
+    x = torch.zeros(1, 3, 4, 4, requires_grad=True)
+    style_distance(style_statistics([x]), [torch.ones(1, 6)]).backward()  # type: ignore[no-untyped-call]
+    assert x.grad is not None and bool(x.grad.isfinite().all())
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 99), channels=st.integers(1, 6))
+def test_adain_gives_the_style_its_mean_and_deviation(seed: int, channels: int) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    content = torch.randn(2, 50, channels, generator=draw, dtype=torch.float64) * 3 + 1
+    style = (torch.randn(2, channels, generator=draw).double(), torch.rand(2, channels, generator=draw).double() + 0.1)
+    own = (content.mean(1), content.std(1, correction=0))
+    styled = adain(content, own, style)
+    torch.testing.assert_close(styled.mean(1), style[0])
+    torch.testing.assert_close(styled.std(1, correction=0), style[1])
+    torch.testing.assert_close(adain(content, own, own), content)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return find_photos([photo_folder(tmp_path_factory.mktemp("photos") / "all", 4)])
+
+
+def test_a_crop_is_a_part_of_the_whole(photos: list[Path]) -> None:
+    photo, encoder = load_photo(photos[0]), RandomConfig(channels=3, stride=2).build()
+    features, rgb = filtered_crop(encoder, photo, 20, GuidedConfig(), torch.Generator().manual_seed(0))
+    whole = filtered_whole(encoder, photo, GuidedConfig()).view(*photo.shape[:2], 3)
+    matches = [
+        (y, x)
+        for y in range(photo.shape[0] - 19)
+        for x in range(photo.shape[1] - 19)
+        if torch.equal(photo[y : y + 20, x : x + 20].reshape(-1, 3), rgb)
+    ]
+    assert len(matches) == 1
+    ((y, x),) = matches
+    torch.testing.assert_close(features, whole[y : y + 20, x : x + 20].reshape(-1, 3), rtol=1e-4, atol=1e-5)
+
+
+def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: list[Path]) -> None:
+    """Colours as features: AdaIN with itself is the crop, so decoding it by doing nothing has neither loss."""
+    encoder, net = RandomConfig(channels=3, stride=1).build(), network()
+    made = prepare_crops(encoder, net, photos, side=24, longest=96, seed=0, measure=True)
+    rgb = torch.stack([load_photo(path, 96)[:24, :24].reshape(-1, 3) for path in photos])
+    seen = net(rgb.view(-1, 24, 24, 3).permute(0, 3, 1, 2))
+    statistics = style_statistics(seen)
+    mean, std = (half[:, :, None, None] for half in statistics[CONTENT].chunk(2, 1))
+    crops = made._replace(
+        features=rgb,
+        mean=rgb.mean(1),
+        std=rgb.std(1, correction=0),
+        structure=(seen[CONTENT] - mean) / std,
+        style=tuple(statistics),
+    )
+    same, other = torch.tensor([1]), torch.tensor([2])
+    assert all(float(loss) < 1e-6 for loss in restyling_losses(crops, net, lambda f: f, same, same))
+    content, style = restyling_losses(crops, net, lambda f: f, same, other)
+    assert float(style) > 1e-4
+    upside_down, _ = restyling_losses(crops, net, lambda f: f.flip(0), same, other)
+    assert float(upside_down) > float(content), "the content loss sees where things are"
+
+
+def test_crops_are_a_function_of_the_seed_and_no_larger_than_the_photographs(photos: list[Path]) -> None:
+    encoder, net = RandomConfig(channels=3, stride=2).build(), network()
+    first, again, other = (
+        prepare_crops(encoder, net, photos, side=24, longest=96, seed=seed, measure=False) for seed in (0, 0, 1)
+    )
+    assert torch.equal(first.features, again.features)
+    assert not torch.equal(first.features, other.features)
+    assert first.features.shape == (4, 24 * 24, 3)
+    whole = prepare_crops(encoder, net, photos, side=500, longest=96, seed=0, measure=False)
+    assert whole.side == min(min(load_photo(path, 96).shape[:2]) for path in photos)
+
+
+def test_gradients_reach_the_decoder_alone(photos: list[Path]) -> None:
+    encoder, net = RandomConfig(channels=3, stride=2).build(), network()
+    crops = prepare_crops(encoder, net, photos, side=16, longest=64, seed=0, measure=True)
+    decoder = torch.nn.Linear(3, 3)
+    losses = restyling_losses(crops, net, lambda f: torch.sigmoid(decoder(f)), torch.tensor([0, 1]), torch.tensor([2, 3]))
+    for loss in losses:
+        (gradient,) = torch.autograd.grad(loss, [decoder.weight], retain_graph=True)
+        assert bool(gradient.isfinite().all()) and float(gradient.abs().sum()) > 0
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    sizes=st.lists(st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=3), min_size=1, max_size=3)
+)
+def test_a_sheet_holds_every_picture(sizes: list[list[tuple[int, int]]]) -> None:
+    rows = [[torch.full((h, w, 3), (y * 3 + x + 1) / 20) for x, (h, w) in enumerate(row)] for y, row in enumerate(sizes)]
+    whole = sheet(rows)
+    for y, row in enumerate(rows):
+        for x, picture in enumerate(row):
+            assert int((whole[..., 0] == picture[0, 0, 0]).sum()) == picture[..., 0].numel(), (y, x)
+    height = sum(max(h for h, _ in row) for row in sizes) + GAP * (len(rows) - 1)
+    assert whole.shape[0] == height
+    assert float(whole.max()) == (1.0 if whole.shape[:2] != rows[0][0].shape[:2] else float(rows[0][0].max()))
