@@ -1,6 +1,11 @@
-"""What a user turns: how strong a style is, and which reference goes where."""
+"""What a user turns, as mathematics: how strong a style is, where, from which reference, and how light its colours are.
 
-from collections.abc import Mapping, Set
+Strengths are one number or one a point. Luminance is Rec. 709 luma of sRGB. It is kept on the colour of each point, not of
+each pixel: luma is linear, so both would agree but for what leaves the range of colours, and on points that is mended where
+it happens: every point's colour stays in [0, 1] (which is what bounds the renderer's error) and is the same from every view.
+"""
+
+from collections.abc import Mapping, Sequence, Set
 from typing import Annotated
 
 import torch
@@ -8,16 +13,21 @@ from torch import Tensor
 
 from ..errors import UsageError
 
-__all__ = ["blend_strength", "edit_table"]
+__all__ = ["allowed_references", "blend_strength", "keep_luminance", "luma"]
+
+_LUMA = (0.2126, 0.7152, 0.0722)
+"""Rec. 709."""
 
 
 def blend_strength(
-    content: Annotated[Tensor, "N C"], styled: Annotated[Tensor, "N C"], strength: float
+    content: Annotated[Tensor, "N C"], styled: Annotated[Tensor, "N C"], strength: float | Annotated[Tensor, "N 1"]
 ) -> Annotated[Tensor, "N C"]:
-    """Between the scene's features (strength 0, bit for bit) and the styled ones (strength 1, bit for bit).
+    """Between the scene's features (strength 0, bit for bit) and the styled ones (strength 1, bit for bit), all finite.
 
-    Raises UsageError outside [0, 1].
+    Raises UsageError for one strength outside [0, 1].
     """
+    if isinstance(strength, Tensor):
+        return torch.lerp(content, styled, strength.to(content))
     if not 0.0 <= strength <= 1.0:
         raise UsageError(f"strength: {strength} must lie in [0, 1]")
     if strength == 0.0:
@@ -27,34 +37,51 @@ def blend_strength(
     return torch.lerp(content, styled, strength)
 
 
-def edit_table(
-    table: Annotated[Tensor, "K T"],
-    reference: Annotated[Tensor, "T"],
-    *,
-    pin: Mapping[int, int] | None = None,
-    forbid: Set[tuple[int, int]] = frozenset(),
-) -> Annotated[Tensor, "K T"]:
-    """A region-to-code table with the user's wishes; rows still sum to 1.
+def luma(rgb: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 1"]:
+    """Luma of sRGB colours, in [0, 1] for colours in [0, 1]."""
+    return (rgb * rgb.new_tensor(_LUMA)).sum(-1, keepdim=True)
 
-    `pin` maps a region to the only reference it may take codes from; `forbid` holds (region, reference) pairs that may not
-    meet. Within what is left the matching's own odds stay. Raises UsageError for numbers out of range or a region that is
-    left with nothing.
+
+def keep_luminance(
+    styled: Annotated[Tensor, "N 3"], own: Annotated[Tensor, "N 3"], share: float | Annotated[Tensor, "N 1"]
+) -> Annotated[Tensor, "N 3"]:
+    """Styled colours whose luma is moved towards the scene's own by `share`: 0 changes nothing, 1 gives luma(own).
+
+    All in [0, 1]. A colour that would leave that range fades towards grey just as far as it must, which leaves its luma.
     """
-    regions, references = len(table), int(reference.max()) + 1
+    before = luma(styled)
+    shift = share * (luma(own) - before)
+    moved, level = styled + shift, (before + shift).clamp(0, 1)
+    tint = moved - level
+    room = torch.where(tint > 0, 1 - level, level)
+    fits = (room / tint.abs().clamp_min(torch.finfo(tint.dtype).tiny)).amin(-1, keepdim=True)
+    return torch.where(fits < 1, level + fits * tint, moved).clamp(0, 1)
+
+
+def allowed_references(
+    regions: int,
+    references: int,
+    *,
+    pin: Mapping[int, Set[int]] | None = None,
+    forbid: Sequence[tuple[int, int]] = (),
+) -> Annotated[Tensor, "regions references"]:
+    """Which references each region may take codes from, bool: all, but for the user's wishes.
+
+    `pin` maps a region to the only references that it may take from; `forbid` holds (region, reference) pairs that may not
+    meet. Raises UsageError for numbers out of range or a region that is left with nothing.
+    """
     pin = pin or {}
-    for k, i in (*pin.items(), *sorted(forbid)):
+    for k, i in (*((k, i) for k, chosen in pin.items() for i in sorted(chosen)), *forbid):
         if not (0 <= k < regions and 0 <= i < references):
             raise UsageError(
                 f"region {k} and reference {i}: regions go from 0 to {regions - 1}, references from 0 to {references - 1}"
             )
-    allowed = torch.ones(table.shape, dtype=torch.bool, device=table.device)
-    for k, i in pin.items():
-        allowed[k] = reference == i
+    allowed = torch.ones(regions, references, dtype=torch.bool)
+    for k, chosen in pin.items():
+        allowed[k] = False
+        allowed[k, sorted(chosen)] = True
     for k, i in forbid:
-        allowed[k] &= reference != i
+        allowed[k, i] = False
     for k in (~allowed.any(1)).nonzero().flatten().tolist():
         raise UsageError(f"region {k}: every reference is forbidden; allow one, or keep the region as it is")
-    # Codes that the matching gave next to nothing share evenly where they are all that is left.
-    odds = torch.where(allowed, table.clamp_min(torch.finfo(table.dtype).tiny), 0.0)
-    odds = odds / odds.amax(1, keepdim=True)
-    return odds / odds.sum(1, keepdim=True)
+    return allowed

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -15,6 +13,7 @@ from torch import Tensor
 
 from ..checks import at_least, between
 from ..errors import CheckpointError, DataError
+from ..output.atomic import write_bytes
 from .clusters import kmeans
 from .statistics import covariance, double, group_moments, mix, moments
 
@@ -24,6 +23,7 @@ __all__ = [
     "StyleDictionary",
     "blend_codes",
     "build_dictionary",
+    "choose",
     "code_odds",
     "load_dictionary",
     "save_dictionary",
@@ -66,6 +66,8 @@ class StyleDictionary(NamedTuple):
     """Names of the references, in dictionary order."""
     blend: float = 0.0
     """Share of the whole reference's statistics that is in each code; `whole_style` takes it out again."""
+    allowed: Annotated[Tensor, "K references"] | None = None
+    """On one scene: which references each of its regions may take from, bool; None = all. See `style.regional`. Not saved."""
 
 
 def build_dictionary(
@@ -141,22 +143,24 @@ def code_odds(d: StyleDictionary) -> Annotated[Tensor, "T"]:
     return odds / odds.sum()
 
 
+def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> tuple[StyleDictionary, Annotated[Tensor, "T"]]:
+    """The dictionary of some of the references (bool, at least one), and which of the codes these are (bool)."""
+    codes = references[d.reference]
+    renumbered = references.cumsum(0) - 1
+    part = d._replace(
+        **{name: getattr(d, name)[codes] for name in ("keys", "mean", "covariance", "share", "weight")},
+        reference=renumbered[d.reference[codes]],
+        names=tuple(name for name, taken in zip(d.names, references.tolist(), strict=True) if taken),
+        allowed=None,
+    )
+    return part, codes
+
+
 def save_dictionary(path: Path, d: StyleDictionary) -> None:
     """Write the dictionary to `path`; a crash leaves the old file or the new one, never a part."""
     tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in _TENSORS}
     meta = {"format": _FORMAT, "names": json.dumps(d.names), "blend": repr(d.blend), "sha256": _digest(tensors)}
-    data = save(tensors, metadata=meta)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_bytes(path, save(tensors, metadata=meta))
 
 
 def load_dictionary(path: Path) -> StyleDictionary:

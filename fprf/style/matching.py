@@ -10,9 +10,21 @@ import torch
 from torch import Tensor
 
 from ..errors import ConfigError
+from ..ops import mixture
+from ..ops.dense import usable
 from .statistics import double
 
-__all__ = ["Similarity", "attention", "full_precision", "score_spread", "scores", "share_mean", "unit"]
+__all__ = [
+    "Similarity",
+    "attention",
+    "compared",
+    "full_precision",
+    "point_shares",
+    "score_spread",
+    "scores",
+    "share_mean",
+    "unit",
+]
 
 Similarity = Literal["cosine", "dot"]
 
@@ -31,6 +43,21 @@ def unit(x: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Annotat
 def share_mean(keys: Annotated[Tensor, "T D"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "D"]:
     """Mean of the keys by their shares: the centre of a set of codes."""
     return (share / share.sum()) @ keys
+
+
+def compared(
+    queries: Annotated[Tensor, "N D"],
+    keys: Annotated[Tensor, "T D"],
+    similarity: Similarity,
+    *,
+    queries_centre: Annotated[Tensor, "D"],
+    keys_centre: Annotated[Tensor, "D"],
+) -> tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "T D"]]:
+    """Both sides, such that their inner products are the scores: cosines of the centred features, or plain dot products."""
+    if similarity == "cosine":
+        return unit(queries, queries_centre), unit(keys, keys_centre)
+    # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
+    return queries, keys - keys_centre
 
 
 def scores(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) -> Annotated[Tensor, "N T"]:
@@ -65,6 +92,29 @@ def attention(
     # The best score is subtracted before dividing: tiny temperatures then give -inf beside it, never inf - inf.
     logits = (r - r.amax(1, keepdim=True)) / max(temperature, torch.finfo(r.dtype).tiny)
     return torch.softmax(logits if prior is None else logits + prior.log(), 1)
+
+
+def point_shares(
+    x: Annotated[Tensor, "N D"],
+    keys: Annotated[Tensor, "T D"],
+    temperature: float,
+    *,
+    centre: Annotated[Tensor, "D"] | None = None,
+    prior: Annotated[Tensor, "T"] | None = None,
+    faint: float = 0.0,
+) -> Annotated[Tensor, "N T"]:
+    """`attention` of the directions of points from a centre (None: of the points as they are), as renderers ask for it.
+
+    Shares below `faint` of a point's largest become 0. Rows sum to 1. Within 4 (D + 4) u / temperature of the exact shares.
+    """
+    if usable(x) and keys.dtype == torch.float32 and len(x) > 0 and temperature > 0:
+        flat = 0.0 if centre is None else _FLAT * float(centre.norm())
+        return mixture.attention(x, keys, temperature, centre=centre, flat=flat, prior=prior, faint=faint)
+    share = attention(x if centre is None else unit(x, centre), keys, temperature, prior)
+    if faint > 0:
+        share = torch.where(share < faint * share.amax(1, keepdim=True), 0.0, share)
+        share = share / share.sum(1, keepdim=True)
+    return share
 
 
 def full_precision(x: Tensor) -> torch.autocast:

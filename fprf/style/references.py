@@ -17,6 +17,7 @@ from torch import Tensor
 from ..checks import at_least
 from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import Image, load_image
+from ..errors import DataError
 from ..interfaces import Encoder
 from ..ops.guided import apply, coefficients
 from .dictionary import Reference
@@ -31,6 +32,9 @@ _SAMPLES = 20_000
 
 _SHORTEST = 64
 """No side is encoded smaller: deep encoders have nothing to pad with on a photograph of a few pixels."""
+
+_WHITE = 128
+"""Grey level, of 255, from which a mask selects."""
 
 _CELL = 16
 """Pixels between guided-filter coefficients."""
@@ -49,22 +53,28 @@ def read_reference(
     longest: int = 512,
     weight: float = 1.0,
     guided: GuidedConfig | None = None,
+    mask: Path | None = None,
+    name: str | None = None,
 ) -> Reference:
     """Encode a photograph, reduced to `longest` pixels a side (the scene's images' own is best), and sample it.
 
-    `basis` projects the semantics as the scene's were; without encoder or basis D is 0. `guided` is the scene's. Raises
-    DataError where the file is no readable image.
+    `basis` projects the semantics as the scene's were; without encoder or basis D is 0. `guided` is the scene's. Of a
+    photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of it.
+    `name` is the file's by default. Raises DataError where a file is no readable image, or a mask does not fit.
     """
     at_least("longest", longest, _SHORTEST)
-    image = torch.from_numpy(_reduced(load_image(path), longest)).float() / 255
-    guided = GuidedConfig() if guided is None else guided
-    samples = _sampled(_encode(content, image), image, guided)
+    photo = load_image(path)
+    image = torch.from_numpy(_reduced(photo, longest)).float() / 255
+    height, width = image.shape[:2]
+    pixel = _grid(height, width) if mask is None else _inside(_mask(mask, path, photo, (width, height)))
+    guided, name = GuidedConfig() if guided is None else guided, path.name if name is None else name
+    samples = _sampled(_encode(content, image), image, pixel, guided)
     if semantic is None or basis is None:
-        return Reference(path.name, samples, samples.new_zeros(len(samples), 0), weight)
+        return Reference(name, samples, samples.new_zeros(len(samples), 0), weight)
     maps = _encode(semantic, image)
     # Projecting is linear and so is the filter: fewer channels first.
     maps = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
-    return Reference(path.name, samples, _sampled(maps, image, guided), weight)
+    return Reference(name, samples, _sampled(maps, image, pixel, guided), weight)
 
 
 def _reduced(photo: Image, longest: int) -> Image:
@@ -81,13 +91,42 @@ def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Te
 
 
 def _sampled(
-    maps: Annotated[Tensor, "C h w"], image: Annotated[Tensor, "H W 3"], guided: GuidedConfig
+    maps: Annotated[Tensor, "C h w"], image: Annotated[Tensor, "H W 3"], pixel: Annotated[Tensor, "N 2"], guided: GuidedConfig
 ) -> Annotated[Tensor, "N C"]:
-    """Filtered features at every n-th pixel of every n-th row."""
+    """Filtered features at pixels (x, y, int64)."""
     height, width = image.shape[:2]
     radius = round(guided.radius * min(height, width))
     cells = coefficients(maps, image, radius=radius, eps=guided.eps, stride=_CELL)
+    parts = torch.split(pixel, _ROWS)
+    return torch.cat([apply(cells, at + 0.5, image[at[:, 1], at[:, 0]], (height, width)) for at in parts])
+
+
+def _grid(height: int, width: int) -> Annotated[Tensor, "N 2"]:
+    """Every n-th pixel of every n-th row."""
     step = max(1, round((height * width / _SAMPLES) ** 0.5))
     y, x = torch.meshgrid(torch.arange(step // 2, height, step), torch.arange(step // 2, width, step), indexing="ij")
-    parts = zip(torch.split(x.flatten(), _ROWS), torch.split(y.flatten(), _ROWS), strict=True)
-    return torch.cat([apply(cells, torch.stack([i, j], 1) + 0.5, image[j, i], (height, width)) for i, j in parts])
+    return torch.stack([x.flatten(), y.flatten()], 1)
+
+
+def _inside(mask: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "N 2"]:
+    """Every n-th pixel of the mask: a small one is looked at closely."""
+    pixel = mask.nonzero().flip(1)
+    step = max(1, round(len(pixel) / _SAMPLES))
+    return pixel[step // 2 :: step]
+
+
+def _mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
+    """What a mask selects at that size (width, height), bool: at least half covered, else whatever is covered at all."""
+    picture = load_image(path)
+    (height, width), (own_height, own_width) = picture.shape[:2], photo.shape[:2]
+    if abs(width * own_height - height * own_width) > 0.5 * (width + height + own_width + own_height):
+        raise DataError(
+            f"{path}: a mask of {width}x{height} pixels does not fit {photo_path.name} of {own_width}x{own_height}; "
+            "draw it on the photograph itself"
+        )
+    white = (picture.mean(axis=2) >= _WHITE).astype(np.float32)
+    cover = torch.from_numpy(np.asarray(cv2.resize(white, size, interpolation=cv2.INTER_AREA)))
+    selected = cover >= 0.5 if bool((cover >= 0.5).any()) else cover > 0
+    if not bool(selected.any()):
+        raise DataError(f"{path}: the mask selects no pixel of {photo_path.name}; paint white what makes the style")
+    return selected

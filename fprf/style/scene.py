@@ -9,7 +9,7 @@ from torch import Tensor
 from ..errors import CheckpointError, DataError
 from .clusters import kmeans
 from .dictionary import BLEND, StyleDictionary, blend_codes
-from .matching import attention, score_spread, unit
+from .matching import point_shares, score_spread, unit
 from .statistics import Moments, covariance, double, group_moments
 from .statistics import moments as moments_of
 
@@ -93,9 +93,7 @@ def membership(
     """How much each point belongs to each region: attention without the faintest shares; rows sum to 1."""
     if len(units) == 1:
         return semantic.new_ones(len(semantic), 1)
-    share = attention(unit(semantic, centre), units, temperature)
-    share = torch.where(share < _FAINT * share.amax(1, keepdim=True), 0.0, share)
-    return share / share.sum(1, keepdim=True)
+    return point_shares(semantic, units, temperature, centre=centre, faint=_FAINT)
 
 
 def own_style(scene: SceneStyle, blend: float = BLEND) -> StyleDictionary:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..errors import NumericsError
 
-__all__ = ["Moments", "covariance", "deviation", "double", "empty", "group_moments", "merge", "mix", "moments"]
+__all__ = ["Moments", "covariance", "dead_channels", "deviation", "double", "empty", "group_moments", "merge", "mix", "moments"]
 
 _CHUNK = 16384
 """Rows centred at a time: bounds the float64 copies of large inputs."""
@@ -105,9 +105,19 @@ def deviation(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "...
     The floor is relative, so it biases no live channel, whatever the encoder's scale; always above 0.
     """
     sigma = variance.clamp_min(0.0).sqrt()
+    return sigma.maximum(_least(mean, sigma))
+
+
+def dead_channels(mean: Annotated[Tensor, "... C"], variance: Annotated[Tensor, "... C"]) -> Annotated[Tensor, "... C"]:
+    """Channels that hardly vary (bool): those whose deviation is the floor of `deviation`, so that styles leave them quiet."""
+    sigma = variance.clamp_min(0.0).sqrt()
+    return sigma <= _least(mean, sigma)
+
+
+def _least(mean: Tensor, sigma: Tensor) -> Tensor:
     floor = _FLOOR * sigma.median(dim=-1, keepdim=True).values
     rounding = _RESOLUTION * mean.abs().amax(dim=-1, keepdim=True)
-    return sigma.maximum(floor).maximum(rounding).clamp_min(1e-12)
+    return floor.maximum(rounding).clamp_min(1e-12)
 
 
 def double(x: Tensor) -> Tensor:

@@ -152,7 +152,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fprf.style.dictionary.os.fsync", full)
+    monkeypatch.setattr("fprf.output.atomic.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         save_dictionary(file, build_dictionary([reference("new")]))
     assert load_dictionary(file).names == ("old",)
@@ -204,3 +204,41 @@ def test_whole_files_with_wrong_contents_are_refused(tmp_path: Path, field: str,
     save_dictionary(tmp_path / "d", d)
     with pytest.raises(CheckpointError, match=said):
         load_dictionary(tmp_path / "d")
+
+
+def test_a_hundred_references_in_any_order_are_one_dictionary() -> None:
+    refs = [reference(f"r{i}", n=60, seed=i, weight=1 + i % 3) for i in range(100)]
+    expected = build_dictionary(refs, clusters=3)
+    order = torch.randperm(100).tolist()
+    assert equal(build_dictionary([refs[i] for i in order], clusters=3), expected)
+    assert len(expected.names) == 100 and len(expected.keys) == 300 and expected.reference.unique().tolist() == list(range(100))
+    mean, total = whole_style(expected)
+    assert bool(mean.isfinite().all() & total.isfinite().all())
+    assert float(code_odds(expected).sum()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("clusters", [1, 2, 7, 500])
+@pytest.mark.parametrize("kind", ["one pixel", "one colour", "three colours", "huge norms", "zero"])
+def test_degenerate_photographs_have_codes(kind: str, clusters: int) -> None:
+    content, semantic = {
+        "one pixel": (torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, 4.0, 5.0]])),
+        "one colour": (torch.full((400, 2), 0.3), torch.full((400, 3), -2.0)),
+        "three colours": (torch.eye(3, 2).repeat(50, 1), torch.eye(3).repeat(50, 1)),
+        "huge norms": (torch.randn(300, 2) * 0.3 + 3000, torch.randn(300, 3) * 0.3 + 3000),
+        "zero": (torch.zeros(100, 2), torch.zeros(100, 3)),
+    }[kind]
+    d = build_dictionary([Reference("x", content, semantic)], clusters=clusters)
+    distinct = len(semantic.unique(dim=0))
+    assert 1 <= len(d.keys) <= min(clusters, distinct) and all(bool(t.isfinite().all()) for t in d[:6])
+    assert float(d.share.sum()) == pytest.approx(1.0)
+    if distinct <= 3:
+        assert len(d.keys) == min(clusters, distinct), "a code for each kind, where there may be so many"
+        torch.testing.assert_close(d.share @ d.mean, content.mean(0), rtol=1e-5, atol=1e-5)
+
+
+def test_one_reference_and_one_code_are_the_whole_photograph() -> None:
+    r = reference("a")
+    d = build_dictionary([r], clusters=1)
+    content = r.content.double()
+    torch.testing.assert_close(d.mean[0].double(), content.mean(0), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(d.covariance[0].double(), torch.cov(content.T, correction=0), rtol=1e-5, atol=1e-5)

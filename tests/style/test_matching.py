@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import ConfigError
-from fprf.style.matching import attention, score_spread, share_mean, unit
+from fprf.style.matching import Similarity, attention, compared, score_spread, share_mean, unit
 
 
 def plain_attention(q: torch.Tensor, k: torch.Tensor, temperature: float) -> torch.Tensor:
@@ -90,3 +90,30 @@ def test_spread_without_anything_to_tell_apart_is_one(shape: tuple[int, int]) ->
 
 def test_share_mean_weighs() -> None:
     torch.testing.assert_close(share_mean(torch.tensor([[0.0], [4.0]]), torch.tensor([3.0, 1.0])), torch.tensor([1.0]))
+
+
+@pytest.mark.parametrize("temperature", [1e-30, 1e-3, 1.0, 100.0, 1e6])
+def test_duplicate_keys_share_evenly_at_any_temperature(temperature: float) -> None:
+    k = torch.randn(3, 8) * 50
+    a = attention(torch.randn(20, 8) * 50, torch.cat([k, k]), temperature)
+    assert bool(a.isfinite().all())
+    torch.testing.assert_close(a[:, :3], a[:, 3:], rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(a.sum(1), torch.ones(20), rtol=0.0, atol=1e-6)
+
+
+def test_one_key_takes_everything() -> None:
+    for scale in (0.0, 1.0, 7e4):
+        assert torch.equal(attention(torch.randn(5, 3) * scale, torch.randn(1, 3) * scale, 0.4), torch.ones(5, 1))
+
+
+@pytest.mark.parametrize("similarity", ["cosine", "dot"])
+def test_scores_of_compared_sides_are_cosines_or_differences_of_dot_products(similarity: Similarity) -> None:
+    q, k = torch.randn(6, 4) + 3, torch.randn(5, 4) - 2
+    a, b = compared(q, k, similarity, queries_centre=q.mean(0), keys_centre=k.mean(0))
+    r = a @ b.T
+    if similarity == "cosine":
+        expected = torch.nn.functional.cosine_similarity((q - q.mean(0))[:, None], (k - k.mean(0))[None], dim=2)
+        torch.testing.assert_close(r, expected, rtol=0.0, atol=1e-5)
+    else:
+        plain = q @ k.T
+        torch.testing.assert_close(r - r[:, :1], plain - plain[:, :1], rtol=1e-4, atol=1e-4)

@@ -86,3 +86,67 @@ def test_unreadable_files_and_sizes_are_named(tmp_path: Path) -> None:
         read_reference(tmp_path / "x.jpg", content=CONTENT, semantic=None, basis=None)
     with pytest.raises(ConfigError, match="longest"):
         read_reference(photo(tmp_path, 9, 9), content=CONTENT, semantic=None, basis=None, longest=8)
+
+
+def two_halves(folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: int = 255) -> tuple[Path, Path]:
+    """A photograph that is dark on the left and light on the right, and a mask of its right half."""
+    image = np.zeros((80, 120, 3), np.uint8)
+    image[:, :60], image[:, 60:] = (30, 40, 50), (210, 200, 190)
+    mask = np.zeros(mask_size, np.uint8)
+    mask[:, mask_size[1] // 2 :] = white
+    for name, pixels in (("photo.png", image), ("mask.png", mask)):
+        cv2.imwrite(str(folder / name), pixels)
+    return folder / "photo.png", folder / "mask.png"
+
+
+def test_a_mask_leaves_only_what_is_white(tmp_path: Path) -> None:
+    path, mask = two_halves(tmp_path)
+    whole, some = (
+        read_reference(path, content=CONTENT, semantic=SEMANTIC, basis=BASIS, longest=120, mask=m) for m in (None, mask)
+    )
+    assert len(some.content) == len(some.semantic) == len(whole.content) // 2
+    grid = whole.content.view(80, 120, -1)
+    assert torch.equal(some.content, grid[:, 60:].reshape(-1, grid.shape[-1])), "the same features, of fewer pixels"
+
+
+def test_a_mask_may_be_smaller_or_larger_than_its_photograph(tmp_path: Path) -> None:
+    path, mask = two_halves(tmp_path, mask_size=(40, 60))
+    half = read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
+    assert len(half.content) == pytest.approx(80 * 60, rel=0.05)
+
+
+def test_a_mask_of_one_pixel_is_one_sample_and_a_code(tmp_path: Path) -> None:
+    path, mask = two_halves(tmp_path, white=0)
+    pixels = np.zeros((80, 120), np.uint8)
+    pixels[11, 17] = 255
+    cv2.imwrite(str(mask), pixels)
+    for longest, most in ((120, 1), (64, 4)):
+        found = read_reference(path, content=CONTENT, semantic=SEMANTIC, basis=BASIS, longest=longest, mask=mask)
+        assert 1 <= len(found.content) <= most
+        made = build_dictionary([found])
+        assert len(made.keys) >= 1 and all(bool(t.isfinite().all()) for t in made[:6])
+
+
+def test_of_a_large_mask_a_regular_share_is_sampled(tmp_path: Path) -> None:
+    path = photo(tmp_path, 400, 600)
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((400, 600), 255, np.uint8))
+    found = read_reference(path, content=CONTENT, semantic=None, basis=None, longest=600, mask=tmp_path / "mask.png")
+    assert 10_000 < len(found.content) <= 30_000
+
+
+def test_masks_that_cannot_be_are_named(tmp_path: Path) -> None:
+    path, mask = two_halves(tmp_path, white=0)
+    with pytest.raises(DataError, match=r"mask\.png: the mask selects no pixel of photo\.png"):
+        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
+    path, mask = two_halves(tmp_path, mask_size=(120, 80))
+    with pytest.raises(DataError, match=r"mask\.png: a mask of 80x120 pixels does not fit photo\.png of 120x80"):
+        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
+    with pytest.raises(DataError, match=r"absent\.png"):
+        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=tmp_path / "absent.png")
+
+
+def test_a_reference_may_be_called_otherwise(tmp_path: Path) -> None:
+    path, _ = two_halves(tmp_path)
+    assert (
+        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, name="a/photo.png").name == "a/photo.png"
+    )

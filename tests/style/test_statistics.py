@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import NumericsError
-from fprf.style.statistics import covariance, deviation, empty, group_moments, merge, mix, moments
+from fprf.style.statistics import covariance, dead_channels, deviation, empty, group_moments, merge, mix, moments
 
 
 def rows(n: int, c: int, *, scale: float = 1.0, offset: float = 0.0, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -140,3 +140,10 @@ def test_deviation_follows_the_scale(scale: float) -> None:
 def test_deviation_of_nothing_is_above_zero() -> None:
     assert bool((deviation(torch.zeros(3), torch.zeros(3)) > 0).all())
     assert float(deviation(torch.full((3,), 100.0), torch.zeros(3)).min()) == pytest.approx(1e-4)
+
+
+def test_dead_channels_are_those_that_are_floored() -> None:
+    sigma = torch.tensor([1.0, 0.5, 2.0, 1e-3, 0.0, 0.9, 0.006])
+    assert dead_channels(torch.zeros(6), sigma.square()).tolist() == [False, False, False, True, True, False, False]
+    assert dead_channels(torch.full((3,), 1e6), torch.full((3,), 0.25)).all(), "rounding of the mean"
+    assert not dead_channels(torch.zeros(4), torch.ones(4)).any()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from ...checks import at_least, between, positive
+from ...checks import at_least, positive
 from ..config import PluginConfig
 
 if TYPE_CHECKING:
@@ -32,6 +32,9 @@ class StylizerConfig(PluginConfig):
     """Moves content features from the scene's style to the references'."""
 
     group: ClassVar[str] = "fprf.stylizers"
+
+    heeds_regions: ClassVar[bool] = False
+    """Its stylizers heed `StyleDictionary.allowed` themselves. For others every choice of references gets one of its own."""
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The stylizer of these references on this scene."""
@@ -83,43 +86,47 @@ class LocalAdainConfig(StylizerConfig):
 class RegionAdainConfig(StylizerConfig):
     """Two-sided AdaIN: points belong to scene regions, regions match style codes, channel by channel."""
 
+    heeds_regions: ClassVar[bool] = True
+
     temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
-    blend: float = 0.3
-    """Share of the whole scene's statistics in each region's, in [0, 1]; the dictionary's own blend matches it."""
+    similarity: Literal["cosine", "dot"] = "cosine"
+    """Score of a match: cosine of centred features, or the paper's dot product."""
     gain: float = 8.0
     """Largest amplification of any channel, at least 1, so that the noise of flat regions stays small."""
 
     def __post_init__(self) -> None:
         positive("stylizer.temperature", self.temperature)
-        between("stylizer.blend", self.blend, 0.0, 1.0)
         at_least("stylizer.gain", self.gain, 1.0)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """Two-sided AdaIN towards these references."""
-        from .region import RegionAdainStylizer
+        from .region import ChannelMaps, TwoSidedStylizer, plan_regions
 
-        return RegionAdainStylizer(dictionary, scene, temperature=self.temperature, blend=self.blend, gain=self.gain)
+        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
+        return TwoSidedStylizer(plan, scene, ChannelMaps(plan, scene, self.gain))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegionOtConfig(StylizerConfig):
     """Two-sided optimal transport (recommended): regions match style codes, all channels move together."""
 
+    heeds_regions: ClassVar[bool] = True
+
     temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
-    blend: float = 0.3
-    """Share of the whole scene's statistics in each region's, in [0, 1]; the dictionary's own blend matches it."""
+    similarity: Literal["cosine", "dot"] = "cosine"
+    """Score of a match: cosine of centred features, or the paper's dot product."""
     gain: float = 8.0
     """Largest amplification in any direction, at least 1, so that the noise of flat regions stays small."""
 
     def __post_init__(self) -> None:
         positive("stylizer.temperature", self.temperature)
-        between("stylizer.blend", self.blend, 0.0, 1.0)
         at_least("stylizer.gain", self.gain, 1.0)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """Two-sided transport towards these references."""
-        from .region import RegionOtStylizer
+        from .region import MatrixMaps, TwoSidedStylizer, plan_regions
 
-        return RegionOtStylizer(dictionary, scene, temperature=self.temperature, blend=self.blend, gain=self.gain)
+        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
+        return TwoSidedStylizer(plan, scene, MatrixMaps(plan, scene, self.gain))

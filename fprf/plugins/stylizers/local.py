@@ -9,8 +9,9 @@ from typing import Annotated
 from torch import Tensor
 
 from ...interfaces import Stylizer
+from ...ops import mixture
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
-from ...style.matching import Similarity, attention, full_precision, score_spread, share_mean, unit
+from ...style.matching import Similarity, compared, full_precision, point_shares, score_spread, share_mean
 from ...style.scene import SceneStyle, check_fit
 from ...style.statistics import deviation, double
 from ...types import Want
@@ -35,11 +36,9 @@ class LocalAdainStylizer(Stylizer):
         self.similarity = similarity
         self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
         centre = share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
-        if similarity == "cosine":
-            keys, queries = unit(dictionary.keys, centre), unit(scene.keys, scene.semantic_mean)
-        else:
-            # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
-            keys, queries = dictionary.keys - centre, scene.keys
+        queries, keys = compared(
+            scene.keys, dictionary.keys, similarity, queries_centre=scene.semantic_mean, keys_centre=centre
+        )
         # The only region of an undivided scene lies at its mean, where it says nothing about scores.
         self.temperature = temperature * score_spread(queries if len(queries) > 1 else keys, keys)
         mean, covariance = double(dictionary.mean), double(dictionary.covariance)
@@ -63,17 +62,18 @@ class LocalAdainStylizer(Stylizer):
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """AdaIN towards each point's own mixture; the mean is subtracted first."""
         with full_precision(content):
-            mean, gain = self.style_mean, self.gain
+            features = content.to(self.gain)
             if self.matched:
                 assert semantic is not None, "Want.SEMANTIC was asked for"
-                share = self.match(semantic)
-                mean, gain = share @ mean, share @ gain
-            return ((content.to(self.gain) - self.content_mean) * gain + mean).to(content)
+                return mixture.scaled(features, self.match(semantic), self.gain, self.style_mean, centre=self.content_mean).to(
+                    content
+                )
+            return ((features - self.content_mean) * self.gain + self.style_mean).to(content)
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """R^S: softmax of the scores."""
         if not self.matched:
             return self.odds.expand(len(semantic), -1)
         query = semantic.to(self.keys)
-        query = unit(query, self.semantic_mean) if self.similarity == "cosine" else query
-        return attention(query, self.keys, self.temperature, self.prior)
+        centre = self.semantic_mean if self.similarity == "cosine" else None
+        return point_shares(query, self.keys, self.temperature, centre=centre, prior=self.prior)

@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 
 from fprf.errors import DataError
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig
-from fprf.plugins.stylizers.region import RegionAdainStylizer, RegionOtStylizer, region_table
-from fprf.style.controls import edit_table
+from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
-from fprf.style.matching import score_spread, share_mean, unit
+from fprf.style.matching import Similarity, score_spread, share_mean, unit
 from fprf.style.scene import SceneStyle, membership, own_style, region_units, scene_style
 from fprf.style.statistics import deviation
 from fprf.style.transport import monge
@@ -34,10 +33,11 @@ def setting(regions: int = 3, clusters: int = 3) -> tuple[torch.Tensor, torch.Te
     return content, semantic, scene, d
 
 
-def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float) -> torch.Tensor:
+def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float, similarity: Similarity = "cosine") -> torch.Tensor:
     q, k = scene.keys.double(), d.keys.double()
-    q = unit(q, share_mean(q, scene.share.double()))
-    k = unit(k, share_mean(k, d.share.double()))
+    if similarity == "cosine":
+        q = unit(q, share_mean(q, scene.share.double()))
+        k = unit(k, share_mean(k, d.share.double()))
     return torch.softmax(q @ k.T / (temperature * score_spread(q, k)), 1)
 
 
@@ -75,7 +75,7 @@ def test_the_scenes_own_style_is_the_identity(config: Config, regions: int, temp
     content[:, 1] *= 1e-3
     content[:, 2] = 4.0
     scene = scene_style(content, semantic, torch.ones(600), None, regions, 0)
-    made = config(temperature=temperature, blend=blend).build(dictionary=own_style(scene, blend), scene=scene)
+    made = config(temperature=temperature).build(dictionary=own_style(scene, blend), scene=scene)
     out = made(content, semantic)
     assert float((out - content).abs().max() / content.abs().max()) < 1e-5
 
@@ -113,23 +113,20 @@ def test_high_temperatures_move_all_regions_alike(config: Config) -> None:
     assert float((fit - out).abs().max()) < 1e-3
 
 
-def test_tables_are_read_edited_and_given_back() -> None:
-    content, semantic, scene, d = setting()
-    table = region_table(scene, d, 0.4)
-    torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))
-    for kind in (RegionAdainStylizer, RegionOtStylizer):
-        plain = kind(d, scene, temperature=0.4, blend=0.3, gain=8.0)
-        same = kind(d, scene, temperature=0.4, blend=0.3, gain=8.0, table=table)
-        assert torch.equal(plain(content, semantic), same(content, semantic))
-        pinned = edit_table(table, d.reference, pin={0: 1, 1: 1, 2: 1})
-        made = kind(d, scene, temperature=0.4, blend=0.3, gain=8.0, table=pinned)
-        assert float(made.match(semantic)[:, d.reference == 0].abs().max()) == 0.0
-
-
-def test_an_edited_table_of_another_shape_is_refused() -> None:
+@pytest.mark.parametrize("similarity", ["cosine", "dot"])
+def test_the_table_is_the_softmax_of_the_scores(similarity: Similarity) -> None:
     _, _, scene, d = setting()
-    with pytest.raises(DataError, match="table"):
-        RegionOtStylizer(d, scene, temperature=0.4, blend=0.3, gain=8.0, table=torch.ones(2, 2))
+    table = region_table(scene, d, 0.4, similarity)
+    torch.testing.assert_close(table, plain_table(scene, d, 0.4, similarity), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_references_of_another_encoder_are_refused(config: Config) -> None:
+    _, _, scene, _ = setting()
+    d = build_dictionary([Reference("a", torch.randn(9, 5), torch.randn(9, 4))])
+    with pytest.raises(DataError, match="5 content and 4 semantic channels"):
+        config().build(dictionary=d, scene=scene)
 
 
 @pytest.mark.parametrize("config", BOTH)
@@ -196,5 +193,5 @@ def test_every_knob_changes_something() -> None:
     content, semantic, scene, d = setting()
     for config in BOTH:
         plain = config().build(dictionary=d, scene=scene)(content, semantic)
-        for other in (config(temperature=0.1), config(blend=0.9), config(gain=1.0)):
+        for other in (config(temperature=0.1), config(similarity="dot"), config(gain=1.0)):
             assert not torch.allclose(other.build(dictionary=d, scene=scene)(content, semantic), plain)

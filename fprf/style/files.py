@@ -1,0 +1,125 @@
+"""`style.json`: a style that can be saved, shared, edited by hand and applied to another scene.
+
+    {"format": 1, "style": {the fields of StyleConfig}, "sha256": {path: hash}, "semantic_encoder": identity,
+     "regions": {name: [key in the encoder's own channels]}, "made": what a run measured}
+
+Only "format" and "style" must be there. Paths are relative to the file, or absolute. A region that the style names is found
+on another scene by its key, since numbers mean something on one scene alone.
+"""
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from .. import __version__
+from ..errors import ConfigError, DataError
+from ..output.atomic import write_json
+from ..plugins.codec import from_json, packages_of, read_json, to_json
+from ..plugins.registry import nearest
+from .config import NO_MASK, StyleConfig
+
+__all__ = ["Key", "StyleFile", "check_photographs", "read_style", "write_style"]
+
+_FORMAT = 1
+_KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
+
+Key = tuple[float, ...]
+
+
+class StyleFile(NamedTuple):
+    """What a style file says; paths as they are found from here."""
+
+    style: StyleConfig
+    regions: Mapping[str, Key] = {}
+    """Regions of the scene that the style was made on, by their semantics in the encoder's own channels."""
+    semantic_encoder: str = ""
+    """Identity of the encoder that the keys are of."""
+    sha256: Mapping[Path, str] = {}
+    """Hash of each photograph and mask when the style was saved."""
+
+
+def read_style(path: Path) -> StyleFile:
+    """Read a style file. Raises ConfigError naming the file and the field."""
+    whole = read_json(path, "a style.json, as `fprf stylize` writes it")
+    try:
+        if not isinstance(whole, dict) or whole.get("format") != _FORMAT or not isinstance(whole.get("style"), dict):
+            raise ConfigError(f'expected an object with "format": {_FORMAT} and "style", as `fprf stylize` writes it')
+        for key in whole:
+            if key not in _KEYS:
+                raise ConfigError(f"unknown key {key!r}{nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
+        style = from_json(whole["style"], StyleConfig, packages=from_json(whole.get("plugins", {}), dict[str, str]))
+        hashes = from_json(whole.get("sha256", {}), dict[str, str])
+        regions = from_json(whole.get("regions", {}), dict[str, tuple[float, ...]])
+        encoder = from_json(whole.get("semantic_encoder", ""), str)
+        for name in regions:
+            if name.isdigit() or not name or ":" in name or "=" in name:
+                raise ConfigError(f"regions: {name!r} is no name; a name is no number and holds neither ':' nor '='")
+    except ConfigError as fault:
+        raise ConfigError(f"{path}: {fault}") from fault
+    return StyleFile(
+        replace(
+            style,
+            references=tuple(_found(path, p) for p in style.references),
+            masks=tuple(p if p == NO_MASK else _found(path, p) for p in style.masks),
+            between=None if style.between is None else _found(path, style.between),
+        ),
+        regions,
+        encoder,
+        {_found(path, Path(text)): value for text, value in hashes.items()},
+    )
+
+
+def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = None) -> None:
+    """Write the style with the hashes of its photographs as they are now; `made` is kept beside it for people to read."""
+    style = file.style
+    masks = [p for p in style.masks if p != NO_MASK]
+    kept = replace(
+        style,
+        references=tuple(_stored(path, p) for p in style.references),
+        masks=tuple(p if p == NO_MASK else _stored(path, p) for p in style.masks),
+        between=None if style.between is None else _stored(path, style.between),
+    )
+    whole = {
+        "format": _FORMAT,
+        "fprf": __version__,
+        "plugins": packages_of(style),
+        "style": to_json(kept),
+        "sha256": {_stored(path, p).as_posix(): _hash(p) for p in (*style.references, *masks)},
+        "semantic_encoder": file.semantic_encoder,
+        "regions": {name: list(key) for name, key in file.regions.items()},
+    }
+    write_json(path, whole if made is None else whole | {"made": made})
+
+
+def check_photographs(path: Path, file: StyleFile) -> None:
+    """Raise DataError where a photograph or mask of a style file is not the one that the style was saved with."""
+    for photo in (*file.style.references, *file.style.masks):
+        then = file.sha256.get(photo)
+        if then is not None and photo.is_file() and (now := _hash(photo)) != then:
+            raise DataError(
+                f"{path}: {photo} has changed since the style was saved (sha256 {then[:12]}…, now {now[:12]}…); "
+                "restore it, or name all photographs with --references to take them as they are"
+            )
+
+
+def _found(file: Path, path: Path) -> Path:
+    """A path of the file as it is found from here: relative to the file, else beside it, where a shared style has it."""
+    whole = file.parent / path
+    beside = file.parent / path.name
+    return beside if not whole.exists() and beside.exists() else whole
+
+
+def _stored(file: Path, path: Path) -> Path:
+    """Relative to the file where it lies in the file's folder or below, so that both can be moved; absolute elsewhere."""
+    here, there = Path(os.path.abspath(file.parent)), Path(os.path.abspath(path))
+    return there.relative_to(here) if there.is_relative_to(here) else there
+
+
+def _hash(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error

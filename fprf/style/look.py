@@ -1,0 +1,114 @@
+"""What a renderer needs to show a scene in a style: features to styled features, strengths and colours, point by point.
+
+A look is one stylizer with its strengths, or a mix of several: features, strengths and luminances are mixed linearly at every
+point, so that a style fades into another without either's edges showing.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Annotated, TypeAlias
+
+import torch
+from torch import Tensor
+
+from ..checks import between
+from ..interfaces import Decoder, Stylizer
+from ..types import Want
+from .controls import blend_strength, keep_luminance
+from .regional import RegionWeight
+
+__all__ = ["Applied", "Restyle"]
+
+Applied: TypeAlias = tuple[Annotated[Tensor, "N C"], float | Annotated[Tensor, "N 1"], float]
+"""Features, strength (one, or one a point) and luminance that is kept."""
+
+
+@dataclass(frozen=True)
+class Restyle:
+    """A stylizer and how strongly it acts, 0 to 1; at 0 it is never called."""
+
+    stylizer: Stylizer
+    strength: float = 1.0
+    regions: RegionWeight | None = None
+    """Strength of each region, times `strength`; None = all 1."""
+    luminance: float = 0.0
+    """How much of the scene's own luminance is kept."""
+    share: float = 1.0
+    """Its part of the mix; those of all parts sum to 1."""
+    others: tuple["Restyle", ...] = ()
+    """The other parts of the mix, which have none themselves."""
+
+    @property
+    def parts(self) -> tuple["Restyle", ...]:
+        """All parts of the mix, without their others."""
+        return (replace(self, others=()), *self.others)
+
+    @property
+    def idle(self) -> bool:
+        """It changes nothing: the renderer need not ask."""
+        return all(part.strength == 0 for part in self.parts if part.share > 0)
+
+    @property
+    def needs(self) -> Want:
+        """What it reads of points."""
+        needs = Want.CONTENT
+        for part in self.parts:
+            if part.share > 0 and part.strength > 0:
+                needs |= part.stylizer.needs
+                if part.regions is not None and part.regions.divided:
+                    needs |= Want.SEMANTIC
+        return needs
+
+    @property
+    def faded(self) -> "Restyle":
+        """The scene as it is, in the terms of this look: what it fades in from."""
+        return replace(self, strength=0.0, others=tuple(replace(part, strength=0.0) for part in self.others))
+
+    def mixed(self, other: "Restyle", at: float) -> "Restyle":
+        """The look on the way to another, which lies at 1. Raises ConfigError outside [0, 1]."""
+        between("at", at, 0.0, 1.0)
+        first, *rest = (
+            *(replace(part, share=part.share * (1 - at)) for part in self.parts),
+            *(replace(part, share=part.share * at) for part in other.parts),
+        )
+        return replace(first, others=tuple(rest))
+
+    def colour(
+        self, decoder: Decoder, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> Annotated[Tensor, "N 3"]:
+        """Colours of points in this look, in [0, 1]."""
+        styled, strength, luminance = self.applied(content, semantic)
+        colour = decoder.restyled(content, styled, strength)
+        return keep_luminance(colour, decoder(content), luminance) if luminance > 0 else colour
+
+    def applied(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Applied:
+        """The features with all strengths applied, and what a decoder must know besides."""
+        shown = [part for part in self.parts if part.share > 0]
+        if len(shown) == 1:
+            return shown[0]._alone(content, semantic)
+        styled, luminance = torch.zeros_like(content), 0.0
+        strength: float | Tensor = 0.0
+        for part in shown:
+            features, at, kept = part._alone(content, semantic)
+            styled, luminance = styled + part.share * features, luminance + part.share * kept
+            strength = strength + part.share * at
+        return styled, strength, luminance
+
+    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
+        """How much each point takes of each style code, those of all parts one after the other; rows sum to 1 at most.
+
+        What is missing to 1 is what regions keep; the overall strength does not count.
+        """
+        taken = []
+        for part in self.parts:
+            own = part.stylizer.match(semantic)
+            taken.append(part.share * (own if part.regions is None else own * part.regions(semantic)))
+        return torch.cat(taken, 1)
+
+    def _alone(self, content: Tensor, semantic: Tensor | None) -> Applied:
+        if self.strength == 0:
+            return content, 0.0, self.luminance
+        strength: float | Tensor = self.strength
+        if self.regions is not None:
+            # Without semantics there is one region, and nothing to look up.
+            strength = self.strength * self.regions(content[:, :0] if semantic is None else semantic)
+        return blend_strength(content, self.stylizer(content, semantic), strength), strength, self.luminance

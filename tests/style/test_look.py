@@ -1,0 +1,159 @@
+"""Looks: strengths, regions, luminance and mixes, against their definitions point by point."""
+
+from typing import Annotated
+
+import pytest
+import torch
+from torch import Tensor
+
+from fprf.errors import ConfigError
+from fprf.interfaces import Decoder, Stylizer
+from fprf.plugins.stylizers.config import AdainConfig, RegionOtConfig
+from fprf.style.controls import keep_luminance, luma
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
+from fprf.style.look import Restyle
+from fprf.style.regional import RegionWeight
+from fprf.style.scene import SceneStyle, scene_style
+from fprf.types import Want
+
+
+class Sigmoid(Decoder):
+    """Colours are three of the channels; what was restyled is marked by nothing."""
+
+    def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
+        return torch.sigmoid(content[:, :3])
+
+    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
+        self.strength = strength
+        return self.forward(styled)
+
+    def unaided(self, content: Tensor) -> None:
+        return None
+
+
+class Never(Stylizer):
+    """Must not be asked."""
+
+    @property
+    def needs(self) -> Want:
+        raise AssertionError
+
+    def forward(self, content: Tensor, semantic: Tensor | None) -> Tensor:
+        raise AssertionError
+
+    def match(self, semantic: Tensor) -> Tensor:
+        raise AssertionError
+
+
+def points(*, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    kind = torch.randint(0, 3, (300,), generator=g)
+    content = torch.randn(3, 6, generator=g)[kind] * 2 + torch.randn(300, 6, generator=g)
+    return content, torch.eye(3, 4)[kind] * 3 + torch.randn(300, 4, generator=g) * 0.3
+
+
+def setting() -> tuple[torch.Tensor, torch.Tensor, SceneStyle, StyleDictionary]:
+    content, semantic = points()
+    scene = scene_style(content, semantic, torch.ones(300), None, 3, 0)
+    return content, semantic, scene, build_dictionary([Reference(f"r{i}", *points(seed=5 + i)) for i in range(2)], clusters=2)
+
+
+def test_one_style_at_one_strength() -> None:
+    content, semantic, scene, d = setting()
+    stylizer, decoder = RegionOtConfig().build(dictionary=d, scene=scene), Sigmoid()
+    look = Restyle(stylizer, 0.3)
+    assert not look.idle and look.needs == Want.CONTENT | Want.SEMANTIC
+    features, strength, luminance = look.applied(content, semantic)
+    assert torch.equal(features, torch.lerp(content, stylizer(content, semantic), 0.3)) and (strength, luminance) == (0.3, 0.0)
+    assert torch.equal(look.colour(decoder, content, semantic), decoder(features)) and decoder.strength == 0.3
+    assert torch.equal(look.match(semantic), stylizer.match(semantic)), "the overall strength does not count"
+
+
+def test_at_strength_0_nothing_is_asked_for() -> None:
+    look = Restyle(Never(), 0.0, luminance=1.0)
+    assert look.idle and look.needs == Want.CONTENT
+    assert look.mixed(look, 0.5).idle and look.mixed(look, 0.5).needs == Want.CONTENT
+
+
+def test_kept_regions_stay_bit_for_bit_and_the_others_are_styled() -> None:
+    content, semantic, scene, d = setting()
+    stylizer = AdainConfig().build(dictionary=d, scene=scene)
+    look = Restyle(stylizer, 1.0, RegionWeight(scene, torch.tensor([[0.0], [1.0], [0.5]])), luminance=0.7)
+    assert stylizer.needs == Want.CONTENT and look.needs == Want.CONTENT | Want.SEMANTIC
+    share = RegionWeight(scene, torch.eye(3))(semantic)
+    decoder = Sigmoid()
+    colour, plain = look.colour(decoder, content, semantic), decoder(content)
+    kept, full = share[:, 0] == 1, share[:, 1] == 1
+    assert int(kept.sum()) > 20 and torch.equal(colour[kept], plain[kept])
+    styled = decoder(stylizer(content, None))
+    torch.testing.assert_close(colour[full], keep_luminance(styled, plain, 0.7)[full], rtol=0.0, atol=1e-6)
+    expected = share @ torch.tensor([0.0, 1.0, 0.5])
+    torch.testing.assert_close(decoder.strength, expected[:, None], rtol=0.0, atol=1e-6)
+    match = look.match(semantic)
+    torch.testing.assert_close(match.sum(1), expected, rtol=0.0, atol=1e-5)
+    assert float(match[kept].abs().max()) == 0
+
+
+def test_kept_luminance_is_the_plain_colours() -> None:
+    content, _, scene, d = setting()
+    decoder = Sigmoid()
+    look = Restyle(AdainConfig().build(dictionary=d, scene=scene), luminance=1.0)
+    torch.testing.assert_close(luma(look.colour(decoder, content, None)), luma(decoder(content)), rtol=0.0, atol=2e-6)
+
+
+@pytest.mark.parametrize("at", [0.25, 0.5])
+def test_between_two_styles_features_strengths_and_luminances_are_linear(at: float) -> None:
+    content, semantic, scene, d = setting()
+    a = Restyle(AdainConfig().build(dictionary=d, scene=scene), 0.8, luminance=0.2)
+    weight = RegionWeight(scene, torch.tensor([[0.0], [1.0], [1.0]]))
+    b = Restyle(RegionOtConfig().build(dictionary=d, scene=scene), 1.0, weight, luminance=0.6)
+    mixed = a.mixed(b, at)
+    assert mixed.needs == Want.CONTENT | Want.SEMANTIC
+    (fa, sa, la), (fb, sb, lb) = a.applied(content, semantic), b.applied(content, semantic)
+    features, strength, luminance = mixed.applied(content, semantic)
+    torch.testing.assert_close(features, torch.lerp(fa, fb, at), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(strength, (1 - at) * sa + at * sb, rtol=0.0, atol=1e-6)
+    assert luminance == pytest.approx((1 - at) * la + at * lb)
+    expected = torch.cat([(1 - at) * a.match(semantic), at * b.match(semantic)], 1)
+    torch.testing.assert_close(mixed.match(semantic), expected)
+
+
+def test_the_ends_of_a_mix_are_its_styles_bit_for_bit_and_the_other_is_not_called() -> None:
+    content, _, scene, d = setting()
+    a = Restyle(AdainConfig().build(dictionary=d, scene=scene), 0.8)
+    for mixed in (a.mixed(Restyle(Never()), 0.0), Restyle(Never()).mixed(a, 1.0)):
+        assert mixed.needs == Want.CONTENT
+        assert torch.equal(mixed.applied(content, None)[0], a.applied(content, None)[0])
+
+
+def test_mixes_of_mixes_are_flat() -> None:
+    content, _, scene, d = setting()
+    looks = [Restyle(AdainConfig().build(dictionary=d, scene=scene), s) for s in (0.2, 0.5, 0.9)]
+    deep = looks[0].mixed(looks[1], 0.5).mixed(looks[2].mixed(looks[0], 0.25), 0.4)
+    assert [part.share for part in deep.parts] == pytest.approx([0.3, 0.3, 0.3, 0.1])
+    assert all(not part.others for part in deep.parts)
+    wanted = sum(w * look.applied(content, None)[0] for w, look in zip((0.4, 0.3, 0.3), looks, strict=True))
+    torch.testing.assert_close(deep.applied(content, None)[0], wanted, rtol=1e-5, atol=1e-5)
+
+
+def test_a_faded_look_is_the_scene_and_a_mix_with_it_a_strength() -> None:
+    content, _, scene, d = setting()
+    look = Restyle(AdainConfig().build(dictionary=d, scene=scene), 0.8)
+    assert look.faded.idle and look.mixed(look, 0.5).faded.idle
+    half = look.faded.mixed(look, 0.5).applied(content, None)
+    torch.testing.assert_close(half[0], Restyle(look.stylizer, 0.4).applied(content, None)[0], rtol=1e-5, atol=1e-5)
+    assert half[1] == pytest.approx(0.4)
+
+
+def test_a_scene_of_one_region_can_be_kept_without_semantics() -> None:
+    content, _ = points()
+    scene = scene_style(content, None, torch.ones(300), None, 3, 0)
+    d = build_dictionary([Reference("r", points(seed=5)[0], torch.zeros(300, 0))])
+    look = Restyle(AdainConfig().build(dictionary=d, scene=scene), 1.0, RegionWeight(scene, torch.zeros(1, 1)))
+    assert look.needs == Want.CONTENT and torch.equal(look.applied(content, None)[0], content)
+
+
+@pytest.mark.parametrize("at", [-0.1, 1.1, float("nan")])
+def test_a_mix_has_a_range(at: float) -> None:
+    with pytest.raises(ConfigError, match="at"):
+        Restyle(Never()).mixed(Restyle(Never()), at)

@@ -1,0 +1,70 @@
+from pathlib import Path
+
+import pytest
+
+from fprf.errors import ConfigError, UsageError
+from fprf.style.wishes import Pixel, Wish, find_reference, labels, parse_strength, parse_wish, pixel_of
+
+PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
+
+
+@pytest.mark.parametrize(
+    ("text", "wish"),
+    [
+        ("3=autumn.jpg", Wish("3", "autumn.jpg")),
+        ("IMG_0012:120,80=0", Wish("IMG_0012:120,80", "0")),
+        ("a=b:mask.png=x.jpg", Wish("a=b:mask.png", "x.jpg")),
+    ],
+)
+def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: Wish) -> None:
+    assert parse_wish("pin", text) == wish
+
+
+@pytest.mark.parametrize("text", ["3", "=a.jpg", "3=", "="])
+def test_half_a_wish_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"^pin: .* is not REGION=VALUE; write for example 3=autumn\.jpg"):
+        parse_wish("pin", text)
+
+
+def test_strengths_are_numbers_in_a_range() -> None:
+    assert parse_strength("region_strength", "sky=0.5") == ("sky", 0.5)
+    for text, said in (("3=1.5", "must lie in"), ("3=nan", "not a finite number"), ("3=much", "'much' is no number")):
+        with pytest.raises(ConfigError, match=f"^region_strength: .*{said}"):
+            parse_strength("region_strength", text)
+
+
+def test_pixels_and_what_is_none() -> None:
+    assert pixel_of("120,80") == Pixel(120.0, 80.0) and pixel_of("-1,2.5") == Pixel(-1.0, 2.5)
+    assert pixel_of("mask.png") is pixel_of("1,2,3") is pixel_of("1,") is pixel_of("") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "index"),
+    [("autumn.jpg", 0), ("a/autumn.jpg", 0), ("autumn", 0), ("night.jpg", 1), ("1", 1), ("3", 3), ("night.png", 3)],
+)
+def test_references_are_found_by_path_name_number_and_stem(text: str, index: int) -> None:
+    assert find_reference(text, PHOTOS) == index
+
+
+def test_a_number_that_is_no_index_may_be_a_stem() -> None:
+    assert find_reference("7", PHOTOS) == 2
+
+
+def test_what_is_not_found_or_not_clear_is_told() -> None:
+    with pytest.raises(UsageError, match=r"reference 'x': no such reference; there are 0 autumn\.jpg, 1 night\.jpg"):
+        find_reference("x", PHOTOS)
+    with pytest.raises(UsageError, match="reference 'night': 2 references are called so; use the number"):
+        find_reference("night", PHOTOS)
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["a/x.jpg", "b/y.jpg"], ("x.jpg", "y.jpg")),
+        (["a/x.jpg", "b/x.jpg"], ("a/x.jpg", "b/x.jpg")),
+        (["1/a/x.jpg", "2/a/x.jpg"], ("1/a/x.jpg", "2/a/x.jpg")),
+        (["a/x.jpg", "a/x.jpg", "a/x.jpg"], ("x.jpg", "x.jpg (2)", "x.jpg (3)")),
+    ],
+)
+def test_labels_are_short_and_different(paths: list[str], names: tuple[str, ...]) -> None:
+    assert labels([Path(p) for p in paths]) == names and len(set(names)) == len(names)
