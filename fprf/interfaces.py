@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .types import Batch, FieldSample, Rays, Sampled, Want
+from .types import Batch, Boxes, FieldSample, Rays, Sampled, Site, Want
 
 if TYPE_CHECKING:
     from .datamanagers.features import FeatureStore
     from .datamanagers.scene import Scene
+    from .rendering.space import Space
 
 __all__ = [
     "BlockLayout",
@@ -82,19 +83,26 @@ class SemanticField(nn.Module, ABC):
 
 
 class Sampler(nn.Module, ABC):
-    """Rays to sample edges. May own proposal fields; `locate` maps space points [N 3] to the unit cube."""
+    """Rays to sample edges. May own proposal fields, which live in the unit cube: `space.locate` leads there."""
+
+    @property
+    def fields(self) -> nn.ModuleList:
+        """The fields that `forward` asks for density, points of the unit cube [N 3] to [N]; none unless it says so.
+
+        A scene of blocks puts others in their place, which route points to the blocks' own.
+        """
+        return nn.ModuleList()
 
     @abstractmethod
     def forward(
         self,
         rays: Rays,
         *,
-        locate: Callable[[Tensor], Tensor],
-        distance: Callable[[Tensor, Tensor, Tensor], Tensor],
+        space: "Space",
         step: int | None,
         generator: torch.Generator | None,
     ) -> Sampled:
-        """Edges along each ray. `distance(s, near, far)` is the spacing of the space; generator None = deterministic."""
+        """Edges along each ray, spaced by `space.distance(s, near, far)`; generator None = deterministic."""
 
     @abstractmethod
     def penalties(self) -> dict[str, Tensor]:
@@ -102,11 +110,33 @@ class Sampler(nn.Module, ABC):
 
 
 class Decoder(nn.Module, ABC):
-    """Content features to colour, point by point, scene-agnostic and frozen while a scene trains (paper, D_VGG)."""
+    """Content features to colour, point by point (paper, D_VGG).
+
+    What is scene-agnostic comes frozen. Parameters that want gradients are the scene's own and are trained with it.
+    """
 
     @abstractmethod
     def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
-        """sRGB in [0, 1]."""
+        """The scene as it is: sRGB in [0, 1]."""
+
+    @abstractmethod
+    def restyled(
+        self,
+        content: Annotated[Tensor, "N C"],
+        styled: Annotated[Tensor, "N C"],
+        strength: float | Annotated[Tensor, "N 1"],
+    ) -> Annotated[Tensor, "N 3"]:
+        """The scene in a new style, sRGB in [0, 1]. `styled` is blended already by `strength`, one for all or one a point.
+
+        Where `styled` is `content`, this is `forward(content)`: bit for bit at strength 0, else within rounding.
+        """
+
+    @abstractmethod
+    def unaided(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"] | None:
+        """`forward` without the scene's own parameters; None where there are none.
+
+        Training asks for these colours as well: they are what a new style starts from.
+        """
 
 
 class Stylizer(nn.Module, ABC):
@@ -129,14 +159,9 @@ class Stylizer(nn.Module, ABC):
 class BlockLayout(ABC):
     """How a scene is cut into blocks: geometry only, no parameters."""
 
-    @property
     @abstractmethod
-    def boxes(self) -> Annotated[Tensor, "K 2 3"]:
-        """Lowest and highest corner of every block in unit-cube coordinates, margins included."""
-
-    @abstractmethod
-    def blend(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N K"]:
-        """Weight of every block at every point; rows sum to 1."""
+    def cut(self, site: Site) -> Boxes:
+        """At least one cell; one alone means that the scene is not cut."""
 
 
 class DataParser(ABC):

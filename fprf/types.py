@@ -1,7 +1,7 @@
 """What flows between the parts. Letters, used in every signature:
 
 R rays · S samples of a ray · E = S+1 edges · N points · C content channels · D semantic channels of the field ·
-L latent channels · T style codes · K scene regions · V views · H W pixels · B images.
+L latent channels · T style codes · K scene regions · V views · H W pixels · B images · Z blocks · P sparse points.
 
 Images are [H W 3] sRGB in [0, 1] float32, channels last; encoders alone take [B 3 H W]. Camera axes are OpenGL's
 (x right, y up, the camera looks along -z); pixel centres lie at +0.5.
@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 
 from torch import Tensor
 
-__all__ = ["Batch", "FieldSample", "Level", "Rays", "Rendered", "Sampled", "Want"]
+__all__ = ["Batch", "Boxes", "FieldSample", "Level", "Rays", "Rendered", "Sampled", "Site", "Want"]
 
 
 class Want(Flag):
@@ -42,6 +42,35 @@ class Level(NamedTuple):
 
     s: Annotated[Tensor, "R E"]
     weights: Annotated[Tensor, "R S"]
+
+
+class Site(NamedTuple):
+    """What a block layout looks at: training cameras and sparse points in the scene's space, float64.
+
+    Axis 0 runs along the capture, axis 2 upwards; one unit is the distance that views commonly see.
+    """
+
+    position: Annotated[Tensor, "V 3"]
+    rays: Annotated[Tensor, "V"]
+    """int64 pixels of each view."""
+    points: Annotated[Tensor, "P 3"]
+    """None at all (P = 0) where the capture has no reconstruction."""
+    unit: float
+    """World units of one space unit."""
+
+
+class Boxes(NamedTuple):
+    """Where a scene is cut: Z cells in the scene's space, float64. Neighbours share faces; what no cell holds is surroundings.
+
+    Point x lies in a cell where low <= turn x <= high.
+    """
+
+    low: Annotated[Tensor, "Z 3"]
+    high: Annotated[Tensor, "Z 3"]
+    turn: Annotated[Tensor, "Z 3 3"]
+    """Rows: the axes of each cell; orthonormal."""
+    margin: float
+    """How far each block reaches beyond its cell; there it blends with its neighbours."""
 
 
 class Sampled(NamedTuple):
@@ -85,3 +114,5 @@ class Rendered(NamedTuple):
     sampled: Sampled | None = None
     counts: Mapping[str, int] = {}
     """How many samples were placed, kept, decoded: what was skipped can be read off."""
+    unaided: Annotated[Tensor, "R 3"] | None = None
+    """In training: the colour without the decoder's parameters that are the scene's own, if it has any."""

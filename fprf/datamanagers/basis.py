@@ -29,6 +29,10 @@ class Basis(NamedTuple):
         """Features in the basis, on the device and in the type of `x`."""
         return (x - self.mean.to(x)) @ self.matrix.to(x)
 
+    def lift(self, y: Annotated[Tensor, "... D"]) -> Annotated[Tensor, "... I"]:
+        """Back to the encoder's channels: what `project` gives `y` for, as near to the mean as can be."""
+        return y @ self.matrix.to(y).T + self.mean.to(y)
+
     def tensors(self) -> dict[str, Tensor]:
         """What `from_tensors` takes: for a tensor file."""
         return {

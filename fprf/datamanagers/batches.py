@@ -5,6 +5,7 @@ ones before, a resumed run sees the same pixels, and neighbouring seeds or steps
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +17,7 @@ from torch import Tensor
 from ..errors import DataError
 from ..interfaces import DataManager, Encoder
 from ..types import Batch
+from .basis import Basis
 from .config import RayBatchesConfig
 from .features import FeatureStore, Progress, extract
 from .images import load_image, load_images
@@ -52,6 +54,8 @@ class RayBatches(DataManager):
         cache: Path,
         seed: int,
         progress: Progress | None = None,
+        basis: Basis | None = None,
+        seen: Callable[[int], Annotated[Tensor, "H W"]] | None = None,
     ) -> None:
         if not len(scene.train):
             raise DataError(f"{scene.name}: no training views; at least one image must not be held out")
@@ -63,6 +67,7 @@ class RayBatches(DataManager):
         self._ends = self._sizes.prod(1).cumsum(0)
         self._slots = {view: slot for slot, view in enumerate(self._views)}
         self._pixels = self._load()
+        self._chosen = None if seen is None else self._choose(seen)
         self.content_store: FeatureStore | None = None
         self.semantic_store: FeatureStore | None = None
         if content is not None:
@@ -71,12 +76,15 @@ class RayBatches(DataManager):
             )
         if semantic is not None:
             self.semantic_store = extract(
-                cache / "semantic", self._views, self._stored, semantic, config.guided, dim=dim, progress=progress
+                cache / "semantic", self._views, self._stored, semantic, config.guided, dim=dim, progress=progress, basis=basis
             )
 
     def batch(self, step: int) -> Batch:
         """The pixels of a step; the first `semantic_share` of them carry semantics."""
-        at = torch.randint(len(self._pixels), (self._config.rays,), generator=generator_of(self._seed, step))
+        chosen = self._chosen
+        room = len(self._pixels) if chosen is None else len(chosen)
+        at = torch.randint(room, (self._config.rays,), generator=generator_of(self._seed, step))
+        at = at if chosen is None else chosen[at].long()
         slot = torch.searchsorted(self._ends, at, right=True)
         width, height = self._sizes[slot].unbind(1)
         local = at - (self._ends[slot] - width * height)
@@ -104,6 +112,17 @@ class RayBatches(DataManager):
         width, height = self._sizes[slot].tolist()
         end = int(self._ends[slot])
         return self._pixels[end - width * height : end].reshape(height, width, 3)
+
+    def _choose(self, seen: Callable[[int], Tensor]) -> Annotated[Tensor, "P"]:
+        """The pixels that `seen` allows, in half the memory while their number allows."""
+        parts = []
+        for slot, view in enumerate(self._views):
+            width, height = self._sizes[slot].tolist()
+            parts.append(seen(view).reshape(-1).nonzero()[:, 0] + int(self._ends[slot]) - width * height)
+        found = torch.cat(parts)
+        if not len(found):
+            raise DataError(f"{self._scene.name}: none of {len(self._views)} training views shows what is to be learnt")
+        return found.int() if len(self._pixels) < 2**31 else found
 
     def _load(self) -> Annotated[Tensor, "P 3"]:
         """All training pixels, uint8, view after view."""

@@ -12,7 +12,10 @@ from ..plugins.config import PluginConfig
 from .parsers.config import DataParserConfig
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ..interfaces import DataManager, Encoder
+    from .basis import Basis
     from .scene import Scene
 
 __all__ = ["DataManagerConfig", "GuidedConfig", "RayBatchesConfig"]
@@ -56,9 +59,18 @@ class DataManagerConfig(PluginConfig):
         cache: Path,
         seed: int,
         progress: Callable[[int, int, str], None] | None = None,
+        basis: Basis | None = None,
+        seen: Callable[[int], Tensor] | None = None,
     ) -> DataManager:
         """The data manager; features are computed into `cache` unless they lie there already. `dim` is the number of
-        principal semantic components that the field learns; `progress(done, total, what)` is told of the features."""
+        principal semantic components that the field learns; `progress(done, total, what)` is told of the features.
+
+        For a block of a larger scene, `basis` is the whole scene's, instead of one of these views; `seen(view)` says which
+        pixels [H W] of a training view batches are drawn from, instead of all."""
+        raise NotImplementedError
+
+    def batch_rays(self) -> int:
+        """Rays of a batch, for estimates."""
         raise NotImplementedError
 
 
@@ -85,10 +97,25 @@ class RayBatchesConfig(DataManagerConfig):
         cache: Path,
         seed: int,
         progress: Callable[[int, int, str], None] | None = None,
+        basis: Basis | None = None,
+        seen: Callable[[int], Tensor] | None = None,
     ) -> DataManager:
         """The data manager."""
         from .batches import RayBatches
 
         return RayBatches(
-            self, scene=scene, content=content, semantic=semantic, dim=dim, cache=cache, seed=seed, progress=progress
+            self,
+            scene=scene,
+            content=content,
+            semantic=semantic,
+            dim=dim,
+            cache=cache,
+            seed=seed,
+            progress=progress,
+            basis=basis,
+            seen=seen,
         )
+
+    def batch_rays(self) -> int:
+        """As many as `rays`."""
+        return self.rays

@@ -25,7 +25,7 @@ from .config import GuidedConfig
 from .store_files import Entry
 
 if TYPE_CHECKING:
-    from ..ops.guided_kernels import ViewArrays
+    from ..ops.guided_kernels import ViewTable
 
 __all__ = ["FeatureStore", "Progress", "extract"]
 
@@ -58,7 +58,8 @@ class FeatureStore:
         self.mean, self.std = _spread(list(self._entries.values()))
         """Mean over all channels, and root mean square over the channels' standard deviations, over all pixels."""
         self._magnitude = max(float(e.centre.abs().max()) for e in self._entries.values())
-        self._arrays = {view: _arrays(entry) for view, entry in self._entries.items()} if _COMPILED else {}
+        self._slots = {view: slot for slot, view in enumerate(self._entries)}
+        self._table = _table(list(self._entries.values())) if _COMPILED else None
 
     @property
     def scale(self) -> float:
@@ -71,26 +72,25 @@ class FeatureStore:
         """Features, float32, raw. `view` counts in the scene; pixel is x, y with centres at +0.5; rgb in [0, 1] is the
         image's own colour there. Raises DataError for a view that is not in the store.
         """
-        views = view.detach().cpu().numpy()
-        order = np.argsort(views, kind="stable")
-        groups = np.split(order, np.flatnonzero(np.diff(views[order])) + 1) if len(order) else []
-        missing = [int(views[g[0]]) for g in groups if int(views[g[0]]) not in self._entries]
+        views, found = np.unique(view.detach().cpu().numpy(), return_inverse=True)
+        missing = [v for v in views.tolist() if v not in self._slots]
         if missing:
             raise DataError(f"feature store: view {missing[0]} has no features; {len(self._entries)} training views have")
+        slot = torch.tensor([self._slots[v] for v in views.tolist()], dtype=torch.int64)[torch.from_numpy(found)]
         positions, colours = pixel.detach().cpu().float().contiguous(), rgb.detach().cpu().float().contiguous()
-        out = torch.empty(len(views), self.channels)
-        (self._compiled if _COMPILED else self._plain)(views, groups, positions, colours, out)
+        out = torch.empty(len(view), self.channels)
+        (self._compiled if _COMPILED else self._plain)(slot, positions, colours, out)
         return out.to(view.device)
 
-    def _compiled(self, views: np.ndarray, groups: list[np.ndarray], pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
+    def _compiled(self, slot: Tensor, pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
         from ..ops.guided_kernels import gather_views
 
-        met = [self._arrays[int(views[group[0]])] for group in groups]
-        gather_views(met, groups, pixel.numpy(), (rgb - store_files.GREY).numpy(), out.numpy())
+        assert self._table is not None
+        gather_views(self._table, slot.numpy(), pixel.numpy(), (rgb - store_files.GREY).numpy(), out.numpy())
 
-    def _plain(self, views: np.ndarray, groups: list[np.ndarray], pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
-        for group in groups:
-            entry, rows = self._entries[int(views[group[0]])], torch.from_numpy(group)
+    def _plain(self, slot: Tensor, pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
+        for number, entry in enumerate(self._entries.values()):
+            rows = (slot == number).nonzero()[:, 0]
             height, width = entry.size.tolist()
             out[rows] = guided.apply(entry.plain(), pixel[rows], rgb[rows], (height, width))
 
@@ -104,18 +104,20 @@ def extract(
     *,
     dim: int | None = None,
     progress: Progress | None = None,
+    basis: Basis | None = None,
 ) -> FeatureStore:
     """The store of some views, made in `folder` as far as it is not there yet.
 
-    `image` gives a view as uint8; `dim` asks for that many principal components (fewer, where the encoder has fewer). A
-    run that is cut off goes on where it stopped. Raises NumericsError where the encoder's features are not finite,
-    PluginError where they are not of the shape it promises.
+    `image` gives a view as uint8; `dim` asks for that many principal components (fewer, where the encoder has fewer), of
+    these views unless the `basis` of a larger scene is given. A run that is cut off goes on where it stopped. Raises
+    NumericsError where the encoder's features are not finite, PluginError where they are not of the shape it promises.
     """
     folder.mkdir(parents=True, exist_ok=True)
     store_files.remove_stale(folder)
     prints = {view: _fingerprint(image(view)) for view in views}
     remembered: dict[int, Tensor] = {}
-    basis = _basis(folder, prints, image, encoder, dim, remembered) if dim is not None else None
+    if basis is None and dim is not None:
+        basis = _basis(folder, prints, image, encoder, dim, remembered)
     projection = store_files.digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
     entries: dict[int, Entry] = {}
     keys = {}
@@ -220,14 +222,17 @@ def _basis(
     return basis
 
 
-def _arrays(entry: Entry) -> "ViewArrays":
-    """What the kernel takes of a view."""
-    from ..ops.guided_kernels import ViewArrays
+def _table(entries: Sequence[Entry]) -> "ViewTable":
+    """What the kernel takes of the views."""
+    from ..ops.guided_kernels import ViewArrays, ViewTable
 
-    rows, columns, _, run = entry.coefs.shape
-    height, width = entry.size.tolist()
-    bits = entry.coefs.view(torch.uint16).numpy().reshape(rows * columns, 4 * run)
-    return ViewArrays(bits, rows, columns, height, width, entry.scale.numpy(), entry.centre.numpy())
+    views = []
+    for entry in entries:
+        rows, columns, _, run = entry.coefs.shape
+        height, width = entry.size.tolist()
+        bits = entry.coefs.view(torch.uint16).numpy().reshape(rows * columns, 4 * run)
+        views.append(ViewArrays(bits, rows, columns, height, width, entry.scale.numpy(), entry.centre.numpy()))
+    return ViewTable(views)
 
 
 def _spread(entries: Sequence[Entry]) -> tuple[float, float]:

@@ -27,5 +27,7 @@ class Scene:
     """Sparse points of the reconstruction, float64 world, for bounds."""
     depths: Annotated[Tensor, "V 2"] | None = None
     """Nearest and farthest depth along each view's axis, where the capture says."""
+    seen: Annotated[Tensor, "O 2"] | None = None
+    """int64 pairs of a view and a point that the reconstruction found in it, where the capture says."""
     alpha: bool = False
     """Images carry transparency."""

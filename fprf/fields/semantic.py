@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..interfaces import SemanticField
 from .config import SemanticPlanesConfig
-from .networks import mlp
+from .networks import mlp, weights
 from .planes import Planes
 
 __all__ = ["SemanticPlanes"]
@@ -24,8 +24,8 @@ class SemanticPlanes(SemanticField):
 
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
         """Semantic features."""
-        result: Tensor = self.network(self.planes(points))
-        return result
+        maps = weights(self.network)
+        return self.planes.network(points, maps, [None] * len(maps))
 
     def penalties(self) -> dict[str, Tensor]:
         """None: semantics need no smoothing beyond the planes' own resolution."""

@@ -16,7 +16,7 @@ from ..errors import DataError
 from .cameras import Cameras, rays_through
 from .space import Kind, Space
 
-__all__ = ["find_kind", "find_space", "focus"]
+__all__ = ["FAR", "NEAR", "ROUNDING", "axes", "find_kind", "find_space", "focus"]
 
 FORWARD_ANGLE = math.radians(35)
 """Cameras that all look within this angle of their mean direction may be forward-facing."""
@@ -92,7 +92,7 @@ def _depths(scene: Scene) -> Tensor | None:
     return None
 
 
-def _axes(cameras: Cameras) -> Tensor:
+def axes(cameras: Cameras) -> Tensor:
     """Rows: the direction along which the cameras spread, third axis, mean up. Planes then follow streets and walls."""
     up = cameras.pose[:, :, 1].mean(0)
     if up.norm() < 0.3:  # a full turn about the optical axis, or nadir views from all sides: any axis is as good
@@ -113,7 +113,7 @@ def _axes(cameras: Cameras) -> Tensor:
 def _contraction(scene: Scene) -> Space:
     cameras = scene.cameras
     position = cameras.pose[:, :, 3]
-    rotation = _axes(cameras)
+    rotation = axes(cameras)
     point, certain = focus(cameras)
     ahead = ((point - position) * -cameras.pose[:, :, 2]).sum(-1) > 0
     inward = certain > 0.02 and ahead.double().mean() > 0.9

@@ -4,6 +4,7 @@ Undistortion takes a dozen Newton steps a pixel; training asks for the same pixe
 need one table (24 bytes a pixel). Above `LIMIT` bytes, for thousands of different lenses, rays are solved as they come.
 """
 
+from functools import lru_cache
 from typing import Annotated
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from .cameras import Cameras, pixel_grid, rays_through
 
-__all__ = ["LIMIT", "PixelRays"]
+__all__ = ["LIMIT", "PixelRays", "grid_rays"]
 
 LIMIT = 256 * 2**20
 """Bytes of tables that are kept at most."""
@@ -49,3 +50,28 @@ class PixelRays:
         pixel = pixel_grid(self.cameras, view)
         _, world = rays_through(self.cameras, torch.full((len(pixel),), view), pixel)
         return world @ self.cameras.pose[view, :, :3]
+
+
+def grid_rays(cameras: Cameras, view: int) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"]]:
+    """`rays_through` all pixels of a view (`pixel_grid`), within float64 rounding.
+
+    The frames of a path, and mostly the views of a capture, look through one lens: the last two are remembered.
+    """
+    numbers = (cameras.focal, cameras.centre, cameras.distortion)
+    width, height = cameras.size[view].tolist()
+    local = _local(*(tuple(x[view].tolist()) for x in numbers), width, height, int(cameras.lens[view]))
+    pose = cameras.pose[view]
+    direction = local.to(pose) @ pose[:, :3].T
+    return pose[:, 3].expand_as(direction), direction
+
+
+@lru_cache(maxsize=2)
+def _local(
+    focal: tuple[float, ...], centre: tuple[float, ...], distortion: tuple[float, ...], width: int, height: int, lens: int
+) -> Annotated[Tensor, "N 3"]:
+    """Unit directions in camera axes: a function of the lens alone."""
+    still = torch.cat([torch.eye(3, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)], 1)
+    focals, centres, bends = (torch.tensor([x], dtype=torch.float64) for x in (focal, centre, distortion))
+    camera = Cameras(still[None], focals, centres, torch.tensor([[width, height]]), bends, torch.tensor([lens]))
+    pixel = pixel_grid(camera, 0)
+    return rays_through(camera, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1]

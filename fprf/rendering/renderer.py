@@ -7,14 +7,14 @@ Only the kept samples meet the content network, the semantic field, the stylizer
 most `budget` a ray, which bounds the colour error (colours lie in [0, 1]).
 """
 
-from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..interfaces import ContentField, Decoder, Sampler, SemanticField, Stylizer
-from ..style.controls import blend_strength
+from ..interfaces import ContentField, Decoder, Sampler, SemanticField
+from ..ops import march as compiled
+from ..style.look import Restyle
 from ..types import Rays, Rendered, Sampled, Want
 from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
@@ -36,14 +36,6 @@ class Parts(NamedTuple):
     decoder: Decoder
 
 
-@dataclass(frozen=True)
-class Restyle:
-    """A stylizer and how strongly it acts, 0 to 1; at 0 it is never called."""
-
-    stylizer: Stylizer
-    strength: float = 1.0
-
-
 class Kept(NamedTuple):
     """The samples of R rays that matter, flattened: M of them, ray after ray."""
 
@@ -56,6 +48,8 @@ class Kept(NamedTuple):
     view: Annotated[Tensor, "M 3"]
     fair: Annotated[Tensor, "M"] | None = None
     """What gradients of their features are multiplied by in training; None = nothing."""
+    start: Annotated[Tensor, "R+1"] | None = None
+    """Where the samples of each ray begin, and at last where they end; None = unknown."""
 
 
 class March(NamedTuple):
@@ -75,18 +69,20 @@ def march(
 ) -> March:
     """Sample, weigh, and keep what matters."""
     space = parts.space
-    sampled = parts.sampler(rays, locate=space.locate, distance=space.distance, step=step, generator=generator)
+    sampled = parts.sampler(rays, space=space, step=step, generator=generator)
+    # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
+    # veil there. Weighing gradients by the square of the distance makes every piece of space count alike (Philip and
+    # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
+    veiled = step is not None and space.kind in ("contraction", "open")
+    if compiled.fit(rays.origin, sampled.t):
+        return _march_compiled(rays, parts, sampled, budget, veiled)
     middle = midpoints(sampled.t)
     points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
     located = space.locate(points.view(-1, 3))
     sample = parts.field.density(located)
     density = sample.density.view(middle.shape)
-    fair = None
-    if step is not None and space.kind == "contraction":
-        # A camera samples what is near it far more densely than any other camera does, and could explain its own image
-        # by a veil there. Weighing gradients by the square of the distance makes every piece of space count alike
-        # (Philip and Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
-        fair = (middle / (VEIL * rays.near[:, None])).square().clamp(max=1)
+    fair = _fairness(rays, middle) if veiled else None
+    if fair is not None:
         density = scale_gradient(density, fair)
     weights = transmittance_weights(density, sampled.t)
     optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
@@ -108,8 +104,24 @@ def march(
     return March(sampled, weights, depth, opacity, through, kept)
 
 
+def _march_compiled(rays: Rays, parts: Parts, sampled: Sampled, budget: float, veiled: bool) -> March:
+    """The same, ray by ray."""
+    point = compiled.place(rays, sampled.t, parts.space.warp)
+    sample = parts.field.density(point.view(-1, 3))
+    fair = _fairness(rays, midpoints(sampled.t)) if veiled else None
+    found = compiled.weigh(sample.density.view(point.shape[:2]), sampled.t, budget, fair=fair)
+    kept = Kept(*compiled.gather(found, point, sample.latent, rays.view, fair), found.start)
+    return March(sampled, found.weights, found.depth, found.opacity, found.through, kept)
+
+
+def _fairness(rays: Rays, middle: Annotated[Tensor, "R S"]) -> Annotated[Tensor, "R S"]:
+    return (middle / (VEIL * rays.near[:, None])).square().clamp(max=1)
+
+
 def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
+    if kept.start is not None and compiled.fit(kept.weight, values):
+        return compiled.composite(kept.weight, values, kept.start)
     return values.new_zeros(rays, values.shape[1]).index_add(0, kept.ray, values * kept.weight[:, None])
 
 
@@ -135,7 +147,7 @@ def render_rays(
     """
     marched = march(rays, parts, budget=budget, step=step, generator=generator)
     kept, count = marched.kept, len(rays.near)
-    rgb = content = semantic = None
+    rgb = content = semantic = unaided = None
     if want & (Want.COLOUR | Want.CONTENT):
         features = parts.field.content(kept.latent, kept.view)
         if kept.fair is not None:
@@ -144,22 +156,24 @@ def render_rays(
             still = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
             content = composite(still, features, count)
         if Want.COLOUR in want:
-            if restyle is not None and restyle.strength > 0:
-                features = _restyled(features, kept, parts, restyle)
-            rgb = composite(kept, parts.decoder(features), count)
-            if background is not None:
-                rgb = rgb + marched.through[:, None] * background
+            behind = 0.0 if background is None else marched.through[:, None] * background
+            rgb = composite(kept, _colour(features, kept, parts, restyle), count) + behind
+            if step is not None and (alone := parts.decoder.unaided(features)) is not None:
+                unaided = composite(kept, alone, count) + behind
     if Want.SEMANTIC in want and parts.semantic is not None:
         semantic = _semantics(marched, rays, parts, count if semantic_rays is None else semantic_rays, semantic_samples)
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
-    return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts)
+    return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts, unaided)
 
 
-def _restyled(features: Tensor, kept: Kept, parts: Parts, restyle: Restyle) -> Tensor:
+def _colour(features: Annotated[Tensor, "M C"], kept: Kept, parts: Parts, restyle: Restyle | None) -> Annotated[Tensor, "M 3"]:
+    if restyle is None or restyle.idle:
+        plain: Tensor = parts.decoder(features)
+        return plain
     semantic = None
-    if Want.SEMANTIC in restyle.stylizer.needs and parts.semantic is not None:
+    if Want.SEMANTIC in restyle.needs and parts.semantic is not None:
         semantic = parts.semantic(kept.point)
-    return blend_strength(features, restyle.stylizer(features, semantic), restyle.strength)
+    return restyle.colour(parts.decoder, features, semantic)
 
 
 def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: int | None) -> Tensor:

@@ -1,11 +1,12 @@
 """The space that a scene's fields live in: from world metres to the unit cube [-1, 1]^3.
 
-Three kinds, chosen from the cameras and points by `bounds.find_space`, never asked for:
+Kinds, chosen from the cameras and points by `bounds.find_space`, never asked for:
 
     box          a bounded object: an affine map; rays are cut at the box
     contraction  anything unbounded: recentred and scaled so that the part that matters lies in [-1, 1]^3, then
                  x -> (2 - 1/m) x / m where m = max |x_i| > 1, and halved; distances are spaced evenly near, in disparity far
     ndc          forward-facing captures: normalised device coordinates of the mean camera (NeRF, appendix C)
+    open         a scene cut into blocks: distances as in the contraction, points as they are (see `blocks.space`)
 
 World coordinates are recentred in float64 before anything is float32: at 4.5e6 m float32 steps are 0.5 m.
 Spacing maps s in [0, 1] to the ray parameter t. In the contraction g(t) = t/2 up to 1 and 1 - 1/(2t) beyond is linear in s;
@@ -13,16 +14,18 @@ the far half works with the complement 1/(2t), which keeps its relative accuracy
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
+from ..ops import march
 from ..types import Rays
 
 __all__ = ["Kind", "Space", "contract", "uncontract"]
 
-Kind = Literal["box", "contraction", "ndc"]
+Kind = Literal["box", "contraction", "ndc", "open"]
 
 
 def contract(x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
@@ -79,7 +82,9 @@ class Space:
         return Rays(o.float(), d.float(), view, near.float(), far.float())
 
     def locate(self, x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
-        """Points of the space to the unit cube."""
+        """Points of the space to the unit cube; of an open one they stay as they are."""
+        if self.kind == "open":
+            return x
         if self.kind == "contraction":
             return contract(x)
         low, high = x.new_tensor(self.low), x.new_tensor(self.high)
@@ -89,8 +94,10 @@ class Space:
         self, s: Annotated[Tensor, "R E"], near: Annotated[Tensor, "R"], far: Annotated[Tensor, "R"]
     ) -> Annotated[Tensor, "R E"]:
         """Ray parameters t of edges s in [0, 1]; increasing, with the ends on near and far."""
+        if march.fit(s, near, far) and march.still(s, near, far):
+            return march.distances(s, near, far, self.warp)
         n, f = near[:, None], far[:, None]
-        if self.kind != "contraction":
+        if self.kind in ("box", "ndc"):
             return n + (f - n) * s
         g_near, g_far = torch.where(n < 1, n / 2, 1 - 0.5 / n), torch.where(f < 1, f / 2, 1 - 0.5 / f)
         c_near, c_far = torch.where(n < 1, 1 - n / 2, 0.5 / n), torch.where(f < 1, 1 - f / 2, 0.5 / f)
@@ -98,6 +105,11 @@ class Space:
         g, c = g_near + (g_far - g_near) * s, c_far + (c_near - c_far) * (1 - s)
         # Both round: the clamp keeps them in order where they meet, since a negative step would be a negative weight.
         return torch.where(g < 0.5, 2 * g, 0.5 / c.clamp(max=0.5))
+
+    @cached_property
+    def warp(self) -> march.Warp:
+        """`locate` and `distance` as compiled kernels take them."""
+        return march.warp_of("box" if self.kind == "ndc" else self.kind, self.low, self.high)
 
     def metric(
         self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], t: Annotated[Tensor, "R"]

@@ -9,7 +9,16 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-__all__ = ["distortion", "interlevel", "keep_heaviest", "midpoints", "resample", "scale_gradient", "transmittance_weights"]
+__all__ = [
+    "distortion",
+    "interlevel",
+    "keep_heaviest",
+    "midpoints",
+    "resample",
+    "scale_gradient",
+    "shifts",
+    "transmittance_weights",
+]
 
 
 class _Weights(torch.autograd.Function):
@@ -72,6 +81,13 @@ def midpoints(t: Annotated[Tensor, "R E"]) -> Annotated[Tensor, "R S"]:
     return 0.5 * (t[:, 1:] + t[:, :-1])
 
 
+def shifts(s: Annotated[Tensor, "R E"], generator: torch.Generator | None) -> Annotated[Tensor, "R 1"]:
+    """How far new edges are shifted, as a share of a step: one draw a ray, one half without a generator."""
+    if generator is None:
+        return torch.full((len(s), 1), 0.5, dtype=s.dtype, device=s.device)
+    return torch.rand((len(s), 1), generator=generator, dtype=s.dtype, device=s.device)
+
+
 def resample(
     s: Annotated[Tensor, "R E"],
     w: Annotated[Tensor, "R S"],
@@ -88,12 +104,7 @@ def resample(
     cdf = w.cumsum(-1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf / cdf[:, -1:]], -1)
     step = 1 / (count + 1)
-    shift = (
-        torch.full((len(s), 1), 0.5, dtype=s.dtype, device=s.device)
-        if generator is None
-        else torch.rand((len(s), 1), generator=generator, dtype=s.dtype, device=s.device)
-    )
-    u = torch.linspace(0, 1 - step, count + 1, dtype=s.dtype, device=s.device) + shift * step
+    u = torch.linspace(0, 1 - step, count + 1, dtype=s.dtype, device=s.device) + shifts(s, generator) * step
     at = torch.searchsorted(cdf, u.contiguous(), right=True)
     low, high = (at - 1).clamp(0, s.shape[1] - 1), at.clamp(0, s.shape[1] - 1)
     c0, c1 = cdf.gather(1, low), cdf.gather(1, high)

@@ -1,9 +1,11 @@
 """A town from a seed: which solids stand where.
 
 The street runs along x from -8 to 42 m and ends in a square before a church; houses, front gardens, trees and lamps line
-it on both sides (y < 0 and y > 0); a wood all around hides the horizon, so that every ray ends within about 80 m.
+it on both sides (y < 0 and y > 0); a wood all around hides the horizon, so that every ray ends within about 80 m. A longer
+street begins further back.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +20,7 @@ __all__ = ["CROSSING", "END", "KERB", "ROAD_HALF", "SQUARE_HALF", "START", "WALK
 ROAD_HALF, WALK_HALF, KERB = 3.4, 5.4, 0.22
 """Half widths of the road and of road plus sidewalks, and the width of the kerb, in metres."""
 START, END, SQUARE_HALF = -8.0, 41.0, 9.0
-"""Where the houses begin, where the road meets the square, and half the square's width."""
+"""Where the houses begin (in the shortest town), where the road meets the square, and half the square's width."""
 CROSSING = 13.0
 """Where the zebra crossing begins."""
 
@@ -52,14 +54,16 @@ class Town(NamedTuple):
     """[K 5] low x, low y, high x, high y, height of what stands on the ground, for ambient occlusion."""
     lamps: NDArray[np.float64]
     """[L 3] positions of the lights."""
+    start: float
+    """x where the houses begin."""
 
 
-def _row(side: int, rng: np.random.Generator) -> list[Shape]:
+def _row(side: int, start: float, rng: np.random.Generator) -> list[Shape]:
     """Houses, gardens and driveways of one side of the street."""
     shapes: list[Shape] = []
     styles = rng.permutation(4)
     number = 0
-    x = START + float(rng.uniform(-1.0, 1.0))
+    x = start + float(rng.uniform(-1.0, 1.0))
     while x < END - 7.0:
         width = float(rng.uniform(6.5, 9.5))
         front = WALK_HALF + float(rng.uniform(2.2, 4.0))
@@ -90,27 +94,27 @@ def _gap(x: float, gap: float, front: float, side: int, rng: np.random.Generator
     return shapes
 
 
-def _avenue(rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float, float, float]]]:
+def _avenue(start: float, rng: np.random.Generator) -> tuple[list[Shape], list[tuple[float, float, float]]]:
     """Trees and lamps along both sidewalks, and cars at the far end of the street."""
     shapes: list[Shape] = []
     lights = []
     for side in (-1, 1):
         shift = float(rng.uniform(0.0, 3.0))
-        for k in range(6):
-            x = -5.0 + shift + 8.2 * k
+        for k in range(6 + math.ceil((START - start) / 8.2)):
+            x = start + 3.0 + shift + 8.2 * k
             if x < END and rng.random() < 0.85:
                 shapes += tree(x, side * (WALK_HALF + 0.9), float(rng.uniform(1.05, 1.65)), rng)
-        for k in range(5):
-            x = -2.0 + 11.0 * k + (5.5 if side > 0 else 0.0)
+        for k in range(5 + math.ceil((START - start) / 11.0)):
+            x = start + 6.0 + 11.0 * k + (5.5 if side > 0 else 0.0)
             shapes += lamp(x, side * (ROAD_HALF + 0.55))
             lights.append((x, side * (ROAD_HALF + 0.55), LANTERN))
         shapes += car(float(rng.uniform(34.0, 38.0)), side * (ROAD_HALF - 1.05), 0, rng)
     return shapes, lights
 
 
-def _wood(rng: np.random.Generator) -> list[Shape]:
+def _wood(start: float, rng: np.random.Generator) -> list[Shape]:
     """Overlapping crowns on a rectangle around the town."""
-    low, high = np.array([-17.0, -27.0]), np.array([70.0, 27.0])
+    low, high = np.array([start - 9.0, -27.0]), np.array([70.0, 27.0])
     shapes: list[Shape] = []
     for x in np.arange(low[0], high[0], 4.0):
         for y in (low[1], high[1]):
@@ -127,12 +131,13 @@ def _table(faces: list[Face]) -> FaceTable:
     return FaceTable(*numbers.T, *frames)
 
 
-def build_town(seed: int) -> Town:
-    """The town of a seed: same seed, same town."""
+def build_town(seed: int, extra: float = 0.0) -> Town:
+    """The town of a seed, its street longer by `extra` metres: same seed and length, same town."""
+    begin = START - extra
     rng = np.random.default_rng([0x70574E, seed])
     shapes = church(END + 7.0, rng)
-    avenue, lights = _avenue(rng)
-    shapes += _row(-1, rng) + _row(1, rng) + avenue + _wood(rng)
+    avenue, lights = _avenue(begin, rng)
+    shapes += _row(-1, begin, rng) + _row(1, begin, rng) + avenue + _wood(begin, rng)
     for side in (-1, 1):
         shapes += tree(END + 4.0, side * 7.2, 2.0, rng) + tree(END + 12.0, side * 10.5, 2.4, rng)
         low, high = sorted((side * 9.4, side * 10.2))
@@ -146,7 +151,10 @@ def build_town(seed: int) -> Town:
     solid = [
         s
         for s in shapes
-        if s.low[2] < 0.4 and abs(s.low[1] + s.high[1]) < 40.0 and s.low[0] > -12.0 and np.ptp([s.low[0], s.high[0]]) > 0.7
+        if s.low[2] < 0.4
+        and abs(s.low[1] + s.high[1]) < 40.0
+        and s.low[0] > begin - 4.0
+        and np.ptp([s.low[0], s.high[0]]) > 0.7
     ]
     prints = np.array([[*s.low[:2], *s.high[:2], s.high[2]] for s in solid])
-    return Town(seed, tuple(shapes), tuple(first), _table(faces), prints, np.array(lights))
+    return Town(seed, tuple(shapes), tuple(first), _table(faces), prints, np.array(lights), begin)

@@ -7,7 +7,7 @@ too depends on the place (how far outside the street it lies), not on the camera
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import END, START, Town
+from .layout import END, Town
 from .paint import foliage_normals, paint
 from .palettes import Palette
 from .shapes import Material
@@ -46,14 +46,16 @@ def _occlusion(town: Town, points: Array, ground: NDArray[np.bool_]) -> NDArray[
     """Share of the ambient light that reaches a point: less on the ground close to walls, hedges and cars."""
     open_ = np.ones(len(points), dtype=np.float32)
     at = np.flatnonzero(ground)
+    at = at[np.argsort(points[at, 0], kind="stable")]  # then what one footprint can reach lies together
     x, y = points[at, 0].astype(np.float32), points[at, 1].astype(np.float32)
     least = np.ones(len(at), dtype=np.float32)
     for low_x, low_y, high_x, high_y, height in town.footprints.astype(np.float32):
         reach = min(0.5 * float(height), 2.0)
-        dx = np.maximum(np.maximum(low_x - x, x - high_x), 0)
-        dy = np.maximum(np.maximum(low_y - y, y - high_y), 0)
+        part = slice(*np.searchsorted(x, [low_x - reach, high_x + reach]))
+        dx = np.maximum(np.maximum(low_x - x[part], x[part] - high_x), 0)
+        dy = np.maximum(np.maximum(low_y - y[part], y[part] - high_y), 0)
         near = 1 - np.minimum((dx + dy) / reach, 1)
-        least *= 1 - np.float32(0.45) * near * near
+        least[part] *= 1 - np.float32(0.45) * near * near
     open_[at] = least
     return open_
 
@@ -98,7 +100,7 @@ def shade(town: Town, look: Palette, face: NDArray[np.integer], points: Array) -
     if look.lamps > 0:
         light = light + _lamplight(town, points, normals, look)
     colour = _linear(albedo) * light * look.exposure + glow * look.exposure
-    outside = np.maximum(np.abs(points[:, 1]) - 9.0, np.maximum(START - points[:, 0], points[:, 0] - END))
+    outside = np.maximum(np.abs(points[:, 1]) - 9.0, np.maximum(town.start - points[:, 0], points[:, 0] - END))
     haze = (1 - np.exp(-np.maximum(outside, 0) / 40.0 * 2.0)) * look.haziness
     hazy = np.array(look.haze) * haze[:, None]
     return np.asarray(_encode(colour) * (1 - haze[:, None]) + hazy, np.float32)

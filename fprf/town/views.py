@@ -22,8 +22,10 @@ def is_test(view: int) -> bool:
     return view % _EVERY == 0
 
 
-def walk(*, seed: int, views: int, width: int, height: int) -> list[View]:
+def walk(*, seed: int, views: int, width: int, height: int, extra: float = 0.0) -> list[View]:
     """Poses up the street and back down again, always facing its far end; looks to a side come from across the road.
+
+    In a street that is `extra` metres longer the walk begins as much further back.
 
     The walk starts a tenth into its loop: the rearmost views, which see what no other does, are then for training.
     """
@@ -33,7 +35,7 @@ def walk(*, seed: int, views: int, width: int, height: int) -> list[View]:
     for k in range(views):
         yaw = _YAW[k % len(_YAW)] + float(rng.uniform(-6, 6))
         way = 1.0 - abs(2.0 * (((k + 0.5) / views + 0.1) % 1.0) - 1.0)
-        x = _FROM + (_TO - _FROM) * way
+        x = _FROM - extra + (_TO - _FROM + extra) * way
         y = -2.6 * math.sin(math.radians(2.0 * yaw)) + 1.4 * math.sin(2.4 * k) + float(rng.uniform(-0.3, 0.3))
         place = np.array([x, float(np.clip(y, -3.2, 3.2)), float(rng.uniform(1.6, 2.4))])
         result.append(View(_pose(place, yaw, float(rng.uniform(4.0, 9.0))), focal, width, height))

@@ -4,7 +4,7 @@ transforms.json           cameras, split
 images/0000.png           sRGB
 depth/0000.npz            `depth` [H W] float32, metres along the unit ray through the pixel's centre, inf = sky
 labels/0000.png           class ids, one channel
-points.npz                `xyz` [P 3] float32 surface points, `rgb` [P 3] uint8
+points.npz                `xyz` [P 3] float32 surface points, `rgb` [P 3] uint8, `seen` [O 2] view and point
 palette.json, town.json   colours and light; the settings, written last
 """
 
@@ -46,6 +46,8 @@ class TownSettings:
     views: int
     width: int
     height: int
+    extra: float = 0.0
+    """Metres by which the street is longer."""
     edition: int = _EDITION
 
     @property
@@ -128,8 +130,8 @@ def _surface(view: View, picture: Picture, rng: np.random.Generator) -> tuple[ND
 
 
 def _fill(folder: Path, settings: TownSettings, look: Palette) -> None:
-    town = build_town(settings.seed)
-    views = walk(seed=settings.seed, views=settings.views, width=settings.width, height=settings.height)
+    town = build_town(settings.seed, settings.extra)
+    views = walk(seed=settings.seed, views=settings.views, width=settings.width, height=settings.height, extra=settings.extra)
     rng = np.random.default_rng([0x9015, settings.seed])
     for name in ("images", "depth", "labels"):
         (folder / name).mkdir()
@@ -141,20 +143,24 @@ def _fill(folder: Path, settings: TownSettings, look: Palette) -> None:
         np.savez_compressed(folder / "depth" / f"{k:04d}.npz", depth=picture.depth)
         if not is_test(k):
             cloud.append(_surface(view, picture, rng))
+    finder = np.repeat([k for k in range(len(views)) if not is_test(k)], [len(c[0]) for c in cloud])
     np.savez_compressed(
-        folder / "points.npz", xyz=np.concatenate([c[0] for c in cloud]), rgb=np.concatenate([c[1] for c in cloud])
+        folder / "points.npz",
+        xyz=np.concatenate([c[0] for c in cloud]),
+        rgb=np.concatenate([c[1] for c in cloud]),
+        seen=np.stack([finder, np.arange(len(finder))], 1),
     )
     _save_json(folder / "transforms.json", _transforms(views))
     _save_json(folder / "palette.json", asdict(look))
     _save_json(folder / _RECORD, {"settings": asdict(settings), "classes": list(CLASSES)})
 
 
-def write_town(folder: Path, *, seed: int, palette: str, views: int, width: int, height: int) -> None:
+def write_town(folder: Path, *, seed: int, palette: str, views: int, width: int, height: int, extra: float = 0.0) -> None:
     """Renders a town into a folder, all or nothing; a complete one of the same settings is left as it is.
 
     Raises DataError where the folder holds something else, or can't be written.
     """
-    settings = TownSettings(seed=seed, palette=palette, views=views, width=width, height=height)
+    settings = TownSettings(seed=seed, palette=palette, views=views, width=width, height=height, extra=float(extra))
     look = palette_of(palette)
     if _complete(folder, settings):
         return

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.lens import FISHEYE, OPENCV, PINHOLE
-from fprf.rendering.pixel_rays import LIMIT, PixelRays
+from fprf.rendering.pixel_rays import LIMIT, PixelRays, grid_rays
 
 K = {PINHOLE: [0.0] * 6, OPENCV: [0.05, -0.08, 0.01, 0.0, -0.001, 0.0002], FISHEYE: [0.05, -0.01, 0.002, 0.0, 0.0, 0.0]}
 
@@ -77,3 +77,32 @@ def test_no_pixels() -> None:
     rays = PixelRays(rig([PINHOLE], [(4, 4)]))
     origin, direction = rays(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2))
     assert origin.shape == direction.shape == (0, 3)
+
+
+@pytest.mark.parametrize("offset", [0.0, 4.5e6])
+def test_whole_views_of_mixed_cameras(offset: float) -> None:
+    """Twice, in turn: what is remembered of one lens must not be taken for another's, nor one place for another."""
+    cameras = rig(*MIXED, offset=offset)
+    for view in (*range(len(cameras)), *range(len(cameras))):
+        pixel = pixel_grid(cameras, view)
+        origin, direction = grid_rays(cameras, view)
+        wanted_origin, wanted = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+        assert torch.equal(origin, wanted_origin) and origin.dtype == direction.dtype == torch.float64
+        assert (direction - wanted).abs().max() <= 1e-14
+
+
+def test_a_lens_that_differs_in_anything_is_another() -> None:
+    base = rig([OPENCV], [(12, 5)])
+    changed = [
+        replace(base, focal=base.focal * 1.01),
+        replace(base, centre=base.centre + 0.5),
+        replace(base, distortion=base.distortion * 0.5),
+        replace(base, lens=torch.tensor([FISHEYE])),
+        base.resized(torch.tensor([[24, 10]])),
+    ]
+    _, known = grid_rays(base, 0)
+    for other in changed:
+        pixel = pixel_grid(other, 0)
+        _, found = grid_rays(other, 0)
+        assert (found - rays_through(other, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1]).abs().max() <= 1e-14
+        assert found.shape != known.shape or (found - known).abs().max() > 1e-4

@@ -29,6 +29,12 @@ class Squash(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return torch.sigmoid(content[:, :3])
 
+    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
+        return self(styled)
+
+    def unaided(self, content: Tensor) -> None:
+        return None
+
 
 class Uniform(ContentField):
     """One density and one content everywhere."""

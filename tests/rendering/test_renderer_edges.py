@@ -36,6 +36,12 @@ class Plain(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return content.sigmoid()
 
+    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
+        return self(styled)
+
+    def unaided(self, content: Tensor) -> None:
+        return None
+
 
 def parts_of(kind: Kind, samples: int) -> Parts:
     values = torch.rand(4 * samples, generator=torch.Generator().manual_seed(0))

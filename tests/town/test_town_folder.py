@@ -43,7 +43,7 @@ def test_folder_holds_everything(folder):
     assert names == sorted([*write._files(9), "town.json"])
     record = json.loads((folder / "town.json").read_text())
     assert record["classes"] == list(CLASSES)
-    assert record["settings"] == {**SMALL, "edition": write._EDITION}
+    assert record["settings"] == {**SMALL, "extra": 0.0, "edition": write._EDITION}
     assert json.loads((folder / "palette.json").read_text())["name"] == "autumn"
     assert [path.name for path in folder.parent.iterdir()] == ["town"], "nothing temporary is left"
 
@@ -142,6 +142,15 @@ def test_the_slower_of_two_writers_yields(folder, tmp_path):
     assert (folder / "town.json").stat().st_ino == before
 
 
+def test_a_longer_street_begins_further_back(tmp_path):
+    write_town(tmp_path / "long", **TINY, extra=60.0)
+    poses = [frame["transform_matrix"] for frame in json.loads((tmp_path / "long/transforms.json").read_text())["frames"]]
+    expected = [view.pose[:, 3] for view in walk(seed=2, views=2, width=24, height=18, extra=60.0)]
+    np.testing.assert_allclose(np.array(poses)[:, :3, 3], expected)
+    usual = [view.pose[:, 3] for view in walk(seed=2, views=2, width=24, height=18)]
+    assert min(x for x, _, _ in expected) < min(x for x, _, _ in usual) - 10
+
+
 def test_truth_that_is_missing_is_reported(folder, tmp_path):
     with pytest.raises(DataError, match=r"0099\.npz"):
         read_truth(folder, 99)
@@ -156,9 +165,17 @@ def test_truth_that_is_missing_is_reported(folder, tmp_path):
 def test_keys_differ_with_every_setting():
     base = {**SMALL}
     keys = {TownSettings(**base).key}
-    for name, value in (("seed", 3), ("palette", "day"), ("views", 10), ("width", 25), ("height", 19), ("edition", 99)):
+    for name, value in (
+        ("seed", 3),
+        ("palette", "day"),
+        ("views", 10),
+        ("width", 25),
+        ("height", 19),
+        ("extra", 8.0),
+        ("edition", 99),
+    ):
         keys.add(TownSettings(**{**base, name: value}).key)
-    assert len(keys) == 7
+    assert len(keys) == 8
 
 
 def test_parser_renders_once_into_the_cache(cache, monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fprf.town.classes import CLASSES, DOOR, LAWN, ROAD, SIDEWALK, SKY, WINDOW
-from fprf.town.layout import ROAD_HALF, build_town
+from fprf.town.layout import END, ROAD_HALF, START, build_town
 from fprf.town.palettes import PALETTES
 from fprf.town.render import geometry
 from fprf.town.shapes import Material, Polyhedron
@@ -47,6 +47,20 @@ def test_towns_are_functions_of_their_seed():
     first, same, other = (walk(seed=s, views=4, width=8, height=8) for s in (1, 1, 2))
     assert all(np.array_equal(a.pose, b.pose) for a, b in zip(first, same, strict=True))
     assert not any(np.array_equal(a.pose, b.pose) for a, b in zip(first, other, strict=True))
+
+
+@pytest.mark.parametrize("extra", [0.0, 70.0])
+def test_houses_lamps_and_trees_line_the_whole_street(extra):
+    town = build_town(1, extra)
+    assert town.start == START - extra
+    for kind in (Material.FACADE, Material.LANTERN, Material.FOLIAGE):
+        own = np.sort(
+            np.array([s.low[0] for s, k in zip(town.shapes, town.first, strict=True) if town.faces.material[k] == kind])
+        )
+        own = own[(own > town.start) & (own < END)]
+        assert own[0] < town.start + 10 and own[-1] > END - 15
+        assert np.diff(own).max() < 16, "no gap wider than between two lamps of a side"
+    assert len(build_town(1, 70.0).shapes) > 1.5 * len(build_town(1).shapes)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

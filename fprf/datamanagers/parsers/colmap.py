@@ -19,6 +19,7 @@ from ..scene import Scene
 from .colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model
 from .config import ColmapConfig
 from .files import inside
+from .seen import pairs
 from .views import View, assemble, rigid
 
 __all__ = ["ColmapParser", "model_folder"]
@@ -51,8 +52,9 @@ class ColmapParser(DataParser):
         name, root = inside(data, "parser.images", self.config.images)
         index = dict(zip(model.point_ids.tolist(), range(len(model.point_ids)), strict=True))
         lenses = {id_: _lens(f"{folder}: camera {id_}", camera) for id_, camera in model.cameras.items()}
+        images = sorted(model.images, key=lambda image: inside(root, f"{folder}: image {image.name!r}", image.name)[0])
         views = []
-        for image in model.images:
+        for image in images:
             where = f"{folder}: image {image.name!r}"
             if image.camera not in lenses:
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
@@ -73,12 +75,11 @@ class ColmapParser(DataParser):
                     depths=_depths(model, index, image, pose),
                 )
             )
-        views.sort(key=lambda view: view.name)
         twice = [inner for inner, times in Counter(view.name for view in views).items() if times > 1]
         if twice:
             raise DataError(f"{folder}: the image {twice[0]!r} is registered twice; export the model again")
-        finite = np.isfinite(model.points).all(1)
-        return assemble(data, views, downscale=downscale, points=model.points[finite], reduced=name != "images")
+        points, seen = pairs(model, images)
+        return assemble(data, views, downscale=downscale, points=points, seen=seen, reduced=name != "images")
 
 
 def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:

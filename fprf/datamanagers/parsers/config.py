@@ -81,8 +81,11 @@ class TownConfig(DataParserConfig):
     """Pixels across an image."""
     height: int = 120
     """Pixels down an image."""
+    extra: float = 0.0
+    """Metres by which the street is longer than the usual 49: a scene for many blocks."""
 
     def __post_init__(self) -> None:
+        at_least("parser.extra", self.extra, 0.0)
         at_least("parser.seed", self.seed, 0)
         at_least("parser.views", self.views, 2)
         at_least("parser.width", self.width, 8)

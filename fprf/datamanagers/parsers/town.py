@@ -1,7 +1,7 @@
 """The embedded town: rendered once per settings into the user's cache, then read like any other scene."""
 
 import os
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from ...errors import DataError
@@ -36,9 +36,11 @@ class TownParser(DataParser):
         from ...town.write import TownSettings, write_town
 
         c = self.config
-        settings = TownSettings(seed=c.seed, palette=c.palette, views=c.views, width=c.width, height=c.height)
+        settings = TownSettings(
+            seed=c.seed, palette=c.palette, views=c.views, width=c.width, height=c.height, extra=float(c.extra)
+        )
         folder = _cache() / f"town-{settings.key}"
-        write_town(folder, seed=c.seed, palette=c.palette, views=c.views, width=c.width, height=c.height)
+        write_town(folder, **{k: v for k, v in asdict(settings).items() if k != "edition"})
         return folder
 
 

@@ -2,7 +2,7 @@
 
 Poses are camera-to-world in OpenGL axes and are kept as they are (an `applied_transform` is not undone). Intrinsics
 (`fl_x fl_y cx cy w h`, else `camera_angle_x`; `k1 k2 k3 k4 p1 p2`; `camera_model`; `near`, `far`) stand once or by frame.
-`points.npz` beside the file holds sparse points in the same frame.
+`points.npz` beside the file holds sparse points in the same frame; so does a COLMAP model in `sparse/0` that it was made of.
 """
 
 import math
@@ -10,6 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...errors import DataError
@@ -18,8 +20,9 @@ from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ..image_header import read_header
 from ..scene import Scene
 from .config import TransformsConfig
-from .files import inside, read_json, read_npz
+from .files import inside, read_json
 from .record import Record, record_of
+from .seen import beside, read_cloud
 from .split import indices
 from .views import View, assemble, found, rigid
 
@@ -65,17 +68,9 @@ class TransformsParser(DataParser):
             if first.name == second.name:
                 raise DataError(f"{second.record.where}: the image {second.name} occurs twice; remove one of the frames")
         found(data, [entry.path for entry in entries])
-        cloud = data / "points.npz"
-        points = read_npz(cloud, "xyz") if cloud.is_file() else None
-        if points is not None and (points.ndim != 2 or points.shape[1] != 3):
-            raise DataError(f"{cloud}: xyz has shape {points.shape}, not [P 3]; write it again or remove the file")
-        return assemble(
-            data,
-            [_view(entry) for entry in entries],
-            downscale=downscale,
-            split=_split(data, tops, entries),
-            points=None if points is None else points[abs(points).max(1, initial=0) < math.inf],
-        )
+        views = [_view(entry) for entry in entries]
+        points, seen = _cloud(data, views)
+        return assemble(data, views, downscale=downscale, split=_split(data, tops, entries), points=points, seen=seen)
 
     def _files(self, data: Path) -> list[tuple[Path, str]]:
         if self.config.file:
@@ -87,6 +82,16 @@ class TransformsParser(DataParser):
         if train.is_file():
             return [(train, "train"), (test, "test")] if test.is_file() else [(train, "")]
         raise DataError(f"{data}: neither transforms.json nor transforms_train.json; name the file with parser.file")
+
+
+def _cloud(data: Path, views: list[View]) -> tuple[NDArray[np.float64] | None, NDArray[np.int64] | None]:
+    """Sparse points, and which views see them: of points.npz, or of the COLMAP model that the transforms came from."""
+    cloud, model = data / "points.npz", data / "sparse" / "0"
+    points, seen = read_cloud(cloud, len(views)) if cloud.is_file() else (None, None)
+    if seen is None and ((model / "cameras.bin").is_file() or (model / "cameras.txt").is_file()):
+        found = beside(model, [view.name for view in views], [view.pose for view in views])
+        return (points, None) if found is None else found
+    return points, seen
 
 
 def _entry(data: Path, record: Record, role: str) -> _Entry:

@@ -81,6 +81,7 @@ def assemble(
     downscale: int,
     split: tuple[Tensor, Tensor] | None = None,
     points: NDArray[np.float64] | None = None,
+    seen: NDArray[np.int64] | None = None,
     reduced: bool = False,
 ) -> Scene:
     """The scene of at least one view, in the given order; without a split every 8th view is held out.
@@ -114,6 +115,7 @@ def assemble(
         train=train,
         test=test,
         points=None if points is None or not len(points) else torch.from_numpy(points),
+        seen=None if seen is None or not len(seen) else torch.from_numpy(seen),
         depths=torch.tensor(depths, dtype=torch.float64) if len(depths) == len(views) else None,
         alpha=alpha,
     )

@@ -1,13 +1,14 @@
 """Proposal sampling (mip-NeRF 360): each level's density says where the next level, and at last the field, looks."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
+from ...fields.density import LIMIT
 from ...fields.proposal import ProposalField
 from ...interfaces import Sampler
-from ...rendering.stepfun import midpoints, resample, transmittance_weights
+from ...ops import march
+from ...rendering.space import Space
+from ...rendering.stepfun import midpoints, resample, shifts, transmittance_weights
 from ...types import Level, Rays, Sampled
 from .config import ProposalConfig
 from .uniform import even_edges
@@ -23,12 +24,16 @@ class ProposalSampler(Sampler):
         self.config = config
         self.levels = nn.ModuleList(ProposalField(r, config.channels, seed=seed + i) for i, r in enumerate(config.resolutions))
 
+    @property
+    def fields(self) -> nn.ModuleList:
+        """One a level."""
+        return self.levels
+
     def forward(
         self,
         rays: Rays,
         *,
-        locate: Callable[[Tensor], Tensor],
-        distance: Callable[[Tensor, Tensor, Tensor], Tensor],
+        space: Space,
         step: int | None,
         generator: torch.Generator | None,
     ) -> Sampled:
@@ -39,16 +44,36 @@ class ProposalSampler(Sampler):
         s = even_edges(rays, self.config.samples[0], generator)
         levels = []
         for field, count in zip(self.levels, counts, strict=True):
-            t = distance(s, rays.near, rays.far)
-            points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
             with torch.set_grad_enabled(learns):
-                density = field(locate(points.view(-1, 3))).view(points.shape[:2])
+                if sharpness == 1 and isinstance(field, ProposalField) and field.planes.fused(rays.origin):
+                    s = self._compiled(field, rays, s, space, count, generator)
+                    continue
+                t = space.distance(s, rays.near, rays.far)
+                points = rays.origin[:, None] + rays.direction[:, None] * midpoints(t)[..., None]
+                density = field(space.locate(points.view(-1, 3))).view(points.shape[:2])
                 w = transmittance_weights(density, t)
             if learns:
                 levels.append(Level(s, w))
             trusted = w.detach() if sharpness == 1 else w.detach().clamp_min(1e-7) ** sharpness
             s = resample(s, trusted, count, padding=self.config.padding, generator=generator)
-        return Sampled(s, distance(s, rays.near, rays.far), tuple(levels))
+        return Sampled(s, space.distance(s, rays.near, rays.far), tuple(levels))
+
+    def _compiled(
+        self, field: ProposalField, rays: Rays, s: Tensor, space: Space, count: int, generator: torch.Generator | None
+    ) -> Tensor:
+        """The same edges, where nothing is learnt from them, ray by ray."""
+        return march.propose(
+            rays,
+            s,
+            space.warp,
+            field.planes.table,
+            field.planes.resolutions[0],
+            field.to_density.weight[0],
+            limit=LIMIT,
+            padding=self.config.padding,
+            count=count,
+            shift=shifts(s, generator),
+        )
 
     def penalties(self) -> dict[str, Tensor]:
         """'proposal_variation' of all levels' planes."""

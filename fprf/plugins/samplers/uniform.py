@@ -1,11 +1,10 @@
 """Even spacing in the space's own measure."""
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from ...interfaces import Sampler
+from ...rendering.space import Space
 from ...types import Rays, Sampled
 from .config import UniformConfig
 
@@ -32,14 +31,13 @@ class UniformSampler(Sampler):
         self,
         rays: Rays,
         *,
-        locate: Callable[[Tensor], Tensor],
-        distance: Callable[[Tensor, Tensor, Tensor], Tensor],
+        space: Space,
         step: int | None,
         generator: torch.Generator | None,
     ) -> Sampled:
         """Even edges."""
         s = even_edges(rays, self.samples, generator)
-        return Sampled(s, distance(s, rays.near, rays.far))
+        return Sampled(s, space.distance(s, rays.near, rays.far))
 
     def penalties(self) -> dict[str, Tensor]:
         """None."""

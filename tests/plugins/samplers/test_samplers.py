@@ -6,7 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
+from torch import Tensor, nn
 
 from fprf.errors import ConfigError
 from fprf.interfaces import Sampler
@@ -31,7 +31,7 @@ def rays_of(count: int, seed: int = 0) -> Rays:
 
 def sample(sampler: Sampler, rays: Rays, step: int | None = None, seed: int | None = None) -> Sampled:
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    sampled: Sampled = sampler(rays, locate=SPACE.locate, distance=SPACE.distance, step=step, generator=generator)
+    sampled: Sampled = sampler(rays, space=SPACE, step=step, generator=generator)
     return sampled
 
 
@@ -100,23 +100,42 @@ def test_the_seed_draws_the_planes() -> None:
     assert not torch.equal(levels[0], levels[1])
 
 
-def wall(sampler: Sampler, rays: Rays, at: float) -> None:
-    """Bend the proposals to a wall: dense where the first coordinate is beyond `at`, thin before."""
+class Wall(nn.Module):
+    """Dense where the first coordinate is beyond a place, thin before; stands in for a proposal, as blocks' fields do."""
+
+    def __init__(self, at: float) -> None:
+        super().__init__()
+        self.at = at
+
+    def forward(self, points: Tensor) -> Tensor:
+        return torch.where(points[:, 0] > self.at, 200.0, 1e-4)
+
+
+def wall(sampler: Sampler, at: float) -> None:
     assert isinstance(sampler, ProposalSampler)
-    for level in sampler.levels:
-        level.forward = lambda points: torch.where(points[:, 0] > at, 200.0, 1e-4)  # type: ignore[method-assign]
+    for k in range(len(sampler.levels)):
+        sampler.levels[k] = Wall(at)
 
 
 def test_samples_go_where_the_density_is() -> None:
     """A wall at x = 1 seen from the origin: all but the padding's share of the samples land about its surface."""
     sampler = ProposalConfig(samples=(128, 64), final=32, resolutions=(4, 4)).build(seed=0)
     rays = SPACE.rays(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64))
-    wall(sampler, rays, 0.5)
+    wall(sampler, 0.5)
     found = sample(sampler, rays)
     near = (found.t > 0.9) & (found.t < 1.15)
     assert int(near.sum()) >= 32
     untrusting = sample(sampler, rays, step=0)
     assert int(((untrusting.t > 0.9) & (untrusting.t < 1.15)).sum()) < 20
+
+
+def test_the_compiled_form_places_samples_as_the_plain_one_does() -> None:
+    """Where nothing is learnt densities are compiled; in double precision they never are."""
+    sampler, rays = SMALL.build(seed=0), rays_of(200)
+    found = sample(sampler, rays)
+    plain = sample(sampler.double(), Rays(*(x.double() for x in rays)))
+    assert found.s.dtype == torch.float32 and plain.s.dtype == torch.float64
+    assert float((found.s - plain.s).abs().max()) <= 1e-3 and float((found.s - plain.s).abs().mean()) <= 1e-5
 
 
 def test_annealing_rises_from_even_to_trusted() -> None:

@@ -1,0 +1,55 @@
+"""From the space of a scene to the unit cube of one of its blocks, or of its surroundings.
+
+A block's chart is affine: its cell with the margin fills the cube, so that no node of its planes lies where it has no say.
+The chart of the surroundings contracts: all blocks together fill the inner half, everything else the rest.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..rendering.space import contract
+from ..types import Boxes
+from .windows import local
+
+__all__ = ["Chart", "chart_of", "surroundings_of"]
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Where low becomes -1 and high becomes 1 (or, contracted, -1/2 and 1/2), in turned axes."""
+
+    low: Annotated[Tensor, "3"]
+    high: Annotated[Tensor, "3"]
+    turn: Annotated[Tensor, "3 3"]
+    contracted: bool = False
+
+    def locate(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+        """Points of the space to the cube; a block's chart takes those inside its box alone to points inside the cube."""
+        x = local(points, self.turn)
+        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+        # The middle is taken off before anything is scaled: float32 keeps what is left of a large coordinate.
+        y = (x - middle.to(x)) / half.to(x)
+        return contract(y) if self.contracted else y
+
+    def inside(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """Whether points lie in the box."""
+        x = local(points, self.turn)
+        return ((x >= self.low.to(x)) & (x <= self.high.to(x))).all(-1)
+
+
+def chart_of(boxes: Boxes, block: int) -> Chart:
+    """The chart of a block: its cell and the margin around it."""
+    return Chart(boxes.low[block] - boxes.margin, boxes.high[block] + boxes.margin, boxes.turn[block])
+
+
+def surroundings_of(boxes: Boxes) -> Chart:
+    """The chart of what no block holds: contracted around the bounds of all blocks, in the axes of the space."""
+    bits = (torch.arange(8)[:, None] >> torch.arange(3)) & 1
+    ends = torch.stack([boxes.low, boxes.high], 1)
+    corners = torch.stack([ends[:, bits[:, a], a] for a in range(3)], -1)
+    world = corners @ boxes.turn
+    flat = world.reshape(-1, 3)
+    return Chart(flat.amin(0), flat.amax(0), torch.eye(3, dtype=boxes.low.dtype), contracted=True)

@@ -1,0 +1,83 @@
+"""Tasks on many processes or machines, by Ray Core. A task whose worker dies is started again and finds its own checkpoint.
+
+A cluster that runs already is joined; without one a private one is started on this machine: on the loopback, with a token of
+its own, without dashboard and without telling anybody that it is used.
+"""
+
+import importlib
+import os
+import secrets
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+from ...errors import PluginError
+from ...interfaces import Executor
+from .config import RayConfig
+
+__all__ = ["RayExecutor"]
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_LOOPBACK = "127.0.0.1"
+
+
+class RayExecutor(Executor):
+    """One Ray task a task, in the order that they are given."""
+
+    def __init__(self, config: RayConfig) -> None:
+        self.config = config
+
+    def map(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
+        """Results in the order of the tasks; the first error cancels the rest and reaches the caller as it was raised.
+
+        Raises PluginError where Ray is not installed or its cluster cannot be reached.
+        """
+        ray = _ray(private=not self.config.address)
+        self._join(ray)
+
+        def work(task: Task) -> Result:  # Ray takes functions alone, and not every callable is one
+            return function(task)
+
+        remote = ray.remote(num_cpus=self.config.processors, max_retries=self.config.retries)(work)
+        waiting = [remote.remote(task) for task in tasks]
+        try:
+            return [ray.get(reference) for reference in waiting]
+        except BaseException as error:
+            for reference in waiting:
+                ray.cancel(reference)
+            if isinstance(error, ray.exceptions.RayTaskError) and isinstance(error.cause, Exception):
+                raise error.cause from None
+            if isinstance(error, ray.exceptions.RayError):
+                raise PluginError(
+                    f"executor: a task's worker died {self.config.retries + 1} times ({type(error).__name__}); look at the "
+                    "memory of the machine, then run the same command again: finished blocks are kept"
+                ) from error
+            raise
+
+    def _join(self, ray: Any) -> None:
+        if ray.is_initialized():
+            return
+        common = {"logging_level": "warning", "log_to_driver": True}
+        try:
+            if self.config.address:
+                ray.init(address=self.config.address, **common)
+                return
+            count = self.config.workers * self.config.processors
+            ray.init(num_cpus=count, include_dashboard=False, _node_ip_address=_LOOPBACK, **common)
+        except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+            where = self.config.address or "this machine"
+            raise PluginError(f"executor: no Ray cluster at {where} ({error}); `fprf cluster` says how to start one") from error
+
+
+def _ray(*, private: bool) -> Any:
+    """The module; it reads the environment when it is imported, so what it shall know is said before."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    if private and not {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & os.environ.keys():
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
+        os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        remedy = '`pip install "fprf[cluster]"`, or choose --executor serial'
+        raise PluginError(f"executor: Ray is not installed; {remedy}") from error

@@ -1,0 +1,66 @@
+"""Scenes without images: cameras over a plane or along a path, and points that they see."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fprf.datamanagers.scene import Scene
+from fprf.rendering.cameras import Cameras
+
+__all__ = ["cameras_at", "drone", "scene_of", "street"]
+
+
+def cameras_at(position: Tensor, ahead: Tensor, upright: Tensor, size: tuple[int, int] = (64, 48)) -> Cameras:
+    """Pinholes of 90 degrees at positions [V 3], looking ahead [V 3]."""
+    back = -ahead / ahead.norm(dim=-1, keepdim=True)
+    right = torch.nn.functional.normalize(torch.linalg.cross(upright.expand_as(back), back), dim=-1)
+    pose = torch.stack([right, torch.linalg.cross(back, right), back, position], -1)
+    count = len(position)
+    return Cameras(
+        pose=pose,
+        focal=torch.full((count, 2), size[0] / 2, dtype=torch.float64),
+        centre=torch.tensor([[size[0] / 2, size[1] / 2]], dtype=torch.float64).expand(count, 2),
+        size=torch.tensor([size]).expand(count, 2),
+        distortion=torch.zeros(count, 6, dtype=torch.float64),
+        lens=torch.zeros(count, dtype=torch.int64),
+    )
+
+
+def scene_of(cameras: Cameras, points: Tensor | None, seen: Tensor | None = None) -> Scene:
+    """Every 8th view held out."""
+    index = torch.arange(len(cameras))
+    return Scene(
+        name="scene",
+        paths=tuple(Path(f"{k:04d}.png") for k in index.tolist()),
+        cameras=cameras,
+        train=index[index % 8 != 0],
+        test=index[index % 8 == 0],
+        points=points,
+        seen=seen,
+    )
+
+
+def street(length: float = 100.0, views: int = 40, walls: int = 4000) -> Scene:
+    """Along x at 2 m above the ground, looking ahead; walls at y = -6 and 6, 8 m high."""
+    draw = torch.Generator().manual_seed(0)
+    x = torch.linspace(0, length, views, dtype=torch.float64)
+    position = torch.stack([x, 0.2 * torch.sin(x), torch.full_like(x, 2.0)], 1)
+    ahead = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(views, 3)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    points = torch.rand(walls, 3, dtype=torch.float64, generator=draw) * torch.tensor([length + 30, 2.0, 8.0]).double()
+    points[:, 1] = torch.where(points[:, 1] > 1, 6.0, -6.0)
+    return scene_of(cameras_at(position, ahead, up), points)
+
+
+def drone(side: float = 90.0, rows: int = 7, height: float = 30.0, points: int = 6000) -> Scene:
+    """A square survey, looking straight down, each flight line the other way round; ground at z = 0."""
+    draw = torch.Generator().manual_seed(0)
+    way = torch.linspace(0, side, rows, dtype=torch.float64)
+    x, y = torch.meshgrid(way, way, indexing="ij")
+    position = torch.stack([x.flatten(), y.flatten(), torch.full((rows * rows,), height).double()], 1)
+    ahead = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(len(position), 3)
+    north = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    ground = torch.rand(points, 3, dtype=torch.float64, generator=draw) * torch.tensor([side + 20, side + 20, 4.0]).double()
+    ground[:, :2] -= 10
+    return scene_of(cameras_at(position, ahead, north), ground)

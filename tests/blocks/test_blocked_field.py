@@ -1,0 +1,247 @@
+"""Fields of blocks against a plain loop in float64, seams, gradients, and what is evaluated at all."""
+
+import math
+from collections.abc import Sequence
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from fprf.blocks.charts import chart_of, surroundings_of
+from fprf.blocks.field import BlockedField, BlockedSemantic, emission
+from fprf.blocks.members import Held, Member, Members
+from fprf.blocks.routing import Blend, Everywhere, Inset
+from fprf.blocks.sampler import BlockedSampler
+from fprf.blocks.windows import shares
+from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
+from fprf.rendering.space import Space
+from fprf.types import Boxes, Rays
+
+CHANNELS, DIMS = 5, 4
+EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+SPACE = Space("open", (0.0, 0.0, 0.0), EYE, 1.0, 0.05, 1e3)
+
+
+def row(count: int, margin: float = 0.3) -> Boxes:
+    low = torch.tensor([[2.0 * i, -1.0, 0.0] for i in range(count)], dtype=torch.float64)
+    high = torch.tensor([[2.0 * i + 2, 1.0, 1.5] for i in range(count)], dtype=torch.float64)
+    return Boxes(low, high, torch.eye(3, dtype=torch.float64).expand(count, 3, 3), margin)
+
+
+def members(boxes: Boxes, spread: float = 3.0) -> list[Member]:
+    """One a block and one for the surroundings, with densities that differ widely."""
+    found = []
+    for number in range(len(boxes.low) + 1):
+        chart = chart_of(boxes, number) if number < len(boxes.low) else surroundings_of(boxes)
+        field = PlanesConfig(resolutions=(4, 8), channels=8, hidden=16, layers=1).build(channels=CHANNELS, seed=number)
+        semantic = SemanticPlanesConfig(resolutions=(4,), channels=8, hidden=16, layers=1).build(channels=DIMS, seed=number)
+        sampler = ProposalConfig(samples=(12, 10), final=8, resolutions=(4, 8), channels=8).build(seed=number)
+        with torch.no_grad():
+            for name, parameter in field.named_parameters():
+                if "to_density" in name:
+                    parameter.mul_(spread * (number + 1))
+        found.append(Member(chart, sampler, field, semantic))
+    return found
+
+
+class Counting(Members):
+    """Members that remember who was asked for."""
+
+    def __init__(self, inner: Sequence[Member]) -> None:
+        self.inner, self.asked = inner, set[int]()
+
+    def member(self, number: int) -> Member:
+        self.asked.add(number)
+        return self.inner[number]
+
+    @property
+    def held(self) -> Sequence[Member]:
+        return self.inner[-1:]
+
+
+def points_of(boxes: Boxes, count: int) -> Tensor:
+    whole = surroundings_of(boxes)
+    draw = torch.rand(count, 3, generator=torch.Generator().manual_seed(5))
+    return whole.low.float() - 1 + draw * (whole.high - whole.low + 2).float()
+
+
+def plain(boxes: Boxes, parts: Sequence[Member], points: Tensor, view: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Density, content and semantics by a loop over points and members."""
+    weight = shares(points.double(), boxes)
+    densities, contents, semantics = [], [], []
+    for p, v, w in zip(points, view, weight, strict=True):
+        sigma, content, semantic = [], [], []
+        for member in parts:
+            at = member.chart.locate(p[None])
+            sample = member.field.density(at)
+            sigma.append(sample.density[0].double())
+            content.append(member.field.content(sample.latent, v[None])[0].double())
+            assert member.semantic is not None
+            semantic.append(member.semantic(at)[0].double())
+        emitted = torch.stack(sigma) * w
+        densities.append(emitted.sum())
+        contents.append((torch.stack(content) * (emitted / emitted.sum())[:, None]).sum(0))
+        semantics.append((torch.stack(semantic) * (emitted / emitted.sum())[:, None]).sum(0))
+    return torch.stack(densities), torch.stack(contents), torch.stack(semantics)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("count", [1, 3])
+def test_against_a_loop(count: int) -> None:
+    boxes = row(count)
+    parts = members(boxes)
+    points = points_of(boxes, 150)
+    view = torch.nn.functional.normalize(torch.randn(150, 3), dim=1)
+    held, router = Held(parts), Blend(boxes)
+    field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
+    sample = field.density(points)
+    density, content, semantics = plain(boxes, parts, points, view)
+    assert torch.allclose(sample.density.double(), density, rtol=3e-5, atol=0)
+    assert torch.allclose(field.content(sample.latent, view).double(), content, rtol=1e-4, atol=1e-5)
+    assert torch.allclose(semantic(points).double(), semantics, rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_content_of_some_of_the_points_in_any_order() -> None:
+    boxes = row(2)
+    field = BlockedField(Held(members(boxes)), Blend(boxes))
+    points = points_of(boxes, 80)
+    view = torch.nn.functional.normalize(torch.randn(80, 3), dim=1)
+    latent = field.density(points).latent
+    some = torch.randperm(80)[:30]
+    assert torch.allclose(field.content(latent[some], view[some]), field.content(latent, view)[some], atol=1e-6)
+    assert field.content(latent[:0], view[:0]).shape == (0, CHANNELS)
+
+
+@torch.no_grad()
+def test_only_the_blocks_that_points_meet_are_asked() -> None:
+    boxes = row(6)
+    counting = Counting(members(boxes))
+    field, semantic = BlockedField(counting, Blend(boxes)), BlockedSemantic(counting, Blend(boxes))
+    points = torch.tensor([[3.0, 0.0, 0.7], [3.9, 0.1, 0.7]])
+    field.content(field.density(points).latent, torch.eye(3)[:2])
+    semantic(points)
+    assert counting.asked == {1, 2}
+
+
+@torch.no_grad()
+def jumps(boxes: Boxes, x: float, apart: float) -> list[float]:
+    """Of log density, content and semantics between points `apart` on both sides of a plane; blocks that agree on nothing."""
+    held, router = Held(members(boxes, spread=1.0)), Blend(boxes)
+    field, semantic = BlockedField(held, router), BlockedSemantic(held, router)
+    draw = torch.Generator().manual_seed(0)
+    y, z = torch.rand(400, generator=draw) * 1.2 - 0.6, torch.rand(400, generator=draw) * 0.7 + 0.4
+    view = torch.tensor([[0.0, 1.0, 0.0]]).expand(400, 3)
+    ends = []
+    for shift in (-apart / 2, apart / 2):
+        at = torch.stack([torch.full_like(y, x + shift), y, z], 1)
+        sample = field.density(at)
+        ends.append((sample.density.log()[:, None], field.content(sample.latent, view), semantic(at)))
+    return [float((b - a).abs().amax(1).quantile(0.95)) for a, b in zip(*ends, strict=True)]
+
+
+@pytest.mark.parametrize("face", [2.0, 4.0, 6.0])
+@pytest.mark.parametrize("beside", [0.0, -0.3, 0.3, -0.15])
+def test_no_seam_at_any_border(face: float, beside: float) -> None:
+    """A step would stay as points come closer; what is continuous shrinks with their distance."""
+    for far, near in zip(jumps(row(4), face + beside, 4e-3), jumps(row(4), face + beside, 1e-3), strict=True):
+        assert near <= 0.3 * far
+
+
+def test_without_a_margin_there_are_seams() -> None:
+    """What the test above would find."""
+    bare = row(4, margin=0.0)
+    for far, near in zip(jumps(bare, 2.0, 4e-3), jumps(bare, 2.0, 1e-3), strict=True):
+        assert near > 0.9 * far
+
+
+def test_emission_is_exact_over_thirty_orders_of_magnitude() -> None:
+    density = torch.tensor([[1e-30, 3e6], [0.0, 0.0], [1e-30, 3e-30], [5.0, 0.0], [float("inf"), 1.0]])
+    weight = torch.tensor([[0.5, 0.5], [0.3, 0.7], [0.5, 0.5], [1e-6, 1 - 1e-6], [0.5, 0.5]])
+    found = emission(density.clamp(max=3e6), weight)
+    assert torch.allclose(found.sum(1), torch.ones(5), atol=1e-6)
+    assert found[0].tolist() == pytest.approx([0.0, 1.0])
+    assert found[1].tolist() == pytest.approx([0.3, 0.7]), "nothing anywhere: by weight alone"
+    assert found[2].tolist() == pytest.approx([0.25, 0.75], rel=1e-5)
+    assert float(found[3, 0]) == pytest.approx(1.0), "who finds a place empty has no say about it"
+    assert emission(density[:1], torch.tensor([[1.0, 0.0]])).tolist() == [[1.0, 0.0]]
+
+
+def test_an_inset_block_learns_inside_and_its_surroundings_outside() -> None:
+    boxes = row(2)
+    parts = members(boxes)
+    chart = chart_of(boxes, 0)
+    field = BlockedField(Held([parts[0], parts[2]]), Inset(chart))
+    points = points_of(boxes, 200)
+    inside = chart.inside(points)
+    view = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    for chosen, learns, rests in ((inside, 0, 1), (~inside, 1, 0)):
+        field.zero_grad()
+        sample = field.density(points)
+        features = field.content(sample.latent, view)
+        (sample.density[chosen].sum() + features[chosen].sum()).backward()
+        touched = [
+            sum(float(p.grad.abs().sum()) for p in m.field.parameters() if p.grad is not None) for m in field.members.held
+        ]
+        assert touched[learns] > 0 and touched[rests] == 0
+
+
+def test_parameters_belong_to_the_field_once() -> None:
+    boxes = row(2)
+    held, router = Held(members(boxes)), Blend(boxes)
+    parts = nn.ModuleList([BlockedField(held, router), BlockedSemantic(held, router)])
+    names = [name for name, _ in parts.named_parameters()]
+    own = [name for member in held.held for name, _ in member.named_parameters()]
+    assert len(names) == len(own) and all(name.startswith("0.held.") for name in names)
+    assert set(parts[0].penalties()) == {"variation"}  # type: ignore[operator]
+    with torch.no_grad():
+        total = sum(float(m.field.penalties()["variation"]) for m in held.held)
+        assert float(parts[0].penalties()["variation"]) == pytest.approx(total)  # type: ignore[operator]
+
+
+def rays(count: int = 20) -> Rays:
+    direction = torch.nn.functional.normalize(torch.randn(count, 3), dim=1)
+    origin = torch.tensor([[1.0, 0.0, 0.5]]).expand(count, 3)
+    return Rays(origin, direction, direction, torch.full((count,), 0.05), torch.full((count,), 1e3))
+
+
+def test_the_sampler_asks_the_blocks_where_to_look() -> None:
+    """One member everywhere is the sampler itself; blocks that differ give other edges."""
+    boxes = row(1)
+    parts = members(boxes)
+    config = ProposalConfig(samples=(12, 10), final=8, resolutions=(4, 8), channels=8)
+    lone = Held([parts[1]])
+    found = BlockedSampler(config.build(seed=9), lone, Everywhere())(rays(), space=SPACE, step=0, generator=None)
+    torch.manual_seed(0)
+
+    class Charted(nn.Module):
+        def __init__(self, inner: nn.Module) -> None:
+            super().__init__()
+            self.inner = inner
+
+        def forward(self, points: Tensor) -> Tensor:
+            out: Tensor = self.inner(parts[1].chart.locate(points))
+            return out
+
+    torch.manual_seed(0)
+    itself = config.build(seed=1)
+    for level in range(2):
+        itself.fields[level] = Charted(parts[1].sampler.fields[level])
+    torch.manual_seed(0)
+    r = rays()
+    torch.manual_seed(0)
+    found = BlockedSampler(config.build(seed=9), lone, Everywhere())(r, space=SPACE, step=0, generator=None)
+    wanted = itself(r, space=SPACE, step=0, generator=None)
+    assert torch.equal(found.t, wanted.t) and len(found.levels) == len(wanted.levels) == 2
+    blended = BlockedSampler(config.build(seed=9), Held(parts), Blend(boxes))(r, space=SPACE, step=0, generator=None)
+    assert not torch.equal(blended.t, wanted.t) and bool((blended.t[:, 1:] >= blended.t[:, :-1]).all())
+
+
+def test_a_sampler_without_fields_needs_none() -> None:
+    boxes = row(1)
+    parts = [Member(m.chart, UniformConfig().build(seed=0), m.field, m.semantic) for m in members(boxes)]
+    sampler = BlockedSampler(UniformConfig(samples=16).build(seed=0), Held(parts), Blend(boxes))
+    found = sampler(rays(5), space=SPACE, step=None, generator=None)
+    assert found.t.shape == (5, 17) and sampler.penalties() == {}
+    assert math.isclose(float(found.t[0, -1]), 1e3, rel_tol=1e-5)

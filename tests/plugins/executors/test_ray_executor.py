@@ -1,0 +1,84 @@
+"""The Ray executor; all but the refusals need Ray (extra `cluster`) and seconds to start it."""
+
+import importlib.util
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from fprf.commands.cluster import run as cluster
+from fprf.errors import ConfigError, DataError, PluginError
+from fprf.plugins.executors.config import RayConfig
+from fprf.testing import check_config, check_executor
+
+
+def test_the_config() -> None:
+    check_config(RayConfig())
+    for values in ({"workers": 0}, {"processors": 0.0}, {"retries": -1}):
+        with pytest.raises(ConfigError, match=rf"executor\.{next(iter(values))}"):
+            RayConfig(**values)  # type: ignore[arg-type]
+
+
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(PluginError, match=r'pip install "fprf\[cluster\]"'):
+        RayConfig().build().map(abs, [1])
+
+
+def test_the_steps_name_the_machine_and_its_port(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cluster(["--head", "mars", "--port", "7777"]) == 0
+    said = capsys.readouterr().out
+    assert "ray start --address mars:7777" in said and "get-auth-token --generate" in said
+    assert said.count("RAY_USAGE_STATS_ENABLED=0 RAY_AUTH_MODE=token") == 2, "on the head and on the others"
+
+
+@pytest.fixture(scope="module")
+def executor() -> RayConfig:
+    if importlib.util.find_spec("ray") is None:  # not imported here: it reads its environment when it is
+        pytest.skip("Ray is not installed")
+    return RayConfig(workers=2, processors=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_contract(executor: RayConfig) -> None:
+    check_executor(executor)
+    assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
+    assert os.environ["RAY_AUTH_MODE"] == "token" and len(os.environ["RAY_AUTH_TOKEN"]) == 64
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_tasks_run_elsewhere_and_a_killed_worker_is_started_again(executor: RayConfig, tmp_path: Path) -> None:
+    def once_killed(name: str) -> int:
+        mark = tmp_path / name
+        if not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return os.getpid()
+
+    found = executor.build().map(once_killed, ["a", "b"])
+    assert os.getpid() not in found and len(found) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_errors_arrive_as_they_were_raised(executor: RayConfig) -> None:
+    def broken(task: int) -> int:
+        raise DataError(f"task {task}: no data")
+
+    with pytest.raises(DataError, match="no data"):
+        executor.build().map(broken, [1, 2])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_worker_that_keeps_dying_is_told(executor: RayConfig) -> None:
+    def killed(task: int) -> int:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return task
+
+    with pytest.raises(PluginError, match="died 1 times"):
+        RayConfig(retries=0).build().map(killed, [1])
