@@ -18,7 +18,7 @@ from ..output.atomic import write_json
 from . import tensorfiles
 from .model import Model
 
-__all__ = ["Saved", "load_latest", "restore", "save", "steps"]
+__all__ = ["Saved", "load_latest", "reached", "restore", "save", "steps"]
 
 KEEP = 2
 """Checkpoints that stay on disk."""
@@ -76,6 +76,18 @@ def load(root: Path, step: int) -> Saved:
         raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
     model, optimizer = (tensorfiles.load(folder / f"{name}.safetensors", entries[name]) for name in entries)
     return Saved(at, seconds, model, optimizer)
+
+
+def reached(root: Path) -> tuple[int, float]:
+    """Step and seconds of the newest checkpoint, (0, 0) without one. Raises CheckpointError."""
+    found = steps(root)
+    if not found:
+        return 0, 0.0
+    manifest = _folder(root, found[-1]) / "manifest.json"
+    try:
+        return found[-1], float(json.loads(manifest.read_text())["seconds"])
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise CheckpointError(f"{manifest}: cannot be read ({e!r})") from e
 
 
 def load_latest(root: Path) -> tuple[Saved | None, list[str]]:

@@ -32,6 +32,9 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
     result: dict[str, Tensor] = {}
     if rendered.rgb is not None and config.rgb > 0:
         result["rgb"] = F.mse_loss(rendered.rgb, batch.rgb)
+        if rendered.unaided is not None:
+            # Else the scene's own part of a decoder would do the frozen part's work, and a new style would have nothing.
+            result["unaided"] = F.mse_loss(rendered.unaided, batch.rgb)
     if rendered.content is not None and batch.content is not None:
         result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
     if rendered.semantic is not None and batch.semantic is not None:
@@ -53,8 +56,11 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
 
 def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
     """Weighted sum."""
+    # Both colours of a decoder with a part of the scene's own share one weight: the regularisers keep theirs.
+    colour = config.rgb / 2 if "unaided" in parts else config.rgb
     weights = {
-        "rgb": config.rgb,
+        "rgb": colour,
+        "unaided": colour,
         "content": config.content,
         "semantic": config.semantic,
         "interlevel": config.interlevel,

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from ..config import TrainConfig
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
+from .decoder import build_decoder
 
 __all__ = ["Facts", "Model", "build_model"]
 
@@ -35,7 +36,7 @@ class Facts:
 
 
 class Model(nn.Module):
-    """Sampler, fields and frozen decoder of one scene."""
+    """Sampler, fields and decoder of one scene."""
 
     def __init__(self, parts: Parts) -> None:
         super().__init__()
@@ -51,7 +52,7 @@ class Model(nn.Module):
         return Parts(self.space, self.sampler, self.field, self.semantic, self.decoder)
 
     def learned(self) -> list[nn.Parameter]:
-        """Parameters that training moves, in a fixed order: everything but the decoder."""
+        """Parameters that training moves, in a fixed order: everything but what decoders bring frozen."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def penalties(self) -> dict[str, Tensor]:
@@ -67,8 +68,7 @@ def background_of(facts: Facts, device: torch.device) -> Annotated[Tensor, "3"] 
 
 def build_model(config: TrainConfig, facts: Facts) -> Model:
     """The model at its seeded start. Raises WeightsError where no decoder fits the content encoder."""
-    decoder = config.content.decoder.build(encoder=facts.content_encoder, channels=facts.channels)
-    decoder.requires_grad_(False)
+    decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     semantic = config.semantic.field.build(channels=facts.dim, seed=config.seed + 2) if facts.dim else None
     return Model(
         Parts(

@@ -9,14 +9,17 @@ import torch
 
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
+from ..datamanagers.features import FeatureStore
 from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import PluginError
-from ..interfaces import DataManager
+from ..interfaces import DataManager, Encoder
 from ..rendering.bounds import find_space
+from ..rendering.space import Space
+from .decoder import build_decoder
 from .model import Facts
 
-__all__ = ["Prepared", "cache_folder", "device_of", "prepare"]
+__all__ = ["Prepared", "cache_folder", "device_of", "facts_of", "prepare"]
 
 
 class Prepared(NamedTuple):
@@ -48,11 +51,9 @@ def device_of(name: str) -> torch.device:
 
 def prepare(config: TrainConfig, progress: Callable[[int, int, str], None] | None = None) -> Prepared:
     """Everything but the model. `progress(done, total, what)` is told of the features."""
-    boxes = config.blocks.build().boxes
-    if len(boxes) != 1:
-        raise PluginError(f"blocks: this layout cuts {len(boxes)} blocks; training takes one so far, choose --blocks single")
     scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
     content = config.content.encoder.build()
+    build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     semantic = config.semantic.encoder.build() if config.semantic.encoder is not None else None
     manager = config.datamanager.build(
         scene=scene,
@@ -63,16 +64,28 @@ def prepare(config: TrainConfig, progress: Callable[[int, int, str], None] | Non
         seed=config.seed,
         progress=progress,
     )
-    content_store, semantic_store = manager.content_store, manager.semantic_store
-    background = config.render.background or ((1.0, 1.0, 1.0) if scene.alpha else None)
-    facts = Facts(
-        space=find_space(scene),
+    semantic_store = manager.semantic_store
+    facts = facts_of(config, scene, find_space(scene), content, semantic, manager.content_store, semantic_store)
+    return Prepared(scene, manager, facts, semantic_store.basis if semantic_store is not None else None)
+
+
+def facts_of(
+    config: TrainConfig,
+    scene: Scene,
+    space: Space,
+    content: Encoder,
+    semantic: Encoder | None,
+    content_store: FeatureStore | None,
+    semantic_store: FeatureStore | None,
+) -> Facts:
+    """What was found out about a scene."""
+    return Facts(
+        space=space,
         channels=content.channels,
         dim=semantic_store.channels if semantic_store is not None else 0,
         content_encoder=content.identity,
         semantic_encoder=semantic.identity if semantic is not None else "",
         content_scale=content_store.scale if content_store is not None else 1.0,
         semantic_scale=semantic_store.scale if semantic_store is not None else 1.0,
-        background=background,
+        background=config.render.background or ((1.0, 1.0, 1.0) if scene.alpha else None),
     )
-    return Prepared(scene, manager, facts, semantic_store.basis if semantic_store is not None else None)

@@ -1,21 +1,51 @@
-"""References to a stylizer: the feed-forward step, a second or less a photograph."""
+"""References to a style on a scene: the feed-forward step, a second or less a photograph."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
+from torch import Tensor
 
-from ..errors import UsageError, WeightsError
+from ..datamanagers.basis import Basis
+from ..errors import ConfigError, UsageError, WeightsError
+from ..interfaces import Encoder
 from ..plugins.stylizers.config import StylizerConfig
-from ..rendering.renderer import Restyle
+from ..style.config import NO_MASK, StyleConfig
 from ..style.dictionary import StyleDictionary, build_dictionary
+from ..style.files import StyleFile, check_photographs, read_style
+from ..style.look import Restyle
+from ..style.matching import unit
 from ..style.references import read_reference
+from ..style.regional import RegionWeight, regional
 from ..style.scene import SceneStyle
+from ..style.wishes import labels
 from .loading import Trained, load_style
-from .prepare import device_of
+from .orders import Orders, take_orders
+from .regions import Regions
 
-__all__ = ["Styled", "restyle"]
+__all__ = ["Codes", "Encoders", "Styled", "apply_style", "open_encoders", "restyle"]
+
+_SHORTEST = 128
+"""References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
+
+
+class Encoders(NamedTuple):
+    """What brings references into a scene's terms: loaded once for any number of styles."""
+
+    content: Encoder
+    semantic: Encoder | None
+    basis: Basis | None
+    scene: SceneStyle
+
+
+class Codes(NamedTuple):
+    """The style codes that points can take, of one style or of two that are mixed: what match maps speak of."""
+
+    reference: Annotated[Tensor, "T"]
+    names: tuple[str, ...]
+    units: Annotated[Tensor, "T D"]
+    """Directions of their keys from the scene's mean: cosines with these are scores."""
 
 
 class Styled(NamedTuple):
@@ -24,28 +54,13 @@ class Styled(NamedTuple):
     restyle: Restyle
     dictionary: StyleDictionary
     scene: SceneStyle
+    codes: Codes
+    orders: Orders
 
 
 @torch.inference_mode()
-def restyle(
-    trained: Trained,
-    references: Sequence[Path],
-    stylizer: StylizerConfig,
-    *,
-    strength: float = 1.0,
-    weights: Sequence[float] = (),
-    clusters: int = 10,
-    blend: float = 0.3,
-) -> Styled:
-    """Build the dictionary of the references and the stylizer on the scene.
-
-    Raises UsageError for no references or weights that do not match them, DataError for unreadable photographs, WeightsError
-    where the encoders are not those that the scene was trained with.
-    """
-    if not references:
-        raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
-    if weights and len(weights) != len(references):
-        raise UsageError(f"--weights: {len(weights)} weights for {len(references)} references; give one each, or none")
+def open_encoders(trained: Trained) -> Encoders:
+    """The encoders that a scene was trained with. Raises WeightsError where those at hand are others."""
     scene, basis = load_style(trained.run)
     config, facts = trained.config, trained.known.facts
     content = config.content.encoder.build()
@@ -56,28 +71,89 @@ def restyle(
                 f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
                 "use the same weights, or train the scene again"
             )
-    longest = int(trained.known.cameras.size.amax())
-    dictionary = build_dictionary(
-        [
-            read_reference(
-                path,
-                content=content,
-                semantic=semantic,
-                basis=basis,
-                longest=max(longest, _SHORTEST),
-                weight=weights[i] if weights else 1.0,
-                guided=config.datamanager.guided,
-            )
-            for i, path in enumerate(references)
-        ],
+    return Encoders(content, semantic, basis, scene)
+
+
+@torch.inference_mode()
+def apply_style(trained: Trained, file: StyleFile, encoders: Encoders | None = None, trail: tuple[Path, ...] = ()) -> Styled:
+    """Build the dictionary of a style's references and its stylizer on the scene; mix in the style that it goes towards.
+
+    `trail` are the style files that led here. Raises UsageError for no references and wishes that the scene does not know,
+    DataError for unreadable photographs, WeightsError where the encoders are not the scene's.
+    """
+    style = file.style
+    if not style.references:
+        raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
+    encoders = open_encoders(trained) if encoders is None else encoders
+    dictionary = _dictionary(trained, style, encoders)
+    scene = encoders.scene
+    regions = Regions(trained, scene, encoders.basis, file.regions, file.semantic_encoder)
+    orders = take_orders(regions, dictionary, style)
+    stylizer = regional(dictionary, scene, orders.allowed, style.stylizer)
+    partly = bool((orders.strength != 1).any())
+    device = next(trained.model.parameters()).device
+    mine = Restyle(
+        stylizer.to(device),
+        style.strength,
+        RegionWeight(scene, orders.strength[:, None]).to(device) if partly else None,
+        style.luminance,
+    )
+    codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
+    styled = Styled(mine, dictionary, scene, codes, orders)
+    if style.between is None or style.at == 0:
+        return styled
+    path = style.between.resolve()
+    if path in trail:
+        raise ConfigError(f"{style.between}: lies between styles that lead back to it; end the circle")
+    other = read_style(style.between)
+    check_photographs(style.between, other)
+    return _mixed(styled, apply_style(trained, other, encoders, (*trail, path)), style.at)
+
+
+def restyle(
+    trained: Trained,
+    references: Sequence[Path],
+    stylizer: StylizerConfig,
+    *,
+    strength: float = 1.0,
+    weights: Sequence[float] = (),
+    clusters: int = 10,
+    blend: float = 0.3,
+) -> Styled:
+    """`apply_style` without wishes about regions."""
+    style = StyleConfig(
+        references=tuple(references),
+        stylizer=stylizer,
+        strength=strength,
+        weights=tuple(weights),
         clusters=clusters,
         blend=blend,
-        seed=config.seed,
     )
-    device = next(trained.model.parameters()).device
-    built = stylizer.build(dictionary=dictionary, scene=scene).to(device_of(str(device)))
-    return Styled(Restyle(built, strength), dictionary, scene)
+    return apply_style(trained, StyleFile(style))
 
 
-_SHORTEST = 128
-"""References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
+def _dictionary(trained: Trained, style: StyleConfig, encoders: Encoders) -> StyleDictionary:
+    longest = max(int(trained.known.cameras.size.amax()), _SHORTEST)
+    references = [
+        read_reference(
+            path,
+            content=encoders.content,
+            semantic=encoders.semantic,
+            basis=encoders.basis,
+            longest=longest,
+            weight=style.weights[i] if style.weights else 1.0,
+            guided=trained.config.datamanager.guided,
+            mask=style.masks[i] if style.masks and style.masks[i] != NO_MASK else None,
+            name=name,
+        )
+        for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True))
+    ]
+    return build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=trained.config.seed)
+
+
+def _mixed(a: Styled, b: Styled, at: float) -> Styled:
+    """Style `a` on the way to `b`. The dictionary and the orders stay those of `a`; codes and notes are those of both."""
+    reference = torch.cat([a.codes.reference, b.codes.reference + len(a.codes.names)])
+    codes = Codes(reference, a.codes.names + b.codes.names, torch.cat([a.codes.units, b.codes.units]))
+    orders = a.orders._replace(notes=a.orders.notes + b.orders.notes)
+    return a._replace(restyle=a.restyle.mixed(b.restyle, at), codes=codes, orders=orders)

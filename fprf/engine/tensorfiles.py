@@ -16,7 +16,7 @@ from torch import Tensor
 from ..errors import CheckpointError
 from ..output.atomic import atomic_path
 
-__all__ = ["load", "save"]
+__all__ = ["load", "read", "save"]
 
 
 def _checksum(tensor: Tensor) -> int:
@@ -36,10 +36,7 @@ def save(path: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]
 
 def load(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> dict[str, Tensor]:
     """The tensors of a file, checked against the manifest. Raises CheckpointError naming file and tensor."""
-    try:
-        tensors = safetensors.torch.load_file(path)
-    except (OSError, SafetensorError) as e:
-        raise CheckpointError(f"{path}: cannot be read ({e}); use another checkpoint or train again") from e
+    tensors = read(path)
     if tensors.keys() != manifest.keys():
         odd = ", ".join(sorted(tensors.keys() ^ manifest.keys())[:3])
         raise CheckpointError(f"{path}: its tensors differ from its manifest ({odd}); use another checkpoint")
@@ -50,3 +47,11 @@ def load(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> dict[str, Ten
         if not entry.get("finite"):
             raise CheckpointError(f"{path}: tensor {name} was not finite when saved; use another checkpoint")
     return tensors
+
+
+def read(path: Path) -> dict[str, Tensor]:
+    """The tensors of a file, unchecked. Raises CheckpointError where it is no such file."""
+    try:
+        return safetensors.torch.load_file(path)
+    except (OSError, SafetensorError) as e:
+        raise CheckpointError(f"{path}: cannot be read ({e}); use another checkpoint or train again") from e

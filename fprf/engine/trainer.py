@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.profiler import record_function
 
 from ..config import TrainConfig
 from ..errors import NumericsError
@@ -21,7 +22,7 @@ from .prepare import Prepared, device_of
 from .run import Run
 from .schedule import progress, rate
 
-__all__ = ["Report", "step_generator", "train"]
+__all__ = ["Loop", "Report", "optimizer_of", "step_generator", "train"]
 
 PATIENCE = 3
 """Steps in a row with a non-finite loss after which training stops: it will not recover by itself."""
@@ -54,22 +55,35 @@ def step_generator(seed: int, step: int, device: torch.device) -> torch.Generato
     return torch.Generator(device).manual_seed(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1)
 
 
-def train(config: TrainConfig, prepared: Prepared, run: Run, report: Callable[[Report], None], *, spent: float = 0.0) -> Model:
+def optimizer_of(config: TrainConfig, model: Model) -> torch.optim.Optimizer:
+    """Adam on all that the model learns."""
+    knobs = config.optimizer
+    return torch.optim.Adam(model.learned(), lr=knobs.rate, betas=(0.9, knobs.beta2), eps=knobs.eps, fused=True)
+
+
+def train(
+    config: TrainConfig,
+    prepared: Prepared,
+    run: Run,
+    report: Callable[[Report], None],
+    *,
+    spent: float = 0.0,
+    model: Model | None = None,
+) -> Model:
     """Train, or go on from the newest checkpoint, until the steps or the minutes are over; `spent` seconds count as used.
 
-    An interrupt saves first, then goes on upwards. Raises NumericsError where the loss stays non-finite.
+    `model` is one at its start, where it is not simply that of the config: a block in its surroundings. An interrupt saves
+    first, then goes on upwards. Raises NumericsError where the loss stays non-finite.
     """
     device = device_of(config.device)
-    model = build_model(config, prepared.facts).to(device)
-    optimizer = torch.optim.Adam(
-        model.learned(), lr=config.optimizer.rate, betas=(0.9, config.optimizer.beta2), eps=config.optimizer.eps, fused=True
-    )
+    model = (build_model(config, prepared.facts) if model is None else model).to(device)
+    optimizer = optimizer_of(config, model)
     saved, damaged = checkpoint.load_latest(run.checkpoints)
     for line in damaged:
         run.log({"damaged": line})
     if saved is not None:
         checkpoint.restore(saved, model, optimizer)
-    loop = _Loop(config, prepared, model, optimizer, device)
+    loop = Loop(config, prepared, model, optimizer, device)
     step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
     start = last_saved = last_report = time.perf_counter()
     clock = before
@@ -95,8 +109,11 @@ def train(config: TrainConfig, prepared: Prepared, run: Run, report: Callable[[R
     return model
 
 
-class _Loop:
-    """The state that lives between steps but is not saved: running means for the display."""
+class Loop:
+    """Training step by step, and what lives between steps but is not saved: running means for the display.
+
+    Its parts carry names (`fprf.batch` ...) that a profiler sees; without one they cost microseconds.
+    """
 
     def __init__(
         self, config: TrainConfig, prepared: Prepared, model: Model, optimizer: torch.optim.Optimizer, device: torch.device
@@ -114,11 +131,13 @@ class _Loop:
 
     def step(self, step: int, share: float) -> Callable[[float, float], Report]:
         """One step; the answer makes a report when one is due."""
-        batch = self._to_device(self.manager.batch(step))
+        with record_function("fprf.batch"):
+            batch = self._to_device(self.manager.batch(step))
+            rays = self._rays(batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
         rendered = render_rays(
-            self._rays(batch),
+            rays,
             self.model.parts,
             want=wanted(self.config.loss, batch),
             budget=self.config.render.train_budget,
@@ -129,13 +148,16 @@ class _Loop:
             semantic_samples=self.config.semantic.samples,
             content_moves_density=self.config.content.moves_density,
         )
-        parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
-        loss = total(self.config.loss, parts)
+        with record_function("fprf.losses"):
+            parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
+            loss = total(self.config.loss, parts)
         self.optimizer.zero_grad(set_to_none=True)
         if torch.isfinite(loss):
             self.failed = 0
-            loss.backward()  # type: ignore[no-untyped-call]
-            self.optimizer.step()
+            with record_function("fprf.backward"):
+                loss.backward()  # type: ignore[no-untyped-call]
+            with record_function("fprf.optimizer"):
+                self.optimizer.step()
         else:
             self._skip(step, parts)
         self._remember(parts, rendered.counts["kept"] / max(1, rendered.counts["samples"]))

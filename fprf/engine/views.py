@@ -1,18 +1,22 @@
 """Whole images from a trained model."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..config import RenderConfig
 from ..interfaces import Stylizer
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
+from ..rendering.pixel_rays import grid_rays
 from ..rendering.renderer import Restyle, composite, march, render_rays
 from ..types import Rays, Want
 from .model import Facts, Model, background_of
 
-__all__ = ["View", "match_view", "render_view"]
+__all__ = ["View", "match_view", "paint_pixels", "render_view", "view_rays"]
 
 
 class View(NamedTuple):
@@ -26,20 +30,28 @@ class View(NamedTuple):
     """Share of the samples that met the content network."""
 
 
-def _view_rays(model: Model, cameras: Cameras, view: int) -> tuple[Rays, Tensor, Tensor]:
+def view_rays(
+    model: Model, cameras: Cameras, view: int, pixel: Annotated[Tensor, "R 2"] | None = None
+) -> tuple[Rays, Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
+    """Rays through some pixels of a view, or all, on the model's device; their origins and directions in the world."""
+    if pixel is None:
+        origin, direction = grid_rays(cameras, view)
+    else:
+        origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
     device = next(model.parameters()).device
-    pixel = pixel_grid(cameras, view)
-    origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
-    rays = model.space.rays(origin, direction)
-    return Rays(*(x.to(device) for x in rays)), origin, direction
+    return Rays(*(x.to(device) for x in model.space.rays(origin, direction))), origin, direction
 
 
 @torch.inference_mode()
 def render_view(
     model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, restyle: Restyle | None = None
 ) -> View:
-    """Colour and depth of one view, in chunks of `config.chunk` rays."""
-    rays, origin, direction = _view_rays(model, cameras, view)
+    """Colour and depth of one view, in chunks of `config.chunk` rays; below `config.resolution` 1 from fewer of them."""
+    if config.resolution < 1:
+        small = cameras.select(torch.tensor([view])).scaled(1 / config.resolution)
+        whole = replace(config, resolution=1.0)
+        return _enlarged(render_view(model, facts, small, 0, whole, restyle), cameras.size[view].tolist())
+    rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
     rgb, depth, opacity, kept, samples = [], [], [], 0, 0
     for start in range(0, len(rays.near), config.chunk):
@@ -60,22 +72,50 @@ def render_view(
     )
 
 
+def _enlarged(small: View, size: list[int]) -> View:
+    """The view at another width and height. Depths stay what they are: between near and far there is nothing."""
+    target = size[::-1]
+    rgb = F.interpolate(small.rgb.permute(2, 0, 1)[None], target, mode="bicubic")[0].permute(1, 2, 0)
+    depth = F.interpolate(small.depth[None, None], target, mode="nearest-exact")[0, 0]
+    opacity = F.interpolate(small.opacity[None, None], target, mode="bilinear")[0, 0]
+    return View(rgb.clamp(0, 1).contiguous(), depth, opacity, small.kept)
+
+
 @torch.inference_mode()
 def match_view(
     model: Model, cameras: Cameras, view: int, config: RenderConfig, stylizer: Stylizer
 ) -> Annotated[Tensor, "H W T"]:
     """Which style code each pixel takes: the composited attention, scaled to sum to 1 (0 where nothing is)."""
-    rays, _, _ = _view_rays(model, cameras, view)
-    parts = []
+    asks = Want.SEMANTIC in stylizer.needs
+    attention, _ = paint_pixels(model, cameras, view, pixel_grid(cameras, view), config, stylizer.match, semantic=asks)
+    width, height = (int(v) for v in cameras.size[view])
+    return attention.view(height, width, -1)
+
+
+@torch.inference_mode()
+def paint_pixels(
+    model: Model,
+    cameras: Cameras,
+    view: int,
+    pixel: Annotated[Tensor, "R 2"],
+    config: RenderConfig,
+    values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+    *,
+    semantic: bool = True,
+) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
+    """Means over what each pixel sees of anything that follows from semantics, and the opacity; on the CPU.
+
+    Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
+    `semantic` is false. Neither content nor colour is computed.
+    """
+    rays, _, _ = view_rays(model, cameras, view, pixel)
+    painted, opacity = [], []
     for start in range(0, len(rays.near), config.chunk):
         chunk = Rays(*(x[start : start + config.chunk] for x in rays))
-        kept = march(chunk, model.parts, budget=config.budget).kept
-        semantic = (
-            model.semantic(kept.point)
-            if model.semantic is not None and Want.SEMANTIC in stylizer.needs
-            else kept.point.new_zeros(len(kept.point), 0)
-        )
-        attention = composite(kept, stylizer.match(semantic), len(chunk.near))
-        parts.append((attention / attention.sum(-1, keepdim=True).clamp_min(1e-10)).cpu())
-    width, height = (int(v) for v in cameras.size[view])
-    return torch.cat(parts).view(height, width, -1)
+        marched = march(chunk, model.parts, budget=config.budget)
+        kept, field = marched.kept, model.semantic if semantic else None
+        found = values(kept.point[:, :0] if field is None else field(kept.point))
+        mass = composite(kept, torch.ones_like(kept.weight)[:, None], len(chunk.near))
+        painted.append((composite(kept, found, len(chunk.near)) / mass.clamp_min(1e-10)).cpu())
+        opacity.append(marched.opacity.cpu())
+    return torch.cat(painted), torch.cat(opacity)

@@ -1,30 +1,12 @@
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from tiny_world import World
-from torch import Tensor
 
 from fprf.engine.prepare import cache_folder, device_of, prepare
 from fprf.errors import DataError, PluginError
-from fprf.fields.layouts import LayoutConfig
-from fprf.interfaces import BlockLayout
-
-
-class Halves(BlockLayout):
-    @property
-    def boxes(self) -> Tensor:
-        return torch.tensor([[[-1.0, -1, -1], [0, 1, 1]], [[0.0, -1, -1], [1, 1, 1]]])
-
-    def blend(self, points: Tensor) -> Tensor:
-        return torch.nn.functional.one_hot((points[:, 0] > 0).long(), 2).to(points)
-
-
-@dataclass(frozen=True, kw_only=True)
-class HalvesConfig(LayoutConfig):
-    def build(self) -> BlockLayout:
-        return Halves()
 
 
 def test_what_is_found_out(world: World) -> None:
@@ -63,11 +45,6 @@ def test_without_semantics(world: World) -> None:
 def test_the_background_of_the_config_counts(world: World) -> None:
     found = prepare(replace(world.config, render=replace(world.config.render, background=(0.0, 0.0, 0.0))))
     assert found.facts.background == (0.0, 0.0, 0.0) and world.prepared.facts.background is None
-
-
-def test_a_layout_of_more_blocks_is_refused_before_any_work(world: World) -> None:
-    with pytest.raises(PluginError, match=r"cuts 2 blocks.*--blocks single"):
-        prepare(replace(world.config, data=Path("nowhere"), blocks=HalvesConfig()))
 
 
 def test_no_data_is_told(world: World, tmp_path: Path) -> None:

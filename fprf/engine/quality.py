@@ -1,0 +1,100 @@
+"""How much time an image may take: presets of what can be changed without training again. Imports no torch at first.
+
+A preset sets samples along rays, error budget and resolution; whoever gives one of them himself keeps it. Trained
+parameters stay as they are. `fprf bench pareto` shows each preset beside every single knob.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+
+from ..checks import at_least, between, positive
+from ..errors import PluginError, UsageError
+
+if TYPE_CHECKING:
+    from .loading import Trained
+
+__all__ = ["PRESETS", "Preset", "QualityConfig", "at_quality"]
+
+Name: TypeAlias = Literal["draft", "standard", "best"]
+
+
+class Preset(NamedTuple):
+    """A point on the curve of time against error."""
+
+    samples: float
+    """Samples along rays, relative to those of training."""
+    budget: float
+    """Largest weight per ray that may be dropped."""
+    resolution: float = 1.0
+    """Share of an image's width and height that is rendered."""
+
+
+PRESETS: dict[Name, Preset] = {
+    # Half the samples would cost 5 dB on fox, half the size 2.7 dB, and the latter is faster.
+    "draft": Preset(samples=1.0, budget=1 / 256, resolution=0.5),
+    "standard": Preset(samples=1.0, budget=1 / 512),
+    "best": Preset(samples=1.5, budget=1 / 1024),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualityConfig:
+    """How much time an image may take."""
+
+    quality: Name | None = None
+    """draft, standard or best; none = as the run's own config says."""
+    samples: float | None = None
+    """Samples along rays, relative to those of training; none = what the quality says."""
+    budget: float | None = None
+    """Largest weight per ray that may be dropped (0 = exact); none = what the quality says."""
+    resolution: float | None = None
+    """Share of an image's width and height that is rendered, in (0, 1]; the rest is interpolated; none = what the quality
+    says."""
+    chunk: int | None = None
+    """Rays rendered at a time; none = as the run's own config says."""
+
+    def __post_init__(self) -> None:
+        if self.samples is not None:
+            positive("samples", self.samples)
+        if self.budget is not None:
+            between("budget", self.budget, 0.0, 0.5)
+        if self.resolution is not None:
+            positive("resolution", self.resolution)
+            between("resolution", self.resolution, 0.0, 1.0)
+        if self.chunk is not None:
+            at_least("chunk", self.chunk, 1)
+
+
+def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
+    """The run with other sampling; the same one where nothing is asked. Raises PluginError or UsageError where its
+    sampler cannot.
+    """
+    preset = PRESETS[quality.quality] if quality.quality is not None else None
+    samples = quality.samples if quality.samples is not None else preset.samples if preset is not None else 1.0
+    render = trained.config.render
+    if preset is not None:
+        render = replace(render, budget=preset.budget, resolution=preset.resolution)
+    given = {name: value for name in ("budget", "resolution", "chunk") if (value := getattr(quality, name)) is not None}
+    render = replace(render, **given)
+    config = replace(trained.config, render=render)
+    if samples == 1:
+        return trained._replace(config=config)
+    return _resampled(trained._replace(config=config), samples)
+
+
+def _resampled(trained: "Trained", samples: float) -> "Trained":
+    from .model import Model
+
+    old = trained.model.sampler
+    try:
+        scaled = trained.config.sampler.scaled(samples)
+    except NotImplementedError:  # a plug-in that does not say
+        raise PluginError(f"samples: {type(trained.config.sampler).__name__} does not scale; leave --samples at 1") from None
+    sampler = scaled.build(seed=trained.config.seed)
+    state, own = old.state_dict(), sampler.state_dict()
+    if state.keys() != own.keys() or any(state[name].shape != own[name].shape for name in own):
+        raise UsageError("samples: this run's sampler has learnt for its own number of samples; leave --samples at 1")
+    sampler.load_state_dict(state)
+    sampler.requires_grad_(False)
+    model = Model(trained.model.parts._replace(sampler=sampler.to(next(trained.model.parameters()).device)))
+    return trained._replace(config=replace(trained.config, sampler=scaled), model=model.eval())
