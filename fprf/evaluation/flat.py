@@ -1,0 +1,99 @@
+"""A photograph as a scene: every pixel is a point. Stylizers, dictionary and decoder are those of radiance fields.
+
+What tells pixels apart is given from outside, as features of any kind: those of an encoder (`encoded`), or painted regions
+(`painted`), which are as good as a perfect encoder.
+"""
+
+from typing import Annotated, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..datamanagers.basis import Basis, fit_basis
+from ..datamanagers.config import GuidedConfig
+from ..interfaces import Decoder, Encoder, Stylizer
+from ..ops.guided import upsample
+from ..style.dictionary import Reference
+from ..style.look import Restyle
+from ..style.scene import SceneStyle, scene_style
+from ..types import Want
+
+__all__ = ["Flat", "cells_basis", "encoded", "flat_reference", "flat_scene", "painted", "render_flat"]
+
+_CELL = 8
+"""Pixels between guided-filter coefficients."""
+_CHUNK = 65_536
+"""Pixels that are restyled at a time."""
+_SAMPLES = 2**16
+"""Pixels whose statistics are taken, at most, in even steps."""
+
+
+class Flat(NamedTuple):
+    """A photograph, ready to be restyled. `semantic` is None where nothing tells its parts apart."""
+
+    content: Annotated[Tensor, "N C"]
+    semantic: Annotated[Tensor, "N D"] | None
+    size: tuple[int, int]
+    """Height, width; N is their product."""
+    style: SceneStyle
+
+
+@torch.no_grad()
+def encoded(
+    image: Annotated[Tensor, "H W 3"], encoder: Encoder, guided: GuidedConfig, basis: Basis | None = None
+) -> Annotated[Tensor, "N C"]:
+    """Features at every pixel through the guided filter, as a scene's targets are; projected on the basis first."""
+    maps: Tensor = encoder(image.permute(2, 0, 1)[None])[0].float()
+    if basis is not None:
+        maps = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
+    radius = round(guided.radius * min(image.shape[:2]))
+    return upsample(maps, image, radius=radius, eps=guided.eps, stride=min(guided.stride, _CELL)).flatten(0, 1)
+
+
+@torch.no_grad()
+def cells_basis(image: Annotated[Tensor, "H W 3"], encoder: Encoder, dim: int) -> Basis:
+    """The principal components of the encoder's features on a photograph: what a scene fits on its training views."""
+    maps: Tensor = encoder(image.permute(2, 0, 1)[None])[0].float()
+    return fit_basis(maps.flatten(1).T, dim)
+
+
+def painted(regions: Annotated[Tensor, "H W"], kinds: int, size: tuple[int, int]) -> Annotated[Tensor, "N D"]:
+    """One channel a region, 1 where a pixel of a picture of `size` (height, width) lies in it: the nearest painted one."""
+    near = F.interpolate(regions[None, None].double(), size, mode="nearest-exact")[0, 0].long()
+    return F.one_hot(near.flatten(), kinds).float()
+
+
+def flat_scene(
+    content: Annotated[Tensor, "N C"],
+    semantic: Annotated[Tensor, "N D"] | None,
+    size: tuple[int, int],
+    *,
+    regions: int = 8,
+    seed: int = 0,
+) -> Flat:
+    """The photograph of these features, with its statistics; all pixels weigh alike."""
+    some = torch.arange(0, len(content), max(1, -(-len(content) // _SAMPLES)))
+    parts = None if semantic is None else semantic[some]
+    style = scene_style(content[some], parts, torch.ones(len(some)), None, regions, seed)
+    return Flat(content, semantic, size, style)
+
+
+def flat_reference(
+    name: str, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None, *, samples: int = 20_000
+) -> Reference:
+    """A photograph's features as a reference; about `samples` pixels of it, in even steps."""
+    some = torch.arange(0, len(content), max(1, len(content) // samples))
+    return Reference(name, content[some], content.new_zeros(len(some), 0) if semantic is None else semantic[some])
+
+
+@torch.no_grad()
+def render_flat(flat: Flat, stylizer: Stylizer, decoder: Decoder, *, strength: float = 1.0) -> Annotated[Tensor, "H W 3"]:
+    """The photograph in a new style, in [0, 1]."""
+    look = Restyle(stylizer, strength)
+    parts = []
+    for start in range(0, len(flat.content), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        semantic = flat.semantic[rows] if flat.semantic is not None and Want.SEMANTIC in look.needs else None
+        parts.append(look.colour(decoder, flat.content[rows], semantic))
+    return torch.cat(parts).reshape(*flat.size, 3)

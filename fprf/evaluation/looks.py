@@ -1,0 +1,46 @@
+"""One view in many looks: geometry, features and semantics are computed once, each style is applied to the same samples."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..config import RenderConfig
+from ..engine.model import Facts, Model, background_of
+from ..rendering.cameras import Cameras, pixel_grid, rays_through
+from ..rendering.renderer import composite, march
+from ..style.look import Restyle
+from ..types import Rays, Want
+
+__all__ = ["render_looks"]
+
+
+@torch.inference_mode()
+def render_looks(
+    model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, looks: Mapping[str, Restyle | None]
+) -> tuple[dict[str, Annotated[Tensor, "H W 3"]], Annotated[Tensor, "H W"]]:
+    """A picture for each look (None: unstylised), in [0, 1], and the depth in world units: what `render_view` gives."""
+    pixel = pixel_grid(cameras, view)
+    origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+    device = next(model.parameters()).device
+    rays = Rays(*(x.to(device) for x in model.space.rays(origin, direction)))
+    background = background_of(facts, device)
+    pictures: dict[str, list[Tensor]] = {name: [] for name in looks}
+    depth = []
+    asks = any(look is not None and Want.SEMANTIC in look.needs for look in looks.values())
+    for start in range(0, len(pixel), config.chunk):
+        part = Rays(*(x[start : start + config.chunk] for x in rays))
+        marched = march(part, model.parts, budget=config.budget)
+        content = model.field.content(marched.kept.latent, marched.kept.view)
+        semantic = model.semantic(marched.kept.point) if asks and model.semantic is not None else None
+        for name, look in looks.items():
+            colour = model.decoder(content) if look is None else look.colour(model.decoder, content, semantic)
+            rgb = composite(marched.kept, colour, len(part.near))
+            pictures[name].append((rgb if background is None else rgb + marched.through[:, None] * background).cpu())
+        depth.append(marched.depth.cpu())
+    width, height = (int(side) for side in cameras.size[view])
+    return (
+        {name: torch.cat(parts).view(height, width, 3).clamp(0, 1) for name, parts in pictures.items()},
+        model.space.metric(origin, direction, torch.cat(depth)).view(height, width),
+    )

@@ -1,0 +1,113 @@
+"""How far a picture's style is from its references', region by region, in the eyes of an encoder that took no part.
+
+Features of each layer are described in each region by their mean and deviation (or, stricter, their whole covariance), and
+two regions are as far apart as the Gaussians are (Fréchet, the 2-Wasserstein distance):
+
+    d² = |μ_a - μ_b|² + |σ_a - σ_b|²          per channel
+    d² = |μ_a - μ_b|² + tr(C_a + C_b - 2 (C_a^½ C_b C_a^½)^½)                                      with covariances
+
+Regions are averaged by their share of the content, then divided by the same for the unstylised picture: 0 = the reference's own
+statistics, 1 = no change. Layers count alike.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import DataError
+from ..interfaces import Encoder
+from ..style.statistics import covariance, moments
+from ..style.transport import symmetric_root
+from .semantic_matching import MIXED, whole_cells
+
+__all__ = ["RegionStatistics", "gaussian_distance", "region_statistics", "relative_distance", "style_distances"]
+
+_CELLS = 8
+"""A region needs so many cells of a layer on both sides: fewer say nothing of a style."""
+
+Labelled = Sequence[tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "G F"]]]
+"""Pictures, each with the region of its pixels (or of cells of any size); the same ids mean the same on all sides."""
+
+
+class RegionStatistics(NamedTuple):
+    """One region in one layer, float64."""
+
+    cells: int
+    mean: Annotated[Tensor, "C"]
+    covariance: Annotated[Tensor, "C C"]
+
+
+@torch.no_grad()
+def region_statistics(encoder: Encoder, pictures: Labelled) -> dict[int, RegionStatistics]:
+    """Statistics of every region over all pictures together; borders between regions are left out.
+
+    Raises DataError where no picture has a cell that lies wholly in one region.
+    """
+    features, labels = [], []
+    for image, regions in pictures:
+        found: Tensor = encoder(image.permute(2, 0, 1)[None])[0]
+        features.append(found.flatten(1).T)
+        labels.append(whole_cells(regions, (found.shape[1], found.shape[2])).flatten())
+    cells, label = torch.cat(features), torch.cat(labels)
+    kinds = sorted(set(label.tolist()) - {MIXED})
+    if not kinds:
+        raise DataError("style distance: no cell lies wholly in one region; use larger pictures or regions")
+    return {kind: _described(cells[label == kind]) for kind in kinds}
+
+
+def gaussian_distance(a: RegionStatistics, b: RegionStatistics, *, full: bool = False) -> float:
+    """The 2-Wasserstein distance of two regions: of means and deviations, or with `full` of means and covariances."""
+    apart = float((a.mean - b.mean).square().sum())
+    if not full:
+        deviations = [each.covariance.diagonal().clamp_min(0).sqrt() for each in (a, b)]
+        return math.sqrt(apart + float((deviations[0] - deviations[1]).square().sum()))
+    cross = torch.linalg.svdvals(symmetric_root(a.covariance) @ symmetric_root(b.covariance)).sum()
+    spread = float(a.covariance.trace() + b.covariance.trace() - 2 * cross)
+    return math.sqrt(apart + max(0.0, spread))
+
+
+def relative_distance(
+    plain: Mapping[int, RegionStatistics],
+    styled: Mapping[int, RegionStatistics],
+    style: Mapping[int, RegionStatistics],
+    *,
+    full: bool = False,
+) -> float | None:
+    """Distance to the style over that of the unstylised picture, regions by their share of it; one layer.
+
+    None where no region has enough cells on all sides, or the unstylised picture has the style's statistics already.
+    """
+    regions = [
+        r
+        for r, found in plain.items()
+        if r in styled and r in style and min(found.cells, styled[r].cells, style[r].cells) >= _CELLS
+    ]
+    before = sum(plain[r].cells * gaussian_distance(plain[r], style[r], full=full) for r in regions)
+    after = sum(plain[r].cells * gaussian_distance(styled[r], style[r], full=full) for r in regions)
+    return after / before if before > 0 else None
+
+
+def style_distances(
+    judges: Mapping[str, Encoder], plain: Labelled, styled: Mapping[str, Labelled], style: Labelled, *, full: bool = False
+) -> dict[str, dict[str, float | None]]:
+    """For every method of `styled`: the relative distance by judge (a layer each), and their mean as `mean`.
+
+    A judge for whom nothing can be compared is None and left out of the mean.
+    """
+    rows: dict[str, dict[str, float | None]] = {name: {} for name in styled}
+    for judge, encoder in judges.items():
+        before, target = region_statistics(encoder, plain), region_statistics(encoder, style)
+        for name, pictures in styled.items():
+            rows[name][judge] = relative_distance(before, region_statistics(encoder, pictures), target, full=full)
+    for row in rows.values():
+        known = [value for value in row.values() if value is not None]
+        row["mean"] = math.fsum(known) / len(known) if known else None
+    return rows
+
+
+def _described(cells: Annotated[Tensor, "N C"]) -> RegionStatistics:
+    found = moments(cells, torch.ones(len(cells)))
+    return RegionStatistics(len(cells), found.mean, covariance(found))
