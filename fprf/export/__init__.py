@@ -1,0 +1,1 @@
+"""A trained scene, plain or restyled, as files that other programs open."""

@@ -1,0 +1,126 @@
+"""What views see of a scene: depth maps, the surface in them, and how points of the world stand to them.
+
+The gap of a point in a view is the depth that the view has at the point's pixel less the point's distance: about 0 where
+the view sees the point, positive where it looks past it (the point floats), negative where something hides it. Depths are
+world distances along the unit ray through a pixel's centre, infinite where nothing is within reach.
+"""
+
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
+
+__all__ = ["Sights", "Surface", "facing_map", "gaps", "surface"]
+
+_TORN = 1.25
+"""Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground falls away fast."""
+_BENT = 3.0
+"""Where the steps to a pixel's two neighbours differ by more than this factor, an edge runs on the longer one's side."""
+
+
+class Sights(NamedTuple):
+    """V depth maps with their cameras."""
+
+    cameras: Cameras
+    depth: tuple[Annotated[Tensor, "H W"], ...]
+    """float32."""
+
+
+class Surface(NamedTuple):
+    """The N pixels of a view in which a surface with a direction is seen."""
+
+    point: Annotated[Tensor, "N 3"]
+    """float64, world."""
+    normal: Annotated[Tensor, "N 3"]
+    """float32, unit, towards the camera."""
+    facing: Annotated[Tensor, "N"]
+    """Cosine between the normal and the way to the camera, 0 to 1."""
+    footprint: Annotated[Tensor, "N"]
+    """World size of the pixel at its depth, seen head-on."""
+
+
+def surface(sights: Sights, view: int) -> Surface:
+    """Points and normals of a view's depth map; pixels at the border are left out."""
+    point, normal, towards = _directed(sights, view)
+    depth = sights.depth[view].double()
+    inner = torch.zeros_like(depth, dtype=torch.bool)
+    inner[1:-1, 1:-1] = True
+    whole = inner & depth.isfinite() & (towards > 0)
+    size = depth[whole] / sights.cameras.focal[view].mean()
+    return Surface(point[whole], normal[whole].float(), towards[whole].float(), size.float())
+
+
+def facing_map(sights: Sights, view: int) -> Annotated[Tensor, "H W"]:
+    """Cosine between each pixel's normal and the way to the camera, float64; 0 where there is no surface."""
+    _, _, towards = _directed(sights, view)
+    return torch.where(sights.depth[view].isfinite(), towards, 0.0).clamp_min(0)
+
+
+def _directed(sights: Sights, view: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Points [H W 3], normals [H W 3] and their cosines [H W] of all pixels.
+
+    Normals come from the steps to neighbouring pixels on the same surface, on one side alone at an edge; what is a pixel
+    thin faces the camera.
+    """
+    cameras, depth = sights.cameras, sights.depth[view].double()
+    height, width = depth.shape
+    pixel = pixel_grid(cameras, view)
+    origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+    here = depth.isfinite()
+    point = (origin + direction * torch.where(here, depth, 1.0).view(-1, 1)).view(height, width, 3)
+    size = torch.where(here, depth, 0.0) / cameras.focal[view].mean()
+    right, up = cameras.pose[view, :, 0], cameras.pose[view, :, 1]
+    across = _step(point, depth, 1, size[..., None] * right)
+    down = _step(point, depth, 0, size[..., None] * -up)
+    # Image rows run downwards: down x across points back to the camera.
+    normal = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
+    return point, normal, -(normal * direction.view(height, width, 3)).sum(-1)
+
+
+def _step(
+    point: Annotated[Tensor, "H W 3"], depth: Annotated[Tensor, "H W"], axis: int, flat: Annotated[Tensor, "H W 3"]
+) -> Annotated[Tensor, "H W 3"]:
+    """How far the surface moves from one pixel to the next along an axis; `flat` where neither neighbour belongs to it."""
+    before, after = point - point.roll(1, axis), point.roll(-1, axis) - point
+    joined = []
+    for shift in (1, -1):
+        other = depth.roll(shift, axis)
+        joined.append((other < _TORN * depth) & (depth < _TORN * other))
+    long, short = torch.linalg.vector_norm(before, dim=-1), torch.linalg.vector_norm(after, dim=-1)
+    from_before = joined[0] & (~joined[1] | (long < _BENT * short))
+    from_after = joined[1] & (~joined[0] | (short < _BENT * long))
+    count = from_before.double() + from_after.double()
+    step = (before * from_before[..., None] + after * from_after[..., None]) / count.clamp_min(1)[..., None]
+    return torch.where(count[..., None] > 0, step, flat)
+
+
+def gaps(sights: Sights, view: int, points: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
+    """Gap of each world point, infinite where the view sees nothing and NaN outside of it, and its distance; float64."""
+    cameras = sights.cameras
+    pixel, _ = project(cameras, torch.full((len(points),), view, dtype=torch.int64), points)
+    distance = torch.linalg.vector_norm(points - cameras.pose[view, :, 3], dim=-1)
+    size = cameras.size[view].to(pixel)
+    inside = ((pixel >= 0) & (pixel <= size)).all(-1)
+    depth = _lookup(sights.depth[view], torch.where(inside[:, None], pixel, 0.0))
+    return torch.where(inside, depth - distance, torch.nan), distance
+
+
+def _lookup(depth: Annotated[Tensor, "H W"], pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N"]:
+    """Depths between pixel centres: linear in 1/depth, as a plane is, or the nearest pixel's where a surface is torn."""
+    height, width = depth.shape
+    at = (pixel - 0.5).clamp_min(0)
+    x = at[:, 0].clamp(max=width - 1)
+    y = at[:, 1].clamp(max=height - 1)
+    left, top = x.long().clamp(max=max(width - 2, 0)), y.long().clamp(max=max(height - 2, 0))
+    right, low = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+    fx, fy = x - left, y - top
+    flat = depth.double().view(-1)
+    corner = torch.stack(
+        [flat[top * width + left], flat[top * width + right], flat[low * width + left], flat[low * width + right]]
+    )
+    part = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
+    whole = corner.amax(0) < _TORN * corner.amin(0)  # never where one is infinite
+    smooth = 1 / (part / torch.where(whole, corner, 1.0)).sum(0)
+    return torch.where(whole, smooth, corner.gather(0, part.argmax(0, keepdim=True))[0])

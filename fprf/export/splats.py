@@ -1,0 +1,94 @@
+"""Points with normals as 3D Gaussians: flat discs on the surface, in the two formats that splat viewers read.
+
+.ply     one vertex a Gaussian, as Kerbl et al. (2023) write it: f_dc the colour's zeroth harmonic, opacity before the
+         sigmoid, scale_* the logarithm of the standard deviations, rot_* a quaternion w x y z
+.splat   32 bytes a Gaussian: position and standard deviations float32, colour and opacity RGBA, quaternion as 4 bytes
+         (q * 128 + 128); the largest and most opaque first, for viewers that draw while they load
+"""
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..output.atomic import write_bytes
+from .fusion import Cloud
+from .ply import write_ply
+
+__all__ = ["Splats", "discs", "facing", "write_gaussians", "write_splat"]
+
+_HARMONIC = 0.28209479177387814
+"""The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
+_WIDTH = 0.6
+"""Standard deviation along the surface, in spacings."""
+_THICKNESS = 0.1
+"""Standard deviation across the surface, as a share of that along it."""
+_OPACITY = 0.95
+_SRGB = 0.5
+
+
+class Splats(NamedTuple):
+    """N Gaussians without colour."""
+
+    point: Annotated[Tensor, "N 3"]
+    """float64, world."""
+    normal: Annotated[Tensor, "N 3"]
+    deviation: Annotated[Tensor, "N 3"]
+    """Standard deviations along the Gaussian's own axes, world units, float32; the third is the normal's."""
+    rotation: Annotated[Tensor, "N 4"]
+    """Own axes to world, unit quaternion w x y z, float32."""
+    opacity: Annotated[Tensor, "N"]
+    """0 to 1, float32."""
+
+
+def discs(cloud: Cloud) -> Splats:
+    """A disc a point, as wide as its neighbours are apart, so that they cover the surface."""
+    along = (_WIDTH * cloud.space).float()
+    return Splats(
+        cloud.point,
+        cloud.normal,
+        torch.stack([along, along, _THICKNESS * along], 1),
+        facing(cloud.normal),
+        torch.full((len(cloud.point),), _OPACITY),
+    )
+
+
+def facing(normal: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 4"]:
+    """The shortest turns, as quaternions w x y z, that bring the z axis to unit vectors."""
+    x, y, z = normal.unbind(-1)
+    turn = torch.stack([1 + z, -y, x, torch.zeros_like(z)], -1)
+    # Half a turn has no shortest way: round x.
+    back = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=normal.dtype)
+    none = torch.linalg.vector_norm(turn, dim=-1, keepdim=True) < 1e-6
+    return torch.nn.functional.normalize(torch.where(none, back, turn), dim=-1)
+
+
+def write_gaussians(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
+    """The 3D Gaussian PLY. Positions are relative to `origin`; colours are sRGB in [0, 1], without view dependence."""
+    columns = dict(zip("xyz", _columns(splats.point - origin), strict=True))
+    columns |= dict(zip(("nx", "ny", "nz"), _columns(splats.normal), strict=True))
+    harmonics = (colour.double() - _SRGB) / _HARMONIC
+    columns |= {f"f_dc_{i}": column for i, column in enumerate(_columns(harmonics))}
+    columns["opacity"] = _columns(torch.logit(splats.opacity.double())[:, None])[0]
+    columns |= {f"scale_{i}": column for i, column in enumerate(_columns(splats.deviation.log()))}
+    columns |= {f"rot_{i}": column for i, column in enumerate(_columns(splats.rotation))}
+    write_ply(path, columns)
+
+
+def write_splat(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
+    """The .splat file."""
+    order = (splats.deviation.log().sum(-1) + splats.opacity.log()).argsort(descending=True, stable=True).numpy()
+    table = np.empty(len(order), dtype=[("at", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
+    table["at"] = (splats.point - origin).numpy()[order]
+    table["deviation"] = splats.deviation.numpy()[order]
+    rgba = torch.cat([colour.float(), splats.opacity[:, None]], 1)
+    table["rgba"] = (rgba.clamp(0, 1) * 255).round().numpy()[order]
+    table["turn"] = (splats.rotation * 128 + 128).round().clamp(0, 255).numpy()[order]
+    write_bytes(path, table.tobytes())
+
+
+def _columns(values: Annotated[Tensor, "N C"]) -> list[NDArray[np.generic]]:
+    return list(values.float().numpy().T)

@@ -1,0 +1,103 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_world import World
+
+from fprf.engine.views import render_view
+from fprf.export.colours import seen_colours
+from fprf.export.depths import chosen, half_way, reach_of, render_sights
+from fprf.rendering.cameras import pixel_grid, rays_through
+from fprf.rendering.renderer import Restyle
+from fprf.rendering.space import Space
+
+
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**31), share=st.floats(0.05, 0.95))
+def test_half_way_is_where_that_much_weight_has_been_met(seed: int, share: float) -> None:
+    """Against weight spread finely over each step, in float64."""
+    draw = torch.Generator().manual_seed(seed)
+    t = torch.rand(4, 9, generator=draw, dtype=torch.float64).cumsum(1)
+    weights = torch.rand(4, 8, generator=draw, dtype=torch.float64) + 1e-3
+    weights /= weights.sum(1, keepdim=True)
+    found = half_way(weights, t, torch.full((4,), share, dtype=torch.float64))
+    for ray in range(4):
+        part = ((found[ray] - t[ray, :-1]) / (t[ray, 1:] - t[ray, :-1])).clamp(0, 1)
+        assert float((weights[ray] * part).sum()) == pytest.approx(share, abs=1e-9)
+
+
+def test_half_way_lies_on_a_surface_and_the_mean_between_two() -> None:
+    t = torch.linspace(0, 10, 101)[None]
+    weights = torch.zeros(1, 100)
+    weights[0, 20], weights[0, 80] = 0.6, 0.4
+    found = half_way(weights, t, torch.tensor([0.5]))
+    assert 2.0 <= float(found) <= 2.1
+
+
+def test_half_way_of_nothing_is_finite() -> None:
+    assert bool(half_way(torch.zeros(3, 5), torch.linspace(0, 1, 6).expand(3, 6), torch.zeros(3)).isfinite().all())
+
+
+def test_views_are_spread_evenly() -> None:
+    assert chosen([3, 5, 7], 5) == [3, 5, 7]
+    assert chosen(list(range(100)), 3) == [0, 50, 99]
+    assert len(set(chosen(list(range(1000)), 120))) == 120
+
+
+def test_reach() -> None:
+    turn = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    assert reach_of(Space("contraction", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == 40
+    assert reach_of(Space("ndc", (0.0, 0.0, 0.0), turn, 1.0, 2.0, 1.0)) == 100
+    assert reach_of(Space("box", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == math.inf
+
+
+def test_depth_maps_are_world_distances_at_a_bounded_size(world: World) -> None:
+    trained = world.load()
+    known, render = trained.known, trained.config.render
+    views = known.train[:2]
+    whole = render_sights(trained.model, known.cameras, views, render, side=400, reach=math.inf)
+    assert [tuple(d.shape) for d in whole.depth] == [(24, 32)] * 2
+    half = render_sights(trained.model, known.cameras, views, render, side=16, reach=math.inf)
+    assert [tuple(d.shape) for d in half.depth] == [(12, 16)] * 2
+    assert torch.equal(half.cameras.focal, whole.cameras.focal / 2)
+    assert torch.equal(whole.cameras.pose, known.cameras.pose[list(views)])
+    near = render_sights(trained.model, known.cameras, views, render, side=400, reach=3.0)
+    for every, some in zip(whole.depth, near.depth, strict=True):
+        assert bool((every[every.isfinite()] > 0).all())
+        assert torch.equal(some, torch.where(every < 3.0, every, torch.inf))
+    mean = render_view(trained.model, known.facts, known.cameras, views[0], render).depth
+    solid = whole.depth[0].isfinite()
+    # Half of the weight and the mean of it lie on the same side of a ray: their medians over an image agree roughly.
+    ratio = (whole.depth[0] / mean)[solid]
+    assert 0.5 < float(ratio.median()) < 1.5
+
+
+def test_points_on_rays_of_pixels_have_the_colours_of_the_picture(world: World) -> None:
+    """At any distance along the ray, and one set for each style."""
+    trained = world.load()
+    known, render = trained.known, trained.config.render
+    pixel = pixel_grid(known.cameras, 1)
+    origin, direction = rays_through(known.cameras, torch.full((len(pixel),), 1), pixel)
+    points = origin + direction * (1 + torch.rand(len(pixel), 1))
+    styled = trained_restyle(world)
+    told: list[tuple[int, int]] = []
+    plain, full, none = seen_colours(
+        trained.model, known.facts, known.cameras, points, torch.full((len(pixel),), 1), render,
+        [None, styled, Restyle(styled.stylizer, 0.0)], lambda done, total: told.append((done, total)),
+    )  # fmt: skip
+    picture = render_view(trained.model, known.facts, known.cameras, 1, render).rgb.view(-1, 3)
+    styled_picture = render_view(trained.model, known.facts, known.cameras, 1, render, styled).rgb.view(-1, 3)
+    # The ray's direction is found again from a point on it, and a sample may then cross the error budget.
+    assert float((plain - picture).abs().amax()) < 5e-3
+    assert float((full - styled_picture).abs().amax()) < 5e-3
+    assert torch.equal(plain, none) and float((plain - full).abs().mean()) > 0.01
+    assert told[-1] == (len(points), len(points))
+
+
+def trained_restyle(world: World) -> Restyle:
+    from fprf.engine.restyle import restyle
+    from fprf.plugins.stylizers.config import RegionOtConfig
+
+    return restyle(world.load(), world.references, RegionOtConfig()).restyle

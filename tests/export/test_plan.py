@@ -1,0 +1,47 @@
+from pathlib import Path
+
+import pytest
+
+from fprf.errors import UsageError
+from fprf.export.plan import KINDS, look_file, plan
+
+
+def test_a_folder_takes_all_kinds_or_those_that_are_named(tmp_path: Path) -> None:
+    assert plan([], tmp_path) == (tuple(KINDS), tmp_path, None)
+    assert plan(["splat", "ply", "splat"], Path("out")) == (("splat", "ply"), Path("out"), None)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "name", "kind"),
+    [
+        ([], "a.ply", "ply"),
+        (["splat"], "a.ply", "splat"),
+        ([], "a.SPLAT", "splat"),
+        ([], "t.json", "cameras"),
+    ],
+)
+def test_a_file_holds_what_its_ending_says(kinds: list[str], name: str, kind: str) -> None:
+    assert plan(kinds, Path("to") / name) == ((kind,), Path("to"), Path("to") / name)
+
+
+def test_a_folder_may_end_like_a_file(tmp_path: Path) -> None:
+    (tmp_path / "x.ply").mkdir()
+    assert plan(["ply"], tmp_path / "x.ply").single is None
+
+
+@pytest.mark.parametrize(
+    ("kinds", "output", "told"),
+    [
+        (["spalt"], "out", r"'spalt' is nothing to export; did you mean 'splat'|'spalt' is nothing to export.*splat"),
+        (["cameras"], "a.ply", r"a single \.ply file holds ply or splat or glb, not cameras"),
+        (["ply", "splat"], "a.ply", r"not ply and splat; name a folder"),
+    ],
+)
+def test_mistakes(kinds: list[str], output: str, told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        plan(kinds, Path(output))
+
+
+def test_names_of_looks() -> None:
+    assert look_file("points", "", ".ply") == "points.ply"
+    assert look_file("points", "dusk", ".ply") == "points.dusk.ply"

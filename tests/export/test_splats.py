@@ -1,0 +1,125 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from analytic import globe
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from splatter import draw, matrices, read_gaussians, read_splat, table
+
+from fprf.datamanagers.images import load_images
+from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.export.fusion import Cloud, fuse, joined
+from fprf.export.sights import Sights
+from fprf.export.sky import dome
+from fprf.export.splats import discs, facing, write_gaussians, write_splat
+from fprf.rendering.cameras import project
+from fprf.town.write import read_truth, write_town
+
+ZERO = torch.zeros(3, dtype=torch.float64)
+STANDARD = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), "opacity"]
+STANDARD += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # Kerbl et al., degree 0
+
+
+@pytest.fixture(scope="module")
+def cloud() -> Cloud:
+    return fuse(globe(8), edge=0.2, most=10**6, tolerance=0.02, agree=2)
+
+
+@settings(deadline=None)
+@given(seed=st.integers(0, 2**31))
+def test_turns_bring_the_z_axis_to_the_normal(seed: int) -> None:
+    drawn = torch.randn(20, 3, generator=torch.Generator().manual_seed(seed)).double()
+    poles = torch.tensor([[0, 0, 1.0], [0, 0, -1.0], [0, 1e-4, -1.0]]).double()
+    normal = torch.nn.functional.normalize(torch.cat([drawn, poles]), dim=-1)
+    turn = facing(normal)
+    assert torch.allclose(turn.norm(dim=-1), torch.ones(23).double())
+    axis = torch.from_numpy(matrices(turn.numpy())[:, :, 2])
+    assert torch.allclose(axis, normal, atol=1e-6)
+
+
+def test_discs_are_flat_and_as_wide_as_their_spacing(cloud: Cloud) -> None:
+    splats = discs(cloud)
+    along, _, across = splats.deviation.unbind(-1)
+    assert torch.allclose(
+        along.double() / cloud.space, torch.full_like(cloud.space, float(along[0] / cloud.space[0])), rtol=1e-5
+    )
+    assert bool((across < 0.2 * along).all())
+    axis = matrices(splats.rotation.double().numpy())[:, :, 2]
+    assert np.allclose(axis, cloud.normal.numpy(), atol=1e-5)
+
+
+def test_both_files_hold_the_same_gaussians(cloud: Cloud, tmp_path: Path) -> None:
+    splats = discs(cloud)._replace(opacity=torch.linspace(0.2, 0.99, len(cloud.point)))
+    colour = torch.rand(len(cloud.point), 3)
+    origin = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    write_gaussians(tmp_path / "g.ply", splats, colour, origin)
+    write_splat(tmp_path / "g.splat", splats, colour, origin)
+    data = (tmp_path / "g.ply").read_bytes()
+    assert list(table(data).dtype.names or ()) == STANDARD
+    ply, splat = read_gaussians(data), read_splat((tmp_path / "g.splat").read_bytes())
+    assert np.allclose(ply.at, (cloud.point - origin).numpy(), atol=1e-6)
+    assert np.allclose(ply.deviation, splats.deviation.numpy(), rtol=1e-5)
+    assert np.allclose(ply.colour, colour.numpy(), atol=1e-6)
+    assert np.allclose(ply.opacity, splats.opacity.numpy(), atol=1e-5)
+    importance = ply.deviation.prod(1) * ply.opacity
+    order = np.argsort(-importance, kind="stable")
+    assert np.all(np.diff(np.float32(splat.deviation).prod(1) * splat.opacity) < 0.02 * importance.max()), "largest first"
+    assert np.allclose(np.sort(importance)[::-1], importance[order])
+    by_place = [tuple(row) for row in np.float32(splat.at)]
+    index = {tuple(row): i for i, row in enumerate(np.float32(ply.at))}
+    match = np.array([index[row] for row in by_place])
+    assert sorted(match) == list(range(len(match)))
+    assert np.abs(splat.colour - ply.colour[match]).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(splat.opacity - ply.opacity[match]).max() <= 0.5 / 255 + 1e-5
+    # 8 bits a component: half a step of 1/128 each, in four of them.
+    turned = np.abs((splat.turn * ply.turn[match]).sum(1))
+    assert turned.min() > np.cos(2 * 0.5 / 128)
+
+
+def test_a_splat_is_32_bytes(cloud: Cloud, tmp_path: Path) -> None:
+    write_splat(tmp_path / "g.splat", discs(cloud), torch.rand(len(cloud.point), 3), ZERO)
+    assert (tmp_path / "g.splat").stat().st_size == 32 * len(cloud.point)
+
+
+def test_discs_leave_no_holes(cloud: Cloud, tmp_path: Path) -> None:
+    """A white sphere on black: opaque where it is seen head-on, empty where it is not."""
+    sights = globe(8)
+    write_gaussians(tmp_path / "g.ply", discs(cloud), torch.ones(len(cloud.point), 3), ZERO)
+    pose = sights.cameras.pose[2].numpy()
+    image, covered = draw(read_gaussians((tmp_path / "g.ply").read_bytes()), pose, 50.0, (48, 40))
+    sees = sights.depth[2].isfinite().numpy()
+    inner = sees & np.roll(sees, 2, 0) & np.roll(sees, -2, 0) & np.roll(sees, 2, 1) & np.roll(sees, -2, 1)
+    assert covered[inner].min() > 0.9 and image[inner].min() > 0.9
+    outer = ~(sees | np.roll(sees, 4, 0) | np.roll(sees, -4, 0) | np.roll(sees, 4, 1) | np.roll(sees, -4, 1))
+    assert covered[outer].max() < 0.1
+
+
+def test_views_of_the_town_come_back(tmp_path: Path) -> None:
+    """Splats of exact depths, with the colours of the nearest pixels, against held-out pictures of the same places.
+
+    Measured 19.1 and 17.5 dB. What remains is the size of the discs, the third of a square pixel that viewers blur by,
+    and what no training view saw.
+    """
+    write_town(tmp_path / "town", seed=0, palette="day", views=16, width=80, height=60)
+    scene = parse_scene(tmp_path / "town", 1, None)
+    images = load_images(scene)
+    depth = tuple(torch.from_numpy(read_truth(tmp_path / "town", v)[0]) for v in scene.train.tolist())
+    sights = Sights(scene.cameras.select(scene.train), depth)
+    solid = fuse(sights, edge=None, most=10**6, tolerance=0.02, agree=2)
+    sky = dome(sights, solid)
+    assert sky is not None
+    cloud = joined(solid, sky)
+    colour = torch.zeros(len(cloud.point), 3)
+    for k, view in enumerate(scene.train.tolist()):
+        mine = cloud.view == k
+        pixel = project(sights.cameras, cloud.view[mine], cloud.point[mine])[0].long()
+        pixel = torch.minimum(pixel.clamp_min(0), scene.cameras.size[view] - 1)
+        colour[mine] = torch.from_numpy(images[view])[pixel[:, 1], pixel[:, 0]].float() / 255
+    write_splat(tmp_path / "town.splat", discs(cloud), colour, ZERO)
+    gaussians = read_splat((tmp_path / "town.splat").read_bytes())
+    for view in scene.test.tolist():
+        image, covered = draw(gaussians, scene.cameras.pose[view].numpy(), float(scene.cameras.focal[view, 0]), (80, 60))
+        psnr = -10 * np.log10(np.square(image - images[view] / 255).mean())
+        assert psnr > 16.5 and covered.mean() > 0.95
