@@ -1,0 +1,1 @@
+"""Benchmarks of a run: speed, where time goes, time against error, memory, scaling."""

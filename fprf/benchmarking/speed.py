@@ -1,0 +1,166 @@
+"""`fprf bench speed`: ours against the naive path, on the same model in the same run, with the error beside each time."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from torch import Tensor
+
+from ..config import RenderConfig
+from ..engine.model import Facts, Model
+from ..engine.prepare import Prepared
+from ..engine.restyle import restyle
+from ..engine.views import render_view
+from ..interfaces import Stylizer
+from ..plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, StylizerConfig
+from ..rendering.cameras import Cameras
+from ..style.look import Restyle
+from .config import SpeedConfig
+from .naive import plain_planes, without_skipping
+from .report import Outcome, Row, document, rows_table
+from .roofline import roofline_rows
+from .subject import Subject, attempt, device_of, find, fresh_model, settings, size_of, test_view, watch_of
+from .timing import ratio, spread
+from .training import batch_rays, colour_gradient, loop_of, stepper
+from .triplane import triplane_rows
+from .views import count, difference, exact, plainly, view_rays
+
+__all__ = ["speed"]
+
+Progress = Callable[[int, int, str], None]
+STYLES: dict[str, StylizerConfig] = {"region-ot": RegionOtConfig(), "local-adain": LocalAdainConfig()}
+"""The recommended stylizer, and the paper's."""
+BUDGET = 1 / 512
+"""The error that skipping may cost: half an 8-bit step."""
+
+
+def speed(config: SpeedConfig, root: Path, folder: Path, progress: Progress) -> Outcome:
+    """Training, rendering, restyling, tri-planes."""
+    subject = find(root, config, folder)
+    rows: list[Row] = []
+    progress(0, 4, "training")
+    prepared, missing = attempt(subject)
+    if prepared is not None:
+        rows.append(_training(config, subject, prepared))
+    progress(1, 4, "rendering")
+    drawn, counters = _rendering(config, subject)
+    rows += drawn
+    progress(2, 4, "restyling")
+    rows += _restyling(config, subject)
+    progress(3, 4, "tri-planes")
+    rows += triplane_rows(config, subject.trained) + roofline_rows(config, subject.trained)
+    progress(4, 4, "done")
+    trained = subject.trained
+    about = settings(config, trained, missing) | {"view": size_of(test_view(config, trained)), "points": config.points}
+    made = document("speed", rows, device=device_of(trained), settings=about, extra={"counters": counters})
+    return Outcome(made, [rows_table("speed, beside the naive path", rows)])
+
+
+def _training(config: SpeedConfig, subject: Subject, prepared: Prepared) -> Row:
+    trained = subject.trained
+    plain = without_skipping(trained.config)
+    ours = loop_of(trained.config, prepared, fresh_model(trained))
+    naive = loop_of(plain, subject.prepare(plain), fresh_model(trained))
+    take, walk = stepper(ours, trained.step), stepper(naive, trained.step)
+
+    def naively() -> None:
+        with plain_planes(naive.model):
+            walk()
+
+    seconds = watch_of(config, trained).in_turn({"ours": take, "naive": naively})
+    batch = ours.manager.batch(trained.step)
+    rays = len(batch.rgb)
+    fast = spread(seconds["ours"]).map(lambda s: rays / s)
+    slow = spread(seconds["naive"]).map(lambda s: len(naive.manager.batch(0).rgb) / s)
+    return Row(
+        name="train",
+        figure=fast.median,
+        low=fast.low,
+        high=fast.high,
+        unit="rays/s",
+        peer=slow.median,
+        ratio=ratio(seconds["naive"], seconds["ours"]),
+        error=_gradient_error(subject, prepared),
+        error_kind="relative L2 error of the colour loss's gradient against float64 without skipping",
+    )
+
+
+def _gradient_error(subject: Subject, prepared: Prepared) -> float:
+    trained = subject.trained
+    batch = prepared.manager.batch(trained.step)
+    model = fresh_model(trained)
+    rays = batch_rays(model, prepared, batch)
+    ours = colour_gradient(model, prepared, trained.config, batch, rays, trained.step).double()
+    wide = fresh_model(trained).double()
+    rays = type(rays)(*(x.double() for x in rays))
+    truth = colour_gradient(wide, prepared, without_skipping(trained.config), batch, rays, trained.step)
+    return float((ours - truth).norm() / truth.norm().clamp_min(1e-30))
+
+
+def _rendering(config: SpeedConfig, subject: Subject) -> tuple[list[Row], dict[str, float]]:
+    trained, camera = subject.trained, test_view(config, subject.trained)
+    pixels = int(camera.size[0].prod())
+    looks: dict[str, Restyle | None] = {"render": None}
+    for name, stylizer in STYLES.items():
+        made = restyle(trained, subject.references, stylizer, clusters=config.clusters)
+        looks[f"stylised, {name}"] = made.restyle
+    model, facts, render = trained.model, trained.known.facts, trained.config.render
+    rays = view_rays(model, camera, 0)
+    calls: dict[str, Callable[[], Tensor]] = {}
+    for name, look in looks.items():
+        calls[name] = partial(_drawn, model, facts, camera, render, look)
+        calls[f"naive {name}"] = partial(_naively, model, facts, camera, replace(render, budget=0.0), look)
+    seconds = watch_of(config, trained).in_turn(calls)
+    rows = []
+    for name, look in looks.items():
+        truth = exact(model, facts, rays, look).cpu()
+        fast = spread(seconds[name]).map(lambda s: pixels / s)
+        rows.append(
+            Row(
+                name=name,
+                figure=fast.median,
+                low=fast.low,
+                high=fast.high,
+                unit="rays/s",
+                peer=pixels / spread(seconds[f"naive {name}"]).median,
+                ratio=ratio(seconds[f"naive {name}"], seconds[name]),
+                ratio_goal=3.0 if render.budget == BUDGET else None,
+                error=difference(calls[name](), truth).largest,
+                error_kind="largest colour error against float64 without skipping",
+                peer_error=difference(calls[f"naive {name}"](), truth).largest,
+            )
+        )
+    return rows, count(model.parts, rays, render.budget).shares
+
+
+def _drawn(model: Model, facts: Facts, camera: Cameras, render: RenderConfig, look: Restyle | None) -> Tensor:
+    return render_view(model, facts, camera, 0, render, look).rgb
+
+
+def _naively(model: Model, facts: Facts, camera: Cameras, render: RenderConfig, look: Restyle | None) -> Tensor:
+    with plain_planes(model):
+        return plainly(model, facts, view_rays(model, camera, 0), render, look).cpu()
+
+
+def _restyling(config: SpeedConfig, subject: Subject) -> list[Row]:
+    """A new photograph: to its dictionary, to the first picture."""
+    trained, camera = subject.trained, test_view(config, subject.trained)
+    made: dict[str, Stylizer] = {}
+
+    def dictionary() -> None:
+        made["new"] = restyle(trained, subject.references[:1], RegionOtConfig(), clusters=config.clusters).restyle.stylizer
+
+    def first() -> None:
+        dictionary()
+        render_view(trained.model, trained.known.facts, camera, 0, trained.config.render, Restyle(made["new"]))
+
+    seconds = watch_of(config, trained).in_turn({"dictionary": dictionary, "first": first})
+    rows = []
+    for name, label, goal in (
+        ("dictionary", "new reference to its dictionary", 1.0),
+        ("first", "new reference to the first view", 2.0),
+    ):
+        taken = spread(seconds[name])
+        rows.append(Row(name=label, figure=taken.median, low=taken.low, high=taken.high, unit="s", goal=goal))
+    return rows
