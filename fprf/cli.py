@@ -13,6 +13,7 @@ from typing import NamedTuple
 from . import __version__
 from .errors import FprfError, UsageError
 from .plugins.registry import nearest
+from .process import settle
 
 __all__ = ["VERBS", "Verb", "main"]
 
@@ -33,6 +34,9 @@ VERBS = {
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
+    "bench": Verb("speed|profile|pareto|... [RUN]", "time and error, where time goes, memory, scaling"),
+    "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
+    "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),
     "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
     "doctor": Verb("[RUN|DIR]", "look over this machine, a run or a scene folder"),
@@ -76,6 +80,7 @@ def _dispatch(args: list[str]) -> int:
     verb, rest = args[0], args[1:]
     if verb not in VERBS:
         raise UsageError(f"fprf {verb}: no such verb{nearest(verb, VERBS)} (verbs: {', '.join(VERBS)})")
+    settle()
     try:
         code = importlib.import_module(f".commands.{verb}", __package__).run(rest)
     except SystemExit as end:  # --help ends this way

@@ -120,6 +120,8 @@ class RenderConfig:
     """Largest weight per ray that may be dropped when rendering; bounds the colour error (0 = exact)."""
     train_budget: float = 1 / 512
     """The same bound while training."""
+    resolution: float = 1.0
+    """Share of an image's width and height that is rendered, in (0, 1]; what lies between is interpolated."""
     chunk: int = 8192
     """Rays rendered at a time."""
     background: tuple[float, float, float] | None = None
@@ -128,6 +130,8 @@ class RenderConfig:
     def __post_init__(self) -> None:
         between("render.budget", self.budget, 0.0, 0.5)
         between("render.train_budget", self.train_budget, 0.0, 0.5)
+        positive("render.resolution", self.resolution)
+        between("render.resolution", self.resolution, 0.0, 1.0)
         at_least("render.chunk", self.chunk, 1)
 
 

@@ -28,8 +28,12 @@ def _seeded() -> None:
 
 @pytest.fixture(autouse=True)
 def _one_kernel_thread() -> None:
-    """Kernels here take a millisecond; on a busy machine waiting for their second thread takes a hundred."""
+    """Kernels here take a millisecond; on a busy machine waiting for their second thread takes a hundred.
+
+    torch and numba share OpenMP: numba's first call gives torch, too, as many threads as there are cores.
+    """
     numba.set_num_threads(1)
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fprf import testing
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.fields.layouts import LayoutConfig, SingleConfig
+from fprf.fields.layouts import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig, StreetConfig
 from fprf.interfaces import BlockLayout, Decoder, Encoder, Executor, Sampler, Stylizer
 from fprf.plugins import registry
 from fprf.plugins.decoders.config import DecoderConfig
@@ -18,8 +18,8 @@ from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
 from fprf.plugins.executors.config import ExecutorConfig, SerialConfig
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
 from fprf.plugins.stylizers.config import StylizerConfig
-from fprf.testing.contracts import _linear
-from fprf.types import Sampled, Want
+from fprf.testing import cases
+from fprf.types import Boxes, Sampled, Site, Want
 
 BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_encoder, RandomConfig(channels=5, stride=3)),
@@ -28,6 +28,9 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_content_field, PlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
     (testing.check_semantic_field, SemanticPlanesConfig(resolutions=(4, 8), channels=2, hidden=8)),
     (testing.check_layout, SingleConfig()),
+    (testing.check_layout, GridConfig()),
+    (testing.check_layout, AdaptiveConfig()),
+    (testing.check_layout, StreetConfig()),
     (testing.check_executor, SerialConfig()),
     *(
         (testing.check_stylizer, registry.load("fprf.stylizers", n, StylizerConfig)())
@@ -161,9 +164,9 @@ def test_breaches_of_a_config_are_told() -> None:
 
 
 class Backwards(Sampler):
-    def forward(self, rays: Any, *, locate: Any, distance: Any, step: Any, generator: Any) -> Sampled:
+    def forward(self, rays: Any, *, space: Any, step: Any, generator: Any) -> Sampled:
         s = torch.linspace(1, 0, 5).expand(len(rays.near), 5)
-        return Sampled(s, distance(s, rays.near, rays.far))
+        return Sampled(s, space.distance(s, rays.near, rays.far))
 
     def penalties(self) -> dict[str, Tensor]:
         return {}
@@ -179,10 +182,16 @@ class Bright(Decoder):
     def forward(self, content: Tensor) -> Tensor:
         return content[:, :3]
 
+    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
+        return self(styled)
+
+    def unaided(self, content: Tensor) -> None:
+        return None
+
 
 @dataclass(frozen=True, kw_only=True)
 class BrightConfig(DecoderConfig):
-    def build(self, *, encoder: str, channels: int) -> Decoder:
+    def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         return Bright()
 
 
@@ -205,12 +214,9 @@ class AveragingConfig(StylizerConfig):
 
 
 class Halves(BlockLayout):
-    @property
-    def boxes(self) -> Tensor:
-        return torch.tensor([[[-1.0, -1, -1], [0, 1, 1]], [[0, -1, -1], [1, 1, 1]]])
-
-    def blend(self, points: Tensor) -> Tensor:
-        return torch.full((len(points), 2), 0.5)
+    def cut(self, site: Site) -> Boxes:
+        low = torch.tensor([[-1.0, -1.0, -1.0], [0.0, -1.0, -1.0]])
+        return Boxes(low, low + 1, 2 * torch.eye(3).expand(2, 3, 3), 0.1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,7 +241,7 @@ class SilentConfig(ExecutorConfig):
     [
         (testing.check_sampler, BackwardsConfig(), "must be sorted"),
         (testing.check_stylizer, AveragingConfig(), "must not depend on the others"),
-        (testing.check_layout, HalvesConfig(), "no weight outside its box"),
+        (testing.check_layout, HalvesConfig(), "orthonormal"),
         (testing.check_executor, SilentConfig(), "must reach the caller"),
     ],
 )
@@ -258,6 +264,8 @@ def test_a_parser_is_checked_on_a_real_scene(shared: Any) -> None:
         testing.check_parser(LlffConfig(), scenes / "fox")
 
 
-def test_the_measure_of_the_cases_is_linear() -> None:
-    s = torch.tensor([[0.0, 0.5, 1.0]])
-    assert _linear(s, torch.tensor([1.0]), torch.tensor([3.0])).tolist() == [[1.0, 2.0, 3.0]]
+def test_the_space_of_the_cases_is_the_unit_cube_as_it_is() -> None:
+    s, space = torch.tensor([[0.0, 0.5, 1.0]]), cases.space()
+    assert space.distance(s, torch.tensor([1.0]), torch.tensor([3.0])).tolist() == [[1.0, 2.0, 3.0]]
+    points = cases.points(9)
+    assert torch.allclose(space.locate(points), points, atol=1e-6)

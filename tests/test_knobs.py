@@ -80,6 +80,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "optimizer.eps": (1e-3, "training"),
     "render.budget": (0.4, "render"),
     "render.train_budget": (0.4, "training"),
+    "render.resolution": (0.5, "render"),
     "render.chunk": (100, "chunks"),
     "render.background": ((1.0, 0.0, 1.0), "background"),
     "statistics.rays": (64, "style"),
@@ -229,6 +230,7 @@ def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         return render_view(trained.model, known.facts, known.cameras, 0, config.render).rgb
 
     assert not torch.equal(view(world.config), view(second("render.budget")))
+    assert not torch.equal(view(world.config), view(second("render.resolution")))
     calls: list[int] = []
     whole = trained.model.field.density
     monkeypatch.setattr(trained.model.field, "density", lambda points: calls.append(len(points)) or whole(points))

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..checks import at_least, positive
+from ..style.config import StyleConfig
+from ..style.files import StyleFile
 from .parsing import parse
 from .progress import Display
 from .render import RenderVerbConfig, camera_path, frames_of
-from .stylize import StyleConfig, build_style
 from .train import train_scene
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ def run(args: list[str]) -> int:
     from ..datamanagers.parsers.config import TownConfig
     from ..datamanagers.parsers.recognise import parse_scene
     from ..engine.loading import load_run
+    from ..engine.restyle import apply_style
     from ..evaluation.judge import judge
     from ..methods import fprf_lite
     from ..output.atomic import write_json
@@ -74,8 +76,8 @@ def run(args: list[str]) -> int:
         styles, seconds = _styles(trained, references, display)
         film = config.output / "film.mp4"
         tour = camera_path(trained, RenderVerbConfig(frames=config.frames, split="train"))[0]
-        mixed = build_style(trained, tuple(references.values()), StyleConfig())
-        write_video(film, frames_of(trained, tour, mixed.restyle, display), fps=12)
+        mixed = apply_style(trained, StyleFile(StyleConfig(references=tuple(references.values()))))
+        write_video(film, frames_of(trained, tour, lambda _: mixed.restyle, display), fps=12)
     metrics = {"method": "fprf-lite", "scene": "town", **metrics, **seconds, "total_seconds": time.perf_counter() - start}
     write_json(config.output / "metrics.json", metrics)
     _show(config.output / "gallery.html", trained, renders, styles, references, metrics, film)
@@ -108,6 +110,7 @@ def _styles(
     trained: "Trained", references: dict[str, Path], display: Display
 ) -> tuple[list[tuple[str, "Styled", list["View"], list["Picture"]]], dict[str, float]]:
     """Each reference alone and all at once, on the test views, with match maps; and what that took."""
+    from ..engine.restyle import apply_style
     from ..engine.views import match_view, render_view
     from ..output.maps import match_image
 
@@ -119,7 +122,7 @@ def _styles(
     for i, (name, paths) in enumerate(chosen):
         display.count(i, len(chosen), "restyling")
         start = time.perf_counter()
-        styled = build_style(trained, paths, StyleConfig())
+        styled = apply_style(trained, StyleFile(StyleConfig(references=paths)))
         built = time.perf_counter()
         pictures = [render_view(trained.model, known.facts, known.cameras, v, config, styled.restyle) for v in views]
         dictionary_seconds += built - start

@@ -7,6 +7,7 @@ from typing import Literal
 from rich.console import Console
 from rich.table import Table
 
+from ..engine.quality import QualityConfig, at_quality
 from ..errors import UsageError
 from .parsing import parse
 from .progress import Display
@@ -15,7 +16,7 @@ __all__ = ["EvalConfig", "run"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalConfig:
+class EvalConfig(QualityConfig):
     """What to measure."""
 
     run: Path = Path()
@@ -42,7 +43,7 @@ def run(args: list[str]) -> int:
     from ..output.images import to_uint8
     from ..output.video import write_frames
 
-    trained = load_run(config.run, config.device)
+    trained = at_quality(load_run(config.run, config.device), config)
     data = config.data or trained.config.data
     scene = parse_scene(data, trained.config.downscale, trained.config.datamanager.parser)
     if tuple(view_names(scene.paths)) != trained.known.names:
@@ -52,7 +53,13 @@ def run(args: list[str]) -> int:
         raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
     with Display() as display:
         metrics, renders = judge(trained, scene, views, display.count)
-    metrics = {"method": trained.method, "scene": trained.known.name, "split": config.split, **metrics}
+    metrics = {
+        "method": trained.method,
+        "scene": trained.known.name,
+        "split": config.split,
+        "quality": config.quality,
+        **metrics,
+    }
     write_json(config.run / "metrics.json", metrics)
     if config.images:
         names = [trained.known.names[v] for v in views]

@@ -2,18 +2,18 @@
 
 import json
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
 from ..errors import UsageError
-from ..pretraining.config import DistilConfig, PretrainConfig, PretrainDecoderConfig
+from ..pretraining.config import DistilConfig, PretrainConfig, PretrainDecoderConfig, SemanticDistilConfig
 from .parsing import parse
 
 __all__ = ["run"]
 
 KINDS = ("content", "semantic", "decoder")
-SEMANTIC = DistilConfig(minutes=12.0, batch=8, rate=3e-3, crops=1, size=224)
 Report = dict[str, float | int | str]
 C = TypeVar("C", bound=PretrainConfig)
 
@@ -31,7 +31,9 @@ def run(args: list[str]) -> int:
     if kind == "semantic":
         from ..pretraining.semantic import pretrain_semantic
 
-        return _run(SEMANTIC, rest, kind, "A small semantic encoder that imitates MobileNetV2s.", pretrain_semantic)
+        return _run(
+            SemanticDistilConfig(), rest, kind, "A small semantic encoder that imitates MobileNetV2s.", pretrain_semantic
+        )
     if kind == "decoder":
         from ..pretraining.decoder import pretrain_decoder
 
@@ -48,8 +50,13 @@ def _run(
         raise UsageError(f"fprf pretrain {kind}: no photographs; name their folders with --images DIR ...")
     if config.output is None:
         raise UsageError(f"fprf pretrain {kind}: nowhere to write; name the weights file with --output FILE")
-    report = pretrain(config, config.output, _say)
-    print(json.dumps({"weights": str(config.output), **report}, indent=2))
+    begun = time.monotonic()
+    found = pretrain(config, config.output, _say)
+    report = {"weights": str(config.output), **found, "seed": config.seed, "seconds": round(time.monotonic() - begun, 1)}
+    from ..pretraining.report import write_report
+
+    write_report(config.output, kind, report)
+    print(json.dumps(report, indent=2))
     return 0
 
 

@@ -63,15 +63,15 @@ class Display:
         """Progress of the feature store."""
         self.count(done, total, what)
 
-    def training(self, report: "Report") -> None:
+    def training(self, report: "Report", what: str = "training") -> None:
         """How training goes."""
         left = report.seconds * (1 - report.share) / max(report.share, 1e-3)
         detail = f"step {report.step}  {report.psnr:.2f} dB  {report.rays_per_second:,.0f} rays/s  {_clock(left)} left"
-        self._bar("training", report.share, detail)
+        self._bar(what, report.share, detail)
         if not self.live and self._due(report.share >= 1):
             self._line(
                 {
-                    "event": "training",
+                    "event": what,
                     "step": report.step,
                     "share": round(report.share, 4),
                     "seconds": round(report.seconds, 1),

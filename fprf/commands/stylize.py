@@ -3,127 +3,182 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from ..checks import at_least, between
-from ..plugins.stylizers.config import RegionOtConfig, StylizerConfig
-from .parsing import parse
+from ..engine.quality import QualityConfig, at_quality
+from ..errors import UsageError
+from ..plugins.registry import nearest
+from ..style.config import StyleConfig
+from ..style.files import write_style
 from .progress import Display
+from .style_flags import read_flags
 
 if TYPE_CHECKING:
+    from ..engine.explain import Region
     from ..engine.loading import Trained
+    from ..engine.regions import Regions
     from ..engine.restyle import Styled
 
-__all__ = ["StyleConfig", "StylizeConfig", "build_style", "run"]
+__all__ = ["StylizeConfig", "run"]
 
 _LONGEST = 80
 """Characters of a style's default name."""
 
+_SHOWN = 0.1
+"""References that a region takes less of are not in the table."""
 
-@dataclass(frozen=True, kw_only=True)
-class StyleConfig:
-    """How references become a style."""
+_HEAD = ("region", "share", "seen best at", "strength", "entropy", "takes")
 
-    stylizer: StylizerConfig = RegionOtConfig()
-    """What moves the scene's features."""
-    strength: float = 1.0
-    """0 leaves the scene bit for bit as it is, 1 is the full style."""
-    weights: tuple[float, ...] = ()
-    """How much each reference counts, in their order; none = all alike."""
-    clusters: int = 10
-    """Local styles per reference."""
-    blend: float = 0.3
-    """Share of a reference's overall style in each of its local ones."""
+_DESCRIPTION = """Restyle captured views with photographs; no training, the same look from every viewpoint.
 
-    def __post_init__(self) -> None:
-        between("strength", self.strength, 0.0, 1.0)
-        between("blend", self.blend, 0.0, 1.0)
-        at_least("clusters", self.clusters, 1)
-        for weight in self.weights:
-            at_least("weights", weight, 1e-6)
+REGION is a region's number (--explain lists them), its name in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png
+(what a mask over a view covers). REFERENCE is a file or its number, from 0 in the order given."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StylizeConfig(StyleConfig):
+class StylizeConfig(StyleConfig, QualityConfig):
     """Which views to restyle, and with what."""
 
     run: Path = Path()
     """Run folder."""
-    references: tuple[Path, ...] = ()
-    """Photographs whose style the scene takes."""
+    style: Path | None = None
+    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
     output: Path | None = None
-    """Folder for the pictures; by default RUN/styles/NAMES-OF-THE-REFERENCES."""
+    """Folder for what is made; by default RUN/styles/NAME, with the name of the style file's folder or of the references."""
     split: Literal["test", "train", "all"] = "test"
     """Views to restyle."""
+    views: tuple[str, ...] = ()
+    """Views to restyle by name, instead of a split."""
+    explain: bool = False
+    """Render nothing; list the scene's regions with what each takes: a table, explain.json, explain.png."""
+    match_only: bool = False
+    """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-entropy.png."""
     matches: bool = True
-    """Also write which reference each pixel takes, as NAME-match.png."""
+    """Also write which reference each pixel takes, as VIEW-match.png."""
+    pixels: bool = False
+    """Also write each match map as numbers, as VIEW-match.npz."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
-
-def build_style(trained: "Trained", references: tuple[Path, ...], config: StyleConfig) -> "Styled":
-    """The style of a config on a run."""
-    from ..engine.restyle import restyle
-
-    return restyle(
-        trained,
-        references,
-        config.stylizer,
-        strength=config.strength,
-        weights=config.weights,
-        clusters=config.clusters,
-        blend=config.blend,
-    )
+    def __post_init__(self) -> None:
+        StyleConfig.__post_init__(self)
+        QualityConfig.__post_init__(self)
 
 
 def run(args: list[str]) -> int:
-    """Build the style, render the views, write pictures, match maps, dictionary and style.json."""
-    description = "Restyle captured views with photographs; no training, the same look from every viewpoint."
-    config = parse(StylizeConfig(), args, prog="fprf stylize", description=description, positional=("run",))
-    from ..engine.loading import load_run
-    from ..engine.views import match_view, render_view
-    from ..output.atomic import write_json
-    from ..output.images import to_uint8, write_image
-    from ..output.maps import match_image, match_summary
+    """Build the style; explain it, map it, or render the views; write style.json."""
+    config, file = read_flags(StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",))
+    from ..engine.loading import load_run, load_style
+    from ..engine.regions import Regions
+    from ..engine.restyle import apply_style
     from ..style.dictionary import save_dictionary
+    from ..style.statistics import dead_channels
 
-    trained = load_run(config.run, config.device)
+    trained = at_quality(load_run(config.run, config.device), config)
+    views, output = _views(trained, config), config.output or config.run / "styles" / _name(config)
+    if config.explain and not config.references:
+        _explain(trained, output, Regions(trained, *load_style(trained.run)), None)
+        return 0
     start = time.perf_counter()
-    styled = build_style(trained, config.references, config)
-    dictionary_seconds = time.perf_counter() - start
-    output = config.output or config.run / "styles" / _name(config.references)
-    views, known, render = trained.known.split(config.split), trained.known, trained.config.render
-    summaries, seconds = {}, 0.0
-    with Display() as display:
-        for i, view in enumerate(views):
-            display.count(i, len(views), "restyling")
-            start = time.perf_counter()
-            picture = render_view(trained.model, known.facts, known.cameras, view, render, styled.restyle)
-            seconds += time.perf_counter() - start
-            write_image(output / f"{known.names[view]}.png", to_uint8(picture.rgb))
-            if config.matches:
-                attention = match_view(trained.model, known.cameras, view, render, styled.restyle.stylizer)
-                of, names = styled.dictionary.reference, styled.dictionary.names
-                write_image(output / f"{known.names[view]}-match.png", match_image(attention, of, names, picture.opacity))
-                summaries[known.names[view]] = match_summary(attention, of, names, picture.opacity)
-        display.count(len(views), len(views), "restyling")
+    styled = apply_style(trained, file)
+    seconds, scene = time.perf_counter() - start, styled.scene
+    made: dict[str, Any] = {
+        "dictionary_seconds": seconds,
+        "codes": len(styled.codes.reference),
+        "dead_channels": dead_channels(scene.mean, scene.covariance.diagonal()).nonzero().flatten().tolist(),
+    }
+    for note in styled.orders.notes:
+        print(note)
+    if config.explain:
+        _explain(trained, output, styled.orders.regions, styled)
+    if config.match_only or not config.explain:
+        made |= _make(trained, output, styled, views, config)
     save_dictionary(output / "dictionary.safetensors", styled.dictionary)
-    write_json(
-        output / "style.json",
-        {
-            "references": [p.name for p in config.references],
-            "strength": config.strength,
-            "dictionary_seconds": dictionary_seconds,
-            "seconds_per_view": seconds / max(1, len(views)),
-            "codes": len(styled.dictionary.keys),
-            "matches": summaries,
-        },
-    )
-    print(f"{len(views)} views in {output}  (style {dictionary_seconds:.2f} s, {seconds / max(1, len(views)):.2f} s a view)")
+    write_style(output / "style.json", styled.orders.saved, made)
     return 0
 
 
-def _name(references: tuple[Path, ...]) -> str:
-    """The stems joined, cut to what every file system takes."""
-    joined = "+".join(p.stem for p in references)
-    return joined if len(joined) <= _LONGEST else f"{joined[:_LONGEST]}+{len(references)}"
+def _make(trained: "Trained", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
+    """Pictures and match maps of the views; what was matched and how long it took."""
+    from ..engine.matches import match_map, match_pictures, summarize, write_pixels
+    from ..engine.views import render_view
+    from ..output.images import to_uint8, write_image
+
+    known, render, shown = trained.known, trained.config.render, not config.match_only
+    maps = ("match", "score", "entropy") if config.match_only else ("match",) if config.matches else ()
+    made: dict[str, Any] = {}
+    rendering, matching, summaries = 0.0, 0.0, {}
+    with Display() as display:
+        for i, view in enumerate(views):
+            display.count(i, len(views), "restyling" if shown else "matching")
+            start, name = time.perf_counter(), known.names[view]
+            if shown:
+                picture = render_view(trained.model, known.facts, known.cameras, view, render, styled.restyle)
+                rendering += time.perf_counter() - start
+                write_image(output / f"{name}.png", to_uint8(picture.rgb))
+            if maps or config.pixels:
+                start = time.perf_counter()
+                found = match_map(trained, styled, view)
+                matching += time.perf_counter() - start
+                summaries[name] = summarize(found, styled.codes)
+                pictures = match_pictures(found, styled.codes)
+                for which in maps:
+                    write_image(output / f"{name}-{which}.png", pictures[which])
+                if config.pixels:
+                    write_pixels(output / f"{name}-match.npz", found, styled.codes)
+        display.count(len(views), len(views), "restyling" if shown else "matching")
+    count = max(1, len(views))
+    made = {"match_seconds_per_view": matching / count, "matches": summaries}
+    if shown:
+        made = {"seconds_per_view": rendering / count, **made}
+    what, each = ("views", rendering / count) if shown else ("match maps", matching / count)
+    print(f"{len(views)} {what} in {output}  ({each:.2f} s each)")
+    return made
+
+
+def _explain(trained: "Trained", output: Path, regions: "Regions", styled: "Styled | None") -> None:
+    """The table on standard output, explain.json and explain.png."""
+    from ..engine.explain import explain, region_row, region_tile
+    from ..output.atomic import write_json
+    from ..output.images import write_image
+    from ..output.sheet import sheet
+
+    found = explain(trained, regions, styled)
+    names = styled.dictionary.names if styled is not None else ()
+    _print_table([_HEAD if styled else _HEAD[:3], *(_cells(region) for region in found)])
+    write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in found]})
+    write_image(output / "explain.png", sheet([region_tile(region, names) for region in found]))
+    print(f"the same with pictures in {output / 'explain.png'} and explain.json")
+
+
+def _cells(region: "Region") -> tuple[str, ...]:
+    """A row of the table."""
+    place = (str(region.number), f"{region.share:.1%}", f"{region.view}:{region.pixel[0]},{region.pixel[1]}")
+    if not region.taken:
+        return place
+    best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
+    takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
+    return (*place, "kept" if region.strength == 0 else f"{region.strength:.2g}", f"{region.entropy:.1f} bit", takes)
+
+
+def _print_table(rows: list[tuple[str, ...]]) -> None:
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _views(trained: "Trained", config: StylizeConfig) -> list[int]:
+    """The views asked for. Raises UsageError for a name that the run does not hold."""
+    names = list(trained.known.names)
+    for name in config.views:
+        if name not in names:
+            raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
+    return [names.index(name) for name in config.views] or list(trained.known.split(config.split))
+
+
+def _name(config: StylizeConfig) -> str:
+    """The style file's folder or own name, else the references' stems joined, cut to what every file system takes."""
+    if config.style is not None:
+        return config.style.stem if config.style.name != "style.json" else config.style.resolve().parent.name or "style"
+    joined = "+".join(p.stem for p in config.references) or "regions"
+    return joined if len(joined) <= _LONGEST else f"{joined[:_LONGEST]}+{len(config.references)}"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UsageError
+from .blocks import show_plan, train_blocks
 from .parsing import load_method, methods, parse
 
 if TYPE_CHECKING:
@@ -14,8 +15,9 @@ if TYPE_CHECKING:
     from ..engine.run import Run
     from ..engine.trainer import Report
 
-__all__ = ["default_output", "run", "train_scene"]
+__all__ = ["EventLog", "default_output", "run", "train_scene"]
 
+PLAN = "--plan"
 LINE_SECONDS = 5.0
 """Time between lines in events.jsonl, and on standard error where it is no terminal."""
 
@@ -31,8 +33,13 @@ def run(args: list[str]) -> int:
     source = Path(args[0])
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
-    config = parse(config, args[1:], prog=f"fprf train {args[0]}", description=f"Train a scene with {method}.")
-    train_scene(config, method)
+    flags = [arg for arg in args[1:] if arg != PLAN]
+    about = f"Train a scene with {method}; {PLAN} alone shows its blocks and what they will cost, and runs nothing."
+    config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
+    if len(flags) < len(args) - 1:
+        show_plan(config, method, config.output or default_output(config, method))
+    else:
+        train_scene(config, method)
     return 0
 
 
@@ -44,6 +51,7 @@ def default_output(config: "TrainConfig", method: str) -> Path:
 def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> Path:
     """Train to the end and return the run folder. An existing run there is resumed if its config fits."""
     from ..engine import prepare, style_pass, trainer
+    from ..engine.lay_out import plan_scene
     from ..engine.run import Run
     from ..style.scene import to_tensors
     from .progress import Display
@@ -55,6 +63,12 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
     with Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         _check_same(folder, config)
+        if config.blocks.cuts:
+            scene, plan = plan_scene(config)
+            if plan.cut:
+                train_blocks(config, method, folder, scene, plan, display, start)
+                display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
+                return output
         prepared = prepare.prepare(config, display.features)
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
@@ -62,7 +76,7 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
         if prepared.basis is not None:
             folder.save_tensors("basis", prepared.basis.tensors())
         display.say(_described(prepared))
-        log = _Log(folder)
+        log = EventLog(folder)
 
         def report(event: "Report") -> None:
             display.training(event)
@@ -77,13 +91,14 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
     return output
 
 
-class _Log:
+class EventLog:
     """Lines for events.jsonl, not more often than every few seconds, and the last one always."""
 
     def __init__(self, folder: "Run") -> None:
         self.folder, self.last = folder, -LINE_SECONDS
 
     def __call__(self, event: "Report") -> None:
+        """A line for the event, if one is due."""
         now = time.perf_counter()
         if now - self.last < LINE_SECONDS and event.share < 1:
             return
@@ -112,11 +127,16 @@ def _described(prepared: "Prepared") -> str:
 
 
 def _check_same(folder: "Run", config: "TrainConfig") -> None:
-    """A run goes on with its own config; only how long, how often saved and where may change."""
+    """A run goes on with its own config; only how long, how often saved and where may change.
+
+    Blocks may be cut anew: those that the cut does not concern are kept.
+    """
     if not folder.exists:
         return
     old, _ = folder.load_config()
     free = {"steps", "minutes", "output", "data", "device", "checkpoint_minutes"}
+    if old.blocks.cuts and config.blocks.cuts:
+        free |= {"blocks", "executor", "statistics", "render"}
     changed = [name for name in vars(old) if name not in free and getattr(old, name) != getattr(config, name)]
     if changed:
         raise UsageError(

@@ -12,10 +12,13 @@ from torch import Tensor
 from ..errors import DataError
 from .images import Picture, to_uint8
 
-__all__ = ["depth_image", "depth_limits", "match_image", "match_summary", "palette"]
+__all__ = ["depth_image", "depth_limits", "match_image", "match_summary", "palette", "scale_image"]
 
 _EMPTY = (0.50, 0.51, 0.53)
 """Where nothing was hit: a grey that neither map uses."""
+
+_KEPT = (0.86, 0.87, 0.88)
+"""Where a style leaves the scene as it is: paler than anything that takes part."""
 
 _COLOURS = (
     (0.902, 0.624, 0.000),  # orange
@@ -80,11 +83,12 @@ def match_image(
     reference: Annotated[Tensor, "T"],
     names: Sequence[str],
     opacity: Annotated[Tensor, "H W"] | None = None,
+    kept: Annotated[Tensor, "H W"] | None = None,
 ) -> Picture:
     """Which reference each pixel took its style from: its hue (`palette`), the code of it as a shade, doubt as darkness.
 
-    `attention` as `Stylizer.match` gives it (rows sum to 1); `reference` is the dictionary's. Raises DataError for
-    numbers that do not fit together.
+    `attention` as `Stylizer.match` gives it (rows sum to 1); `reference` is the dictionary's; `kept` is how much of each
+    pixel takes no style at all, shown pale. Raises DataError for numbers that do not fit together.
     """
     _fitting(attention, reference, names)
     colours = _code_colours(reference.cpu(), len(names))
@@ -92,8 +96,20 @@ def match_image(
     # Doubt never hides the hue: the darkest is 45 %.
     light = 0.45 + 0.55 * (1 - _entropy(weights) / math.log(max(2, weights.shape[-1])))
     picture = colours[weights.argmax(dim=-1)] * light.clamp(0, 1)[..., None]
+    if kept is not None:
+        picture = torch.lerp(picture, torch.tensor(_KEPT), kept.detach().cpu().float().clamp(0, 1)[..., None])
     cover = torch.ones(weights.shape[:2]) if opacity is None else opacity.detach().cpu().float().clamp(0, 1)
     return _over_empty(picture, cover)
+
+
+def scale_image(
+    values: Annotated[Tensor, "H W"], low: float, high: float, opacity: Annotated[Tensor, "H W"] | None = None
+) -> Picture:
+    """Numbers as colour on a fixed scale: `low` and below dark blue, `high` and above yellow (viridis), nothing grey."""
+    even = ((values.detach().cpu().float() - low) / (high - low)).nan_to_num(0.0).clamp(0, 1)
+    coloured = cv2.cvtColor(cv2.applyColorMap((even * 255).to(torch.uint8).numpy(), cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+    cover = torch.ones(values.shape) if opacity is None else opacity.detach().cpu().float().clamp(0, 1)
+    return _over_empty(torch.from_numpy(coloured).float() / 255, cover)
 
 
 def match_summary(

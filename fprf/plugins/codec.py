@@ -18,7 +18,7 @@ from .typed_json import Missing, from_json, to_json
 if TYPE_CHECKING:
     from ..config import TrainConfig
 
-__all__ = ["Missing", "from_json", "load_config", "save_config", "to_json"]
+__all__ = ["Missing", "from_json", "load_config", "packages_of", "read_json", "save_config", "to_json"]
 
 _FORMAT = 1
 _KEYS = ("format", "fprf", "method", "plugins", "config")
@@ -30,7 +30,7 @@ def save_config(path: Path, config: "TrainConfig", method: str) -> None:
         "format": _FORMAT,
         "fprf": __version__,
         "method": method,
-        "plugins": _packages(config),
+        "plugins": packages_of(config),
         "config": to_json(config),
     }
     text = json.dumps(whole, indent=1, allow_nan=False) + "\n"
@@ -41,7 +41,7 @@ def load_config(path: Path) -> "tuple[TrainConfig, str]":
     """The config of a file and the name of its method. Raises ConfigError naming the file and the field."""
     from ..config import TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
 
-    whole = _parse(path)
+    whole = read_json(path)
     try:
         _check(whole)
         return from_json(whole["config"], TrainConfig, packages=whole["plugins"]), whole["method"]
@@ -49,7 +49,7 @@ def load_config(path: Path) -> "tuple[TrainConfig, str]":
         raise ConfigError(f"{path}: {fault}") from fault
 
 
-def _packages(config: object) -> dict[str, str]:
+def packages_of(config: object) -> dict[str, str]:
     """Name, package and version of what fills every slot, by dotted path."""
     found = {}
     for slot in slots(config):
@@ -61,11 +61,12 @@ def _packages(config: object) -> dict[str, str]:
     return found
 
 
-def _parse(path: Path) -> Any:
+def read_json(path: Path, name: str = "a config.json") -> Any:
+    """Strict JSON: no duplicate keys, no NaN. Raises ConfigError, which asks for `name` where there is no such file."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read ({fault.strerror or fault}); name a config.json") from fault
+        raise ConfigError(f"{path}: cannot be read ({fault.strerror or fault}); name {name}") from fault
     except UnicodeDecodeError as fault:
         raise ConfigError(f"{path}: is not UTF-8 text ({fault.reason} at byte {fault.start})") from fault
     try:

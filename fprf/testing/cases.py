@@ -5,11 +5,12 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from ..rendering.space import Space
 from ..style.dictionary import StyleDictionary
 from ..style.scene import SceneStyle
-from ..types import Rays
+from ..types import Rays, Site
 
-__all__ = ["dictionary", "normal", "points", "rays", "scene", "uniform"]
+__all__ = ["dictionary", "normal", "points", "rays", "scene", "site", "space", "uniform"]
 
 
 def uniform(*shape: int) -> Tensor:
@@ -33,6 +34,20 @@ def rays(count: int) -> Rays:
     direction = torch.nn.functional.normalize(normal(count, 3), dim=1)
     near, far = torch.full((count,), 0.5), torch.full((count,), 3.5)
     return Rays(origin=-2 * direction, direction=direction, view=direction, near=near, far=far)
+
+
+def site(views: int, points: int) -> Site:
+    """Cameras along a winding path, and points around them."""
+    way = torch.linspace(-3, 3, views, dtype=torch.float64)
+    position = torch.stack([way, 0.3 * torch.sin(2 * way), torch.zeros_like(way)], 1)
+    spread = normal(points, 3).double() * torch.tensor([3.0, 1.0, 0.3], dtype=torch.float64)
+    return Site(position=position, rays=torch.full((views,), 640 * 480), points=spread, unit=10.0)
+
+
+def space() -> Space:
+    """The unit cube as it is, for `rays`."""
+    eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    return Space("box", centre=(0.0, 0.0, 0.0), rotation=eye, scale=1.0, near=0.5, far=3.5)
 
 
 def dictionary(codes: int, channels: int, dims: int) -> StyleDictionary:

@@ -9,8 +9,9 @@ import math
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
+from ..blocks.windows import shares
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import DataError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
@@ -72,21 +73,42 @@ def check_encoder(config: EncoderConfig) -> None:
         require(not features.requires_grad, f"{name}: features must not carry gradients to the weights")
         same(encoder(image), features, 0.0, f"{name}: must be deterministic")
         same(encoder(image[1:]), features[1:], 1e-3, f"{name}: an image's features must not depend on its batch")
+    for height, width in ((1, 1), (2, 90), (90, 2)):
+        features = encoder(cases.uniform(1, 3, height, width))
+        tensor(features, (1, encoder.channels, None, None), f"{name} of {height} x {width} pixels")
     for level in (0.0, 1.0):
         tensor(encoder(torch.full((1, 3, 40, 40), level)), (1, encoder.channels, None, None), f"{name} of a flat image")
 
 
 def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None:
-    """Colours in [0, 1], point by point, frozen. `encoder` is the identity of an encoder that it has weights for."""
+    """Colours in [0, 1], point by point; at strength 0, or without a change, those of the scene as it is.
+
+    `encoder` is the identity of an encoder that it has weights for.
+    """
     check_config(config)
     decoder, name = config.build(encoder=encoder, channels=channels), type(config).__name__
     require(isinstance(decoder, Decoder), f"{name}: build() gives {type(decoder).__name__}, not an fprf.interfaces.Decoder")
-    require(not any(p.requires_grad for p in decoder.parameters()), f"{name}: must be frozen")
+    same_parameters(decoder, config.build(encoder=encoder, channels=channels), name)
     content = torch.cat([cases.normal(9, channels), cases.normal(9, channels) * 1e3])
     colour = decoder(content)
     tensor(colour, (18, 3), name)
     require(bool(((colour >= 0) & (colour <= 1)).all()), f"{name}: colours must lie in [0, 1], for any features")
     pointwise(lambda points: decoder(points), content, name)
+    styled = content.flip(0)
+    for strength in (0.0, 0.3, 1.0, cases.uniform(18, 1)):
+        restyled = decoder.restyled(content, styled, strength)
+        tensor(restyled, (18, 3), f"{name}.restyled")
+        require(bool(((restyled >= 0) & (restyled <= 1)).all()), f"{name}.restyled: colours must lie in [0, 1]")
+        same(decoder.restyled(content, content, strength), colour, 1e-5, f"{name}.restyled: no change, no other colour")
+    same(decoder.restyled(content, content, 0.0), colour, 0.0, f"{name}.restyled: must be forward at strength 0")
+    pointwise(lambda points: decoder.restyled(points, points + 1, 0.6), content, f"{name}.restyled")
+    own = [parameter for parameter in decoder.parameters() if parameter.requires_grad]
+    alone = decoder.unaided(content)
+    require((alone is None) == (not own), f"{name}.unaided: colours where it has parameters to train, None where it is frozen")
+    if alone is not None:
+        tensor(alone, (18, 3), f"{name}.unaided")
+        moved = torch.autograd.grad(alone.sum() + colour.sum(), own, allow_unused=True)
+        require(all(each is not None for each in moved), f"{name}: no gradient reaches a parameter that wants one")
 
 
 def check_stylizer(config: StylizerConfig) -> None:
@@ -112,6 +134,11 @@ def check_stylizer(config: StylizerConfig) -> None:
         tensor(match, (11, codes), f"{name}.match")
         whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(11), 1e-4)
         require(whole, f"{name}.match: rows must be shares that sum to 1")
+    if config.heeds_regions:
+        both = cases.dictionary(4, 8, 4)._replace(reference=torch.tensor([0, 0, 1, 1]), names=("one", "other"))
+        pinned = both._replace(allowed=torch.tensor([[True, False]] * 3))
+        match = config.build(dictionary=pinned, scene=cases.scene(3, 8, 4)).match(cases.normal(11, 4))
+        require(not bool(match[:, 2:].any()), f"{name}: heeds_regions is true, but codes that are not allowed are taken")
 
 
 def check_sampler(config: SamplerConfig) -> None:
@@ -174,21 +201,26 @@ def check_semantic_field(config: SemanticFieldConfig) -> None:
 
 
 def check_layout(config: LayoutConfig) -> None:
-    """Boxes with room in them, and weights that sum to 1 everywhere and vanish outside their boxes."""
+    """Boxes with room in them and orthonormal axes, from any site, and weights of them that sum to 1 everywhere."""
     check_config(config)
     layout, name = config.build(), type(config).__name__
     require(isinstance(layout, BlockLayout), f"{name}: build() gives {type(layout).__name__}, not a BlockLayout")
-    boxes = layout.boxes
-    tensor(boxes, (None, 2, 3), f"{name}: boxes")
-    require(bool((boxes[:, 0] < boxes[:, 1]).all()), f"{name}: a box's lowest corner must lie below its highest")
-    points = cases.points(64)
-    blend = layout.blend(points)
-    tensor(blend, (64, len(boxes)), f"{name}: blend")
-    whole = bool((blend >= 0).all()) and close(blend.sum(1), torch.ones(64), 1e-4)
-    require(whole, f"{name}: blend: rows must be at least 0 and sum to 1")
-    inside = ((points[:, None] >= boxes[:, 0] - 1e-5) & (points[:, None] <= boxes[:, 1] + 1e-5)).all(2)
-    require(not bool(((blend > 0) & ~inside).any()), f"{name}: a block must have no weight outside its box")
-    pointwise(layout.blend, points, name)
+    for site in (cases.site(40, 200), cases.site(3, 0), cases.site(1, 0)):
+        boxes = layout.cut(site)
+        count = len(boxes.low)
+        require(count > 0, f"{name}: at least one block is needed")
+        shapes = (tuple(boxes.low.shape), tuple(boxes.high.shape), tuple(boxes.turn.shape))
+        require(shapes == ((count, 3), (count, 3), (count, 3, 3)), f"{name}: expected [Z 3], [Z 3] and [Z 3 3], found {shapes}")
+        require(bool((boxes.low < boxes.high).all()), f"{name}: a box's lowest corner must lie below its highest")
+        apart = (boxes.turn @ boxes.turn.mT - torch.eye(3, dtype=boxes.turn.dtype)).abs().amax()
+        require(float(apart) < 1e-6, f"{name}: the axes of a box must be orthonormal")
+        require(boxes.margin > 0 or count == 1, f"{name}: blocks need a margin above 0 to blend in")
+        points = 4 * cases.points(64)
+        weight = shares(points, boxes)
+        whole = bool((weight >= 0).all()) and close(weight.sum(1), torch.ones(64), 1e-4)
+        require(whole, f"{name}: weights must be at least 0 and sum to 1")
+        again = layout.cut(site)
+        require(torch.equal(again.low, boxes.low) and torch.equal(again.high, boxes.high), f"{name}: must be deterministic")
 
 
 def check_parser(config: DataParserConfig, data: Path) -> None:
@@ -233,9 +265,5 @@ def check_executor(config: ExecutorConfig) -> None:
 def _sample(sampler: Sampler, rays: Rays, seed: int | None) -> Sampled:
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     step = None if seed is None else 10
-    sampled: Sampled = sampler(rays, locate=lambda x: x.clamp(-1, 1), distance=_linear, step=step, generator=generator)
+    sampled: Sampled = sampler(rays, space=cases.space(), step=step, generator=generator)
     return sampled
-
-
-def _linear(s: Tensor, near: Tensor, far: Tensor) -> Tensor:
-    return near[:, None] + s * (far - near)[:, None]

@@ -1,0 +1,104 @@
+"""What `fprf train` does with a scene of several blocks: plan it, train each one as a task, measure the style of the whole."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .progress import Display
+
+if TYPE_CHECKING:
+    from ..blocks.plan import Plan
+    from ..config import TrainConfig
+    from ..datamanagers.scene import Scene
+    from ..engine.block_task import BlockTask
+    from ..engine.run import Run
+    from ..engine.trainer import Report
+
+__all__ = ["SHARE", "block_minutes", "run_block", "show_plan", "train_blocks"]
+
+SHARE = 0.2
+"""Share of a time limit that the surroundings take, which all blocks start from; the blocks share the rest."""
+
+
+def train_blocks(
+    config: "TrainConfig", method: str, folder: "Run", scene: "Scene", plan: "Plan", display: Display, start: float
+) -> None:
+    """Features of all views, the surroundings, the blocks, largest first, and the style of the whole. Finished ones stay."""
+    from ..engine.block_task import BlockTask
+    from ..engine.blocks import SURROUNDINGS
+    from ..engine.lay_out import lay_out, write_down
+    from ..engine.loading import load_run
+    from ..engine.style_pass import measure_style
+    from ..style.scene import to_tensors
+
+    laid = lay_out(config, scene, plan, display.features)
+    write_down(folder, config, method, laid)
+    count = len(plan.boxes.low)
+    display.say(f"{scene.name}: {len(scene.train)} + {len(scene.test)} views, {count} blocks and their surroundings")
+    executor = config.executor.build()
+    around, each = block_minutes(config, count, time.perf_counter() - start)
+    root, data = str(folder.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
+
+    def task(block: int, minutes: float | None) -> BlockTask:
+        return BlockTask(root=root, data=data, block=block, minutes=minutes, quiet=display.quiet)
+
+    rays = plan.rays
+    executor.map(run_block, [task(SURROUNDINGS, around)])
+    executor.map(run_block, [task(block, each) for block in rays.argsort(descending=True).tolist()])
+    display.say("measuring the scene's own style")
+    trained = load_run(folder.root, config.device)
+    folder.save_tensors("style", to_tensors(measure_style(config, trained.model, scene.cameras, scene.train)))
+
+
+def block_minutes(config: "TrainConfig", blocks: int, spent: float) -> tuple[float | None, float | None]:
+    """Minutes for the surroundings, and for each block, one after the other; `spent` seconds of the limit are gone."""
+    if config.minutes is None:
+        return None, None
+    left = max(config.minutes - spent / 60, 0.05 * config.minutes)
+    return SHARE * left, (1 - SHARE) * left / blocks
+
+
+def run_block(task: "BlockTask") -> None:
+    """Train one block, here or on a worker, and show how it goes."""
+    from ..engine.block_task import train_block
+    from ..engine.blocks import SURROUNDINGS, folder_of
+    from ..engine.run import Run
+    from .train import EventLog
+
+    name = "surroundings" if task.block == SURROUNDINGS else f"block {task.block:02d}"
+    log = EventLog(Run(folder_of(Path(task.root), task.block)))
+    with Display(quiet=task.quiet) as display:
+
+        def report(event: "Report") -> None:
+            display.training(event, name)
+            log(event)
+
+        if not train_block(task, report):
+            display.say(f"{name} is finished already")
+
+
+def show_plan(config: "TrainConfig", method: str, output: Path) -> None:
+    """Print the blocks with what each will cost, and write a top view beside."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..blocks.picture import top_view
+    from ..engine.estimate import estimates
+    from ..engine.lay_out import plan_scene
+    from ..output.atomic import write_json
+    from ..output.images import write_image
+
+    scene, plan = plan_scene(config)
+    rows = estimates(config, scene, plan)
+    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    for column in ("block", "images", "rays", "size", "memory", "disk", "time"):
+        table.add_column(column, justify="left" if column == "block" else "right")
+    for row in rows:
+        table.add_row(*row.cells())
+    console = Console(highlight=False, width=100)
+    console.print(f"{method} on {scene.name}: {len(scene.train)} training images, space unit {1 / plan.space.scale:.3g}")
+    console.print(table)
+    picture = output / "plan.png"
+    write_image(picture, top_view(scene, plan))
+    write_json(output / "plan.json", {"method": method, "scene": scene.name, "blocks": [row.json() for row in rows]})
+    console.print(f"seen from above: {picture}")

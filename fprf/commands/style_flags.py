@@ -1,0 +1,68 @@
+"""Flags of the verbs that restyle: a style file first, where one is named, then every flag over it."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..style.config import StyleConfig
+from ..style.files import StyleFile, check_photographs, read_style
+from .parsing import parse
+
+__all__ = ["read_flags"]
+
+C = TypeVar("C", bound=StyleConfig)
+
+
+def read_flags(
+    default: C, args: Sequence[str], *, prog: str, description: str, positional: tuple[str, ...]
+) -> tuple[C, StyleFile]:
+    """The verb's config and the style that it asks for; `--style FILE` gives the values that no flag gives.
+
+    A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg 5=b.jpg`. Raises what
+    `parse` and `read_style` raise, and DataError where a photograph of the file is no longer the one it was.
+    """
+    path, args = _style_flag(args), _joined(args, default)
+    file = read_style(path) if path is not None else StyleFile(StyleConfig())
+    if path is not None:
+        default = replace(default, **_styles(file.style))
+    config = parse(default, args, prog=prog, description=description, positional=positional)
+    file = file._replace(style=StyleConfig(**_styles(config)))
+    given = {arg.partition("=")[0] for arg in args}
+    if path is not None and not given & {"--references", "--masks"}:
+        check_photographs(path, file)
+    return config, file
+
+
+def _styles(config: StyleConfig) -> dict[str, Any]:
+    return {field.name: getattr(config, field.name) for field in fields(StyleConfig)}
+
+
+def _joined(args: Sequence[str], config: StyleConfig) -> list[str]:
+    """The arguments with each flag of many values once, with all of its values: otherwise the last one alone would count."""
+    many = {f"--{field.name.replace('_', '-')}" for field in fields(config) if isinstance(getattr(config, field.name), tuple)}
+    rest: list[str] = []
+    values: dict[str, list[str]] = {}
+    into = rest
+    for arg in args:
+        key, equals, inline = arg.partition("=")
+        flag = key.replace("_", "-")
+        if flag in many:
+            into = values.setdefault(flag, [])
+            into += [inline] if equals else []
+            continue
+        if arg.startswith("-"):
+            into = rest
+        into.append(arg)
+    return [*rest, *(word for flag, words in values.items() for word in (flag, *words))]
+
+
+def _style_flag(args: Sequence[str]) -> Path | None:
+    """The last `--style FILE`; what is wrong with it otherwise, `parse` says."""
+    found = None
+    for at, arg in enumerate(args):
+        key, equals, inline = arg.partition("=")
+        value = inline if equals else "".join(args[at + 1 : at + 2])
+        if key == "--style" and value and not value.startswith("-") and value != "none":
+            found = Path(value)
+    return found

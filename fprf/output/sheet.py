@@ -1,0 +1,93 @@
+"""One picture of many: a thumbnail for each of a scene's regions, with what it takes from the references."""
+
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .images import Picture, checked
+from .maps import palette
+
+__all__ = ["Tile", "highlight", "sheet"]
+
+_SIDE = 240
+"""Width of a tile in pixels; pictures are enlarged or reduced to it."""
+_LINE, _GAP, _BAR = 17, 8, 6
+_INK, _PAPER, _FAINT = (30, 32, 36), (250, 250, 248), (215, 216, 218)
+_OUTLINE = (255, 214, 10)
+_COLUMNS = 4
+
+
+class Tile(NamedTuple):
+    """A picture with lines of text below."""
+
+    picture: Picture
+    lines: tuple[str, ...]
+    shares: tuple[float, ...] = ()
+    """Of each reference, drawn as a bar in their colours; what is missing to 1 stays pale."""
+
+
+def highlight(picture: Picture, inside: Annotated[Tensor, "H W"]) -> Picture:
+    """A picture in which one part keeps its colours, with an outline, and the rest is dim and grey.
+
+    `inside` lies in [0, 1], at any size.
+    """
+    height, width = checked(picture).shape[:2]
+    share = np.clip(cv2.resize(inside.detach().cpu().float().numpy(), (width, height), interpolation=cv2.INTER_LINEAR), 0, 1)
+    grey = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB).astype(np.float32)
+    dim = 0.35 * grey + 40
+    mixed = np.asarray(dim + (picture - dim) * share[..., None]).clip(0, 255).astype(np.uint8)
+    edges, _ = cv2.findContours((share > 0.5).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(mixed, edges, -1, _OUTLINE, 1), dtype=np.uint8)
+
+
+def sheet(tiles: Sequence[Tile]) -> Picture:
+    """The tiles in rows of four, in their order. Letters beyond ASCII are shown as '?'."""
+    if not tiles:
+        return np.full((_GAP, _GAP, 3), _PAPER, dtype=np.uint8)
+    drawn = [_tile(tile) for tile in tiles]
+    columns = min(_COLUMNS, len(drawn))
+    height = max(len(each) for each in drawn)
+    page = np.full((_ceil(len(drawn), columns) * (height + _GAP) + _GAP, columns * (_SIDE + _GAP) + _GAP, 3), _PAPER, np.uint8)
+    for i, each in enumerate(drawn):
+        top, left = _GAP + (i // columns) * (height + _GAP), _GAP + (i % columns) * (_SIDE + _GAP)
+        page[top : top + len(each), left : left + _SIDE] = each
+    return page
+
+
+def _tile(tile: Tile) -> Picture:
+    height, width = checked(tile.picture).shape[:2]
+    tall = max(1, round(height * _SIDE / width))
+    smaller = width > _SIDE
+    picture = cv2.resize(tile.picture, (_SIDE, tall), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+    below = np.full((_BAR + _LINE * len(tile.lines) + _GAP, _SIDE, 3), _PAPER, dtype=np.uint8)
+    if tile.shares:
+        _draw_bar(below[:_BAR], tile.shares)
+    for i, line in enumerate(tile.lines):
+        text, scale = line.encode("ascii", "replace").decode(), 0.42
+        at = (1, _BAR + _LINE * i + 14)
+        cv2.putText(below, _cut(text, scale), at, cv2.FONT_HERSHEY_SIMPLEX, scale, _INK, 1, cv2.LINE_AA)
+    return np.concatenate([picture, below])
+
+
+def _draw_bar(bar: NDArray[np.uint8], shares: Sequence[float]) -> None:
+    bar[:] = _FAINT
+    colours = (palette(len(shares)) * 255).round().int().tolist()
+    edge = 0.0
+    for share, colour in zip(shares, colours, strict=True):
+        bar[:, round(edge * _SIDE) : round((edge + share) * _SIDE)] = colour
+        edge += share
+
+
+def _cut(text: str, scale: float) -> str:
+    """As much of a line as a tile is wide."""
+    while text and cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > _SIDE - 2:
+        text = text[:-1]
+    return text
+
+
+def _ceil(a: int, b: int) -> int:
+    return -(-a // b)
