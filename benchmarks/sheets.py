@@ -1,0 +1,29 @@
+"""Contact sheets: rows of pictures of one height, each with its name below."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from fprf.output.images import Picture, to_uint8
+
+BAR = 18
+GAP = 4
+
+
+def cell(picture: Picture, name: str, height: int) -> Picture:
+    width = max(1, round(picture.shape[1] * height / picture.shape[0]))
+    smaller = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+    made = np.full((height + BAR + GAP, width + GAP, 3), 255, dtype=np.uint8)
+    made[:height, :width] = smaller
+    cv2.putText(made, name, (2, height + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.38, (40, 40, 40), 1, cv2.LINE_AA)
+    return made
+
+
+def sheet(rows: Sequence[Mapping[str, Tensor]], height: int = 144) -> Picture:
+    """Rows of pictures [H W 3] in [0, 1] by name."""
+    lines = [np.concatenate([cell(to_uint8(image), name, height) for name, image in row.items()], axis=1) for row in rows]
+    width = max(line.shape[1] for line in lines)
+    padded = [np.pad(line, ((0, 0), (0, width - line.shape[1]), (0, 0)), constant_values=255) for line in lines]
+    return np.concatenate(padded, axis=0)
