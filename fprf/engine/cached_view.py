@@ -5,6 +5,7 @@ decodes the samples that the renderer kept. Its pictures are those of `render_vi
 90 MB: 4 bytes for each of 48 content and 32 semantic channels of some eight samples a pixel.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -19,12 +20,12 @@ from ..types import Rays, Want
 from .model import Facts, Model, background_of
 from .views import View, view_rays
 
-__all__ = ["CachedView", "cache_view"]
+__all__ = ["CachedView", "Part", "cache_view", "view_parts"]
 
 
 @dataclass(frozen=True)
-class _Part:
-    """A chunk of rays."""
+class Part:
+    """A chunk of rays, row after row of a view; it knows no style."""
 
     kept: Kept
     content: Annotated[Tensor, "M C"]
@@ -32,47 +33,85 @@ class _Part:
     behind: Annotated[Tensor, "R 3"] | float
     """Light of the background that reaches the eye."""
     rays: int
-
-
-@dataclass(frozen=True)
-class CachedView:
-    """One view of one model; it knows no style."""
-
-    decoder: Decoder
-    parts: tuple[_Part, ...]
-    depth: Annotated[Tensor, "H W"]
-    opacity: Annotated[Tensor, "H W"]
-    kept: float
-    """Share of the samples that met the content network."""
+    depth: Annotated[Tensor, "R"]
+    """World units, on the CPU."""
+    opacity: Annotated[Tensor, "R"]
+    """On the CPU."""
+    samples: int
+    """How many there were before the light ones were dropped."""
 
     @property
     def bytes(self) -> int:
         """Memory that it holds."""
-        tensors = [t for p in self.parts for t in (*p.kept, p.content, p.semantic) if isinstance(t, Tensor)]
-        return sum(t.numel() * t.element_size() for t in tensors)
+        held = (*self.kept, self.content, self.semantic, self.depth, self.opacity)
+        return sum(t.numel() * t.element_size() for t in held if isinstance(t, Tensor))
+
+    @torch.inference_mode()
+    def colour(self, decoder: Decoder, restyle: Restyle | None) -> Annotated[Tensor, "R 3"]:
+        """Colours of its pixels in a style, or as they are, in [0, 1]; on the CPU."""
+        if restyle is None or restyle.idle:
+            points: Tensor = decoder(self.content)
+        else:
+            points = restyle.colour(decoder, self.content, self.semantic if Want.SEMANTIC in restyle.needs else None)
+        return (composite(self.kept, points, self.rays) + self.behind).cpu().clamp(0, 1)
+
+    @torch.inference_mode()
+    def mean(self, values: Annotated[Tensor, "M X"]) -> Annotated[Tensor, "R X"]:
+        """What each pixel sees of values at the samples, scaled to what it sees at all; 0 where that is nothing."""
+        mass = composite(self.kept, torch.ones_like(self.kept.weight)[:, None], self.rays)
+        return (composite(self.kept, values, self.rays) / mass.clamp_min(1e-10)).cpu()
+
+
+@dataclass(frozen=True)
+class CachedView:
+    """One view of one model."""
+
+    decoder: Decoder
+    parts: tuple[Part, ...]
+    size: tuple[int, int]
+    """Height, width."""
+
+    @property
+    def depth(self) -> Annotated[Tensor, "H W"]:
+        """World units."""
+        return torch.cat([part.depth for part in self.parts]).view(self.size)
+
+    @property
+    def opacity(self) -> Annotated[Tensor, "H W"]:
+        """How much of each ray is met, in [0, 1]."""
+        return torch.cat([part.opacity for part in self.parts]).view(self.size)
+
+    @property
+    def kept(self) -> float:
+        """Share of the samples that met the content network."""
+        return sum(len(part.kept.ray) for part in self.parts) / max(1, sum(part.samples for part in self.parts))
+
+    @property
+    def bytes(self) -> int:
+        """Memory that it holds."""
+        return sum(part.bytes for part in self.parts)
 
     @torch.inference_mode()
     def restyled(self, restyle: Restyle | None = None) -> View:
         """The view in a style, or as it is."""
-        rgb = [composite(p.kept, self._colour(p, restyle), p.rays) + p.behind for p in self.parts]
-        image = torch.cat(rgb).cpu().view(*self.depth.shape, 3).clamp(0, 1)
-        return View(image, self.depth, self.opacity, self.kept)
+        rgb = torch.cat([part.colour(self.decoder, restyle) for part in self.parts])
+        return View(rgb.view(*self.size, 3), self.depth, self.opacity, self.kept)
 
-    def _colour(self, part: _Part, restyle: Restyle | None) -> Tensor:
-        if restyle is None or restyle.idle:
-            plain: Tensor = self.decoder(part.content)
-            return plain
-        return restyle.colour(self.decoder, part.content, part.semantic if Want.SEMANTIC in restyle.needs else None)
+
+def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
+    """Render everything but a style, in chunks of `config.chunk` rays."""
+    width, height = (int(v) for v in cameras.size[view])
+    return CachedView(model.decoder, tuple(view_parts(model, facts, cameras, view, config)), (height, width))
 
 
 @torch.inference_mode()
-def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
-    """Render everything but a style, in chunks of `config.chunk` rays."""
+def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> Iterator[Part]:
+    """The same chunk by chunk, for those who may stop half-way or keep none."""
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
-    parts, depth, opacity, samples = [], [], [], 0
     for start in range(0, len(rays.near), config.chunk):
-        chunk = Rays(*(x[start : start + config.chunk] for x in rays))
+        here = slice(start, start + config.chunk)
+        chunk = Rays(*(x[here] for x in rays))
         marched = march(chunk, model.parts, budget=config.budget)
         kept = marched.kept
         content = model.field.content(kept.latent, kept.view)
@@ -80,11 +119,5 @@ def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
         behind = 0.0 if background is None else marched.through[:, None] * background
         # Points and latents have done their part.
         bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
-        parts.append(_Part(bare, content, semantic, behind, len(chunk.near)))
-        depth.append(marched.depth.cpu())
-        opacity.append(marched.opacity.cpu())
-        samples += marched.weights.numel()
-    width, height = (int(v) for v in cameras.size[view])
-    metric = model.space.metric(origin, direction, torch.cat(depth))
-    share = sum(len(part.kept.ray) for part in parts) / max(1, samples)
-    return CachedView(model.decoder, tuple(parts), metric.view(height, width), torch.cat(opacity).view(height, width), share)
+        depth = model.space.metric(origin[here], direction[here], marched.depth.cpu())
+        yield Part(bare, content, semantic, behind, len(chunk.near), depth, marched.opacity.cpu(), marched.weights.numel())

@@ -12,7 +12,7 @@ from ..errors import ConfigError, UsageError, WeightsError
 from ..interfaces import Encoder
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.config import NO_MASK, StyleConfig
-from ..style.dictionary import StyleDictionary, build_dictionary
+from ..style.dictionary import Reference, StyleDictionary, build_dictionary
 from ..style.files import StyleFile, check_photographs, read_style
 from ..style.look import Restyle
 from ..style.matching import unit
@@ -24,7 +24,17 @@ from .loading import Trained, load_style
 from .orders import Orders, take_orders
 from .regions import Regions
 
-__all__ = ["Codes", "Encoders", "Styled", "apply_style", "open_encoders", "restyle"]
+__all__ = [
+    "Codes",
+    "Encoders",
+    "Styled",
+    "apply_style",
+    "dress",
+    "encode_photograph",
+    "mixed",
+    "open_encoders",
+    "restyle",
+]
 
 _SHORTEST = 128
 """References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
@@ -85,8 +95,24 @@ def apply_style(trained: Trained, file: StyleFile, encoders: Encoders | None = N
     if not style.references:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
     encoders = open_encoders(trained) if encoders is None else encoders
-    dictionary = _dictionary(trained, style, encoders)
-    scene = encoders.scene
+    styled = dress(trained, file, encoders, _dictionary(trained, style, encoders))
+    if style.between is None or style.at == 0:
+        return styled
+    path = style.between.resolve()
+    if path in trail:
+        raise ConfigError(f"{style.between}: lies between styles that lead back to it; end the circle")
+    other = read_style(style.between)
+    check_photographs(style.between, other)
+    return mixed(styled, apply_style(trained, other, encoders, (*trail, path)), style.at)
+
+
+@torch.inference_mode()
+def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
+    """A style whose dictionary is built already, on the scene. `between` is not heeded.
+
+    The dictionary's names are the labels of the style's references. Raises UsageError for wishes that the scene does not know.
+    """
+    style, scene = file.style, encoders.scene
     regions = Regions(trained, scene, encoders.basis, file.regions, file.semantic_encoder)
     orders = take_orders(regions, dictionary, style)
     stylizer = regional(dictionary, scene, orders.allowed, style.stylizer)
@@ -99,15 +125,7 @@ def apply_style(trained: Trained, file: StyleFile, encoders: Encoders | None = N
         style.luminance,
     )
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
-    styled = Styled(mine, dictionary, scene, codes, orders)
-    if style.between is None or style.at == 0:
-        return styled
-    path = style.between.resolve()
-    if path in trail:
-        raise ConfigError(f"{style.between}: lies between styles that lead back to it; end the circle")
-    other = read_style(style.between)
-    check_photographs(style.between, other)
-    return _mixed(styled, apply_style(trained, other, encoders, (*trail, path)), style.at)
+    return Styled(mine, dictionary, scene, codes, orders)
 
 
 def restyle(
@@ -132,27 +150,44 @@ def restyle(
     return apply_style(trained, StyleFile(style))
 
 
+@torch.inference_mode()
+def encode_photograph(
+    trained: Trained, path: Path, encoders: Encoders, *, name: str, weight: float = 1.0, mask: Path | None = None
+) -> Reference:
+    """One photograph as samples in the scene's terms, at the size of the scene's own views."""
+    return read_reference(
+        path,
+        content=encoders.content,
+        semantic=encoders.semantic,
+        basis=encoders.basis,
+        longest=max(int(trained.known.cameras.size.amax()), _SHORTEST),
+        weight=weight,
+        guided=trained.config.datamanager.guided,
+        mask=mask,
+        name=name,
+    )
+
+
 def _dictionary(trained: Trained, style: StyleConfig, encoders: Encoders) -> StyleDictionary:
-    longest = max(int(trained.known.cameras.size.amax()), _SHORTEST)
     references = [
-        read_reference(
+        encode_photograph(
+            trained,
             path,
-            content=encoders.content,
-            semantic=encoders.semantic,
-            basis=encoders.basis,
-            longest=longest,
-            weight=style.weights[i] if style.weights else 1.0,
-            guided=trained.config.datamanager.guided,
-            mask=style.masks[i] if style.masks and style.masks[i] != NO_MASK else None,
+            encoders,
             name=name,
+            weight=style.weights[i] if style.weights else 1.0,
+            mask=style.masks[i] if style.masks and style.masks[i] != NO_MASK else None,
         )
         for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True))
     ]
     return build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=trained.config.seed)
 
 
-def _mixed(a: Styled, b: Styled, at: float) -> Styled:
-    """Style `a` on the way to `b`. The dictionary and the orders stay those of `a`; codes and notes are those of both."""
+def mixed(a: Styled, b: Styled, at: float) -> Styled:
+    """Style `a` on the way to `b`, which lies at 1.
+
+    The dictionary and the orders stay those of `a`; codes and notes are those of both.
+    """
     reference = torch.cat([a.codes.reference, b.codes.reference + len(a.codes.names)])
     codes = Codes(reference, a.codes.names + b.codes.names, torch.cat([a.codes.units, b.codes.units]))
     orders = a.orders._replace(notes=a.orders.notes + b.orders.notes)

@@ -6,9 +6,9 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.engine.cached_view import cache_view
+from fprf.engine.cached_view import cache_view, view_parts
 from fprf.engine.restyle import restyle
-from fprf.engine.views import render_view
+from fprf.engine.views import match_view, render_view
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import (
     AdainConfig,
@@ -55,7 +55,7 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
     assert sum(part.rays for part in cached.parts) == 32 * 24
     per_sample = 4 * (1 + 48 + trained.known.facts.dim) + 8
     kept = sum(len(part.kept.ray) for part in cached.parts)
-    assert kept * per_sample <= cached.bytes <= kept * per_sample + 8 * (32 * 24 + 1)
+    assert kept * per_sample <= cached.bytes <= kept * per_sample + 16 * 32 * 24 + 8
 
 
 def test_plain_forms_agree(world: World) -> None:
@@ -64,3 +64,15 @@ def test_plain_forms_agree(world: World) -> None:
     with backend.plain():
         plain = cache_view(trained.model, known.facts, known.cameras, 2, render).restyled()
     assert torch.allclose(plain.rgb, cache_view(trained.model, known.facts, known.cameras, 2, render).restyled().rgb, atol=1e-4)
+
+
+def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_maps(world: World) -> None:
+    trained = world.load()
+    known, config = trained.known, replace(trained.config.render, chunk=100)
+    stylizer = restyle(trained, world.references, RegionOtConfig(), clusters=3).restyle.stylizer
+    parts = view_parts(trained.model, known.facts, known.cameras, 2, config)
+    first = next(parts)
+    assert first.rays == 100 and first.semantic is not None
+    wanted = match_view(trained.model, known.cameras, 2, config, stylizer)
+    assert torch.allclose(first.mean(stylizer.match(first.semantic)), wanted.view(-1, wanted.shape[-1])[:100], atol=1e-6)
+    assert 100 + sum(part.rays for part in parts) == 32 * 24
