@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ..checks import at_least
 from ..engine.quality import QualityConfig, at_quality
-from ..errors import ConfigError, UsageError
+from ..errors import ConfigError
 from ..style.config import StyleConfig
 from .keyframes import keyed_looks, read_keyframes
 from .progress import Display
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ..style.look import Restyle
 
 __all__ = ["RenderVerbConfig", "camera_path", "frames_of", "run"]
-
-MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,27 +98,12 @@ def _looks(trained: "Trained", config: RenderVerbConfig, file: "StyleFile") -> "
 
 def camera_path(trained: "Trained", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
     """Cameras of the path and a name for each frame; captured views keep the stem of their image."""
-    import torch
+    from ..rendering.motions import make_path
 
-    from ..rendering import paths
-    from ..rendering.camera_path import read_camera_path
-
-    known = trained.known
-    views = torch.tensor(known.split(config.split))
+    known, views = trained.known, trained.known.split(config.split)
+    cameras = make_path(known.cameras, views, config.path, config.frames)
     if config.path == "dataset":
-        return paths.dataset(known.cameras, views), [known.names[v] for v in views.tolist()]
-    if config.path in ("spiral", "orbit"):
-        move = paths.spiral if config.path == "spiral" else paths.orbit
-        cameras = move(known.cameras, config.frames)
-    elif config.path == "interpolate":
-        order = paths.tour(known.cameras, views)
-        between = max(0, round((config.frames - 1) / max(1, len(order) - 1)) - 1)
-        cameras = paths.interpolate(known.cameras, order, between)
-    else:
-        file = Path(config.path)
-        if not file.is_file():
-            raise UsageError(f"--path {config.path}: neither a file nor one of {', '.join(MOTIONS)}")
-        cameras, _ = read_camera_path(file)
+        return cameras, [known.names[view] for view in views]
     return cameras, [f"{i:05d}" for i in range(len(cameras))]
 
 

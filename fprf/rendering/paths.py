@@ -16,7 +16,7 @@ from .cameras import Cameras
 from .lens import PINHOLE
 from .splines import catmull_rom, quaternions, rotations, slerp
 
-__all__ = ["dataset", "interpolate", "look_at", "orbit", "spiral", "tour"]
+__all__ = ["dataset", "interpolate", "look_at", "orbit", "pinhole", "spiral", "tour"]
 
 
 def dataset(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Cameras:
@@ -37,6 +37,20 @@ def look_at(
     vague = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm()
     right = _unit(torch.where(vague, torch.linalg.cross(spare.expand_as(back), back), right))
     return torch.stack([right, torch.linalg.cross(back, right), back, position], dim=-1)
+
+
+def pinhole(pose: Annotated[Tensor, "F 3 4"], *, width: int, height: int, fov: float) -> Cameras:
+    """Frames at `pose` with square pixels, the principal point in the middle and a vertical angle of `fov` degrees."""
+    count, size = len(pose), torch.tensor([width, height])
+    focal = height / 2 / math.tan(math.radians(fov) / 2)
+    return Cameras(
+        pose=pose,
+        focal=torch.full((count, 2), focal, dtype=torch.float64),
+        centre=(size.double() / 2).repeat(count, 1),
+        size=size.repeat(count, 1),
+        distortion=torch.zeros(count, 6, dtype=torch.float64),
+        lens=torch.full((count,), PINHOLE),
+    )
 
 
 def spiral(

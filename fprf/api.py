@@ -1,0 +1,238 @@
+"""A trained run as a Python object: look, restyle, render.
+
+    import fprf
+    scene = fprf.load("runs/town-fprf-lite")
+    autumn = scene.stylize(["autumn.jpg"])
+    shot = autumn.render(scene.camera("0015"))
+    shot.save("autumn.png")
+
+Scenes never change: what restyles one returns another, and both share the trained model. Tensors are on the CPU.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+from torch import Tensor
+
+from .checks import at_least, between
+from .engine.loading import Trained, load_run
+from .engine.matches import MatchMap, match_map
+from .engine.quality import Name, QualityConfig, at_quality
+from .engine.restyle import Encoders, Styled, apply_style, mixed, open_encoders
+from .engine.views import render_view
+from .errors import UsageError
+from .output.images import Picture, to_uint8, write_image
+from .plugins.registry import nearest
+from .plugins.stylizers.config import RegionOtConfig, StylizerConfig
+from .rendering.cameras import Cameras
+from .rendering.motions import make_path, upwards
+from .rendering.paths import look_at, pinhole
+from .style.config import StyleConfig
+from .style.files import StyleFile, check_photographs, read_style, write_style
+from .style.look import Restyle
+
+__all__ = ["Shot", "TrainedScene", "open_scene"]
+
+PathLike = str | Path
+Split = Literal["train", "test", "all"]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One rendered view."""
+
+    rgb: Annotated[Tensor, "H W 3"]
+    """sRGB in [0, 1], float32."""
+    depth: Annotated[Tensor, "H W"]
+    """Distance along the unit ray, in the capture's units."""
+    opacity: Annotated[Tensor, "H W"]
+    """How much of the ray is met, in [0, 1]."""
+
+    @property
+    def pixels(self) -> Picture:
+        """The colours as uint8 RGB, a numpy array [H W 3]."""
+        return to_uint8(self.rgb)
+
+    def save(self, path: PathLike) -> None:
+        """Write the colours: .png, .jpg or .webp. Raises DataError for another ending."""
+        write_image(Path(path), self.pixels)
+
+
+class _Opened:
+    """Encoders of a run, loaded at the first style and kept for the next."""
+
+    def __init__(self, trained: Trained) -> None:
+        self.trained = trained
+
+    @cached_property
+    def encoders(self) -> Encoders:
+        return open_encoders(self.trained)
+
+
+@dataclass(frozen=True)
+class TrainedScene:
+    """A scene, as it was captured or in a style. Make one with `fprf.load`."""
+
+    trained: Trained
+    """Model, cameras and config, for what this class does not offer."""
+    styled: Styled | None = None
+    """The style with its dictionary and codes; None = as it was captured."""
+    opened: _Opened = field(kw_only=True, repr=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the captured views."""
+        return self.trained.known.names
+
+    @property
+    def cameras(self) -> Cameras:
+        """Cameras of the captured views, in the order of `names`."""
+        return self.trained.known.cameras
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of the references of the style; those of a mix one after the other."""
+        return () if self.styled is None else self.styled.codes.names
+
+    def camera(self, view: int | str) -> Cameras:
+        """One captured camera, by number or name. Raises UsageError where there is none."""
+        return self.cameras.select(torch.tensor([self._number(view)]))
+
+    def camera_at(
+        self,
+        position: Sequence[float],
+        target: Sequence[float],
+        *,
+        fov: float = 60.0,
+        width: int = 640,
+        height: int = 480,
+    ) -> Cameras:
+        """A pinhole camera at a place (world units) that looks at another; `fov` is its vertical angle in degrees.
+
+        Up is where the captured cameras have it. Raises UsageError where position and target are one, ConfigError for an
+        angle or a size that no camera has.
+        """
+        between("fov", fov, 1e-3, 179.0)
+        at_least("width", width, 1)
+        at_least("height", height, 1)
+        here, there = (torch.tensor([list(place)], dtype=torch.float64) for place in (position, target))
+        if here.shape != (1, 3) or there.shape != (1, 3) or bool(torch.equal(here, there)):
+            raise UsageError(f"camera_at: position {position} and target {target} must be two places of three numbers each")
+        pose = look_at(here, there, upwards(self.cameras))
+        return pinhole(pose, width=width, height=height, fov=fov)
+
+    def path(self, motion: str, frames: int = 120, split: Split = "all") -> Cameras:
+        """Cameras of a flight: spiral, orbit, interpolate, dataset, or a camera-path JSON file. Raises UsageError."""
+        return make_path(self.cameras, self.trained.known.split(split), motion, frames)
+
+    def stylize(
+        self,
+        references: Sequence[PathLike],
+        *,
+        weights: Sequence[float] = (),
+        strength: float = 1.0,
+        luminance: float = 0.0,
+        clusters: int = 10,
+        blend: float = 0.3,
+        stylizer: StylizerConfig | None = None,
+        pin: Sequence[str] = (),
+        forbid: Sequence[str] = (),
+        keep: Sequence[str] = (),
+    ) -> "TrainedScene":
+        """The scene in the style of photographs, feed-forward; every argument is a field of `StyleConfig`.
+
+        Raises UsageError for no references or wishes that the scene does not know, DataError for unreadable photographs,
+        WeightsError where the encoders at hand are not the scene's.
+        """
+        return self.apply(
+            StyleConfig(
+                references=tuple(Path(path) for path in references),
+                weights=tuple(weights),
+                strength=strength,
+                luminance=luminance,
+                clusters=clusters,
+                blend=blend,
+                stylizer=RegionOtConfig() if stylizer is None else stylizer,
+                pin=tuple(pin),
+                forbid=tuple(forbid),
+                keep=tuple(keep),
+            )
+        )
+
+    def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
+        """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as `stylize`."""
+        if isinstance(style, StyleConfig):
+            return replace(self, styled=apply_style(self.trained, StyleFile(style), self.opened.encoders))
+        path = Path(style)
+        file = read_style(path)
+        check_photographs(path, file)
+        return replace(self, styled=apply_style(self.trained, file, self.opened.encoders, (path.resolve(),)))
+
+    def towards(self, other: "TrainedScene", at: float) -> "TrainedScene":
+        """On the way from this style (0) to that of `other` (1), point by point. Raises UsageError without two styles."""
+        if self.styled is None or other.styled is None or self.opened is not other.opened:
+            raise UsageError("towards: both must be styles of one loaded scene; call `stylize` on the same scene for each")
+        return replace(self, styled=mixed(self.styled, other.styled, at))
+
+    def plain(self) -> "TrainedScene":
+        """The scene as it was captured."""
+        return replace(self, styled=None)
+
+    def save_style(self, path: PathLike) -> None:
+        """Write the style as a style.json. Raises UsageError without one, or for a mix made by `towards`."""
+        styled = self._style("save_style")
+        if len(styled.restyle.parts) > 1 and styled.orders.saved.style.between is None:
+            raise UsageError("save_style: a mix has no file of its own; save both styles, and give one `between` and `at`")
+        write_style(Path(path), styled.orders.saved)
+
+    def render(self, camera: Cameras | int | str) -> Shot:
+        """One view: of a camera, or of a captured one by number or name. Raises UsageError for several cameras."""
+        return next(self.film(self._single("render", camera)))
+
+    def film(self, cameras: Cameras) -> Iterator[Shot]:
+        """Views of many cameras, one after the other, each when it is asked for."""
+        trained, look = self.trained, self.restyle
+        for view in range(len(cameras)):
+            made = render_view(trained.model, trained.known.facts, cameras, view, trained.config.render, look)
+            yield Shot(made.rgb, made.depth, made.opacity)
+
+    def matches(self, camera: Cameras | int | str) -> MatchMap:
+        """Which style codes each pixel of a view takes; `styled.codes` names them. Raises UsageError without a style."""
+        styled, one = self._style("matches"), self._single("matches", camera)
+        known = replace(self.trained.known, cameras=one)
+        return match_map(self.trained._replace(known=known), styled, 0)
+
+    @property
+    def restyle(self) -> Restyle | None:
+        """What the renderer is given; None = nothing."""
+        return None if self.styled is None else self.styled.restyle
+
+    def _style(self, what: str) -> Styled:
+        if self.styled is None:
+            raise UsageError(f"{what}: the scene is in no style; call `stylize` or `apply` first")
+        return self.styled
+
+    def _single(self, what: str, camera: Cameras | int | str) -> Cameras:
+        one = camera if isinstance(camera, Cameras) else self.camera(camera)
+        if len(one) != 1:
+            raise UsageError(f"{what}: {len(one)} cameras; give one, or render them all with `film`")
+        return one
+
+    def _number(self, view: int | str) -> int:
+        if isinstance(view, str):
+            if view not in self.names:
+                raise UsageError(f"camera {view!r}: no such view{nearest(view, list(self.names))}; `names` lists them")
+            return self.names.index(view)
+        if not 0 <= view < len(self.names):
+            raise UsageError(f"camera {view}: no such view; numbers go from 0 to {len(self.names) - 1}")
+        return view
+
+
+def open_scene(run: PathLike, *, device: str = "auto", quality: Name | None = None) -> TrainedScene:
+    """A run folder as a scene: see `fprf.load`."""
+    trained = at_quality(load_run(Path(run), device), QualityConfig(quality=quality))
+    return TrainedScene(trained, opened=_Opened(trained))

@@ -1,0 +1,171 @@
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_world import World
+
+import fprf
+from fprf import cli
+from fprf.api import TrainedScene
+from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
+from fprf.rendering.cameras import project
+from fprf.style.config import StyleConfig
+
+
+@pytest.fixture(scope="module")
+def _scene() -> dict[str, TrainedScene]:
+    return {}
+
+
+@pytest.fixture
+def scene(world: World, _scene: dict[str, TrainedScene]) -> TrainedScene:
+    """Loaded once: its encoders, too."""
+    if not _scene:
+        _scene["scene"] = fprf.load(world.run, device="cpu")
+    return _scene["scene"]
+
+
+def test_five_lines_do_what_the_verbs_do(world: World, tmp_path: Path) -> None:
+    scene = fprf.load(world.run, device="cpu")
+    dusk = scene.stylize([world.references[0]], strength=0.8)
+    shot = dusk.render(scene.camera("0008"))
+    shot.save(tmp_path / "dusk.png")
+
+    shutil.copytree(world.run, tmp_path / "run")
+    args = ["stylize", str(tmp_path / "run"), "--references", str(world.references[0]), "--strength", "0.8", "--views", "0008"]
+    assert cli.main([*args, "--output", str(tmp_path / "verb"), "--device", "cpu"]) == 0
+    mine, theirs = (cv2.imread(str(path)) for path in (tmp_path / "dusk.png", tmp_path / "verb" / "0008.png"))
+    assert mine.shape == (24, 32, 3) and np.array_equal(mine, theirs)
+
+
+def test_a_shot_has_colour_depth_and_opacity(scene: TrainedScene) -> None:
+    shot = scene.render(3)
+    assert shot.rgb.shape == (24, 32, 3) and shot.depth.shape == shot.opacity.shape == (24, 32)
+    assert 0 <= float(shot.rgb.min()) <= float(shot.rgb.max()) <= 1 and float(shot.depth.min()) > 0
+    assert shot.pixels.dtype == np.uint8 and np.abs(shot.pixels / 255 - shot.rgb.numpy()).max() <= 0.5 / 255 + 1e-6
+
+
+def test_views_go_by_number_and_name(scene: TrainedScene) -> None:
+    assert len(scene.names) == len(scene.cameras) == 10
+    by_name, by_number = scene.render("0003"), scene.render(3)
+    assert torch.equal(by_name.rgb, by_number.rgb) and torch.equal(by_name.rgb, scene.render(scene.camera(3)).rgb)
+
+
+def test_scenes_never_change(scene: TrainedScene, world: World) -> None:
+    before = scene.render(0).rgb
+    styled = scene.stylize(world.references)
+    assert scene.styled is None and torch.equal(scene.render(0).rgb, before)
+    assert not torch.equal(styled.render(0).rgb, before)
+    assert styled.references == ("dusk.png", "snow.png") and scene.references == ()
+    assert torch.equal(styled.plain().render(0).rgb, before)
+    assert torch.equal(scene.stylize(world.references, strength=0).render(0).rgb, before)
+    assert styled.trained is scene.trained and styled.opened is scene.opened
+
+
+def test_a_style_file_goes_out_and_comes_back(scene: TrainedScene, world: World, tmp_path: Path) -> None:
+    styled = scene.stylize(world.references, weights=[1, 3], keep=["1"], luminance=0.5)
+    styled.save_style(tmp_path / "style.json")
+    assert json.loads((tmp_path / "style.json").read_text())["style"]["weights"] == [1, 3]
+    again = scene.apply(tmp_path / "style.json")
+    assert torch.allclose(styled.render(2).rgb, again.render(2).rgb, atol=1e-6)
+    config = StyleConfig(references=world.references, weights=(1, 3), keep=("1",), luminance=0.5)
+    assert torch.equal(styled.render(2).rgb, scene.apply(config).render(2).rgb)
+
+
+def test_every_control_reaches_the_style(scene: TrainedScene, world: World) -> None:
+    plain = scene.stylize(world.references).render(1).rgb
+    changed = {
+        "weights": scene.stylize(world.references, weights=[1, 9]),
+        "strength": scene.stylize(world.references, strength=0.5),
+        "luminance": scene.stylize(world.references, luminance=0.5),
+        "clusters": scene.stylize(world.references, clusters=2),
+        "blend": scene.stylize(world.references, blend=0.9),
+        "pin": scene.stylize(world.references, pin=["0=dusk", "1=dusk", "2=dusk", "3=dusk"]),
+        "forbid": scene.stylize(world.references, forbid=["0=snow", "1=snow", "2=snow", "3=snow"]),
+        "keep": scene.stylize(world.references, keep=["0", "1"]),
+    }
+    assert [name for name, styled in changed.items() if torch.equal(styled.render(1).rgb, plain)] == []
+
+
+def test_between_two_styles(scene: TrainedScene, world: World, tmp_path: Path) -> None:
+    dusk, snow = (scene.stylize([path]) for path in world.references)
+    ends = dusk.render(4).rgb, snow.render(4).rgb
+    assert torch.allclose(dusk.towards(snow, 0).render(4).rgb, ends[0], atol=1e-6)
+    assert torch.allclose(dusk.towards(snow, 1).render(4).rgb, ends[1], atol=1e-6)
+    half = dusk.towards(snow, 0.5)
+    assert half.references == ("dusk.png", "snow.png")
+    apart = [float((half.render(4).rgb - end).abs().mean()) for end in ends]
+    assert max(apart) < float((ends[0] - ends[1]).abs().mean())
+    with pytest.raises(UsageError, match="a mix has no file"):
+        half.save_style(tmp_path / "style.json")
+    with pytest.raises(ConfigError, match="at"):
+        dusk.towards(snow, 1.5)
+
+
+def test_matches_of_any_camera(scene: TrainedScene, world: World) -> None:
+    styled = scene.stylize(world.references)
+    captured, moved = styled.matches("0002"), styled.matches(styled.path("orbit", 5).select(torch.tensor([2])))
+    codes = len(styled.styled.codes.reference)  # type: ignore[union-attr]
+    assert captured.taken.shape == moved.taken.shape == (24, 32, codes)
+    assert not torch.equal(captured.taken, moved.taken)
+    seen = captured.opacity > 0.5
+    assert torch.allclose(captured.taken.sum(-1)[seen], torch.ones(int(seen.sum())), atol=1e-3)
+
+
+def test_a_camera_of_ones_own_looks_where_it_should(scene: TrainedScene) -> None:
+    position, target = scene.cameras.pose[0, :, 3].tolist(), [20.0, 1.0, 2.0]
+    camera = scene.camera_at(position, target, fov=50, width=40, height=20)
+    pixel, depth = project(camera, torch.tensor([0]), torch.tensor([target], dtype=torch.float64))
+    assert torch.allclose(pixel, torch.tensor([[20.0, 10.0]], dtype=torch.float64)) and float(depth) > 0
+    above = torch.tensor([[*target[:2], target[2] + 1]], dtype=torch.float64)
+    assert float(project(camera, torch.tensor([0]), above)[0][0, 1]) < 10, "up is up"
+    assert scene.render(camera).rgb.shape == (20, 40, 3)
+    # The vertical angle: what lies half of it above the axis is at the edge.
+    assert float(camera.focal[0, 1]) == pytest.approx(10 / np.tan(np.radians(25)))
+
+
+def test_a_flight_is_lazy_and_as_long_as_asked(scene: TrainedScene) -> None:
+    cameras = scene.path("spiral", frames=3)
+    film = scene.film(cameras)
+    first = next(film)
+    assert torch.equal(first.rgb, scene.render(cameras.select(torch.tensor([0]))).rgb)
+    assert len(list(film)) == 2
+    assert len(scene.path("dataset", split="test")) == 2
+
+
+def test_quality_is_heard(world: World, scene: TrainedScene) -> None:
+    draft = fprf.load(world.run, device="cpu", quality="draft").render(0)
+    assert draft.rgb.shape == (24, 32, 3) and not torch.equal(draft.rgb, scene.render(0).rgb)
+
+
+def test_mistakes_are_named(scene: TrainedScene, world: World, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no run folder"):
+        fprf.load(tmp_path)
+    with pytest.raises(UsageError, match=r"camera '00003': no such view \(did you mean '0003'|camera '00003': no such view"):
+        scene.camera("00003")
+    with pytest.raises(UsageError, match="from 0 to 9"):
+        scene.camera(10)
+    with pytest.raises(UsageError, match="10 cameras; give one"):
+        scene.render(scene.cameras)
+    with pytest.raises(UsageError, match="in no style"):
+        scene.matches(0)
+    with pytest.raises(UsageError, match="in no style"):
+        scene.save_style(tmp_path / "style.json")
+    with pytest.raises(UsageError, match="styles of one loaded scene"):
+        scene.towards(scene.stylize([world.references[0]]), 0.5)
+    with pytest.raises(UsageError, match="at least one photograph"):
+        scene.stylize([])
+    with pytest.raises(DataError, match=r"absent\.png"):
+        scene.stylize([tmp_path / "absent.png"])
+    with pytest.raises(UsageError, match="two places"):
+        scene.camera_at([0, 0, 0], [0, 0, 0])
+    with pytest.raises(ConfigError, match="fov"):
+        scene.camera_at([0, 0, 0], [1, 0, 0], fov=180)
+    with pytest.raises(UsageError, match="neither a file nor one of"):
+        scene.path("spirale")
+    with pytest.raises(DataError, match="no picture format"):
+        scene.render(0).save(tmp_path / "x.txt")
