@@ -111,7 +111,7 @@ def restore(saved: Saved, model: Model, optimizer: torch.optim.Optimizer | None)
     if wrong:
         raise CheckpointError(f"checkpoint of step {saved.step}: {wrong[0]} does not fit the config; it was changed since")
     model.load_state_dict(saved.model)
-    if optimizer is None or not saved.optimizer:
+    if optimizer is None:
         return
     state = optimizer.state_dict()
     state["state"] = {}

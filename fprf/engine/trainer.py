@@ -16,6 +16,8 @@ from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays
 from . import checkpoint
+from .guards import CLEAR_EVERY, PATIENCE, clear_denormals, unfit_gradients, unfit_terms
+from .interrupts import held_back
 from .losses import terms, total, wanted
 from .model import Facts, Model, background_of, build_model
 from .prepare import Prepared, device_of
@@ -24,8 +26,6 @@ from .schedule import progress, rate
 
 __all__ = ["Loop", "Report", "optimizer_of", "step_generator", "train"]
 
-PATIENCE = 3
-"""Steps in a row with a non-finite loss after which training stops: it will not recover by itself."""
 SMOOTHING = 0.95
 """Decay of the running means that are shown."""
 REPORT_SECONDS = 0.5
@@ -46,7 +46,7 @@ class Report(NamedTuple):
     """Share of the samples that met the content network."""
     losses: dict[str, float]
     skipped: int
-    """Steps skipped because their loss was not finite."""
+    """Steps skipped because their loss or a gradient was not finite."""
 
 
 def step_generator(seed: int, step: int, device: torch.device) -> torch.Generator:
@@ -73,7 +73,8 @@ def train(
     """Train, or go on from the newest checkpoint, until the steps or the minutes are over; `spent` seconds count as used.
 
     `model` is one at its start, where it is not simply that of the config: a block in its surroundings. An interrupt saves
-    first, then goes on upwards. Raises NumericsError where the loss stays non-finite.
+    first, then goes on upwards. Steps that are not finite change nothing and are logged; several in a row lead back to the
+    last checkpoint. Raises NumericsError where there is none, or where that was of no use.
     """
     device = device_of(config.device)
     model = (build_model(config, prepared.facts) if model is None else model).to(device)
@@ -86,27 +87,51 @@ def train(
     loop = Loop(config, prepared, model, optimizer, device)
     step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
     start = last_saved = last_report = time.perf_counter()
-    clock = before
-    try:
-        while progress(config, step, clock) < 1:
-            result = loop.step(step, progress(config, step, clock))
-            step += 1
-            now = time.perf_counter()
-            clock = before + now - start
-            if now - last_report > REPORT_SECONDS:
-                last_report = now
-                report(result(progress(config, step, clock), clock))
-            if now - last_saved > 60 * config.checkpoint_minutes:
+    clock, again = before, -1
+    with held_back() as stop:
+        try:
+            while progress(config, step, clock) < 1:
+                stop.obey()
+                result = loop.step(step, progress(config, step, clock))
+                if loop.fault is not None:
+                    run.log({"step": step, "skipped": loop.fault})
+                if loop.failed >= PATIENCE:
+                    again = step = _go_back(run, loop, step, again)
+                    continue
+                step += 1
+                now = time.perf_counter()
+                clock = before + now - start
+                if now - last_report > REPORT_SECONDS:
+                    last_report = now
+                    report(result(progress(config, step, clock), clock))
+                if now - last_saved > 60 * config.checkpoint_minutes:
+                    checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
+                    last_saved = time.perf_counter()
+            stop.obey()
+        except KeyboardInterrupt:
+            if not stop.hurried:
                 checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
-                last_saved = time.perf_counter()
-    except KeyboardInterrupt:
-        checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
-        raise
+            raise
     if saved is None or step > saved.step:
         checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
     if loop.steps:
         report(loop.summary(step, 1.0, clock))
     return model
+
+
+def _go_back(run: Run, loop: "Loop", step: int, again: int) -> int:
+    """Put the newest checkpoint back and return its step; a second time to the same one (`again`) would change nothing."""
+    why = f"step {step}: {loop.fault} is not finite for {PATIENCE} steps in a row"
+    remedy = "lower --optimizer.rate, or check the images"
+    saved, _ = checkpoint.load_latest(run.checkpoints)
+    if saved is None:
+        raise NumericsError(f"{why}; {remedy}")
+    if saved.step == again:
+        raise NumericsError(f"{why}, again after going back to step {again}; {remedy}")
+    checkpoint.restore(saved, loop.model, loop.optimizer)
+    loop.failed = 0
+    run.log({"step": step, "gone_back_to": saved.step, "because": why})
+    return saved.step
 
 
 class Loop:
@@ -126,6 +151,8 @@ class Loop:
         self.mean: dict[str, float] = {}
         self.seen: dict[str, float] = {}
         self.steps = self.skipped = self.failed = 0
+        self.fault: str | None = None
+        """What was not finite in the last step; None where it was well."""
         self.rays = 0
         self.begun = time.perf_counter()
 
@@ -152,14 +179,19 @@ class Loop:
             parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
             loss = total(self.config.loss, parts)
         self.optimizer.zero_grad(set_to_none=True)
-        if torch.isfinite(loss):
-            self.failed = 0
+        self.fault = unfit_terms(loss, parts)
+        if self.fault is None:
             with record_function("fprf.backward"):
                 loss.backward()  # type: ignore[no-untyped-call]
+            self.fault = unfit_gradients(self.model.named_parameters())
+        if self.fault is None:
             with record_function("fprf.optimizer"):
                 self.optimizer.step()
+            if (step + 1) % CLEAR_EVERY == 0:
+                clear_denormals(self.optimizer)
+            self.failed = 0
         else:
-            self._skip(step, parts)
+            self.skipped, self.failed = self.skipped + 1, self.failed + 1
         self._remember(parts, rendered.counts["kept"] / max(1, rendered.counts["samples"]))
         self.steps, self.rays = self.steps + 1, self.rays + len(batch.rgb)
         return lambda share, seconds: self.summary(step + 1, share, seconds)
@@ -177,14 +209,6 @@ class Loop:
             if math.isfinite(value):
                 self.mean[name] = SMOOTHING * self.mean.get(name, 0.0) + (1 - SMOOTHING) * value
                 self.seen[name] = SMOOTHING * self.seen.get(name, 0.0) + (1 - SMOOTHING)
-
-    def _skip(self, step: int, parts: dict[str, Tensor]) -> None:
-        self.skipped, self.failed = self.skipped + 1, self.failed + 1
-        if self.failed >= PATIENCE:
-            bad = ", ".join(name for name, value in parts.items() if not torch.isfinite(value))
-            raise NumericsError(
-                f"step {step}: {bad} is not finite for {PATIENCE} steps in a row; lower --optimizer.rate, or check the images"
-            )
 
     def _rays(self, batch: Batch) -> Rays:
         rays = self.model.space.rays(*self.through(batch.view.cpu(), batch.pixel.cpu()))
