@@ -39,7 +39,7 @@ class BlockedSampler(Sampler):
 
     def __init__(self, inner: Sampler, members: Members, router: Router) -> None:
         super().__init__()
-        self.members = members
+        self.members, self.router = members, router
         self.inner = inner
         for level in range(len(inner.fields)):
             inner.fields[level] = _Routed(members, router, level)

@@ -43,7 +43,7 @@ def run(args: list[str]) -> int:
     from ..output.images import to_uint8
     from ..output.video import write_frames
 
-    trained = at_quality(load_run(config.run, config.device), config)
+    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
     data = config.data or trained.config.data
     scene = parse_scene(data, trained.config.downscale, trained.config.datamanager.parser)
     if tuple(view_names(scene.paths)) != trained.known.names:

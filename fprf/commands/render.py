@@ -65,7 +65,7 @@ def run(args: list[str]) -> int:
     from ..engine.loading import load_run
     from ..output.video import write_frames, write_video
 
-    trained = at_quality(load_run(config.run, config.device), config)
+    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
     cameras, names = camera_path(trained, config)
     looks = _looks(trained, config, file)
     start = time.perf_counter()

@@ -74,7 +74,7 @@ def run(args: list[str]) -> int:
     from ..style.dictionary import save_dictionary
     from ..style.statistics import dead_channels
 
-    trained = at_quality(load_run(config.run, config.device), config)
+    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
     views, output = _views(trained, config), config.output or config.run / "styles" / _name(config)
     if config.explain and not config.references:
         _explain(trained, output, Regions(trained, *load_style(trained.run)), None)

@@ -20,7 +20,7 @@ from ..types import Boxes
 from . import tensorfiles
 from .blocks import SURROUNDINGS, Built, folder_of, inset, load_finished, read_done, restore, save_finished, surroundings
 from .checkpoint import reached
-from .lay_out import asked_of, load_boxes
+from .lay_out import RAYS, asked_of, load_boxes
 from .model import Facts
 from .prepare import Prepared, cache_folder
 from .run import Run
@@ -57,13 +57,13 @@ def train_block(task: BlockTask, report: Callable[[Report], None]) -> bool:
     facts, boxes = run.load_known().facts, load_boxes(root)
     folder = folder_of(root, task.block)
     scene = parse_scene(Path(task.data), config.downscale, config.datamanager.parser)
-    config = replace(config, minutes=task.minutes)
-    asked = asked_of(config, facts, scene, boxes, task.block, folder)
+    own = _scene_of(scene, folder)
+    asked = asked_of(config, facts, scene, boxes, task.block, tensorfiles.read(folder / RAYS))
     done = read_done(folder)
     if done is not None and done["asked"] == asked:
         return False
+    config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
     _begin(folder, asked["task"])
-    own = _scene_of(scene, folder)
     manager = _manager(run, config, facts, own, folder)
     built = _built(root, config, facts, boxes, task.block)
     block_run = Run(folder)
@@ -89,7 +89,7 @@ def _begin(folder: Path, task: str) -> None:
 
 def _scene_of(scene: Scene, folder: Path) -> Scene:
     """The scene with the training views that a block learns from."""
-    views = tensorfiles.read(folder / "rays.safetensors")["views"]
+    views = tensorfiles.read(folder / RAYS)["views"]
     if len(views) and int(views.max()) >= len(scene.paths):
         raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
     return replace(scene, train=views)
@@ -97,7 +97,7 @@ def _scene_of(scene: Scene, folder: Path) -> Scene:
 
 def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: Path) -> DataManager:
     """The block's own batches: its views, its pixels, the whole scene's basis; features are in the cache."""
-    rays = tensorfiles.read(folder / "rays.safetensors")
+    rays = tensorfiles.read(folder / RAYS)
     slots = {view: slot for slot, view in enumerate(rays["views"].tolist())}
 
     def seen(view: int) -> Tensor:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ..blocks.charts import chart_of, surroundings_of
 from ..blocks.plan import Plan, boxes_from, boxes_to, make_plan
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
@@ -32,12 +33,17 @@ from .blocks import SURROUNDINGS, folder_of
 from .decoder import build_decoder
 from .model import Facts
 from .prepare import cache_folder, facts_of
+from .renumber import renumber, trained_tasks
 from .run import Run
 
-__all__ = ["FREE", "Laid", "asked_of", "lay_out", "load_boxes", "plan_scene", "write_down"]
+__all__ = ["FREE", "RAYS", "Laid", "asked_of", "lay_out", "load_boxes", "plan_scene", "write_down"]
 
 FREE = ("steps", "minutes", "output", "data", "device", "checkpoint_minutes", "blocks", "executor", "statistics", "render")
 """Fields of a config that do not decide what a block of given bounds and rays learns."""
+
+
+RAYS = "rays.safetensors"
+"""In a block's folder: the views and tiles that it learns from."""
 
 
 class Laid(NamedTuple):
@@ -85,13 +91,14 @@ def write_down(run: Run, config: TrainConfig, method: str, laid: Laid) -> None:
     if laid.basis is not None:
         run.save_tensors("basis", laid.basis.tensors())
     count = len(plan.boxes.low)
-    for block in (SURROUNDINGS, *range(count)):
+    rays = {block: _rays_of(plan, block) for block in (SURROUNDINGS, *range(count))}
+    if trained_tasks(run.root):
+        asked = {block: asked_of(config, laid.facts, scene, plan.boxes, block, own)["task"] for block, own in rays.items()}
+        renumber(run.root, {block: task for block, task in asked.items() if block != SURROUNDINGS})
+    for block, own in rays.items():
         folder = folder_of(run.root, block)
         folder.mkdir(parents=True, exist_ok=True)
-        views = plan.views if block == SURROUNDINGS else plan.views_of(block)
-        at = torch.isin(plan.views, views)
-        seen = torch.ones_like(plan.seen[:, 0]) if block == SURROUNDINGS else plan.seen[:, block]
-        tensorfiles.save(folder / "rays.safetensors", {"views": views, "seen": seen[at].to(torch.uint8)})
+        tensorfiles.save(folder / RAYS, own)
     write_json(
         run.root / "blocks.json",
         {
@@ -101,6 +108,14 @@ def write_down(run: Run, config: TrainConfig, method: str, laid: Laid) -> None:
             "views": [len(plan.views_of(b)) for b in range(count)],
         },
     )
+
+
+def _rays_of(plan: Plan, block: int) -> dict[str, Tensor]:
+    """What a block learns from: `views` [M] and their tiles `seen` [M TILES TILES]; the surroundings from everything."""
+    views = plan.views if block == SURROUNDINGS else plan.views_of(block)
+    at = torch.isin(plan.views, views)
+    seen = torch.ones_like(plan.seen[:, 0]) if block == SURROUNDINGS else plan.seen[:, block]
+    return {"views": views, "seen": seen[at].to(torch.uint8)}
 
 
 def load_boxes(root: Path) -> Boxes:
@@ -115,8 +130,10 @@ def load_boxes(root: Path) -> Boxes:
         raise CheckpointError(f"{path}: cannot be read ({e}); train the scene again") from e
 
 
-def asked_of(config: TrainConfig, facts: Facts, scene: Scene, boxes: Boxes, block: int, folder: Path) -> dict[str, Any]:
-    """What a block is trained as; while it stays the same, what was trained stays good.
+def asked_of(
+    config: TrainConfig, facts: Facts, scene: Scene, boxes: Boxes, block: int, rays: dict[str, Tensor]
+) -> dict[str, Any]:
+    """What a block is trained as; while it stays the same, what was trained stays good. `rays` is its rays.safetensors.
 
     A block is decided by its bounds and rays, its images, and the config but for what may change, not by its surroundings:
     they are only its frame.
@@ -124,17 +141,18 @@ def asked_of(config: TrainConfig, facts: Facts, scene: Scene, boxes: Boxes, bloc
     tree = to_json(config)
     assert isinstance(tree, dict)
     knobs = {name: value for name, value in tree.items() if name not in FREE}
-    rays = (folder / "rays.safetensors").read_bytes()
-    views = tensorfiles.read(folder / "rays.safetensors")["views"].tolist()
+    views = rays["views"].tolist()
+    # What the surroundings span follows from all blocks together, not from how they are cut.
+    chart = surroundings_of(boxes) if block == SURROUNDINGS else chart_of(boxes, block)
     parts = {
         "config": knobs,
-        "bounds": None if block == SURROUNDINGS else [t[block].tolist() for t in (boxes.low, boxes.high, boxes.turn)],
-        "margin": boxes.margin,
+        "bounds": [t.tolist() for t in (chart.low, chart.high, chart.turn)],
         "space": [facts.space.centre, facts.space.rotation, facts.space.scale, facts.space.near, facts.space.far],
+        "views": views,
         "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
         "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background],
     }
-    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode() + rays)
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode() + rays["seen"].numpy().tobytes())
     for view in views:
         digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
     return {"task": digest.hexdigest()[:32], "steps": config.steps, "minutes": config.minutes}

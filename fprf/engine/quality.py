@@ -52,10 +52,14 @@ class QualityConfig:
     says."""
     chunk: int | None = None
     """Rays rendered at a time; none = as the run's own config says."""
+    max_memory: float | None = None
+    """MiB that blocks of a large scene may take together; the least recently used make room. none = all stay."""
 
     def __post_init__(self) -> None:
         if self.samples is not None:
             positive("samples", self.samples)
+        if self.max_memory is not None:
+            positive("max_memory", self.max_memory)
         if self.budget is not None:
             between("budget", self.budget, 0.0, 0.5)
         if self.resolution is not None:
@@ -83,6 +87,7 @@ def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
 
 
 def _resampled(trained: "Trained", samples: float) -> "Trained":
+    from ..blocks.sampler import BlockedSampler
     from .model import Model
 
     old = trained.model.sampler
@@ -91,6 +96,11 @@ def _resampled(trained: "Trained", samples: float) -> "Trained":
     except NotImplementedError:  # a plug-in that does not say
         raise PluginError(f"samples: {type(trained.config.sampler).__name__} does not scale; leave --samples at 1") from None
     sampler = scaled.build(seed=trained.config.seed)
+    if trained.known.facts.space.kind == "open":  # what proposes lies in the blocks
+        assert isinstance(old, BlockedSampler)
+        routed = BlockedSampler(sampler, old.members, old.router).requires_grad_(False)
+        model = Model(trained.model.parts._replace(sampler=routed.to(next(trained.model.parameters()).device)))
+        return trained._replace(config=replace(trained.config, sampler=scaled), model=model.eval())
     state, own = old.state_dict(), sampler.state_dict()
     if state.keys() != own.keys() or any(state[name].shape != own[name].shape for name in own):
         raise UsageError("samples: this run's sampler has learnt for its own number of samples; leave --samples at 1")
