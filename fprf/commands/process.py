@@ -1,0 +1,94 @@
+"""`fprf process IMAGES|VIDEO --output SCENE`: poses for images that have none, by COLMAP's Python package."""
+
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from .. import __version__
+from ..errors import UsageError
+from ..sfm.config import SfmConfig
+from .parsing import parse
+from .progress import Display
+
+__all__ = ["ProcessConfig", "run"]
+
+_DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
+
+Needs the extra `sfm` (pip install 'fprf[sfm]') and no other program. Run again, it goes on where it stopped."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessConfig(SfmConfig):
+    """What to process."""
+
+    source: Path = Path()
+    """A folder of images, or a video."""
+    output: Path | None = None
+    """The scene folder to make; by default scenes/NAME."""
+
+
+def run(args: list[str]) -> int:
+    """Choose, match, reconstruct; report what was dropped; check that the scene can be read."""
+    config = parse(ProcessConfig(), args, prog="fprf process", description=_DESCRIPTION, positional=("source",))
+    if find_spec("pycolmap") is None:
+        raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
+    from ..output.atomic import write_json
+    from ..sfm.database import Tables
+    from ..sfm.gather import gather
+    from ..sfm.place import Place, State
+    from ..sfm.report import report
+    from ..sfm.steps import find_features, find_matches, find_poses
+
+    place = Place(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
+    state = State.load(place)
+    models: list[dict[str, Any]] = []
+    matching: str = config.matching
+    with Display() as display:
+        gather(config.source, place, state, config, display.count)
+        find_features(place, state, config, display.count)
+        matching = find_matches(place, state, config, display.count)
+        try:
+            models = find_poses(place, state, config, display.count)
+        finally:
+            content = report(asdict(state), matching, Tables(place.database), models, __version__)
+            write_json(place.root / "process.json", content)
+    _print(content, place.root)
+    _check(place.root)
+    return 0
+
+
+def _print(content: dict[str, Any], root: Path) -> None:
+    from ..sfm.report import summary
+
+    console = Console(highlight=False)
+    images = content["images"]
+    console.print(
+        f"{images['posed']} of {images['given']} images have a pose; {content['points']} points, "
+        f"{content['error_pixels']:.2f} pixels off; {content['matching']} matching, "
+        f"{sum(content['step_seconds'].values()):.0f} s",
+        soft_wrap=True,
+    )
+    rows = summary(content)
+    if rows:
+        table = Table(box=None, show_header=True, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
+        for head in ("lost in", "image", "why"):
+            table.add_column(head, overflow="fold")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+        console.print(f"all of them in {root / 'process.json'}", soft_wrap=True)
+
+
+def _check(root: Path) -> None:
+    """The scene as training will see it. Raises DataError where it cannot be read."""
+    import shlex
+
+    from ..datamanagers.parsers.config import ColmapConfig
+    from ..datamanagers.parsers.recognise import parse_scene
+
+    scene = parse_scene(root, 1, ColmapConfig())
+    print(f"{len(scene.train)} + {len(scene.test)} views: fprf train fprf-lite --data {shlex.quote(str(root))}")

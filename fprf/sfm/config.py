@@ -1,0 +1,52 @@
+"""How poses are found: the knobs of `fprf process`. No cv2, no torch."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from ..checks import at_least, between
+
+__all__ = ["SfmConfig"]
+
+Lens = Literal["simple-pinhole", "pinhole", "simple-radial", "radial", "opencv", "opencv-fisheye"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmConfig:
+    """Which frames, features, pairs and lenses."""
+
+    frames: int = 150
+    """Sharp frames taken from a video, at most; images of a folder are all used."""
+    blurred: float = 0.3
+    """A stretch of a video whose sharpest frame has less than this share of the sharpness around it gives none, in [0, 1)."""
+    lens: Lens = "simple-radial"
+    """Lens model that is fitted; wide-angle and action cameras want opencv or opencv-fisheye."""
+    cameras: Literal["shared", "each"] = "shared"
+    """shared: images of one size, model and focal length have one lens; each: every image has its own."""
+    features: int = 8192
+    """Features of an image, at most."""
+    side: int = 1600
+    """Longest side in pixels at which features are sought; larger images are reduced for that."""
+    matching: Literal["auto", "exhaustive", "sequential", "similar"] = "auto"
+    """exhaustive: all with all. sequential: in the order of names or time. similar: with those that look alike, by a
+    vocabulary of the scene's own features, and with their neighbours by name. auto: exhaustive for up to 120 images, else
+    similar, with sequential for videos."""
+    overlap: int = 10
+    """Neighbours in order that an image is matched with, and 2, 4, 8, ... 2^overlap further on."""
+    neighbours: int = 30
+    """Images alike that an image is matched with."""
+    threads: int | None = None
+    """Threads of COLMAP; none = all cores."""
+    gpu: bool = True
+    """Let COLMAP use a GPU where there is one and it was built for it."""
+    seed: int = 0
+    """Of COLMAP's random choices."""
+
+    def __post_init__(self) -> None:
+        at_least("frames", self.frames, 3)
+        between("blurred", self.blurred, 0.0, 0.99)
+        at_least("features", self.features, 100)
+        at_least("side", self.side, 100)
+        at_least("overlap", self.overlap, 1)
+        at_least("neighbours", self.neighbours, 1)
+        if self.threads is not None:
+            at_least("threads", self.threads, 1)
