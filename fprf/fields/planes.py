@@ -6,7 +6,7 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
-from ..ops import dense, triplane, triplane_numba
+from ..ops import dense, triplane
 from .density import LIMIT, density
 
 __all__ = ["Planes"]
@@ -28,14 +28,14 @@ class Planes(nn.Module):
         return triplane.lookup(points, self.table, self.resolutions)
 
     def fused(self, points: Tensor) -> bool:
-        """Whether kernels may read the table where these points lie: the CPU, float32, no gradients, whole vectors."""
-        return len(points) > 0 and dense.usable(points) and triplane_numba.usable(points, self.table)
+        """Whether kernels may read the table where these points lie, and nobody wants gradients."""
+        return len(points) > 0 and not torch.is_grad_enabled() and triplane.fused(points, self.table)
 
     def density(
         self, points: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "out"]
     ) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N out"]]:
         """`fields.density` of the features' product with the weight, and the features."""
-        if triplane_numba.usable(points, self.table):
+        if triplane.fused(points, self.table):
             return triplane.density(points, self.table, self.resolutions, weight, LIMIT)
         latent = self(points)
         return density(latent @ weight), latent

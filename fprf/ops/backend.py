@@ -5,15 +5,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-__all__ = ["compiled", "plain"]
+__all__ = ["asked_plain", "compiled", "plain"]
 
 _AVAILABLE = importlib.util.find_spec("numba") is not None
 _PLAIN: ContextVar[bool] = ContextVar("fprf.ops.plain", default=False)
 
 
 def compiled() -> bool:
-    """Whether kernels may run: numba is installed, and nobody asked for the plain forms."""
+    """Whether kernels for the CPU may run: numba is installed, and nobody asked for the plain forms."""
     return _AVAILABLE and not _PLAIN.get()
+
+
+def asked_plain() -> bool:
+    """Whether somebody asked for the plain forms."""
+    return _PLAIN.get()
 
 
 @contextmanager

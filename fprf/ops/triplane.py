@@ -5,24 +5,26 @@ agree on it. A point outside takes the value at the border. Plane p spans the ax
 in one table [rows, channels] of channel vectors: scale after scale, plane after plane, row v after row, node u after node.
 One table means one parameter, one optimiser state and one pass.
 
-The torch form is the reference for every device and dtype; on the CPU in float32 the fused kernels of `triplane_numba` take
-over. Both keep coordinates and arithmetic in the dtype of the points, never half (half coordinates cost 3.5e-2 of the
-feature at 512 nodes). Gradients go to the table; points are constants, since samplers do not learn through them.
+The torch form is the reference for every device and dtype; in float32 fused kernels take over, those of `triplane_numba` on
+the CPU and those of `triplane_triton` on a GPU. All keep coordinates and arithmetic in the dtype of the points, never half
+(half coordinates cost 3.5e-2 of the feature at 512 nodes); a table that nobody trains may be stored in half. Gradients go to
+the table; points are constants, since samplers do not learn through them.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import torch
 from torch import Tensor
 
-from . import triplane_numba as fused
+from . import triplane_numba, triplane_triton
 
 __all__ = [
     "AXES",
     "density",
     "density_alone",
+    "fused",
     "lookup",
     "lookup_reference",
     "rows",
@@ -77,17 +79,50 @@ def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequenc
     return total
 
 
+class _Form(Protocol):
+    """Fused kernels of one kind of device: `triplane_numba`, `triplane_triton`."""
+
+    def forward(self, points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Tensor: ...
+
+    def density(
+        self, points: Tensor, table: Tensor, resolutions: Sequence[int], weight: Tensor, limit: float, *, keep: bool
+    ) -> tuple[Tensor, Tensor]: ...
+
+    def backward(
+        self,
+        points: Tensor,
+        table: Tensor,
+        resolutions: Sequence[int],
+        grad: Tensor | None,
+        raw: Tensor | None = None,
+        weight: Tensor | None = None,
+    ) -> Tensor: ...
+
+    def summed(self, raw: Tensor, latent: Tensor) -> Tensor: ...
+
+
+def _form(points: Tensor, table: Tensor) -> _Form | None:
+    if triplane_triton.usable(points, table):
+        return triplane_triton
+    return triplane_numba if triplane_numba.usable(points, table) else None
+
+
+def fused(points: Tensor, table: Tensor) -> bool:
+    """Whether `density` and `density_alone` may be called: there are kernels for this device and these dtypes."""
+    return _form(points, table) is not None
+
+
 class _Lookup(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], form: _Form) -> Tensor:
         ctx.save_for_backward(points, table)
-        ctx.resolutions = resolutions
-        return fused.forward(points, table, resolutions)
+        ctx.resolutions, ctx.form = resolutions, form
+        return form.forward(points, table, resolutions)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None, None]:
         points, table = ctx.saved_tensors
-        return None, fused.backward(points, table, ctx.resolutions, grads[0].contiguous()), None
+        return None, ctx.form.backward(points, table, ctx.resolutions, grads[0].contiguous()), None, None
 
 
 class _Density(torch.autograd.Function):
@@ -95,24 +130,24 @@ class _Density(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], weight: Tensor, limit: float
+        ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], weight: Tensor, limit: float, form: _Form
     ) -> tuple[Tensor, Tensor]:
-        density, latent = fused.density(points, table, resolutions, weight, limit, keep=True)
+        density, latent = form.density(points, table, resolutions, weight, limit, keep=True)
         ctx.save_for_backward(points, table, weight, density, latent)
-        ctx.resolutions, ctx.limit = resolutions, limit
+        ctx.resolutions, ctx.limit, ctx.form = resolutions, limit, form
         ctx.set_materialize_grads(False)
         return density, latent
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[None, Tensor | None, None, Tensor | None, None]:
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[None, Tensor | None, None, Tensor | None, None, None]:
         points, table, weight, density, latent = ctx.saved_tensors
         thick, feature = grads
         if thick is None and feature is None:
-            return None, None, None, None, None
+            return None, None, None, None, None, None
         # As `exp_gradient`: no gradient explodes or dies where the density is cut off.
         raw = None if thick is None else thick * density.clamp_min(math.exp(-ctx.limit))
-        found = fused.backward(points, table, ctx.resolutions, feature, raw, weight)
-        return None, found, None, None if raw is None else fused.summed(raw, latent), None
+        found = ctx.form.backward(points, table, ctx.resolutions, feature, raw, weight)
+        return None, found, None, None if raw is None else ctx.form.summed(raw, latent), None, None
 
 
 class _Variation(torch.autograd.Function):
@@ -120,21 +155,22 @@ class _Variation(torch.autograd.Function):
     def forward(ctx: Any, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
         ctx.save_for_backward(table)
         ctx.resolutions = resolutions
-        return fused.variation(table, resolutions)
+        return triplane_numba.variation(table, resolutions)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
         (table,) = ctx.saved_tensors
-        return fused.variation_gradient(table, ctx.resolutions, float(grads[0])), None
+        return triplane_numba.variation_gradient(table, ctx.resolutions, float(grads[0])), None
 
 
 def lookup(
     points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
 ) -> Annotated[Tensor, "N scales*F"]:
     """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3 |value|)."""
-    if not fused.usable(points, table):
+    form = _form(points, table)
+    if form is None:
         return lookup_reference(points, table, resolutions)
-    result: Tensor = _Lookup.apply(points.detach().contiguous(), table, tuple(resolutions))  # type: ignore[no-untyped-call]
+    result: Tensor = _Lookup.apply(points.detach().contiguous(), table, tuple(resolutions), form)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -145,12 +181,13 @@ def density(
     weight: Annotated[Tensor, "scales*F"],
     limit: float,
 ) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N scales*F"]]:
-    """exp(min(feature . weight - 1, limit)), and the features of `lookup`, for the CPU in float32.
+    """exp(min(feature . weight - 1, limit)), and the features of `lookup`, where kernels are `fused`.
 
     The gradient of the density is that of exp between -limit and limit, and the one at the nearer of them beyond.
     """
-    given = points.detach().contiguous()
-    found: tuple[Tensor, Tensor] = _Density.apply(given, table, tuple(resolutions), weight, limit)  # type: ignore[no-untyped-call]
+    form, given = _form(points, table), points.detach().contiguous()
+    assert form is not None, "callers ask `fused`"
+    found: tuple[Tensor, Tensor] = _Density.apply(given, table, tuple(resolutions), weight, limit, form)  # type: ignore[no-untyped-call]
     return found
 
 
@@ -162,12 +199,14 @@ def density_alone(
     limit: float,
 ) -> Annotated[Tensor, "N"]:
     """The density of `density` without gradients: features are summed up as they are found."""
-    return fused.density(points.detach().contiguous(), table, resolutions, weight, limit, keep=False)[0]
+    form = _form(points, table)
+    assert form is not None, "callers ask `fused`"
+    return form.density(points.detach().contiguous(), table, resolutions, weight, limit, keep=False)[0]
 
 
 def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
     """`variation_reference`, fused where the device has it."""
-    if not fused.usable(table, table):
+    if not triplane_numba.usable(table, table):
         return variation_reference(table, resolutions)
     result: Tensor = _Variation.apply(table, tuple(resolutions))  # type: ignore[no-untyped-call]
     return result

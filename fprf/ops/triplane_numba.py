@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .backend import compiled
 
-__all__ = ["backward", "density", "forward", "layout", "usable", "variation", "variation_gradient"]
+__all__ = ["backward", "density", "forward", "layout", "summed", "usable", "variation", "variation_gradient"]
 
 _LANES = 8
 _SLICES = 4

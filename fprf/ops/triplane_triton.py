@@ -1,0 +1,119 @@
+"""Tri-planes on a GPU: one launch over all planes and scales, forward and backward (device code: `triplane_triton_kernels`).
+
+Triton comes with torch for CUDA; where it is not installed nothing here is usable, and the reference runs. With
+TRITON_INTERPRET=1 the same code runs on the CPU, number by number: slow, for tests.
+
+Gradients are summed up by atomic additions, whose order differs from run to run: bits may differ, within rounding.
+"""
+
+import importlib.util
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor
+
+from .backend import asked_plain
+
+__all__ = ["backward", "density", "forward", "interpreted", "summed", "usable"]
+
+_AVAILABLE = importlib.util.find_spec("triton") is not None
+_TILE = 1024
+"""Numbers of a program's tile: channels times points. Compiled for compute capability 9.0 this leaves 72 registers a thread
+forward and 102 backward, nothing spilled and no barrier; twice as many cost barriers, four times as many spill."""
+
+
+def interpreted() -> bool:
+    """Whether Triton was told to interpret its code on the CPU."""
+    if not _AVAILABLE:
+        return False
+    import triton
+
+    return bool(triton.knobs.runtime.interpret)
+
+
+def usable(points: Tensor, table: Tensor) -> bool:
+    """Triton on one CUDA device (or interpreted), points in float32, the table in float32, or half where nobody learns."""
+    if not _AVAILABLE or asked_plain() or points.device != table.device or points.dtype != torch.float32:
+        return False
+    fixed = not (torch.is_grad_enabled() and table.requires_grad)
+    stored = table.dtype == torch.float32 or (table.dtype == torch.float16 and fixed)
+    return stored and (points.device.type == "cuda" or (points.device.type == "cpu" and interpreted()))
+
+
+def forward(points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Tensor:
+    """[N scales*F] of contiguous points [N 3] in a table [rows F]."""
+    from . import triplane_triton_kernels as kernels
+
+    table = table.detach().contiguous()
+    out = torch.empty(len(points), len(resolutions) * table.shape[1], device=points.device)
+    if len(points) > 0:
+        with _on(points):
+            kernels.forward[_grid(points, table)](
+                points, table, out, len(points), *_constants(table, resolutions), enable_fp_fusion=True
+            )
+    return out
+
+
+def density(
+    points: Tensor, table: Tensor, resolutions: Sequence[int], weight: Tensor, limit: float, *, keep: bool
+) -> tuple[Tensor, Tensor]:
+    """[N] exp(min(feature . weight - 1, limit)) of contiguous points; features [N scales*F], or [0] unless they are kept."""
+    from . import triplane_triton_kernels as kernels
+
+    table, weight = table.detach().contiguous(), weight.detach().contiguous()
+    out = torch.empty(len(points), device=points.device)
+    shape = (len(points), len(resolutions) * table.shape[1]) if keep else (0,)
+    latent = torch.empty(shape, device=points.device)
+    if len(points) > 0:
+        with _on(points):
+            kernels.density[_grid(points, table)](
+                points, table, weight, limit, latent, out, len(points),
+                *_constants(table, resolutions), keep, enable_fp_fusion=True,
+            )  # fmt: skip
+    return out, latent
+
+
+def backward(
+    points: Tensor,
+    table: Tensor,
+    resolutions: Sequence[int],
+    grad: Tensor | None,
+    raw: Tensor | None = None,
+    weight: Tensor | None = None,
+) -> Tensor:
+    """Gradient of the table [rows F] for a gradient [N scales*F] of the lookup, and raw [N] weight [scales*F] in addition."""
+    from . import triplane_triton_kernels as kernels
+
+    table = table.detach().contiguous()
+    out = torch.zeros_like(table)
+    if len(points) > 0:
+        # What is absent is never read; a pointer is needed all the same.
+        given = [table if part is None else part.detach().contiguous() for part in (grad, raw, weight)]
+        with _on(points):
+            kernels.backward[_grid(points, table)](
+                points, table, *given, out, len(points),
+                *_constants(table, resolutions), grad is not None, raw is not None, enable_fp_fusion=True,
+            )  # fmt: skip
+    return out
+
+
+def summed(raw: Tensor, latent: Tensor) -> Tensor:
+    """raw [N] @ latent [N C]."""
+    return raw @ latent
+
+
+def _constants(table: Tensor, resolutions: Sequence[int]) -> tuple[tuple[int, ...], int, int, int]:
+    """Nodes a side of each scale, channels, channels rounded up to a power of two, points of a program."""
+    lanes = 1 << (table.shape[1] - 1).bit_length()
+    return tuple(resolutions), table.shape[1], lanes, max(1, _TILE // lanes)
+
+
+def _grid(points: Tensor, table: Tensor) -> tuple[int]:
+    block = _constants(table, ())[-1]
+    return (-(-len(points) // block),)
+
+
+def _on(points: Tensor) -> AbstractContextManager[object]:
+    """Launches go to the current device, which need not be that of the points."""
+    return torch.cuda.device(points.device) if points.device.type == "cuda" else nullcontext()

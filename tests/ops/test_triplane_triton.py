@@ -1,0 +1,178 @@
+"""The Triton form of the tri-planes against fp64: on a GPU where there is one, else through Triton's interpreter."""
+
+import importlib.util
+import itertools
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+
+import pytest
+import torch
+from torch import Tensor
+
+from fprf.ops import backend, triplane, triplane_triton
+from fprf.ops.triplane import lookup, lookup_reference, rows
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
+GPU = torch.cuda.is_available()
+DEVICE = torch.device("cuda" if GPU else "cpu")
+
+
+@pytest.fixture(autouse=True)
+def _form(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Kernels are interpreted or not from the moment they are loaded."""
+    if not GPU:
+        monkeypatch.setenv("TRITON_INTERPRET", "1")
+    yield
+
+
+def table_of(resolutions: Sequence[int], channels: int, seed: int = 0) -> Tensor:
+    draw = torch.Generator().manual_seed(seed)
+    return torch.empty(rows(resolutions), channels).uniform_(-1, 1, generator=draw).to(DEVICE)
+
+
+def points_of(count: int, seed: int = 0) -> Tensor:
+    """Multiples of 1/256 fall exactly between the nodes: rounding of coordinates is the bound of `test_triplane`."""
+    drawn = torch.empty(count, 3).uniform_(-1, 1, generator=torch.Generator().manual_seed(seed))
+    return ((drawn * 256).round() / 256).to(DEVICE)
+
+
+CASES = [((16, 64), 16, 500), ((5, 33, 2), 24, 130), ((182,), 8, 300), ((3, 7), 5, 1), ((1024,), 8, 257)]
+
+
+@pytest.mark.parametrize(("resolutions", "channels", "count"), CASES)
+def test_values_and_gradients_are_those_of_fp64(resolutions: tuple[int, ...], channels: int, count: int) -> None:
+    """As gsplat compares them: elementwise, relative L2, cosine, signed bias; nothing at nodes that no point touches."""
+    points, table = points_of(count), table_of(resolutions, channels).requires_grad_(True)
+    assert triplane_triton.usable(points, table) and triplane.fused(points, table)
+    weight = torch.randn(count, len(resolutions) * channels, generator=torch.Generator().manual_seed(5)).to(DEVICE)
+    found = lookup(points, table, resolutions)
+    assert found.grad_fn is not None and "Lookup" in type(found.grad_fn).__name__
+    (gradient,) = torch.autograd.grad((found * weight).sum(), table)
+    wide = table.detach().double().requires_grad_(True)
+    value = lookup_reference(points.double(), wide, resolutions)
+    (exact,) = torch.autograd.grad((value * weight).sum(), wide)
+    assert found.dtype == torch.float32 and (found - value).abs().max() <= 2e-6
+    error = gradient.double() - exact
+    assert error.norm() <= 1e-5 * exact.norm()
+    assert (gradient.double() * exact).sum() / (gradient.double().norm() * exact.norm()) >= 1 - 1e-9
+    assert error.sum().abs() <= 1e-6 * exact.abs().sum()
+    assert not gradient[exact == 0].any()
+
+
+def test_nodes_are_met_exactly() -> None:
+    table = table_of((5,), 8)
+    at = torch.tensor(list(itertools.product((-1.0, -0.5, 0.0, 0.5, 1.0), repeat=3)), device=DEVICE)
+    assert torch.equal(lookup(at, table, (5,)), lookup_reference(at, table, (5,)))
+
+
+WILD = (float("nan"), float("inf"), -float("inf"), 1e30, -1e30, 1.0 + 2e-7, -1.0 - 2e-7, 1.0, -1.0, 0.3)
+
+
+@pytest.mark.parametrize(("size", "channels"), [(2, 5), (182, 8)])
+def test_no_coordinate_leaves_the_table(size: int, channels: int) -> None:
+    """The table lies between sentinels: forward never reads them, backward never writes them. NaN is the lower border."""
+    points = torch.tensor(list(itertools.product(WILD, repeat=3)), device=DEVICE)
+    tame = points.nan_to_num(nan=-1.0).clamp(-1, 1)
+    total, edge = rows((size,)), 2 * size
+    padded = torch.full((total + 2 * edge, channels), float("nan"), device=DEVICE)
+    table = padded[edge : edge + total]
+    table.copy_(table_of((size,), channels))
+    table.requires_grad_(True)
+    found = lookup(points, table, (size,))
+    assert found.isfinite().all() and torch.equal(found, lookup(tame, table, (size,)))
+    (gradient,) = torch.autograd.grad(found.sum(), table)
+    assert gradient.shape == table.shape and gradient.isfinite().all()
+    assert padded[:edge].isnan().all() and padded[edge + total :].isnan().all()
+
+
+def test_no_points_at_all() -> None:
+    table = table_of((4, 9), 8).requires_grad_(True)
+    found = lookup(points_of(0), table, (4, 9))
+    assert found.shape == (0, 16)
+    assert not torch.autograd.grad(found.sum(), table)[0].any()
+
+
+@pytest.mark.parametrize(("resolutions", "channels", "count"), CASES[:3])
+def test_densities_and_features_come_together(resolutions: tuple[int, ...], channels: int, count: int) -> None:
+    """Gradients where both, or one of them, are asked for; cut off at the limit, they neither explode nor die."""
+    points, table = points_of(count), table_of(resolutions, channels).requires_grad_(True)
+    drawn = torch.Generator().manual_seed(1)
+    weight = (torch.randn(len(resolutions) * channels, generator=drawn) * 8).to(DEVICE).requires_grad_(True)
+    inputs, wide = [table, weight], [x.detach().double().requires_grad_(True) for x in (table, weight)]
+    features = lookup_reference(points.double(), wide[0], resolutions)
+    raw = features @ wide[1] - 1
+    found, latent = triplane.density(points, table, resolutions, weight, 1.0)
+    exact = raw.clamp(max=1.0).exp()
+    assert (raw > 1.0).any() and (raw < -1.0).any()
+    assert torch.equal(latent, lookup(points, table, resolutions))
+    assert ((found - exact).abs() <= 1e-4 * exact).all()
+    with torch.no_grad():
+        assert torch.equal(triplane.density_alone(points, table, resolutions, weight, 1.0), found)
+    g, h = (torch.randn(shape, generator=drawn).to(DEVICE) for shape in ((count,), tuple(latent.shape)))
+    slope = raw.clamp(-1.0, 1.0).exp().detach()
+    for thick, feature in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0)):
+        ours = [part for part, on in (((found * g).sum(), thick), ((latent * h).sum(), feature)) if on]
+        got = torch.autograd.grad(torch.stack(ours).sum(), inputs, retain_graph=True, allow_unused=True)
+        theirs = thick * (raw * slope * g).sum() + feature * (features * h).sum()
+        for a, b in zip(got, torch.autograd.grad(theirs, wide, retain_graph=True), strict=True):
+            if a is None:
+                assert not b.any()
+            else:
+                assert (a - b).norm() <= 1e-5 * b.norm() and (a - b).sum().abs() <= 1e-5 * b.abs().sum()
+
+
+def test_half_tables_are_for_those_who_do_not_learn() -> None:
+    """What is stored in half is rounded, and nothing else: the arithmetic is that of the rounded table in float32."""
+    resolutions, points = (16, 64), points_of(300)
+    table = table_of(resolutions, 16)
+    half = table.half()
+    assert not triplane_triton.usable(points, half.clone().requires_grad_(True))
+    assert triplane_triton.usable(points, half) and not triplane_triton.usable(points.half(), half)
+    assert not triplane_triton.usable(points, table.bfloat16())
+    found = lookup(points, half, resolutions)
+    assert found.dtype == torch.float32
+    assert torch.equal(found, lookup(points, half.float(), resolutions))
+    exact = lookup(points, table, resolutions)
+    assert 1e-5 * exact.norm() < (found - exact).norm() <= 5e-4 * exact.norm()
+
+
+def test_plain_means_plain() -> None:
+    points, table = points_of(3), table_of((4,), 8)
+    with backend.plain():
+        assert not triplane_triton.usable(points, table)
+    assert not triplane_triton.usable(points.double(), table) and not triplane_triton.usable(points, table.double())
+
+
+def test_kernels_are_not_for_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    points, table = torch.zeros(3, 3), torch.zeros(rows((4,)), 8)
+    assert not triplane_triton.interpreted() and not triplane_triton.usable(points, table)
+
+
+COMPILE = """
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from fprf.ops import triplane_triton_kernels as kernels
+
+def build(kernel, **constants):
+    names = kernel.arg_names
+    numbers = {"count": "i64", "limit": "fp32"} | dict.fromkeys(constants, "constexpr")
+    kinds = {name: numbers.get(name, "*fp32") for name in names}
+    source = ASTSource(fn=kernel, signature=kinds, constexprs=constants)
+    return triton.compile(source, target=GPUTarget("cuda", 90, 32), options={"num_warps": 4, "enable_fp_fusion": True}).asm
+
+shape = dict(SIZES=(64, 512), CHANNELS=24, LANES=32, BLOCK=64)
+assert "ld.global" in build(kernels.forward, **shape)["ptx"]
+assert "ex2" in build(kernels.density, **shape, KEEP=False)["ptx"]
+ptx = build(kernels.backward, **shape, FEATURE=True, RAW=True)["ptx"]
+assert "atom" in ptx or "red." in ptx
+"""
+
+
+def test_kernels_compile_for_a_gpu() -> None:
+    """To machine code, on any machine: the interpreter takes more than the compiler does."""
+    environment = {"PATH": "/usr/bin:/bin", "HOME": "/tmp", "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
