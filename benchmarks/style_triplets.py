@@ -11,7 +11,7 @@ from torch import Tensor
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.evaluation.contest import PLAIN, STYLIZERS, Exhibit, Row, colour_baselines, judge_exhibit
-from fprf.evaluation.flat import cells_basis, encoded, flat_reference, flat_scene, painted, render_flat
+from fprf.evaluation.flat import cells_basis, encoded, flat_look, flat_reference, flat_scene, painted, render_flat
 from fprf.evaluation.triplets import COLOURS, Triplet, read_triplets, triplet_names
 from fprf.interfaces import Decoder, Encoder
 from fprf.output.images import shrink
@@ -55,11 +55,12 @@ def restyled(triplet: Triplet, tools: Tools, source: str) -> dict[str, Tensor]:
         where, where_there = (encoded(image, tools.semantic, guided, basis) for image in (triplet.content, triplet.style))
     flat = flat_scene(here, where, size, regions=len(COLOURS) if source == "painted" else REGIONS)
     dictionary = build_dictionary(
-        [flat_reference("style", there, where_there)], clusters=len(COLOURS) if source == "painted" else CLUSTERS
+        [flat_reference("style", there, where_there, triplet.style.reshape(-1, 3))],
+        clusters=len(COLOURS) if source == "painted" else CLUSTERS,
     )
     configs = {"decoded": IdentityConfig(), **STYLIZERS} if source == SOURCES[0] else STYLIZERS
     return {
-        name: render_flat(flat, config.build(dictionary=dictionary, scene=flat.style), tools.decoder)
+        name: render_flat(flat, flat_look(flat, dictionary, config, tools.decoder), tools.decoder)
         for name, config in configs.items()
     }
 

@@ -11,6 +11,7 @@ from ..datamanagers.basis import Basis
 from ..errors import ConfigError, UsageError, WeightsError
 from ..interfaces import Encoder
 from ..plugins.stylizers.config import StylizerConfig
+from ..style.colours import colour_maps
 from ..style.config import NO_MASK, StyleConfig
 from ..style.dictionary import Reference, StyleDictionary, build_dictionary
 from ..style.files import StyleFile, check_photographs, read_style
@@ -115,13 +116,18 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
     style, scene = file.style, encoders.scene
     regions = Regions(trained, scene, encoders.basis, file.regions, file.semantic_encoder)
     orders = take_orders(regions, dictionary, style)
-    stylizer = regional(dictionary, scene, orders.allowed, style.stylizer)
+    chosen = style.stylizer
+    stylizer = regional(dictionary, scene, orders.allowed, chosen)
     partly = bool((orders.strength != 1).any())
     device = next(trained.model.parameters()).device
+    stylizer = stylizer.to(device)
+    colours = colour_maps(stylizer, dictionary, scene, trained.model.decoder, features=chosen.features, share=chosen.colours)
     mine = Restyle(
-        stylizer.to(device),
+        stylizer,
         style.strength,
         RegionWeight(scene, orders.strength[:, None]).to(device) if partly else None,
+        chosen.features,
+        None if colours is None else colours.to(device),
         style.luminance,
     )
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from ..errors import DataError
 from ..interfaces import Encoder
-from ..plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
+from ..plugins.stylizers.config import (
+    AdainConfig,
+    LocalAdainConfig,
+    RegionAdainConfig,
+    RegionOtConfig,
+    RegionToneConfig,
+    StylizerConfig,
+)
 from .colour_transfer import histogram_matching, reinhard
 from .structure import luminance_ssim, structure
 from .style_distance import style_distances
@@ -25,8 +32,9 @@ STYLIZERS: Mapping[str, StylizerConfig] = {
     "local-adain": LocalAdainConfig(),
     "region-adain": RegionAdainConfig(),
     "region-ot": RegionOtConfig(),
+    "region-tone": RegionToneConfig(),
 }
-RECOMMENDED = "region-ot"
+RECOMMENDED = "region-tone"
 
 GOALS: Mapping[str, float] = {"adain": 0.30, "local-adain": 0.15}
 """By what share the recommended stylizer shall come nearer to the style than these."""

@@ -12,14 +12,16 @@ from torch import Tensor
 
 from ..datamanagers.basis import Basis, fit_basis
 from ..datamanagers.config import GuidedConfig
-from ..interfaces import Decoder, Encoder, Stylizer
+from ..interfaces import Decoder, Encoder
 from ..ops.guided import upsample
-from ..style.dictionary import Reference
+from ..plugins.stylizers.config import StylizerConfig
+from ..style.colours import colour_maps
+from ..style.dictionary import Reference, StyleDictionary
 from ..style.look import Restyle
 from ..style.scene import SceneStyle, scene_style
 from ..types import Want
 
-__all__ = ["Flat", "cells_basis", "encoded", "flat_reference", "flat_scene", "painted", "render_flat"]
+__all__ = ["Flat", "cells_basis", "encoded", "flat_look", "flat_reference", "flat_scene", "painted", "render_flat"]
 
 _CELL = 8
 """Pixels between guided-filter coefficients."""
@@ -80,17 +82,29 @@ def flat_scene(
 
 
 def flat_reference(
-    name: str, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None, *, samples: int = 20_000
+    name: str,
+    content: Annotated[Tensor, "N C"],
+    semantic: Annotated[Tensor, "N D"] | None,
+    colour: Annotated[Tensor, "N 3"] | None = None,
+    *,
+    samples: int = 20_000,
 ) -> Reference:
-    """A photograph's features as a reference; about `samples` pixels of it, in even steps."""
+    """A photograph's features, and its colours, as a reference; about `samples` pixels of it, in even steps."""
     some = torch.arange(0, len(content), max(1, len(content) // samples))
-    return Reference(name, content[some], content.new_zeros(len(some), 0) if semantic is None else semantic[some])
+    parts = content.new_zeros(len(some), 0) if semantic is None else semantic[some]
+    return Reference(name, content[some], parts, colour=None if colour is None else colour[some])
+
+
+def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder) -> Restyle:
+    """What `fprf stylize` would do to the photograph."""
+    stylizer = config.build(dictionary=dictionary, scene=flat.style)
+    colours = colour_maps(stylizer, dictionary, flat.style, decoder, features=config.features, share=config.colours)
+    return Restyle(stylizer, features=config.features, colours=colours)
 
 
 @torch.no_grad()
-def render_flat(flat: Flat, stylizer: Stylizer, decoder: Decoder, *, strength: float = 1.0) -> Annotated[Tensor, "H W 3"]:
+def render_flat(flat: Flat, look: Restyle, decoder: Decoder) -> Annotated[Tensor, "H W 3"]:
     """The photograph in a new style, in [0, 1]."""
-    look = Restyle(stylizer, strength)
     parts = []
     for start in range(0, len(flat.content), _CHUNK):
         rows = slice(start, start + _CHUNK)

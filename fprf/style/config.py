@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..checks import at_least, between
 from ..errors import ConfigError
-from ..plugins.stylizers.config import RegionOtConfig, StylizerConfig
+from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .wishes import parse_strength, parse_wish
 
 __all__ = ["NO_MASK", "StyleConfig"]
@@ -24,7 +24,7 @@ class StyleConfig:
     """How much each reference counts, in their order, above 0; none = all alike."""
     masks: tuple[Path, ...] = ()
     """A picture for each reference, in their order: only what is white there makes style codes; `none` = all of it."""
-    stylizer: StylizerConfig = RegionOtConfig()
+    stylizer: StylizerConfig = RegionToneConfig()
     """What moves the scene's features."""
     clusters: int = 10
     """Local styles (codes) per reference, at least 1."""

@@ -35,6 +35,7 @@ BLEND = 0.3
 
 _FORMAT = "fprf-style-1"
 _TENSORS = ("keys", "mean", "covariance", "share", "reference", "weight")
+_COLOURS = ("colour_mean", "colour_covariance")
 
 
 class Reference(NamedTuple):
@@ -46,6 +47,8 @@ class Reference(NamedTuple):
     """In the scene's semantic basis; D = 0 where the scene has no semantics."""
     weight: float = 1.0
     """How much it counts beside the others; above 0."""
+    colour: Annotated[Tensor, "N 3"] | None = None
+    """The samples' own colours, sRGB in [0, 1]; None where nobody will ask."""
 
 
 class StyleDictionary(NamedTuple):
@@ -66,6 +69,9 @@ class StyleDictionary(NamedTuple):
     """Names of the references, in dictionary order."""
     blend: float = 0.0
     """Share of the whole reference's statistics that is in each code; `whole_style` takes it out again."""
+    colour_mean: Annotated[Tensor, "T 3"] | None = None
+    """Mean colour of each code's pixels, blended as `mean` is; None where a reference came without colours."""
+    colour_covariance: Annotated[Tensor, "T 3 3"] | None = None
     allowed: Annotated[Tensor, "K references"] | None = None
     """On one scene: which references each of its regions may take from, bool; None = all. See `style.regional`. Not saved."""
 
@@ -90,8 +96,10 @@ def build_dictionary(
     _check(references)
     ordered = sorted(references, key=lambda r: (_content_hash(r), r.name, r.weight))
     parts = [_codes(r, clusters, blend, seed, min_members) for r in ordered]
-    keys, mean, covariances, share = (torch.cat(part) for part in zip(*parts, strict=True))
-    count = torch.tensor([len(p[0]) for p in parts])
+    keys, mean, covariances, share = (torch.cat(part) for part in zip(*(p.fields for p in parts), strict=True))
+    colours = [p.colours for p in parts if p.colours is not None]
+    coloured = len(colours) == len(parts)
+    count = torch.tensor([len(p.fields[0]) for p in parts])
     return StyleDictionary(
         keys=keys,
         mean=mean,
@@ -101,6 +109,8 @@ def build_dictionary(
         weight=torch.tensor([float(r.weight) for r in ordered]).repeat_interleave(count),
         names=tuple(r.name for r in ordered),
         blend=float(blend),
+        colour_mean=torch.cat([mean for mean, _ in colours]) if coloured else None,
+        colour_covariance=torch.cat([spread for _, spread in colours]) if coloured else None,
     )
 
 
@@ -149,6 +159,7 @@ def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> t
     renumbered = references.cumsum(0) - 1
     part = d._replace(
         **{name: getattr(d, name)[codes] for name in ("keys", "mean", "covariance", "share", "weight")},
+        **{name: getattr(d, name)[codes] for name in _COLOURS if getattr(d, name) is not None},
         reference=renumbered[d.reference[codes]],
         names=tuple(name for name, taken in zip(d.names, references.tolist(), strict=True) if taken),
         allowed=None,
@@ -158,7 +169,7 @@ def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> t
 
 def save_dictionary(path: Path, d: StyleDictionary) -> None:
     """Write the dictionary to `path`; a crash leaves the old file or the new one, never a part."""
-    tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in _TENSORS}
+    tensors = {name: getattr(d, name).detach().cpu().contiguous() for name in _stored(d)}
     meta = {"format": _FORMAT, "names": json.dumps(d.names), "blend": repr(d.blend), "sha256": _digest(tensors)}
     write_bytes(path, save(tensors, metadata=meta))
 
@@ -173,7 +184,7 @@ def load_dictionary(path: Path) -> StyleDictionary:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path}: not readable as safetensors ({error}); build the style again") from error
-    if meta.get("format") != _FORMAT or set(tensors) != set(_TENSORS):
+    if meta.get("format") != _FORMAT or set(tensors) not in (set(_TENSORS), {*_TENSORS, *_COLOURS}):
         raise CheckpointError(f"{path}: not a style dictionary of format {_FORMAT}; build the style again")
     if meta.get("sha256") != _digest(tensors):
         raise CheckpointError(f"{path}: checksum does not match, the file is damaged; build the style again")
@@ -187,15 +198,32 @@ def load_dictionary(path: Path) -> StyleDictionary:
     return d
 
 
-def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> tuple[Tensor, ...]:
-    """Keys, means, covariances and shares of one reference."""
+class _Codes(NamedTuple):
+    """Of one reference."""
+
+    fields: tuple[Tensor, Tensor, Tensor, Tensor]
+    """Keys, means, covariances and shares."""
+    colours: tuple[Tensor, Tensor] | None
+    """Means and covariances."""
+
+
+def _stored(d: StyleDictionary) -> tuple[str, ...]:
+    return _TENSORS if d.colour_mean is None else _TENSORS + _COLOURS
+
+
+def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> _Codes:
     label, centres = _cluster(r.semantic, clusters, seed)
     whole = moments(r.content, torch.ones(len(r.content)))
     member = torch.nn.functional.one_hot(label, len(centres)).double()
     mean, covariances, share = group_moments(r.content, member)
-    trust = (share * len(label) / min_members).clamp_max(1.0)
-    mean, covariances = blend_codes(mean, covariances, whole.mean, covariance(whole), 1 - (1 - blend) * trust)
-    return centres.float(), mean.float(), covariances.float(), share.float()
+    at = 1 - (1 - blend) * (share * len(label) / min_members).clamp_max(1.0)
+    mean, covariances = blend_codes(mean, covariances, whole.mean, covariance(whole), at)
+    fields = (centres.float(), mean.float(), covariances.float(), share.float())
+    if r.colour is None:
+        return _Codes(fields, None)
+    overall, (tint, spread, _) = moments(r.colour, torch.ones(len(r.colour))), group_moments(r.colour, member)
+    tint, spread = blend_codes(tint, spread, overall.mean, covariance(overall), at)
+    return _Codes(fields, (tint.float(), spread.float()))
 
 
 def _cluster(semantic: Tensor, clusters: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -228,6 +256,8 @@ def _check(references: Sequence[Reference]) -> None:
                 f"{r.name}: {r.content.shape[1]} content and {r.semantic.shape[1]} semantic channels, but {first.name} "
                 f"has {first.content.shape[1]} and {first.semantic.shape[1]}; encode all with the scene's encoders"
             )
+        if r.colour is not None and tuple(r.colour.shape) != (len(r.content), 3):
+            raise DataError(f"{r.name}: colours of shape {tuple(r.colour.shape)}; expected ({len(r.content)}, 3)")
         if not bool(r.content.isfinite().all() & r.semantic.isfinite().all()):
             raise DataError(f"{r.name}: a feature is not finite; the image or the encoder's weights are damaged")
         if not 0 < r.weight < float("inf"):
@@ -239,10 +269,12 @@ def _check_stored(path: Path, d: StyleDictionary) -> None:
     t = len(d.keys) if d.keys.ndim == 2 else 0
     c = d.mean.shape[-1] if d.mean.ndim == 2 else 0
     shapes = {"mean": (t, c), "covariance": (t, c, c), "share": (t,), "reference": (t,), "weight": (t,)}
+    if d.colour_mean is not None:
+        shapes |= {"colour_mean": (t, 3), "colour_covariance": (t, 3, 3)}
     wrong = [name for name, shape in shapes.items() if tuple(getattr(d, name).shape) != shape]
     if t == 0 or c == 0 or wrong:
         raise CheckpointError(f"{path}: {', '.join(wrong) or 'keys'} of the wrong shape; build the style again")
-    if not all(bool(getattr(d, name).isfinite().all()) for name in _TENSORS):
+    if not all(bool(getattr(d, name).isfinite().all()) for name in _stored(d)):
         raise CheckpointError(f"{path}: a value is not finite; build the style again")
     used = torch.arange(len(d.names))
     if d.reference.dtype != torch.int64 or not torch.equal(torch.unique(d.reference), used):

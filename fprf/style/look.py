@@ -13,6 +13,7 @@ from torch import Tensor
 from ..checks import between
 from ..interfaces import Decoder, Stylizer
 from ..types import Want
+from .colours import ColourMaps
 from .controls import blend_strength, keep_luminance
 from .regional import RegionWeight
 
@@ -30,6 +31,10 @@ class Restyle:
     strength: float = 1.0
     regions: RegionWeight | None = None
     """Strength of each region, times `strength`; None = all 1."""
+    features: float = 1.0
+    """How much of the stylizer's change of features counts at full strength."""
+    colours: ColourMaps | None = None
+    """What is done to colours behind the decoder at full strength; None = nothing."""
     luminance: float = 0.0
     """How much of the scene's own luminance is kept."""
     share: float = 1.0
@@ -54,6 +59,8 @@ class Restyle:
         for part in self.parts:
             if part.share > 0 and part.strength > 0:
                 needs |= part.stylizer.needs
+                if part.colours is not None:
+                    needs |= part.colours.needs
                 if part.regions is not None and part.regions.divided:
                     needs |= Want.SEMANTIC
         return needs
@@ -77,7 +84,10 @@ class Restyle:
     ) -> Annotated[Tensor, "N 3"]:
         """Colours of points in this look, in [0, 1]."""
         styled, strength, luminance = self.applied(content, semantic)
-        colour = decoder.restyled(content, styled, strength)
+        colour: Tensor = decoder.restyled(content, styled, strength)
+        change = [x for part in self.parts if (x := part._recoloured(colour, semantic)) is not None]
+        if change:
+            colour = (colour + torch.stack(change).sum(0)).clamp(0, 1)
         return keep_luminance(colour, decoder(content), luminance) if luminance > 0 else colour
 
     def applied(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Applied:
@@ -107,8 +117,19 @@ class Restyle:
     def _alone(self, content: Tensor, semantic: Tensor | None) -> Applied:
         if self.strength == 0:
             return content, 0.0, self.luminance
-        strength: float | Tensor = self.strength
-        if self.regions is not None:
-            # Without semantics there is one region, and nothing to look up.
-            strength = self.strength * self.regions(content[:, :0] if semantic is None else semantic)
+        strength = self.features * self._strength(content, semantic)
         return blend_strength(content, self.stylizer(content, semantic), strength), strength, self.luminance
+
+    def _strength(self, points: Annotated[Tensor, "N X"], semantic: Tensor | None) -> float | Annotated[Tensor, "N 1"]:
+        if self.regions is None:
+            return self.strength
+        # Without semantics there is one region, and nothing to look up.
+        weight: Tensor = self.regions(points[:, :0] if semantic is None else semantic)
+        return self.strength * weight
+
+    def _recoloured(self, colour: Annotated[Tensor, "N 3"], semantic: Tensor | None) -> Annotated[Tensor, "N 3"] | None:
+        """What this part adds to colours; None where that is nothing."""
+        if self.colours is None or self.share == 0 or self.strength == 0:
+            return None
+        change: Tensor = self.colours(colour, semantic)
+        return self.share * self._strength(colour, semantic) * change

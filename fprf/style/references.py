@@ -68,13 +68,13 @@ def read_reference(
     height, width = image.shape[:2]
     pixel = _grid(height, width) if mask is None else _inside(_mask(mask, path, photo, (width, height)))
     guided, name = GuidedConfig() if guided is None else guided, path.name if name is None else name
-    samples = _sampled(_encode(content, image), image, pixel, guided)
+    samples, colour = _sampled(_encode(content, image), image, pixel, guided), image[pixel[:, 1], pixel[:, 0]]
     if semantic is None or basis is None:
-        return Reference(name, samples, samples.new_zeros(len(samples), 0), weight)
+        return Reference(name, samples, samples.new_zeros(len(samples), 0), weight, colour)
     maps = _encode(semantic, image)
     # Projecting is linear and so is the filter: fewer channels first.
     maps = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
-    return Reference(name, samples, _sampled(maps, image, pixel, guided), weight)
+    return Reference(name, samples, _sampled(maps, image, pixel, guided), weight, colour)
 
 
 def _reduced(photo: Image, longest: int) -> Image:

@@ -10,6 +10,7 @@ from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, RandomConfig
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.style.dictionary import build_dictionary
+from fprf.style.look import Restyle
 from fprf.style.scene import own_style
 
 GUIDED = GuidedConfig()
@@ -56,7 +57,7 @@ def test_features_lie_at_pixels_and_in_the_basis(content: Encoder) -> None:
 def test_a_photographs_own_style_returns_it(scene: Flat, decoder: Decoder, config: StylizerConfig) -> None:
     stylizer = config.build(dictionary=own_style(scene.style), scene=scene.style)
     plain = decoder(scene.content).reshape(40, 56, 3)
-    assert psnr(render_flat(scene, stylizer, decoder), plain) > 40
+    assert psnr(render_flat(scene, Restyle(stylizer), decoder), plain) > 40
     assert psnr(plain, photo(0)) > 15  # such colours are none that the decoder has met
 
 
@@ -66,8 +67,8 @@ def test_strength_zero_is_the_decoded_photograph(scene: Flat, decoder: Decoder, 
     stylizer = AdainConfig().build(dictionary=build_dictionary([other]), scene=bare.style)
     with torch.inference_mode():  # as in rendering: kernels and gradients round differently
         plain = decoder(scene.content).reshape(40, 56, 3)
-    assert render_flat(bare, stylizer, decoder, strength=0.0).equal(plain)
-    assert psnr(render_flat(bare, stylizer, decoder), plain) < 40
+    assert render_flat(bare, Restyle(stylizer, 0.0), decoder).equal(plain)
+    assert psnr(render_flat(bare, Restyle(stylizer), decoder), plain) < 40
 
 
 @pytest.mark.parametrize("config", TWO_SIDED)
@@ -82,7 +83,7 @@ def test_painted_regions_take_the_colours_of_their_like(content: Encoder, decode
     reference = flat_reference("halves", encoded(style, content, GUIDED), there)
     assert len(flat.style.keys) == 2
     stylizer = config.build(dictionary=build_dictionary([reference], blend=0.0), scene=flat.style)
-    found = render_flat(flat, stylizer, decoder)
+    found = render_flat(flat, Restyle(stylizer), decoder)
     for here, right, wrong in ((slice(4, 24), slice(32, 52), slice(4, 24)), (slice(32, 52), slice(4, 24), slice(32, 52))):
         colour = found[:, here].mean((0, 1))
         near, far = ((colour - style[:, part].mean((0, 1))).norm() for part in (right, wrong))

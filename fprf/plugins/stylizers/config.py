@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from ...checks import at_least, positive
+from ...checks import at_least, between, positive
 from ..config import PluginConfig
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ __all__ = [
     "LocalAdainConfig",
     "RegionAdainConfig",
     "RegionOtConfig",
+    "RegionToneConfig",
     "StylizerConfig",
 ]
 
@@ -35,6 +36,15 @@ class StylizerConfig(PluginConfig):
 
     heeds_regions: ClassVar[bool] = False
     """Its stylizers heed `StyleDictionary.allowed` themselves. For others every choice of references gets one of its own."""
+
+    features: float = 1.0
+    """How much of the change of features counts, in [0, 1]."""
+    colours: float = 0.0
+    """How far the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        between("stylizer.features", self.features, 0.0, 1.0)
+        between("stylizer.colours", self.colours, 0.0, 1.0)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The stylizer of these references on this scene."""
@@ -73,6 +83,7 @@ class LocalAdainConfig(StylizerConfig):
     """Score of a match: cosine of centred features, or the paper's dot product."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         positive("stylizer.temperature", self.temperature)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
@@ -96,6 +107,7 @@ class RegionAdainConfig(StylizerConfig):
     """Largest amplification of any channel, at least 1, so that the noise of flat regions stays small."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         positive("stylizer.temperature", self.temperature)
         at_least("stylizer.gain", self.gain, 1.0)
 
@@ -109,7 +121,7 @@ class RegionAdainConfig(StylizerConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class RegionOtConfig(StylizerConfig):
-    """Two-sided optimal transport (recommended): regions match style codes, all channels move together."""
+    """Two-sided optimal transport : regions match style codes, all channels move together."""
 
     heeds_regions: ClassVar[bool] = True
 
@@ -121,6 +133,7 @@ class RegionOtConfig(StylizerConfig):
     """Largest amplification in any direction, at least 1, so that the noise of flat regions stays small."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         positive("stylizer.temperature", self.temperature)
         at_least("stylizer.gain", self.gain, 1.0)
 
@@ -130,3 +143,33 @@ class RegionOtConfig(StylizerConfig):
 
         plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
         return TwoSidedStylizer(plan, scene, MatrixMaps(plan, scene, self.gain))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionToneConfig(StylizerConfig):
+    """Two-sided (recommended): half of AdaIN's change, then each region's colours as a whole to those of its match."""
+
+    heeds_regions: ClassVar[bool] = True
+
+    features: float = 0.5
+    """How much of the change of features (contrast, texture) counts, in [0, 1]."""
+    colours: float = 1.0
+    """How far the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
+    temperature: float = 0.4
+    """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
+    similarity: Literal["cosine", "dot"] = "cosine"
+    """Score of a match: cosine of centred features, or the paper's dot product."""
+    gain: float = 8.0
+    """Largest amplification of any channel, at least 1, so that the noise of flat regions stays small."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive("stylizer.temperature", self.temperature)
+        at_least("stylizer.gain", self.gain, 1.0)
+
+    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        """Two-sided AdaIN towards these references; what `features` and `colours` say is done around it."""
+        from .region import ChannelMaps, TwoSidedStylizer, plan_regions
+
+        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
+        return TwoSidedStylizer(plan, scene, ChannelMaps(plan, scene, self.gain))

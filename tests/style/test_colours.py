@@ -1,0 +1,194 @@
+"""Colours behind the decoder: targets met, nothing moved where nothing is asked, colours stay colours."""
+
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.errors import CheckpointError, DataError
+from fprf.interfaces import Decoder
+from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, RegionToneConfig
+from fprf.style.colours import ColourMaps, colour_maps, decoded_colours
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, load_dictionary, save_dictionary
+from fprf.style.look import Restyle
+from fprf.style.regional import RegionWeight
+from fprf.style.scene import SceneStyle, own_style, scene_style
+from fprf.types import Want
+
+COUNT, KINDS = 600, 3
+
+
+class Straight(Decoder):
+    """Colours are the first three channels: means and covariances carry over as they are."""
+
+    def forward(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
+        return content[:, :3]
+
+    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
+        return self.forward(styled)
+
+    def unaided(self, content: Tensor) -> None:
+        return None
+
+
+def points(seed: int, spread: float = 0.03) -> tuple[Tensor, Tensor, Tensor]:
+    """Content, semantics and kind; colours well inside [0, 1], so that nothing is cut off."""
+    draw = torch.Generator().manual_seed(seed)
+    kind = torch.arange(COUNT) % KINDS
+    middle = 0.35 + 0.3 * torch.rand(KINDS, 6, generator=draw)
+    content = middle[kind] + spread * torch.randn(COUNT, 6, generator=draw) @ torch.rand(6, 6, generator=draw)
+    semantic = 3 * torch.eye(KINDS, 4)[kind] + 0.01 * torch.randn(COUNT, 4, generator=draw)
+    return content, semantic, kind
+
+
+def reference(seed: int, coloured: bool = True) -> Reference:
+    content, semantic, _ = points(seed)
+    return Reference(f"r{seed}", content, semantic, colour=points(seed + 100)[0][:, :3] if coloured else None)
+
+
+def setting(*seeds: int, blend: float = 0.0) -> tuple[Tensor, Tensor, Tensor, SceneStyle, StyleDictionary]:
+    content, semantic, kind = points(0)
+    scene = scene_style(content, semantic, torch.ones(COUNT), None, KINDS, 0)
+    return content, semantic, kind, scene, build_dictionary([reference(s) for s in seeds or (1,)], clusters=KINDS, blend=blend)
+
+
+def carried(maps: ColourMaps | None, colour: Tensor, semantic: Tensor | None) -> Tensor:
+    assert maps is not None
+    found: Tensor = colour + maps(colour, semantic)
+    return found
+
+
+def test_colours_get_mean_and_covariance_of_their_match() -> None:
+    content, semantic, kind, scene, d = setting()
+    sharp = RegionToneConfig(temperature=1e-3, features=0.0).build(dictionary=d, scene=scene)
+    found = carried(colour_maps(sharp, d, scene, Straight(), features=0.0), content[:, :3], semantic)
+    assert d.colour_mean is not None and d.colour_covariance is not None
+    code = sharp.match(semantic).argmax(1)
+    for k in range(KINDS):
+        own, taken = found[kind == k].double(), int(code[kind == k][0])
+        assert torch.allclose(own.mean(0), d.colour_mean[taken].double(), atol=2e-3)
+        # 512 draws know a deviation to 3 %, and _QUIET widens both sides.
+        assert torch.allclose(torch.cov(own.T), d.colour_covariance[taken].double(), atol=0.2 * float(own.var(0).max()))
+
+
+def test_what_has_the_colours_already_is_left_alone() -> None:
+    content, semantic, _, scene, _ = setting()
+    stylizer = RegionToneConfig(temperature=1e-3).build(dictionary=own_style(scene, 0.0), scene=scene)
+    mean, spread = decoded_colours(stylizer, scene, Straight())
+    same = own_style(scene, 0.0)._replace(colour_mean=mean.float(), colour_covariance=spread.float())
+    maps = colour_maps(stylizer, same, scene, Straight())
+    assert float((carried(maps, content[:, :3], semantic) - content[:, :3]).abs().max()) < 2e-3
+
+
+def test_draws_meet_the_mean_of_the_features() -> None:
+    *_, scene, d = setting()
+    stylizer = IdentityConfig().build(dictionary=d, scene=scene)
+    mean, spread = decoded_colours(stylizer, scene, Straight())
+    assert torch.allclose(mean, scene.region_mean[:, :3].double(), atol=1e-6), "drawn in pairs"
+    wanted = scene.region_covariance[:, :3, :3].double()
+    assert float((spread - wanted).norm() / wanted.norm()) < 0.15
+    again = decoded_colours(stylizer, scene, Straight())
+    assert torch.equal(mean, again[0]) and torch.equal(spread, again[1]), "no chance in it"
+
+
+@pytest.mark.parametrize("config", [AdainConfig(), LocalAdainConfig(), RegionToneConfig(), IdentityConfig()])
+def test_any_stylizer_can_be_followed(config: AdainConfig | LocalAdainConfig | RegionToneConfig | IdentityConfig) -> None:
+    content, semantic, _, scene, d = setting(1, 2, blend=0.3)
+    stylizer = config.build(dictionary=d, scene=scene)
+    found = carried(colour_maps(stylizer, d, scene, Straight()), content[:, :3], semantic)
+    assert bool(found.isfinite().all()) and float(found.min()) >= -1e-6 and float(found.max()) <= 1 + 1e-6
+
+
+def test_nothing_asked_nothing_made() -> None:
+    *_, scene, d = setting()
+    stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
+    assert colour_maps(stylizer, d, scene, Straight(), share=0.0) is None
+    bare = build_dictionary([reference(1), reference(2, coloured=False)], clusters=2)
+    assert bare.colour_mean is None and colour_maps(stylizer, bare, scene, Straight()) is None
+    assert colour_maps(stylizer, own_style(scene), scene, Straight()) is None
+
+
+def test_half_the_share_is_half_the_way() -> None:
+    content, semantic, _, scene, d = setting()
+    stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
+    whole, half = (colour_maps(stylizer, d, scene, Straight(), share=s) for s in (1.0, 0.5))
+    assert whole is not None and half is not None
+    assert torch.allclose(half(content[:, :3], semantic), whole(content[:, :3], semantic) / 2, atol=1e-6)
+
+
+def test_one_region_needs_no_semantics() -> None:
+    content, _, _ = points(0)
+    scene = scene_style(content, None, torch.ones(COUNT), None, 1, 0)
+    d = build_dictionary([Reference("r", points(1)[0], torch.zeros(COUNT, 0), colour=points(7)[0][:, :3])])
+    stylizer = IdentityConfig().build(dictionary=d, scene=scene)
+    maps = colour_maps(stylizer, d, scene, Straight())
+    assert maps is not None and maps.needs == Want.CONTENT
+    found = carried(maps, content[:, :3], None)
+    assert torch.allclose(found.mean(0), points(7)[0][:, :3].mean(0), atol=2e-3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.0, 1.0))
+def test_colours_stay_colours_and_kept_regions_stay(seed: int, strength: float) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    content, semantic, _, scene, d = setting()
+    stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
+    wild = ColourMaps(scene, 3 * torch.randn(KINDS, 3, 3, generator=draw), torch.randn(KINDS, 3, generator=draw))
+    weight = RegionWeight(scene, torch.tensor([[0.0], [1.0], [0.5]]))
+    look = Restyle(stylizer, strength, weight, colours=wild)
+    rgb = look.colour(Straight(), content, semantic)
+    assert float(rgb.min()) >= 0 and float(rgb.max()) <= 1
+    kept = weight(semantic)[:, 0] == 0
+    assert bool(kept.any()) and torch.equal(rgb[kept], content[kept, :3]), "what is kept is kept bit for bit"
+
+
+def test_a_look_fades_in() -> None:
+    content, semantic, _, scene, d = setting()
+    stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
+    look = Restyle(stylizer, features=0.5, colours=colour_maps(stylizer, d, scene, Straight(), features=0.5))
+    full = look.colour(Straight(), content, semantic)
+    assert torch.allclose(look.faded.mixed(look, 1.0).colour(Straight(), content, semantic), full, atol=1e-6)
+    assert torch.equal(look.faded.mixed(look, 0.0).colour(Straight(), content, semantic), content[:, :3])
+    assert look.needs == Want.CONTENT | Want.SEMANTIC
+    steps = [look.faded.mixed(look, at).colour(Straight(), content, semantic) for at in (0.25, 0.26)]
+    assert float((steps[1] - steps[0]).abs().max()) < 0.05 * float((full - content[:, :3]).abs().max())
+
+
+def test_dictionaries_know_the_colours_of_their_pixels(tmp_path: Path) -> None:
+    d = build_dictionary([reference(1)], clusters=KINDS, blend=0.0)
+    r, kind = reference(1), points(1)[2]
+    assert r.colour is not None and d.colour_mean is not None and d.colour_covariance is not None
+    wanted = torch.stack([r.colour[kind == k].mean(0) for k in range(KINDS)])
+    apart = (d.colour_mean[:, None] - wanted[None]).norm(dim=-1).amin(1)
+    assert float(apart.max()) < 1e-5, "each code has the mean of one kind"
+    save_dictionary(tmp_path / "d.safetensors", d)
+    loaded = load_dictionary(tmp_path / "d.safetensors")
+    assert loaded.colour_mean is not None and torch.equal(loaded.colour_mean, d.colour_mean)
+    both = build_dictionary([reference(1), reference(2)], clusters=KINDS)
+    part, codes = choose(both, torch.tensor([True, False]))
+    assert part.colour_covariance is not None and part.colour_covariance.shape == (int(codes.sum()), 3, 3)
+    flipped = build_dictionary([reference(2), reference(1)], clusters=KINDS)
+    assert both.colour_mean is not None and flipped.colour_mean is not None
+    assert torch.equal(both.colour_mean, flipped.colour_mean), "the order of files plays no part"
+
+
+def test_blend_draws_colours_together_as_it_does_features() -> None:
+    r = reference(1)
+    assert r.colour is not None
+    d = build_dictionary([r], clusters=KINDS, blend=1.0)
+    assert d.colour_mean is not None
+    assert torch.allclose(d.colour_mean, r.colour.mean(0).expand(KINDS, 3), atol=1e-6)
+
+
+def test_mistakes(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"colours of shape \(5, 3\)"):
+        build_dictionary([reference(1)._replace(colour=torch.zeros(5, 3))])
+    d = build_dictionary([reference(1)], clusters=2)
+    assert d.colour_mean is not None
+    save_dictionary(tmp_path / "d.safetensors", d._replace(colour_mean=d.colour_mean[:, :2]))
+    with pytest.raises(CheckpointError, match="colour_mean"):
+        load_dictionary(tmp_path / "d.safetensors")
