@@ -12,7 +12,6 @@ thread computed what.
 from collections.abc import Iterable, Mapping
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 __all__ = ["CLEAR_EVERY", "PATIENCE", "clear_denormals", "unfit_gradients", "unfit_terms"]
@@ -55,4 +54,4 @@ def clear_denormals(optimizer: torch.optim.Optimizer) -> None:
         first, second = state.get("exp_avg"), state.get("exp_avg_sq")
         if first is not None and second is not None:
             torch.hardshrink(first, FAINT_FIRST, out=first)
-            F.threshold_(second, FAINT_SECOND, 0.0)
+            torch.threshold_(second, FAINT_SECOND, 0.0)
