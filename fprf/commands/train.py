@@ -49,9 +49,13 @@ def default_output(config: "TrainConfig", method: str) -> Path:
 
 
 def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> Path:
-    """Train to the end and return the run folder. An existing run there is resumed if its config fits."""
+    """Train to the end and return the run folder. An existing run there is resumed if its config fits.
+
+    Raises DataError where another process is training there.
+    """
     from ..engine import prepare, style_pass, trainer
     from ..engine.lay_out import plan_scene
+    from ..engine.lock import held
     from ..engine.run import Run
     from ..style.scene import to_tensors
     from .progress import Display
@@ -60,7 +64,7 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
     output = config.output or default_output(config, method)
     config = replace(config, output=output)
     folder = Run(output)
-    with Display(quiet=quiet) as display:
+    with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         _check_same(folder, config)
         if config.blocks.cuts:

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import CheckpointError
-from ..output.atomic import write_json
+from ..errors import CheckpointError, DataError
+from ..output.atomic import remove_unfinished, write_json
 from . import tensorfiles
 from .model import Model
 
-__all__ = ["Saved", "load_latest", "reached", "restore", "save", "steps"]
+__all__ = ["Saved", "load_latest", "reached", "restore", "save", "steps", "tidy"]
 
 KEEP = 2
 """Checkpoints that stay on disk."""
@@ -49,18 +49,35 @@ def steps(root: Path) -> list[int]:
 
 
 def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
-    """Write the checkpoint of a step, then drop all but the newest two."""
+    """Write the checkpoint of a step, then drop all but the newest two; later ones are of a past that was gone back from.
+
+    Raises DataError where the system refuses; what was there before is then there still.
+    """
     folder = _folder(root, step)
-    folder.mkdir(parents=True, exist_ok=True)
-    files = {
-        "model": tensorfiles.save(folder / "model.safetensors", model.state_dict()),
-        "optimizer": tensorfiles.save(folder / "optimizer.safetensors", _moments(optimizer)),
-    }
-    write_json(folder / "manifest.json", {"format": 1, "step": step, "seconds": seconds, "files": files})
-    for old in steps(root)[:-KEEP]:
+    try:
+        files = {
+            "model": tensorfiles.save(folder / "model.safetensors", model.state_dict()),
+            "optimizer": tensorfiles.save(folder / "optimizer.safetensors", _moments(optimizer)),
+        }
+        write_json(folder / "manifest.json", {"format": 1, "step": step, "seconds": seconds, "files": files})
+    except DataError:
+        tidy(root)
+        raise
+    found = steps(root)
+    for old in [s for s in found if s <= step][:-KEEP] + [s for s in found if s > step]:
         (_folder(root, old) / "manifest.json").unlink()
         shutil.rmtree(_folder(root, old))
     return folder
+
+
+def tidy(root: Path) -> None:
+    """Remove what was cut short: folders without a manifest, unfinished files. Only where nobody else writes."""
+    complete = {_folder(root, step) for step in steps(root)}
+    for folder in root.glob("step-*"):
+        if folder in complete:
+            remove_unfinished(folder)
+        elif folder.name.removeprefix("step-").isdecimal() and not (folder / "manifest.json").exists():
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def load(root: Path, step: int) -> Saved:

@@ -13,23 +13,23 @@ It can be moved and shared: it holds no absolute path that matters and needs nei
 
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from ..config import TrainConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
-from ..output.atomic import atomic_path, write_json
+from ..output.atomic import write_json
 from ..plugins.codec import load_config, save_config
 from ..rendering.cameras import Cameras
 from ..rendering.space import Space
+from . import tensorfiles
 from .model import Facts
 
 __all__ = ["Known", "Run", "view_names"]
@@ -125,24 +125,22 @@ class Run:
             raise CheckpointError(f"{path}: cannot be read ({e!r}); train the scene again") from e
 
     def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
-        """Write NAME.safetensors."""
-        with atomic_path(self.root / f"{name}.safetensors") as temporary:
-            save_file({k: v.contiguous() for k, v in tensors.items()}, temporary)
+        """Write NAME.safetensors, with a checksum for each tensor."""
+        tensorfiles.save_sealed(self.root / f"{name}.safetensors", tensors)
 
     def load_tensors(self, name: str) -> dict[str, Tensor]:
-        """Read NAME.safetensors. Raises CheckpointError where training did not get that far."""
+        """Read NAME.safetensors. Raises CheckpointError where training did not get that far, or the file is damaged."""
         path = self.root / f"{name}.safetensors"
         if not path.is_file():
             raise CheckpointError(f"{path}: not written yet; finish training with `fprf train {self.root}/config.json`")
-        try:
-            return load_file(path)
-        except (OSError, SafetensorError) as e:
-            raise CheckpointError(f"{path}: cannot be read ({e}); train again") from e
+        return tensorfiles.load_sealed(path)
 
     def log(self, event: dict[str, Any]) -> None:
-        """Append one line to events.jsonl."""
-        with (self.root / "events.jsonl").open("a") as f:
-            f.write(json.dumps(event, allow_nan=False) + "\n")
+        """Append one line to events.jsonl; a line that a killed process left unfinished is ended first."""
+        with (self.root / "events.jsonl").open("a+b") as f:
+            f.seek(max(0, f.seek(0, os.SEEK_END) - 1))
+            torn = f.read(1) not in (b"", b"\n")
+            f.write(b"\n" * torn + json.dumps(event, allow_nan=False).encode() + b"\n")
 
 
 def view_names(paths: Sequence[Path]) -> list[str]:

@@ -79,6 +79,7 @@ def train(
     device = device_of(config.device)
     model = (build_model(config, prepared.facts) if model is None else model).to(device)
     optimizer = optimizer_of(config, model)
+    checkpoint.tidy(run.checkpoints)
     saved, damaged = checkpoint.load_latest(run.checkpoints)
     for line in damaged:
         run.log({"damaged": line})

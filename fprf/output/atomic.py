@@ -1,15 +1,41 @@
 """Files that are whole or absent: written beside their final name, flushed to disk, then renamed over it."""
 
+import errno
 import json
 import os
+import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import DataError, NumericsError
 
-__all__ = ["atomic_path", "write_bytes", "write_json", "write_text"]
+__all__ = ["atomic_path", "remove_unfinished", "unwritable", "write_bytes", "write_json", "write_text"]
+
+_HOPELESS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+_UNFINISHED = re.compile(r"\..{1,40}\.[0-9a-f]{8}(\.\w+)?|\.tmp\w{6}")
+"""Hidden names of `atomic_path`, and of safetensors beside them."""
+
+
+def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataError:
+    """What to say where the system refuses to write at `path`; `needed` are the bytes of the file, where they are known."""
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    try:
+        folder = next(p for p in (path.absolute(), *path.absolute().parents) if p.is_dir())
+        free = f", {shutil.disk_usage(folder).free >> 10} KiB are free there"
+    except (OSError, StopIteration):
+        free = ""
+    wants = "" if needed is None else f", {-(-needed // 1024)} KiB are needed"
+    return DataError(f"{path}: cannot be written ({reason}{wants}{free}); make room, or choose a folder that can be written to")
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Delete what killed processes left directly in a folder. Only where nobody else writes."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if _UNFINISHED.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def _flush(path: Path, mode: int) -> None:
@@ -25,7 +51,8 @@ def atomic_path(final: Path) -> Iterator[Path]:
     """A hidden name beside `final` to write to; it becomes `final` when the block ends, and is removed if it fails.
 
     Keeps the ending of the name, which encoders choose their format by. Creates the folder. A reader sees the old file
-    or the new one, whenever the process dies. Raises DataError where `final` is a folder or its folder is a file.
+    or the new one, whenever the process dies. Raises DataError where `final` is a folder, its folder is a file, or the
+    system refuses: a full disk, a folder without permission.
     """
     if final.is_dir():
         raise DataError(f"{final}: a folder is in the place of a file to be written; remove it or choose another name")
@@ -33,14 +60,18 @@ def atomic_path(final: Path) -> Iterator[Path]:
         final.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise DataError(f"{final}: {error.filename} is a file, not a folder; choose another output") from error
+    except OSError as error:
+        raise unwritable(final, error) from error
     # The stem is cut so that a name of the longest length allowed (255 bytes) still has a temporary one.
     temporary = final.with_name(f".{final.stem[:40]}.{secrets.token_hex(4)}{final.suffix}")
     try:
         yield temporary
         _flush(temporary, os.O_RDWR)
         os.replace(temporary, final)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno in _HOPELESS:
+            raise unwritable(final, error) from error
         raise
     if os.name == "posix":  # elsewhere a folder cannot be opened; the rename is then as durable as the system makes it
         _flush(final.parent, os.O_RDONLY)

@@ -56,6 +56,28 @@ def test_two_are_kept(world: World, tmp_path: Path) -> None:
     assert checkpoint.steps(tmp_path) == [10, 11]
 
 
+def test_a_past_that_was_gone_back_from_is_dropped(world: World, root: Path) -> None:
+    """Else a damaged newest one would keep its place, and only one intact would be left."""
+    model, optimizer = fresh(world)
+    checkpoint.save(root, model, optimizer, step=7, seconds=0.0)
+    assert checkpoint.steps(root) == [5, 7]
+
+
+def test_tidying_removes_what_was_cut_short_and_nothing_else(root: Path) -> None:
+    whole = {p: p.read_bytes() for p in root.rglob("*") if p.is_file()}
+    cut = root / "step-0000020"
+    shutil.copytree(root / "step-0000009", cut)
+    (cut / "manifest.json").unlink()
+    for name in (".model.0123abcd.safetensors", ".tmpAb12Cd"):
+        (root / "step-0000009" / name).write_bytes(b"cut")
+    mine = root / "step-by-step" / "notes.txt"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    checkpoint.tidy(root)
+    assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == whole | {mine: b"mine"} and not cut.exists()
+    checkpoint.tidy(root / "absent")
+
+
 def test_none_is_no_mistake(tmp_path: Path) -> None:
     assert checkpoint.load_latest(tmp_path / "absent") == (None, [])
     assert checkpoint.steps(tmp_path) == []

@@ -109,6 +109,17 @@ def test_events_are_strict_json_lines(world: World, run: Run) -> None:
         run.log({"loss": float("nan")})
 
 
+def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    run.log({"step": 1})
+    with (tmp_path / "events.jsonl").open("a") as file:
+        file.write('{"step": 2, "los')
+    run.log({"step": 3})
+    run.log({"step": 4})
+    lines = (tmp_path / "events.jsonl").read_text().splitlines()
+    assert [json.loads(lines[i])["step"] for i in (0, 2, 3)] == [1, 3, 4] and len(lines) == 4
+
+
 def test_names_are_stems_where_those_differ() -> None:
     assert view_names([Path("a/0001.png"), Path("a/0002.jpg")]) == ["0001", "0002"]
     assert view_names([Path("s/left/1.png"), Path("s/right/1.png")]) == ["left-1", "right-1"]

@@ -4,6 +4,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from safetensors.torch import save_file
 
 from fprf.engine import tensorfiles
 from fprf.errors import CheckpointError
@@ -106,3 +107,49 @@ def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="memory format"):
         tensorfiles.save(tmp_path / "x", {"t": torch.zeros(2).to_sparse()})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sealed_file_comes_back_and_carries_its_own_checksums(tmp_path: Path) -> None:
+    made = tensors() | {"none": torch.zeros(0, 3)}
+    tensorfiles.save_sealed(tmp_path / "x", made)
+    found = tensorfiles.load_sealed(tmp_path / "x")
+    assert found.keys() == made.keys() and all(torch.equal(found[name], made[name]) for name in made)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
+    torch.manual_seed(1)
+    path, made = tmp_path / "x.safetensors", tensors()
+    tensorfiles.save_sealed(path, made)
+    raw = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, len(raw) - 1))
+    raw[at] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(raw)
+    try:
+        found = tensorfiles.load_sealed(path)
+    except CheckpointError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+    else:
+        assert all(torch.equal(found[name], made[name]) and found[name].dtype == made[name].dtype for name in made)
+
+
+def test_a_sealed_file_that_was_not_finite_is_refused(tmp_path: Path) -> None:
+    tensorfiles.save_sealed(tmp_path / "x", {"t": torch.tensor([1.0, float("inf")])})
+    with pytest.raises(CheckpointError, match="tensor t was not finite"):
+        tensorfiles.load_sealed(tmp_path / "x")
+
+
+@pytest.mark.parametrize("seal", ["", "3", "{", '{"a.weight": 3}', '{"a.weight": {}}', "[" * 9999, "{}"])
+def test_a_seal_of_nonsense_is_damage(tmp_path: Path, seal: str) -> None:
+    save_file(tensors(), tmp_path / "x", {"manifest": seal})
+    with pytest.raises(CheckpointError, match="x: "):
+        tensorfiles.load_sealed(tmp_path / "x")
+
+
+def test_files_of_before_there_were_seals_are_read(tmp_path: Path) -> None:
+    save_file(tensors(), tmp_path / "x")
+    assert tensorfiles.load_sealed(tmp_path / "x").keys() == tensors().keys()
+    save_file(tensors(), tmp_path / "y", {"format": "pt"})
+    with pytest.raises(CheckpointError, match="its checksums cannot be read"):
+        tensorfiles.load_sealed(tmp_path / "y")

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, NumericsError
-from fprf.output.atomic import atomic_path, write_bytes, write_json, write_text
+from fprf.output.atomic import atomic_path, remove_unfinished, write_bytes, write_json, write_text
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -49,10 +49,23 @@ def test_a_failing_flush_or_rename_leaves_the_old_file(tmp_path: Path, monkeypat
     for name in ("fsync", "replace"):
         with monkeypatch.context() as patch:
             patch.setattr(os, name, full)
-            with pytest.raises(OSError, match="No space"):
+            with pytest.raises(DataError, match=r"m\.json: cannot be written \(No space left on device, \d+ KiB are free"):
                 write_text(final, "new")
         assert final.read_text() == "old"
         assert list(tmp_path.iterdir()) == [final]
+
+
+def test_unfinished_files_and_no_others_are_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "folder.0badf00d"
+    for name in (".model.0123abcd.safetensors", ".tmpA1b2C3", ".events.89abcdef"):
+        (tmp_path / name).touch()
+    kept = {".lock", ".hidden", "model.safetensors", ".tmp", ".model.safetensors", "model.0123abcd.json", folder.name}
+    for name in kept - {folder.name}:
+        (tmp_path / name).touch()
+    folder.mkdir()
+    remove_unfinished(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == kept
+    remove_unfinished(tmp_path / "absent")
 
 
 def test_data_is_on_disk_before_the_name_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
