@@ -37,7 +37,8 @@ ABOUT = {
     "adain": "one mean and deviation for the whole scene",
     "local-adain": "the paper: every point mixes the local styles that its semantics resemble",
     "region-adain": "scene regions match local styles, channel by channel",
-    "region-ot": "scene regions match local styles, all channels at once; the default",
+    "region-ot": "scene regions match local styles, all channels at once",
+    "region-tone": "half of region-adain's features, then each region's colours carried over; the default",
 }
 
 
