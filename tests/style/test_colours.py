@@ -192,3 +192,18 @@ def test_mistakes(tmp_path: Path) -> None:
     save_dictionary(tmp_path / "d.safetensors", d._replace(colour_mean=d.colour_mean[:, :2]))
     with pytest.raises(CheckpointError, match="colour_mean"):
         load_dictionary(tmp_path / "d.safetensors")
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 50])
+@pytest.mark.parametrize("clusters", [1, 10])
+def test_a_reference_of_one_colour_gives_that_colour(pixels: int, clusters: int) -> None:
+    content, semantic, _, scene, _ = setting()
+    flat = torch.full((pixels, 1), 0.7)
+    one = Reference("one", flat.expand(-1, 6), flat.expand(-1, 4), colour=flat * torch.tensor([1.0, 0.5, 0.0]))
+    d = build_dictionary([one], clusters=clusters)
+    stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
+    found = carried(colour_maps(stylizer, d, scene, Straight(), features=0.0), content[:, :3], semantic)
+    assert bool(found.isfinite().all())
+    assert torch.allclose(found.mean(0), torch.tensor([0.7, 0.35, 0.0]), atol=0.02)
+    # What is left of the spread is that of _QUIET.
+    assert float(found.std(0).max()) < 0.03
