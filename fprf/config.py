@@ -133,6 +133,8 @@ class RenderConfig:
         positive("render.resolution", self.resolution)
         between("render.resolution", self.resolution, 0.0, 1.0)
         at_least("render.chunk", self.chunk, 1)
+        for part in self.background or ():
+            between("render.background", part, 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)

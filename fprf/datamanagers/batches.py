@@ -40,7 +40,7 @@ class RayBatches(DataManager):
     """Pixels drawn uniformly, with replacement, from all pixels of the training views.
 
     Images are held as uint8, one after the other; feature coefficients stay in memory-mapped files under `cache`. Transparent
-    scenes are composited on white. `progress(done, total, what)` is told how far features are.
+    pixels show the background, white by default. `progress(done, total, what)` is told how far features are.
     """
 
     def __init__(
@@ -56,10 +56,11 @@ class RayBatches(DataManager):
         progress: Progress | None = None,
         basis: Basis | None = None,
         seen: Callable[[int], Annotated[Tensor, "H W"]] | None = None,
+        background: tuple[float, float, float] | None = None,
     ) -> None:
         if not len(scene.train):
             raise DataError(f"{scene.name}: no training views; at least one image must not be held out")
-        self.background = WHITE if scene.alpha else None
+        self.background = background or (WHITE if scene.alpha else None)
         """Colour (RGB in [0, 1]) behind transparent pixels; None for opaque scenes."""
         self._config, self._scene, self._seed = config, scene, seed
         self._views = scene.train.tolist()

@@ -61,12 +61,14 @@ class DataManagerConfig(PluginConfig):
         progress: Callable[[int, int, str], None] | None = None,
         basis: Basis | None = None,
         seen: Callable[[int], Tensor] | None = None,
+        background: tuple[float, float, float] | None = None,
     ) -> DataManager:
         """The data manager; features are computed into `cache` unless they lie there already. `dim` is the number of
         principal semantic components that the field learns; `progress(done, total, what)` is told of the features.
 
         For a block of a larger scene, `basis` is the whole scene's, instead of one of these views; `seen(view)` says which
-        pixels [H W] of a training view batches are drawn from, instead of all."""
+        pixels [H W] of a training view batches are drawn from, instead of all. `background` is what transparent pixels show,
+        RGB in [0, 1]; white by default."""
         raise NotImplementedError
 
     def batch_rays(self) -> int:
@@ -99,6 +101,7 @@ class RayBatchesConfig(DataManagerConfig):
         progress: Callable[[int, int, str], None] | None = None,
         basis: Basis | None = None,
         seen: Callable[[int], Tensor] | None = None,
+        background: tuple[float, float, float] | None = None,
     ) -> DataManager:
         """The data manager."""
         from .batches import RayBatches
@@ -114,6 +117,7 @@ class RayBatchesConfig(DataManagerConfig):
             progress=progress,
             basis=basis,
             seen=seen,
+            background=background,
         )
 
     def batch_rays(self) -> int:

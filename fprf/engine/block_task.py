@@ -114,6 +114,7 @@ def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: 
         seed=config.seed,
         basis=Basis.from_tensors(run.load_tensors("basis")) if facts.dim else None,
         seen=seen,
+        background=facts.background,
     )
 
 

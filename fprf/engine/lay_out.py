@@ -19,7 +19,6 @@ from ..blocks.charts import chart_of, surroundings_of
 from ..blocks.plan import Plan, boxes_from, boxes_to, make_plan
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
-from ..datamanagers.batches import WHITE
 from ..datamanagers.features import extract
 from ..datamanagers.images import load_image
 from ..datamanagers.parsers.recognise import parse_scene
@@ -32,7 +31,7 @@ from . import tensorfiles
 from .blocks import SURROUNDINGS, folder_of
 from .decoder import build_decoder
 from .model import Facts
-from .prepare import cache_folder, facts_of
+from .prepare import behind, cache_folder, facts_of
 from .renumber import renumber, trained_tasks
 from .run import Run
 
@@ -66,7 +65,7 @@ def lay_out(config: TrainConfig, scene: Scene, plan: Plan, progress: Callable[[i
     content = config.content.encoder.build()
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     semantic = config.semantic.encoder.build() if config.semantic.encoder is not None else None
-    background, cache, views = WHITE if scene.alpha else None, cache_folder() / "features", scene.train.tolist()
+    background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
 
     def image(view: int) -> Tensor:
         width, height = scene.cameras.size[view].tolist()

@@ -9,6 +9,7 @@ import torch
 
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
+from ..datamanagers.batches import WHITE
 from ..datamanagers.features import FeatureStore
 from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
@@ -19,7 +20,7 @@ from ..rendering.space import Space
 from .decoder import build_decoder
 from .model import Facts
 
-__all__ = ["Prepared", "cache_folder", "device_of", "facts_of", "prepare"]
+__all__ = ["Prepared", "behind", "cache_folder", "device_of", "facts_of", "prepare"]
 
 
 class Prepared(NamedTuple):
@@ -63,6 +64,7 @@ def prepare(config: TrainConfig, progress: Callable[[int, int, str], None] | Non
         cache=cache_folder() / "features",
         seed=config.seed,
         progress=progress,
+        background=behind(config, scene),
     )
     semantic_store = manager.semantic_store
     facts = facts_of(config, scene, find_space(scene), content, semantic, manager.content_store, semantic_store)
@@ -87,5 +89,10 @@ def facts_of(
         semantic_encoder=semantic.identity if semantic is not None else "",
         content_scale=content_store.scale if content_store is not None else 1.0,
         semantic_scale=semantic_store.scale if semantic_store is not None else 1.0,
-        background=config.render.background or ((1.0, 1.0, 1.0) if scene.alpha else None),
+        background=behind(config, scene),
     )
+
+
+def behind(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | None:
+    """Colour behind everything: images and renders show the same. None where nothing is assumed."""
+    return config.render.background or (WHITE if scene.alpha else None)

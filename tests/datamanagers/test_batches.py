@@ -144,6 +144,21 @@ def test_transparency_shows_white(tmp_path: Path) -> None:
         assert (manager.image(view) - expected).abs().max() <= 0.51 / 255
 
 
+@pytest.mark.parametrize("channels", [3, 4])
+def test_transparency_shows_the_background_that_is_given(tmp_path: Path, channels: int) -> None:
+    scene, images = make_scene(tmp_path, channels=channels)
+    given = (0.2, 0.0, 1.0)
+    config = RayBatchesConfig(rays=64)
+    manager = config.build(scene=scene, content=None, semantic=None, dim=4, cache=tmp_path, seed=0, background=given)
+    batch = manager.batch(0)
+    for view in range(len(SIZES)):
+        alpha = images[view][..., 3:] / 255 if channels == 4 else np.ones((*images[view].shape[:2], 1))
+        expected = torch.from_numpy(images[view][..., :3] / 255 * alpha + np.array(given) * (1 - alpha)).float()
+        assert (manager.image(view) - expected).abs().max() <= 0.51 / 255
+        for pixel, rgb in zip(batch.pixel[batch.view == view].long(), batch.rgb[batch.view == view], strict=True):
+            assert (rgb - expected[pixel[1], pixel[0]]).abs().max() <= 0.51 / 255
+
+
 def test_features_are_made_for_training_views_only(tmp_path: Path) -> None:
     scene, _ = make_scene(tmp_path)
     told: list[int] = []

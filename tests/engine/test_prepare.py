@@ -5,8 +5,9 @@ import pytest
 import torch
 from tiny_world import World
 
+from fprf.datamanagers.batches import RayBatches
 from fprf.engine.prepare import cache_folder, device_of, prepare
-from fprf.errors import DataError, PluginError
+from fprf.errors import ConfigError, DataError, PluginError
 
 
 def test_what_is_found_out(world: World) -> None:
@@ -66,3 +67,13 @@ def test_the_cache_follows_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_
     for unset in ("", None):
         monkeypatch.setenv("XDG_CACHE_HOME", "") if unset == "" else monkeypatch.delenv("XDG_CACHE_HOME")
         assert cache_folder() == Path.home() / ".cache" / "fprf"
+
+
+def test_images_and_renders_show_the_same_background(world: World) -> None:
+    given = (0.5, 0.25, 0.0)
+    found = prepare(replace(world.config, render=replace(world.config.render, background=given)))
+    assert found.facts.background == given
+    assert isinstance(found.manager, RayBatches) and found.manager.background == given
+    for wrong in (1.5, -0.1, float("nan")):
+        with pytest.raises(ConfigError, match=r"render\.background"):
+            replace(world.config.render, background=(0.0, wrong, 0.0))
