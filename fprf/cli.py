@@ -35,6 +35,7 @@ VERBS = {
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
+    "view": Verb("RUN", "look at a scene in the browser; drop a photograph on it to restyle it"),
     "bench": Verb("speed|profile|pareto|... [RUN]", "time and error, where time goes, memory, scaling"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
     "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),

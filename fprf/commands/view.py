@@ -1,0 +1,67 @@
+"""`fprf view RUN`: the scene in the browser; drop a photograph on it and it is restyled."""
+
+import importlib.util
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..checks import at_least, between
+from ..engine.quality import QualityConfig, at_quality
+from ..errors import UsageError
+from .parsing import parse
+
+if TYPE_CHECKING:
+    from ..engine.loading import Trained
+
+__all__ = ["ViewConfig", "run"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig(QualityConfig):
+    """What to look at, and who may."""
+
+    run: Path = Path()
+    """Run folder."""
+    references: tuple[Path, ...] = ()
+    """Photographs to begin with: on the shelf, and all in the mix."""
+    host: str = "127.0.0.1"
+    """Address to listen on; any but this machine's own needs a token."""
+    port: int = 8080
+    """Port to listen on; 0 = any that is free."""
+    token: str | None = None
+    """What the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
+    pixels: int = 640
+    """Longest side of the sharpest picture."""
+    max_memory: float | None = None
+    """MiB that blocks of a large scene may take; none = no limit."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("port", self.port, 0)
+        between("port", float(self.port), 0.0, 65535.0)
+        at_least("pixels", self.pixels, 64)
+
+
+def run(args: list[str]) -> int:
+    """Serve until interrupted."""
+    config = parse(ViewConfig(), args, prog="fprf view", description="Look at a run in the browser.", positional=("run",))
+    if importlib.util.find_spec("viser") is None:
+        raise UsageError("fprf view: needs viser; install it with pip install 'fprf[viewer]'")
+    from ..viewer.access import make_access
+    from ..viewer.host import Host
+
+    access = make_access(config.host, config.token)
+    with Host(access, config.port) as host:
+        print(host.address, flush=True)
+        host.open(lambda: _load(config), config.references, config.pixels)
+        threading.Event().wait()
+    return 0
+
+
+def _load(config: ViewConfig) -> "Trained":
+    from ..engine.loading import load_run
+
+    return at_quality(load_run(config.run, config.device, config.max_memory), config)

@@ -1,0 +1,170 @@
+// Over viser's canvas: photographs are dropped, weighed and removed here, a wipe is dragged, a region is told what to take.
+"use strict";
+(() => {
+  const make = (tag, props = {}, ...inside) => {
+    const node = Object.assign(document.createElement(tag), props);
+    node.append(...inside);
+    return node;
+  };
+  const ask = async (path, body, raw = false) => {
+    const answer = await fetch(path, { method: "POST", body: raw ? body : JSON.stringify(body) });
+    if (!answer.ok) throw new Error((await answer.text()).trim() || answer.statusText);
+    return answer.json();
+  };
+  const told = make("div", { id: "fprf-said", className: "fprf" });
+  told.setAttribute("role", "status");
+  const say = (text, bad = false, seconds = 5) => {
+    const line = make("div", { textContent: text, className: bad ? "bad" : "" });
+    told.append(line);
+    while (told.children.length > 4) told.firstChild.remove();
+    if (seconds) setTimeout(() => line.remove(), 1000 * seconds);
+    return line;
+  };
+  const tell = (path, body) => ask(path, body).catch((error) => say(error.message, true));
+
+  // Photographs
+  const veil = make("div", { id: "fprf-drop", className: "fprf" },
+    make("div", {}, "Drop a photograph", make("small", { textContent: "the scene takes its style" })));
+  const send = async (file) => {
+    const line = say(`${file.name} …`, false, 0);
+    try {
+      await ask(`/fprf/photograph?name=${encodeURIComponent(file.name)}`, file, true);
+    } catch (error) {
+      say(error.message, true, 8);
+    }
+    line.remove();
+  };
+  const sendAll = async (files) => {
+    for (const file of [...files].slice(0, 12)) await send(file);
+  };
+  const carries = (event) => [...(event.dataTransfer?.types ?? [])].includes("Files");
+  let depth = 0;
+  const on = (name, act) => window.addEventListener(name, (event) => {
+    if (!carries(event)) return;
+    event.preventDefault();
+    event.stopPropagation();
+    act(event);
+  }, true);
+  on("dragenter", () => { depth += 1; veil.classList.add("on"); });
+  on("dragover", (event) => { event.dataTransfer.dropEffect = "copy"; });
+  on("dragleave", () => { depth = Math.max(0, depth - 1); veil.classList.toggle("on", depth > 0); });
+  on("drop", (event) => { depth = 0; veil.classList.remove("on"); sendAll(event.dataTransfer.files); });
+  window.addEventListener("paste", (event) => {
+    const files = [...(event.clipboardData?.files ?? [])].filter((file) => file.type.startsWith("image/"));
+    if (files.length) sendAll(files);
+  });
+  const picker = make("input", { type: "file", accept: "image/*", multiple: true, hidden: true, id: "fprf-files" });
+  picker.onchange = () => { sendAll(picker.files).then(() => { picker.value = ""; }); };
+
+  // The shelf
+  const shelf = make("div", { id: "fprf-shelf", className: "fprf" });
+  const add = make("button", { id: "fprf-add", title: "Choose photographs, or drop them anywhere", onclick: () => picker.click() },
+    make("b", { textContent: "+" }), "photograph");
+  const cards = new Map();
+  const card = (row) => {
+    const picture = make("img", { src: `/fprf/card?card=${row.card}`, alt: row.name, draggable: false,
+      title: `${row.name}\nclick: this one alone; shift-click: in or out of the mix` });
+    const weight = make("input", { type: "range", min: 0, max: 2, step: 0.05, title: "weight in the mix" });
+    weight.setAttribute("aria-label", `weight of ${row.name}`);
+    const node = make("div", { className: "fprf-card" }, picture, make("span", { textContent: row.name }), weight,
+      make("button", { textContent: "×", title: "remove", onclick: () => tell("/fprf/shelf", { card: row.card, action: "remove" }) }));
+    picture.onclick = (event) => tell("/fprf/shelf", event.shiftKey
+      ? { card: row.card, action: "weight", weight: node.classList.contains("on") ? 0 : 1 }
+      : { card: row.card, action: "alone" });
+    weight.oninput = () => {
+      node.moved = Date.now();
+      steady(`weight ${row.card}`, () => ask("/fprf/shelf", { card: row.card, action: "weight", weight: +weight.value }));
+    };
+    return Object.assign(node, { weight });
+  };
+  const fillShelf = (rows) => {
+    const now = new Set(rows.map((row) => row.card));
+    for (const [number, node] of cards) if (!now.has(number)) { node.remove(); cards.delete(number); }
+    for (const row of rows) {
+      if (!cards.has(row.card)) { cards.set(row.card, card(row)); shelf.insertBefore(cards.get(row.card), add); }
+      const node = cards.get(row.card);
+      node.classList.toggle("on", row.weight > 0);
+      if (Date.now() - (node.moved ?? 0) > 800) node.weight.value = row.weight;
+    }
+  };
+
+  // One request at a time for what is dragged: the newest value follows the one before.
+  const underway = new Map();
+  const steady = async (name, act) => {
+    if (underway.has(name)) { underway.set(name, act); return; }
+    for (let next = act; next; next = underway.get(name)) {
+      underway.set(name, null);
+      try { await next(); } catch (error) { say(error.message, true); }
+    }
+    underway.delete(name);
+  };
+
+  // The wipe
+  const wipe = make("div", { id: "fprf-wipe", className: "fprf" }, make("em", { textContent: "captured" }),
+    make("i", { textContent: "⇔" }), make("em", { textContent: "restyled" }));
+  let held = false;
+  const place = (at) => { wipe.style.left = `${100 * at}vw`; };
+  wipe.onpointerdown = (event) => { held = true; wipe.setPointerCapture(event.pointerId); event.preventDefault(); };
+  wipe.onpointerup = () => { held = false; };
+  wipe.onpointermove = (event) => {
+    if (!held) return;
+    const at = Math.min(1, Math.max(0, event.clientX / window.innerWidth));
+    place(at);
+    steady("wipe", () => ask("/fprf/wipe", { at }));
+  };
+
+  // A region
+  const region = make("div", { id: "fprf-region", className: "fprf" });
+  const fillRegion = (picked, rows) => {
+    region.classList.toggle("on", picked !== null);
+    if (!picked) return;
+    const kept = picked.orders.some((order) => order.verb === "keep");
+    const set = (verb, number) => picked.orders.some((order) => order.verb === verb && order.card === number);
+    const button = (text, verb, number, chosen) => make("button", { textContent: text, className: chosen ? "set" : "",
+      onclick: () => tell("/fprf/region", { verb: chosen ? "free" : verb, card: number }) });
+    const share = new Map(picked.taken.map((row) => [row.name, row.share]));
+    const lines = rows.map((row) => make("div", { className: "row" },
+      make("img", { src: `/fprf/card?card=${row.card}`, alt: "" }),
+      make("span", { textContent: share.has(row.name) ? `${Math.round(100 * share.get(row.name))} %  ${row.name}` : row.name, title: row.name }),
+      button("only", "pin", row.card, set("pin", row.card)), button("never", "forbid", row.card, set("forbid", row.card))));
+    region.replaceChildren(
+      make("button", { className: "close", textContent: "×", title: "close", onclick: () => tell("/fprf/region", { verb: "close" }) }),
+      make("h2", { textContent: `Region ${picked.region}` }),
+      make("p", { textContent: `${(100 * picked.share).toFixed(1)} % of the scene${kept ? ", kept as it is" : rows.length ? "; it takes from" : ""}` }),
+      ...lines,
+      make("div", { className: "all" }, button("keep as it is", "keep", null, kept),
+        make("button", { textContent: "free", onclick: () => tell("/fprf/region", { verb: "free" }) })));
+  };
+
+  // What has changed
+  let version = -1;
+  let film = false;
+  const follow = async () => {
+    for (;;) {
+      try {
+        const answer = await fetch(`/fprf/state?after=${version}`);
+        if (!answer.ok) throw new Error(await answer.text());
+        const state = await answer.json();
+        state.said.forEach((text) => say(text, /error|cannot|must|none|not /.test(text)));
+        version = state.version;
+        fillShelf(state.shelf);
+        fillRegion(state.picked, state.shelf);
+        wipe.classList.toggle("on", state.wipe !== null);
+        if (state.wipe !== null && !held) place(state.wipe);
+        if (state.film.ready && !film && version > 0) {
+          const line = say("", false, 60);
+          line.append(make("a", { href: "/fprf/film", textContent: "download the film", style: "color:#9cc4ff" }));
+        }
+        film = state.film.ready;
+      } catch (error) {
+        await new Promise((done) => setTimeout(done, 1500));
+      }
+    }
+  };
+  const begin = () => {
+    shelf.append(add);
+    document.body.append(veil, shelf, wipe, region, told, picker);
+    follow();
+  };
+  if (document.body) begin(); else window.addEventListener("DOMContentLoaded", begin);
+})();

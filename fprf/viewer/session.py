@@ -1,0 +1,229 @@
+"""The scene that is viewed: its state, its clients' cameras, and everything that changes either. Knows no page.
+
+Calls come from any thread. What touches the model happens on the desk; `Face` is told what became of it.
+"""
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+from queue import Queue
+
+from ..engine.loading import Trained
+from ..errors import FprfError, UsageError
+from ..output.images import Picture
+from ..output.video import write_video
+from .desk import Desk
+from .eyes import Frame, Glance, Sight
+from .film import FilmPlan, frames_of_film, lay_film, new_folder
+from .intake import Intake, shown_name
+from .looks import Card
+from .stage import Eye, Stage, stage_of
+from .state import Film, State, dropped
+from .studio import Studio
+
+__all__ = ["Face", "Session"]
+
+
+class Face(ABC):
+    """What a session talks to: the page. Called from several threads; a call that fails harms nothing."""
+
+    @abstractmethod
+    def show(self, client: Hashable, frame: Frame) -> None:
+        """A picture for a client."""
+
+    @abstractmethod
+    def changed(self, before: State, now: State) -> None:
+        """The state is another one."""
+
+    @abstractmethod
+    def say(self, text: str, client: Hashable | None = None) -> None:
+        """Something to read, for one client or for all."""
+
+
+class Session:
+    """Use as a context manager, which ends its threads and processes."""
+
+    def __init__(self, trained: Trained, state: State) -> None:
+        self.trained = trained
+        self.stage: Stage = stage_of(trained.known.cameras)
+        self.studio = Studio(trained)
+        self.intake = Intake()
+        self.state = state
+        self._face: Face | None = None
+        self._eyes: dict[Hashable, Eye] = {}
+        self._lock = threading.RLock()
+        self._sight = Sight(trained, self.studio, self.stage, self._show)
+        self._desk: Desk[Glance] = Desk(self._sight.look, self._fault)
+
+    def __enter__(self) -> "Session":
+        self._desk.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End everything; a film that is being made is left unfinished."""
+        self._desk.close()
+        self.intake.close()
+
+    def meet(self, face: Face) -> None:
+        """From now on this is who is told."""
+        self._face = face
+
+    def warm(self) -> None:
+        """Make ready what the first photograph needs."""
+        self.intake.warm()
+        self._desk.do("warm", self._open)
+
+    def _open(self) -> None:
+        self.studio.encoders  # noqa: B018  they are opened by asking for them
+
+    def see(self, client: Hashable, eye: Eye) -> None:
+        """A client's camera is here now."""
+        with self._lock:
+            self._eyes[client] = eye
+            self._desk.ask(client, Glance(eye, self.state.shown, self.state.pixels))
+
+    def leave(self, client: Hashable) -> None:
+        """A client has gone."""
+        with self._lock:
+            self._eyes.pop(client, None)
+        self._desk.leave(client)
+        self._desk.do(("forget", client), lambda: self._sight.forget(client))
+
+    def change(self, to: Callable[[State], State], client: Hashable | None = None) -> bool:
+        """Replace the state; all clients see it. What cannot be is said to the client, and nothing changes."""
+        try:
+            with self._lock:
+                before, self.state = self.state, to(self.state)
+                now = self.state
+                if (before.shown, before.pixels) != (now.shown, now.pixels):
+                    for each, eye in self._eyes.items():
+                        self._desk.ask(each, Glance(eye, now.shown, now.pixels))
+        except FprfError as error:
+            self._say(str(error), client)
+            return False
+        if now.picked is not None and now.look != before.look:
+            self.choose(now.picked.region, client)  # what it takes is another thing now
+        if now != before and self._face is not None:
+            self._face.changed(before, now)
+        return True
+
+    def drop(self, data: bytes, name: str) -> Card:
+        """A photograph: decoded, encoded, and the scene's style from now on. Raises DataError for what is none."""
+        return self.add(self.intake.take(data), shown_name(name))
+
+    def add(self, path: Path, name: str) -> Card:
+        """The same for a file of this machine."""
+        done: Future[Card] = Future()
+
+        def encode() -> None:
+            try:
+                card = self.studio.card(path, _free(name, self.state))
+                self.change(lambda state: dropped(state, card))
+                done.set_result(card)
+            except Exception as error:
+                done.set_exception(error)
+
+        self._desk.do(("add", path), encode)
+        return done.result()
+
+    def pick(self, client: Hashable, place: tuple[float, float]) -> None:
+        """A click at shares of a client's width and height: the region there is picked; of nothing, none is."""
+
+        def find() -> None:
+            eye = self._eyes.get(client)
+            if eye is None:
+                return
+            side = 1000
+            cameras = self.stage.cameras([eye], (round(side * eye.aspect), side))
+            width, height = cameras.size[0].tolist()
+            region = self.studio.region_at(cameras, (place[0] * width, place[1] * height))
+            self._choose(region)
+
+        self._desk.do(("pick", client), self._told(find, client))
+
+    def choose(self, region: int | None, client: Hashable | None = None) -> None:
+        """Pick a region by number, or none."""
+        self._desk.do("choose", self._told(lambda: self._choose(region), client))
+
+    def film(self, plan: FilmPlan, client: Hashable | None = None) -> None:
+        """Make a film in the run's folder, while nobody waits for a picture; one at a time."""
+        with self._lock:
+            if self.state.film.busy:
+                self._say("film: one is being made; wait for it", client)
+                return
+            self.change(lambda state: replace(state, film=Film(0, 1)))
+        threading.Thread(target=self._make, args=(plan, client), name="fprf-film", daemon=True).start()
+
+    def _make(self, plan: FilmPlan, client: Hashable | None) -> None:
+        try:
+            folder = new_folder(self.trained.run.root)
+            lay_film(folder, self.stage, plan, self.trained.known.facts.semantic_encoder)
+            frames: Queue[Picture | None] = Queue(2)
+            failed: list[Exception] = []
+            self._desk.spare(_watched(frames_of_film(folder, self.trained, frames, self._progress), failed))
+            write_video(folder / "film.mp4", iter(frames.get, None), plan.fps)
+            if failed:
+                raise failed[0]
+        except (FprfError, OSError) as error:
+            self.change(lambda state: replace(state, film=Film()))
+            self._say(f"film: {error}", client)
+            return
+        self.change(lambda state: replace(state, film=replace(state.film, path=folder / "film.mp4")))
+        self._say(f"film: {folder / 'film.mp4'}")
+
+    def _progress(self, done: int, total: int) -> None:
+        self.change(lambda state: replace(state, film=Film(done, total)))
+
+    def _choose(self, region: int | None) -> None:
+        count = self.studio.regions
+        if region is not None and not 0 <= region < count:
+            raise UsageError(f"region {region}: regions go from 0 to {count - 1}")
+        picked = None if region is None else self.studio.picked(self.state.look, region)
+        self.change(lambda state: replace(state, picked=picked))
+
+    def _told(self, call: Callable[[], None], client: Hashable | None) -> Callable[[], None]:
+        """The call, with what goes wrong told to the client."""
+
+        def told() -> None:
+            try:
+                call()
+            except FprfError as error:
+                self._say(str(error), client)
+
+        return told
+
+    def _show(self, client: Hashable, frame: Frame) -> None:
+        if self._face is not None:
+            self._face.show(client, frame)
+
+    def _say(self, text: str, client: Hashable | None = None) -> None:
+        if self._face is not None:
+            self._face.say(text, client)
+
+    def _fault(self, client: Hashable | None, error: Exception) -> None:
+        known = isinstance(error, FprfError)
+        self._say(str(error) if known else f"this should not have happened: {type(error).__name__}: {error}", client)
+
+
+def _watched(frames: Iterator[None], failed: list[Exception]) -> Iterator[None]:
+    """The work, remembering what went wrong for who waits for its end."""
+    try:
+        yield from frames
+    except Exception as error:
+        failed.append(error)
+        raise
+
+
+def _free(name: str, state: State) -> str:
+    """The name, or one like it that no photograph on the shelf has."""
+    taken, count, found = {card.name for card in state.shelf}, 1, name
+    while found in taken:
+        count += 1
+        found = f"{name} ({count})"
+    return found
