@@ -4,7 +4,7 @@ import struct
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Lens", "read_lens"]
+__all__ = ["Lens", "lens_of", "read_lens"]
 
 _HEAD = 1 << 17
 """EXIF lies within the first 64 KiB of a JPEG."""
@@ -27,9 +27,16 @@ def read_lens(path: Path) -> Lens:
     """The lens of a photograph; an empty one where its file says nothing, or nothing that can be understood."""
     try:
         with path.open("rb") as file:
-            data = file.read(_HEAD)
+            return lens_of(file.read(_HEAD))
+    except OSError:
+        return Lens()
+
+
+def lens_of(data: bytes) -> Lens:
+    """The lens of a photograph by the first bytes of its file."""
+    try:
         return _lens(_tiff(data))
-    except (OSError, struct.error, IndexError, ValueError):
+    except (struct.error, IndexError, ValueError):
         return Lens()
 
 

@@ -53,10 +53,16 @@ def gather(source: Path, place: Place, state: State, config: SfmConfig, progress
 
 def in_order(names: Iterable[str]) -> list[str]:
     """Names as people number them: 2 before 10."""
-    return sorted(names, key=lambda name: [(int(part) if part.isdecimal() else -1, part) for part in _PARTS.findall(name)])
+    return sorted(names, key=lambda name: [_rank(part) for part in _PARTS.findall(name)])
 
 
 _PARTS = re.compile(r"[0-9]+|[^0-9]+")
+
+
+def _rank(part: str) -> tuple[bool, int, str]:
+    """Numbers by their value, before words."""
+    number = "0" <= part[0] <= "9"
+    return not number, int(part) if number else 0, part
 
 
 def _from_folder(source: Path, place: Place, state: State, progress: Progress) -> dict[str, dict[str, Any]]:

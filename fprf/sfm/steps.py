@@ -3,6 +3,7 @@
 Features and matches go into a database as they are found: a step that was cut off goes on where it stood.
 """
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import DataError, UsageError
 from ..output.atomic import write_json, write_text
@@ -58,8 +59,7 @@ def find_features(place: Place, state: State, config: SfmConfig, progress: Progr
         "features": config.features,
         "side": config.side,
     }
-    total = len(state.images)
-    _run(place, state, config, job, lambda: progress(min(total, counts(place.database)[0]), total, "finding features"))
+    _run(place, state, config, job, _Watch(lambda: counts(place.database)[0], len(state.images), "finding features", progress))
     state.done["features"] = key
     state.save(place)
 
@@ -83,14 +83,8 @@ def find_matches(place: Place, state: State, config: SfmConfig, progress: Progre
         chosen = pairs.merged(near, _alike(place, names, config))
     listed = place.work / "pairs.txt"
     write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
-    total = len(chosen)
-    _run(
-        place,
-        state,
-        config,
-        {"step": "matches", "pairs": str(listed)},
-        lambda: progress(min(total, counts(place.database)[1]), total, "matching"),
-    )
+    job = {"step": "matches", "pairs": str(listed)}
+    _run(place, state, config, job, _Watch(lambda: counts(place.database)[1], len(chosen), "matching", progress))
     state.done["matches"] = key
     state.save(place)
     return kind
@@ -103,14 +97,8 @@ def find_poses(place: Place, state: State, config: SfmConfig, progress: Progress
     if state.done.get("mapping") == key and (place.model / "images.bin").is_file() and described.is_file():
         return list(json.loads(described.read_text(encoding="utf-8")))
     shutil.rmtree(described.parent, ignore_errors=True)
-    total = len(state.images)
-    _run(
-        place,
-        state,
-        config,
-        {"step": "mapping", "models": str(described.parent)},
-        lambda: progress(min(total, _registered(place)), total, "finding poses"),
-    )
+    job = {"step": "mapping", "models": str(described.parent)}
+    _run(place, state, config, job, _Watch(lambda: _registered(place), len(state.images), "finding poses", progress))
     fresh = place.root / "sparse" / ".fresh"
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.copytree(described.parent / "best", fresh)
@@ -131,7 +119,16 @@ def _alike(place: Place, names: Sequence[str], config: SfmConfig) -> list[pairs.
     return pairs.similar(vectors(read, len(names), vocabulary), config.neighbours)
 
 
-def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], look: Callable[[], None]) -> None:
+class _Watch(NamedTuple):
+    """How a step is seen from outside."""
+
+    count: Callable[[], int]
+    total: int
+    what: str
+    progress: Progress
+
+
+def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], watch: _Watch) -> None:
     """One step in its process. Raises UsageError where pycolmap is absent, DataError where COLMAP fails."""
     name, start = job["step"], time.perf_counter()
     path = place.work / f"{name}.job.json"
@@ -147,13 +144,13 @@ def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], loo
         process = subprocess.Popen([*_COMMAND, str(path)], stdout=out, stderr=log, stdin=subprocess.DEVNULL)
         try:
             while process.poll() is None:
-                look()
-                time.sleep(_POLL)
+                watch.progress(max(0, min(watch.total - 1, watch.count())), watch.total, watch.what)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_POLL)
         finally:
             if process.poll() is None:
                 process.terminate()
                 process.wait()
-    look()
     code = process.returncode
     if code == ABSENT:
         raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'fprf[sfm]'")
@@ -164,6 +161,7 @@ def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], loo
         )
     if code:
         raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {_last(place.log)}; {place.log} has the rest")
+    watch.progress(watch.total, watch.total, watch.what)
     state.seconds[name] = round(time.perf_counter() - start, 2)
 
 
