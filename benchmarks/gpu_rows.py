@@ -18,7 +18,7 @@ from fprf.benchmarking.report import Row, document, rows_table
 from fprf.output.atomic import write_json
 
 FRAME = 1008 * 756
-STYLES = ("stylised, region-ot", "stylised, local-adain")
+STYLES = ("stylised, region-tone", "stylised, region-ot", "stylised, local-adain")
 
 
 def rows(work: Path) -> list[Row]:

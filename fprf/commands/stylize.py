@@ -100,6 +100,7 @@ def run(args: list[str]) -> int:
 
 def _make(trained: "Trained", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
     """Pictures and match maps of the views; what was matched and how long it took."""
+    from ..engine.folding import Folded, folded
     from ..engine.matches import match_map, match_pictures, summarize, write_pixels
     from ..engine.views import render_view
     from ..output.images import to_uint8, write_image
@@ -108,12 +109,13 @@ def _make(trained: "Trained", output: Path, styled: "Styled", views: list[int], 
     maps = ("match", "score", "entropy") if config.match_only else ("match",) if config.matches else ()
     made: dict[str, Any] = {}
     rendering, matching, summaries = 0.0, 0.0, {}
+    drawn = folded(trained.model, styled, config.stylizer) or Folded(trained.model, styled.restyle)
     with Display() as display:
         for i, view in enumerate(views):
             display.count(i, len(views), "restyling" if shown else "matching")
             start, name = time.perf_counter(), known.names[view]
             if shown:
-                picture = render_view(trained.model, known.facts, known.cameras, view, render, styled.restyle)
+                picture = render_view(drawn.model, known.facts, known.cameras, view, render, drawn.look)
                 rendering += time.perf_counter() - start
                 write_image(output / f"{name}.png", to_uint8(picture.rgb))
             if maps or config.pixels:

@@ -23,9 +23,10 @@ def bench(world: World, name: str, output: Path, *more: str) -> dict[str, object
 
 
 def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = bench(world, "speed", tmp_path / "speed.json", "--points", "500")
+    document = bench(world, "speed", tmp_path / "speed.json", "--points", "500", "--clusters", "4")
     rows = {row["name"]: row for row in document["rows"]}
-    compared = {"train", "render", "stylised, region-ot", "stylised, local-adain"}
+    styles = ("region-tone", "region-ot", "local-adain")
+    compared = {"train", "render", *(f"stylised, {name}" for name in styles)}
     assert rows.keys() > compared
     for name in compared:
         row = rows[name]
@@ -35,6 +36,11 @@ def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert all(rows[name]["error"] <= budget + 1e-5 for name in compared - {"train"})
     assert rows["render"]["peer_error"] < 1e-4, "the naive path is exact up to float32"
     assert 0 <= rows["train"]["error"] < 1
+    for name in styles:
+        cached = rows[f"cached view restyled, {name}"]
+        assert cached["error"] == 0 and cached["figure"] > 0 and "goal" not in cached, "goals are for views of full size"
+    folded = rows["semantics and matching, dictionary folded into the field"]
+    assert folded["error"] < 1e-5 and folded["peer_error"] < 1e-5 and folded["ratio"] > 0
     lookup = next(row for name, row in rows.items() if "grid_sample" in name)
     assert lookup["error"] < 1e-5 and lookup["peer_error"] < 1e-5
     assert 0 < document["counters"]["kept_samples_share"] <= 1
