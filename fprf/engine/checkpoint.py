@@ -7,6 +7,7 @@ A folder without a valid manifest was cut short and does not count. The two newe
 import json
 import math
 import shutil
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,7 +60,8 @@ def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: in
             "model": tensorfiles.save(folder / "model.safetensors", model.state_dict()),
             "optimizer": tensorfiles.save(folder / "optimizer.safetensors", _moments(optimizer)),
         }
-        write_json(folder / "manifest.json", {"format": 1, "step": step, "seconds": seconds, "files": files})
+        manifest = {"format": 1, "step": step, "seconds": seconds, "files": files}
+        write_json(folder / "manifest.json", manifest | {"crc32": _checksum(manifest)})
     except DataError:
         tidy(root)
         raise
@@ -84,10 +86,10 @@ def load(root: Path, step: int) -> Saved:
     """One checkpoint, verified. Raises CheckpointError."""
     folder = _folder(root, step)
     try:
-        manifest: dict[str, Any] = json.loads((folder / "manifest.json").read_text())
+        manifest = _read(folder / "manifest.json")
         at, seconds = int(manifest["step"]), float(manifest["seconds"])
         entries = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as e:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as e:
         raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
     if at != step or not math.isfinite(seconds):
         raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
@@ -102,9 +104,21 @@ def reached(root: Path) -> tuple[int, float]:
         return 0, 0.0
     manifest = _folder(root, found[-1]) / "manifest.json"
     try:
-        return found[-1], float(json.loads(manifest.read_text())["seconds"])
-    except (OSError, ValueError, KeyError, TypeError) as e:
+        return found[-1], float(_read(manifest)["seconds"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:
         raise CheckpointError(f"{manifest}: cannot be read ({e!r})") from e
+
+
+def _checksum(manifest: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(manifest, sort_keys=True).encode())
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A manifest, checked; those of before had no checksum of their own. Raises ValueError among others."""
+    manifest: dict[str, Any] = json.loads(path.read_text())
+    if manifest.pop("crc32", None) not in (None, _checksum(manifest)):
+        raise ValueError("its checksum differs")
+    return manifest
 
 
 def load_latest(root: Path) -> tuple[Saved | None, list[str]]:
