@@ -9,6 +9,7 @@ from rich.console import Console
 
 from ..benchmarking.config import BenchConfig, MemoryConfig, ParetoConfig, ProfileConfig, ScalingConfig, SpeedConfig
 from ..errors import UsageError
+from . import evidence
 from .parsing import load_method, parse
 from .progress import Display
 from .train import train_scene
@@ -35,8 +36,10 @@ def run(args: list[str]) -> int:
     if name in ("", "-h", "--help"):
         print(_usage())
         return 0 if name else 2
+    if name in evidence.NAMES:
+        return evidence.run(name, rest)
     if name not in NAMES:
-        raise UsageError(f"fprf bench {name}: no such benchmark; allowed are {', '.join(NAMES)}")
+        raise UsageError(f"fprf bench {name}: no such benchmark; allowed are {', '.join([*NAMES, *evidence.NAMES])}")
     if rest and not rest[0].startswith("-"):  # tyro has no positional argument that may be absent
         rest = ["--run", *rest]
     default = NAMES[name]
@@ -70,8 +73,10 @@ def _about(config: BenchConfig) -> str:
 
 
 def _usage() -> str:
-    width = max(map(len, NAMES))
-    lines = [f"usage: fprf bench {'|'.join(NAMES)} [RUN] [--output JSON] [any field]", ""]
-    lines += [f"  {name:<{width}}  {_about(config)}" for name, config in NAMES.items()]
+    every = {name: _about(config) for name, config in NAMES.items()}
+    every |= {name: evidence.about(config) for name, config in evidence.NAMES.items()}
+    width = max(map(len, every))
+    lines = [f"usage: fprf bench {'|'.join(every)} [RUN] [--output JSON] [any field]", ""]
+    lines += [f"  {name:<{width}}  {text}" for name, text in every.items()]
     lines += ["", "`fprf bench NAME --help` lists every field; without RUN a scene is trained first, --data DIR by --method."]
     return "\n".join(lines)

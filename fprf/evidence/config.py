@@ -1,0 +1,59 @@
+"""Knobs of `fprf bench restyle`, `peer` and `paper`. Imports no torch."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..checks import at_least, between, positive
+from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
+
+__all__ = ["EvidenceConfig", "RestyleConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvidenceConfig:
+    """What every report shares."""
+
+    output: Path | None = None
+    """JSON file for the figures; none = only the table."""
+    page: Path | None = None
+    """Markdown file for them; none = none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestyleConfig(EvidenceConfig):
+    """Restyling judged by the truth: a town in the light of other towns, against itself in that very light."""
+
+    run: Path | None = None
+    """Run folder, trained on the embedded town; none = fprf-lite is trained on it first, in a folder that is thrown away."""
+    minutes: float = 2.0
+    """How long it is trained, where no run is given."""
+    palettes: tuple[str, ...] = ("autumn", "winter", "sunset", "night")
+    """Lights that are asked for."""
+    seeds: tuple[int, ...] = (7, 11, 13)
+    """Three other towns, which the references show."""
+    views: int = 4
+    """Held-out views that are judged."""
+    frames: int = 8
+    """Frames of the path on which consistency is measured; at least 8, so that there is a pair 7 apart."""
+    longest: int = 120
+    """Longer side in pixels of views and frames."""
+    stylizer: StylizerConfig = RegionToneConfig()
+    """The method that is to be recommended."""
+    clusters: int = 10
+    """Style codes per reference, for all methods."""
+    blend: float = 0.3
+    """Share of the overall style in each local one, for all methods, in [0, 1]."""
+    sheet: Path | None = None
+    """Picture of all methods side by side, .png or .jpg; none = none."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        positive("minutes", self.minutes)
+        at_least("views", self.views, 1)
+        at_least("frames", self.frames, 8)
+        at_least("longest", self.longest, 16)
+        at_least("clusters", self.clusters, 1)
+        between("blend", self.blend, 0.0, 1.0)
+        at_least("palettes", len(self.palettes), 1)
+        at_least("seeds", len(self.seeds), 3)
