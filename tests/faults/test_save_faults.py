@@ -1,0 +1,271 @@
+"""Faults 2, 3, 4, 6 and 7: a save that dies anywhere, a full disk, a folder that cannot be written to, files gone bad."""
+
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+from forked import DEAD, Deadly, forked
+from tiny_world import World
+
+from fprf import cli
+from fprf.engine import checkpoint
+from fprf.engine.lock import held
+from fprf.engine.model import Model, build_model
+from fprf.engine.run import Run
+from fprf.errors import CheckpointError, DataError
+
+Trainer = tuple[Model, torch.optim.Optimizer]
+
+
+@pytest.fixture
+def trainer(world: World) -> Trainer:
+    """A model after one step of Adam on made-up gradients."""
+    model = build_model(world.config, world.prepared.facts)
+    optimizer = torch.optim.Adam(model.learned(), lr=1e-3, fused=True)
+    for parameter in model.learned():
+        parameter.grad = torch.randn_like(parameter)
+    optimizer.step()
+    return model, optimizer
+
+
+@pytest.fixture
+def root(trainer: Trainer, tmp_path: Path) -> Path:
+    """Checkpoints of steps 5 and 9, a number of the model telling which."""
+    model, optimizer = trainer
+    for step in (5, 9):
+        mark(model, step)
+        checkpoint.save(tmp_path / "c", model, optimizer, step=step, seconds=step / 2)
+    return tmp_path / "c"
+
+
+def mark(model: Model, step: int) -> None:
+    with torch.no_grad():
+        model.learned()[0].view(-1)[0] = step
+
+
+def marked(root: Path, model: Model) -> tuple[int, float]:
+    saved, damaged = checkpoint.load_latest(root)
+    assert saved is not None and not damaged
+    checkpoint.restore(saved, model, None)
+    return saved.step, float(model.learned()[0].detach().view(-1)[0])
+
+
+def test_a_save_that_dies_at_any_call_leaves_the_old_or_the_new(root: Path, trainer: Trainer, monkeypatch) -> None:
+    """Every call to the system that Python makes for it, in turn; what was left is tidied and the next save works."""
+    model, optimizer = trainer
+    seen = []
+    for at in range(500):
+        mark(model, 12)
+
+        def save(at: int = at) -> None:
+            deadly = Deadly(at)
+            for name in Deadly.NAMES:
+                monkeypatch.setattr(os, name, deadly.around(getattr(os, name)))
+            checkpoint.save(root, model, optimizer, step=12, seconds=6.0)
+
+        code = forked(save)
+        found = marked(root, model)
+        assert found in ((9, 9.0), (12, 12.0)), (at, found)
+        checkpoint.tidy(root)
+        assert marked(root, model) == found and 1 <= len(checkpoint.steps(root)) <= 3
+        assert {p.name for p in root.iterdir()} == {f"step-{step:07d}" for step in checkpoint.steps(root)}
+        assert not list(root.rglob(".*"))
+        seen.append(found[0])
+        if code == 0:
+            break
+        assert code == DEAD
+        shutil.rmtree(root)
+        for step in (5, 9):
+            mark(model, step)
+            checkpoint.save(root, model, optimizer, step=step, seconds=step / 2)
+    assert code == 0 and checkpoint.steps(root) == [9, 12]
+    assert seen == sorted(seen) and seen.count(9) > 8 and seen.count(12) > 2, "kills before and after the manifest"
+
+
+def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(root: Path, trainer: Trainer, tmp_path: Path) -> None:
+    """As on a full disk, by a limit to the size of files: safetensors' own writes fail."""
+    model, optimizer = trainer
+
+    def save() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+        try:
+            checkpoint.save(root, model, optimizer, step=12, seconds=6.0)
+        except DataError as error:
+            os.write(handle, str(error).encode())
+
+    told = tmp_path / "told"
+    handle = os.open(told, os.O_WRONLY | os.O_CREAT)
+    assert forked(save) == 0
+    os.close(handle)
+    line = told.read_text()
+    assert "model.safetensors: cannot be written (" in line and "KiB are needed, " in line and "\n" not in line
+    assert checkpoint.steps(root) == [5, 9] and marked(root, model) == (9, 9.0)
+    assert sorted(p.name for p in root.iterdir()) == ["step-0000005", "step-0000009"]
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fprf.engine.prepare.prepare", None)
+    place = Path("/proc/fprf-run")
+    if not place.parent.is_dir():
+        pytest.skip("no folder that refuses everybody")
+    with pytest.raises(DataError, match="cannot be written"), held(place):
+        pass
+
+
+def test_two_trainers_in_one_folder(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Fault 5."""
+    shutil.copytree(world.run, tmp_path / "run")
+    before = {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file()}
+    with held(tmp_path / "run"):
+        assert cli.main(["train", str(tmp_path / "run" / "config.json"), "--steps", "17"]) == 2
+    error = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("{")]
+    assert len(error) == 1 and f"process {os.getpid()} on " in error[0] and "is training here" in error[0]
+    assert {p: p.read_bytes() for p in (tmp_path / "run").rglob("*") if p.is_file()} == before
+    assert cli.main(["train", str(tmp_path / "run" / "config.json"), "--steps", "17"]) == 0
+
+
+def flips(root: Path, count: int, seed: int) -> tuple[int, int, list[str]]:
+    """Single flipped bits anywhere in the newest checkpoint: how many were found, how many changed nothing, and the rest."""
+    draw = random.Random(seed)
+    folder = root / f"step-{checkpoint.steps(root)[-1]:07d}"
+    whole = checkpoint.load(root, checkpoint.steps(root)[-1])
+    numbers = {f"{k}.{n}": t.clone() for k, part in (("m", whole.model), ("o", whole.optimizer)) for n, t in part.items()}
+    files = sorted(folder.iterdir())
+    sizes = [path.stat().st_size for path in files]
+    found, harmless, missed = 0, 0, []
+    for _ in range(count):
+        path = draw.choices(files, sizes)[0]
+        raw = bytearray(path.read_bytes())
+        at, bit = draw.randrange(len(raw)), draw.randrange(8)
+        raw[at] ^= 1 << bit
+        spoilt = root.parent / "spoilt"
+        shutil.copytree(folder, spoilt / folder.name)
+        (spoilt / folder.name / path.name).write_bytes(raw)
+        try:
+            saved = checkpoint.load(spoilt, whole.step)
+        except CheckpointError:
+            found += 1
+        else:
+            now = {f"{k}.{n}": t for k, part in (("m", saved.model), ("o", saved.optimizer)) for n, t in part.items()}
+            same = saved[:2] == whole[:2] and now.keys() == numbers.keys()
+            same = same and all(torch.equal(now[n], numbers[n]) and now[n].dtype == numbers[n].dtype for n in now)
+            harmless += same
+            missed += [] if same else [f"{path.name} byte {at} bit {bit}"]
+        shutil.rmtree(spoilt)
+    return found, harmless, missed
+
+
+def test_two_hundred_flipped_bits(world: World, tmp_path: Path) -> None:
+    shutil.copytree(world.run / "checkpoints", tmp_path / "c")
+    found, harmless, missed = flips(tmp_path / "c", 200, seed=0)
+    assert not missed and found + harmless == 200
+    assert harmless <= 2, "blanks between words of a header mean nothing; few bytes are such"
+
+
+def test_every_tensor_byte_and_every_cut_is_found(world: World, tmp_path: Path) -> None:
+    shutil.copytree(world.run / "checkpoints", tmp_path / "c")
+    (step,) = checkpoint.steps(tmp_path / "c")
+    for name in ("model.safetensors", "optimizer.safetensors", "manifest.json"):
+        path = tmp_path / "c" / f"step-{step:07d}" / name
+        raw = path.read_bytes()
+        start = 8 + int.from_bytes(raw[:8], "little") if name != "manifest.json" else len(raw)
+        for part in range(50):
+            if start + part * (len(raw) - start) // 50 < len(raw):
+                at = start + part * (len(raw) - start) // 50
+                path.write_bytes(raw[:at] + bytes([raw[at] ^ 16]) + raw[at + 1 :])
+                with pytest.raises(CheckpointError, match="is damaged"):
+                    checkpoint.load(tmp_path / "c", step)
+            path.write_bytes(raw[: part * len(raw) // 50])
+            with pytest.raises(CheckpointError, match=r"step-0000015"):
+                checkpoint.load(tmp_path / "c", step)
+        path.write_bytes(raw)
+    assert checkpoint.load(tmp_path / "c", step).step == step
+
+
+def test_swapped_files_are_found(root: Path, trainer: Trainer) -> None:
+    for name in ("model.safetensors", "manifest.json"):
+        path, other = (root / f"step-{step:07d}" / name for step in (9, 5))
+        raw = path.read_bytes()
+        shutil.copy(other, path)
+        saved, damaged = checkpoint.load_latest(root)
+        assert saved is not None and saved.step == 5 and len(damaged) == 1
+        path.write_bytes(raw)
+    assert marked(root, trainer[0]) == (9, 9.0)
+
+
+@pytest.mark.parametrize("file", ["model", "optimizer"])
+def test_numbers_that_are_not_finite_are_refused_at_load(root: Path, file: str) -> None:
+    """Fault 7: whoever wrote them, and with whatever checksums."""
+    folder = root / "step-0000009"
+    tensors = safetensors.torch.load_file(folder / f"{file}.safetensors")
+    name = next(n for n, t in tensors.items() if t.is_floating_point() and t.ndim)
+    tensors = {n: t.clone() for n, t in tensors.items()}
+    tensors[name].view(-1)[-1] = float("nan")
+    safetensors.torch.save_file(tensors, folder / f"{file}.safetensors")
+    saved, damaged = checkpoint.load_latest(root)
+    assert saved is not None and saved.step == 5 and f"{file}.safetensors: tensor {name}" in damaged[0]
+
+
+def test_style_and_basis_gone_bad_are_told(world: World, tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    for name in ("style", "basis"):
+        raw = (world.run / f"{name}.safetensors").read_bytes()
+        path = tmp_path / f"{name}.safetensors"
+        start = 8 + int.from_bytes(raw[:8], "little")
+        for part in range(20):
+            at = start + part * (len(raw) - start) // 20
+            path.write_bytes(raw[:at] + bytes([raw[at] ^ 1]) + raw[at + 1 :])
+            with pytest.raises(CheckpointError, match=rf"{name}\.safetensors: tensor .* is damaged"):
+                run.load_tensors(name)
+            path.write_bytes(raw[: part * len(raw) // 20])
+            with pytest.raises(CheckpointError, match=rf"{name}\.safetensors"):
+                run.load_tensors(name)
+
+
+MOUNTED = """
+import os, subprocess, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[4])
+folder, town = Path(sys.argv[1]), Path(sys.argv[2])
+subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={sys.argv[3]}", "none", str(folder)], check=True)
+if sys.argv[3] == "8m":
+    subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+from kills import tiny
+from dataclasses import replace
+from fprf import cli
+from fprf.plugins.codec import save_config
+config = Path(sys.argv[2]).parent / "config.json"
+save_config(config, replace(tiny(town, 40), output=folder / "run"), "fprf-lite")
+code = cli.main(["train", str(config)])
+left = sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))
+print(code, left)
+from fprf.engine import checkpoint
+print("latest", checkpoint.load_latest(folder / "run" / "checkpoints")[0] is not None)
+"""
+
+
+@pytest.mark.fault
+@pytest.mark.parametrize(("size", "reason"), [("900k", "No space left on device"), ("8m", "Read-only file system")])
+def test_a_disk_that_is_full_or_read_only(world: World, tmp_path: Path, size: str, reason: str) -> None:
+    """A real one, in a name space of its own: 900 KiB hold two checkpoints and no third; 8 MiB are mounted read-only."""
+    if subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
+        pytest.skip("may not mount here")
+    (tmp_path / "disk").mkdir()
+    shutil.copytree(world.town, tmp_path / "town")
+    benchmarks = Path(__file__).parents[2] / "benchmarks"
+    words = [sys.executable, "-c", MOUNTED, str(tmp_path / "disk"), str(tmp_path / "town"), size, str(benchmarks)]
+    done = subprocess.run(["unshare", "-m", *words], capture_output=True, text=True, timeout=240)
+    errors = [line for line in done.stderr.splitlines() if not line.startswith("{")]
+    assert len(errors) == 1 and errors[0].startswith("error: ") and f"cannot be written ({reason}" in errors[0], done.stderr
+    assert done.stdout.startswith("2 ")
+    if size == "8m":
+        assert "2 []" in done.stdout and "checkpoint" not in errors[0], "before any work"
+    else:
+        assert "KiB are free" in errors[0] and "latest True" in done.stdout
