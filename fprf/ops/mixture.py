@@ -112,20 +112,19 @@ def attention(
     With a centre, x are the directions from it, and 0 within `flat` of it. Shares below `faint` of the largest are dropped.
     """
     from . import mixture_kernels as kernels
-    from .lanes import BLOCK
 
-    out = torch.empty(len(x), len(keys))
-    rows = torch.nn.functional.pad(keys, (0, 0, 0, -len(keys) % BLOCK))
+    out, columns = torch.empty(len(x), len(keys)), _whole(keys.T)
     odds = torch.zeros(len(keys)) if prior is None else prior.log()
     kernels.attention(
         _flat(x),
         _flat(torch.zeros(x.shape[1]) if centre is None else centre),
         np.float32(-1.0 if centre is None else flat),
-        _flat(rows),
+        _flat(columns),
+        columns.shape[1],
         np.float32(1 / max(temperature, torch.finfo(torch.float32).tiny)),
         _flat(odds),
         np.float32(faint),
-        np.zeros(BLOCK, np.float32),
+        np.zeros(columns.shape[1], np.float32),
         out.view(-1).numpy(),
     )
     return out

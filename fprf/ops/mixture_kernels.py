@@ -22,6 +22,8 @@ from .tile import (
     accumulate_3,
     accumulate_4,
 )
+from .vector import LANES, dot
+from .vector import scaled as scaled_lanes
 
 __all__ = ["affine", "attention", "scaled"]
 
@@ -30,16 +32,20 @@ _0, _1, _LEAST = np.float32(0), np.float32(1), np.float32(-np.inf)
 
 
 @numba.njit(inline="always", cache=True)
-def _directions(query, least, factor):
-    """Of each column of query [depth BLOCK] one by its length, 0 within `least`; NaN stays."""
-    depth, block = query.shape
-    for r in range(block):
-        factor[r] = _0
-    for c in range(depth):
-        for r in range(block):
-            factor[r] += query[c, r] * query[c, r]
-    for r in range(block):
-        norm = np.sqrt(factor[r])
+def _away(x, first, rows, centre, least, away, factor):
+    """away[r] = x[first + r] - centre, and one by its length, 0 within `least`; NaN stays."""
+    depth = len(centre)
+    whole = depth - depth % LANES
+    for r in range(rows):
+        at, to = (first + r) * depth, r * depth
+        for c in range(0, whole, LANES):
+            scaled_lanes(centre, c, np.float32(-1), x, at + c, away, to + c)
+        for c in range(whole, depth):
+            away[to + c] = x[at + c] - centre[c]
+        square = dot(away, to, away, to, whole) if whole > 0 else _0
+        for c in range(whole, depth):
+            square += away[to + c] * away[to + c]
+        norm = np.sqrt(square)
         factor[r] = _1 / norm if norm > least else _0 * norm
 
 
@@ -72,32 +78,38 @@ def _softmax(score, count, factor, sharpness, odds, faint, best, total):
             # The best has exp(0) = 1, so this is a share of it. A NaN is not below and stays.
             score[k, r] = _0 if score[k, r] < faint else score[k, r]
             total[r] += score[k, r]
+    for r in range(block):
+        total[r] = _1 / total[r]
     for k in range(count):
         for r in range(block):
-            score[k, r] /= total[r]
+            score[k, r] *= total[r]
 
 
 @_jit
-def attention(x, centre, least, keys, sharpness, odds, faint, none, out):
-    """out [N count] = softmax of the scores of points x [N depth] with keys [rows depth], rows >= count = len(odds).
+def attention(x, centre, least, keys, width, sharpness, odds, faint, none, out):
+    """out [N count] = softmax of the scores of points x [N depth] with keys [depth width], count = len(odds) <= width.
 
     least >= 0: points are directions from the centre, and none within `least` of it. least < 0: points as they are.
     """
     count, depth = len(odds), len(centre)
-    rows, total = len(keys) // depth, len(out) // count
+    total = len(out) // count
     for task in numba.prange((total + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         points = min(BLOCK, total - first)
-        # Points side by side: a vector holds one number of several points.
-        query, score = np.zeros((depth, BLOCK), np.float32), np.empty((rows, BLOCK), np.float32)
+        side, score = np.empty(BLOCK * width, np.float32), np.empty((count, BLOCK), np.float32)
         factor, best, sums = np.ones(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-        for r in range(points):
-            mine = x[(first + r) * depth : (first + r + 1) * depth]
-            for c in range(depth):
-                query[c, r] = mine[c] - centre[c]
-        if least >= _0:
-            _directions(query, least, factor)
-        product(keys, 0, depth, 1, rows, query.reshape(-1), 0, BLOCK, none, 0, 0, score.reshape(-1), 0, BLOCK, depth, _LEAST)
+        source, at = x, first * depth
+        if least >= _0 or points < BLOCK:
+            source, at = np.zeros(BLOCK * depth, np.float32), 0
+            if least >= _0:
+                _away(x, first, points, centre, least, source, factor)
+            else:
+                source[: points * depth] = x[first * depth : (first + points) * depth]
+        product(source, at, depth, 1, BLOCK, keys, 0, width, none, 0, 0, side, 0, width, depth, _LEAST)
+        # Points side by side: from here on a vector holds one number of several points.
+        for r in range(BLOCK):
+            for k in range(count):
+                score[k, r] = side[r * width + k]
         _softmax(score, count, factor, sharpness, odds, faint, best, sums)
         for r in range(points):
             mine = out[(first + r) * count : (first + r + 1) * count]
