@@ -34,6 +34,7 @@ VERBS = {
     "train": Verb("METHOD|CONFIG.json --data DIR", "train a scene, or go on where a run stopped"),
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
+    "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("RUN", "look at a scene in the browser; drop a photograph on it to restyle it"),
     "bench": Verb("speed|profile|pareto|... [RUN]", "time and error, where time goes, memory, scaling"),

@@ -6,6 +6,8 @@
   const before = wipe.querySelector(".before");
   const after = wipe.querySelector(".after");
   const tag = wipe.querySelector(".tag.two");
+  const left = document.querySelector("#left");
+  const one = wipe.querySelector(".tag.one");
   const shown = { style: 0, view: 0 };
 
   const move = (at) => {
@@ -38,15 +40,18 @@
 
   const show = (change) => {
     Object.assign(shown, change);
-    const one = document.querySelector(`[data-view="${shown.view}"] img`);
-    const two = document.querySelector(`[data-shot="${shown.style}-${shown.view}"] img`);
-    before.src = one.src;
-    before.alt = one.alt;
-    after.src = two.src;
-    after.alt = two.alt;
-    const { width, height } = one.dataset;
+    const original = document.querySelector(`[data-view="${shown.view}"] img`);
+    const taken = document.querySelector(`[data-shot="${shown.style}-${shown.view}"] img`);
+    const from = left.value === "match" ? `[data-match="${shown.style}-${shown.view}"] img` : `[data-shot="${left.value}-${shown.view}"] img`;
+    const against = left.value === "original" ? original : document.querySelector(from) || original;
+    before.src = against.src;
+    before.alt = against.alt;
+    after.src = taken.src;
+    after.alt = taken.alt;
+    one.textContent = against === original ? "Original" : left.selectedOptions[0].textContent;
+    const { width, height } = original.dataset;
     wipe.style.setProperty("--ratio", String(width / height));
-    wipe.style.setProperty("--most", `${2.6 * width}px`);
+    wipe.style.setProperty("--most", `${Math.max(760, 2.6 * width)}px`);
     document.querySelectorAll("[data-style], [data-view]").forEach((button) => {
       const { style, view } = button.dataset;
       button.setAttribute("aria-pressed", String(style === String(shown.style) || view === String(shown.view)));
@@ -56,15 +61,17 @@
   document.addEventListener("click", (event) => {
     const button = event.target.closest("button");
     if (!button) return;
-    const { style, view, shot } = button.dataset;
+    const { style, view, shot, go } = button.dataset;
     if (style) show({ style: Number(style) });
     if (view) show({ view: Number(view) });
-    if (shot) {
-      const [style, view] = shot.split("-").map(Number);
-      show({ style, view });
+    if (shot || go) {
+      const [style, view] = (shot || go).split("-");
+      show({ style: style === "" ? shown.style : Number(style), view: Number(view) });
       wipe.scrollIntoView({ block: "center" });
       slider.focus({ preventScroll: true });
     }
   });
+  left.addEventListener("change", () => show({}));
+  left.value = "original";
   move(50);
 })();

@@ -8,41 +8,20 @@ from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from string import Template
-from typing import NamedTuple
 from urllib.parse import quote
 
 from ..errors import DataError
 from .atomic import write_text
 from .figures import Metrics, figures, number
-from .images import Picture, data_uri, shrink, to_uint8
-from .maps import palette
+from .gallery_compare import compare
+from .gallery_pieces import Reference, Style, cards_of
+from .gallery_styles import overview, styles_section
+from .images import Picture
 
 __all__ = ["Reference", "Style", "write_gallery"]
 
-_VIEW_SIDE, _MAP_SIDE, _SMALL_SIDE = 1024, 512, 80
-"""Longest sides in pixels of embedded views, of maps and references, and of thumbnails."""
 _EMBEDDED_VIDEO = 8 * 2**20
 """Bytes up to which a film is put into the page."""
-
-
-class Reference(NamedTuple):
-    """A photograph that a style was taken from."""
-
-    name: str
-    image: Picture
-
-
-class Style(NamedTuple):
-    """A restyled scene: one picture per view, in the order of the originals."""
-
-    name: str
-    views: Sequence[Picture]
-    references: Sequence[str] = ()
-    """Names of its references, in dictionary order."""
-    shares: Sequence[float] = ()
-    """How much of the scene each of them styled (`maps.match_summary`); none where that was not measured."""
-    matches: Sequence[Picture] = ()
-    """Match maps (`maps.match_image`), one per view or fewer."""
 
 
 def write_gallery(
@@ -68,8 +47,9 @@ def write_gallery(
     known = {reference.name: reference for reference in references}
     parts = [
         ("", _opening(title, scene)),
-        ("Compare", _compare(view_names, originals, styles, known)),
-        ("Styles", _styles(view_names, styles, known)),
+        ("Compare", compare(view_names, originals, styles, known)),
+        ("Overview", overview(view_names, originals, styles)),
+        ("Styles", styles_section(view_names, styles, known)),
         ("Geometry", _geometry(view_names, depth)),
         ("Flight", "" if video is None else _flight(video, path)),
         ("Figures", _figures(metrics or {})),
@@ -102,121 +82,10 @@ def _fitting(
             raise DataError(f"gallery: style {style.name} has {len(style.shares)} shares of {len(style.references)} references")
 
 
-def _img(picture: Picture, side: int, alt: str, *, eager: bool = False, of: str = "") -> str:
-    small = shrink(picture, side)
-    height, width = small.shape[:2]
-    lazy = "" if eager else ' loading="lazy"'
-    kind = f' class="{of}"' if of else ""
-    # width and height hold the place while the picture is decoded; data-* survive CSS for the script.
-    return (
-        f'<img{kind} src="{data_uri(small)}" alt="{escape(alt)}" width="{width}" height="{height}" '
-        f'data-width="{width}" data-height="{height}" decoding="async"{lazy}>'
-    )
-
-
-def _ratio(picture: Picture) -> str:
-    return f"{picture.shape[1] / picture.shape[0]:.5f}"
-
-
 def _opening(title: str, scene: Mapping[str, str | int | float]) -> str:
     facts = "\n".join(f"<div><dt>{escape(name)}</dt><dd>{escape(number(fact))}</dd></div>" for name, fact in scene.items())
     listed = f'\n<dl class="facts">\n{facts}\n</dl>' if facts else ""
     return f'<section class="opening">\n<h1>{escape(title)}</h1>{listed}\n</section>'
-
-
-def _compare(
-    view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style], known: Mapping[str, Reference]
-) -> str:
-    if not styles:
-        return ""
-    first, most = originals[0], 2.6 * min(_VIEW_SIDE, originals[0].shape[1])
-    picks = "\n".join(
-        f'<button class="pick" type="button" data-style="{index}" aria-pressed="{str(index == 0).lower()}">'
-        f"{_stack(style, known)}<span>{escape(style.name)}</span></button>"
-        for index, style in enumerate(styles)
-    )
-    film = "\n".join(
-        f'<button type="button" data-view="{index}" aria-pressed="{str(index == 0).lower()}" title="{escape(name)}">'
-        f"{_img(picture, _VIEW_SIDE, f'View {name}, original', eager=True)}</button>"
-        for index, (name, picture) in enumerate(zip(view_names, originals, strict=True))
-    )
-    return f"""<section class="compare" id="compare" aria-label="Compare">
-<div class="stage">
-<figure class="wipe" style="--at:50%;--ratio:{_ratio(first)};--most:{most:.0f}px">
-{_img(styles[0].views[0], _VIEW_SIDE, f"View {view_names[0]}, {styles[0].name}", eager=True, of="after")}
-{_img(first, _VIEW_SIDE, f"View {view_names[0]}, original", eager=True, of="before")}
-<span class="tag one">Original</span><span class="tag two">{escape(styles[0].name)}</span>
-<input type="range" min="0" max="100" step="any" value="50" aria-label="How much of the original is shown">
-<span class="seam"></span>
-</figure>
-</div>
-<div class="choose">
-<div><h2 id="pick-style">Style</h2>
-<div class="picks" role="group" aria-labelledby="pick-style">
-{picks}
-</div></div>
-<div><h2 id="pick-view">View</h2>
-<div class="film" role="group" aria-labelledby="pick-view">
-{film}
-</div></div>
-</div>
-</section>"""
-
-
-def _stack(style: Style, known: Mapping[str, Reference]) -> str:
-    small = [_img(known[name].image, _SMALL_SIDE, "", eager=True) for name in style.references[:3]]
-    return f'<span class="stack">{"".join(small)}</span>' if small else ""
-
-
-def _styles(view_names: Sequence[str], styles: Sequence[Style], known: Mapping[str, Reference]) -> str:
-    if not styles:
-        return ""
-    blocks = "\n".join(_style(index, style, view_names, known) for index, style in enumerate(styles))
-    return f"""<section class="styles" id="styles">
-<h2>Styles</h2>
-<p class="lead">The same trained scene, restyled by photographs. Choose a view to compare it above.</p>
-{blocks}
-</section>"""
-
-
-def _style(index: int, style: Style, view_names: Sequence[str], known: Mapping[str, Reference]) -> str:
-    cards = "\n".join(
-        f'<button class="card" type="button" data-shot="{index}-{view}" style="--ratio:{_ratio(picture)}">'
-        f"{_img(picture, _VIEW_SIDE, f'View {name}, {style.name}')}<span>{escape(name)}</span></button>"
-        for view, (name, picture) in enumerate(zip(view_names, style.views, strict=True))
-    )
-    matches = ""
-    if style.matches:
-        maps = _figures_grid(style.matches, view_names, "reference of every place")
-        matches = f'\n<div class="under"><p class="label">Which reference each place took its style from</p>\n{maps}\n</div>'
-    return f"""<article class="style">
-<div><h3>{escape(style.name)}</h3>
-{_sources(style, known)}</div>
-<div><div class="grid">
-{cards}
-</div>{matches}</div>
-</article>"""
-
-
-def _sources(style: Style, known: Mapping[str, Reference]) -> str:
-    """The references of a style: with the colours of its match maps and with shares, where there are any."""
-    rows = []
-    colours = to_uint8(palette(len(style.references))[None])[0] if style.references else []
-    for place, name in enumerate(style.references):
-        chip = f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>' if style.matches else ""
-        share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>' if style.shares else ""
-        image = _img(known[name].image, _MAP_SIDE, f"Reference {name}")
-        rows.append(f'<figure class="source">{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>')
-    return f'<div class="sources">{"".join(rows)}</div>' if rows else ""
-
-
-def _figures_grid(pictures: Sequence[Picture], view_names: Sequence[str], what: str) -> str:
-    cards = "\n".join(
-        f'<figure class="card" style="--ratio:{_ratio(picture)}">{_img(picture, _MAP_SIDE, f"View {name}, {what}")}'
-        f"<figcaption>{escape(name)}</figcaption></figure>"
-        for name, picture in zip(view_names, pictures, strict=False)
-    )
-    return f'<div class="grid small">\n{cards}\n</div>'
 
 
 def _geometry(view_names: Sequence[str], depth: Sequence[Picture]) -> str:
@@ -225,7 +94,7 @@ def _geometry(view_names: Sequence[str], depth: Sequence[Picture]) -> str:
     return f"""<section id="geometry">
 <h2>Geometry</h2>
 <p class="lead">Rendered depth: near is bright, far is dark, nothing is grey. All styles share it.</p>
-{_figures_grid(depth, view_names, "depth")}
+{cards_of(depth, view_names, "depth")}
 </section>"""
 
 

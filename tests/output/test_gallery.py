@@ -82,10 +82,10 @@ def test_everything_is_on_the_page(gallery: Page) -> None:
     text = " ".join(gallery.text)
     for shown in ("Town", "Photographs", "34", "40 × 30", "dusk", "plain", "city", "75%", "0003", "PSNR", "27.30", "dB", "–"):
         assert shown in text
-    # thumbnails of references, the pair, the film strip, style views, references, matches, depth
-    assert len(gallery.all("img")) == 2 + 2 + 3 + 6 + 2 + 2 + 3
+    # thumbnails of references, the pair, the film strip, overview, style views, references, matches, depth
+    assert len(gallery.all("img")) == 2 + 2 + 3 + 9 + 6 + 2 + 2 + 3
     assert [link["href"] for link in gallery.all("a") if "class" not in link] == [
-        "#compare", "#styles", "#geometry", "#figures",
+        "#compare", "#overview", "#styles", "#geometry", "#figures",
     ]  # fmt: skip
     anchors = {attrs["id"] for _, attrs in gallery.tags if "id" in attrs}
     assert {link["href"][1:] for link in gallery.all("a")} <= anchors
