@@ -29,5 +29,7 @@ class Scene:
     """Nearest and farthest depth along each view's axis, where the capture says."""
     seen: Annotated[Tensor, "O 2"] | None = None
     """int64 pairs of a view and a point that the reconstruction found in it, where the capture says."""
+    exposure: Annotated[Tensor, "V"] | None = None
+    """Exposure of each view, where the capture says: light is in proportion to it. float64, above 0."""
     alpha: bool = False
     """Images carry transparency."""

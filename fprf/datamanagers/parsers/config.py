@@ -5,13 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from ...checks import at_least
+from ...checks import at_least, positive
 from ...plugins.config import PluginConfig
 
 if TYPE_CHECKING:
     from ...interfaces import DataParser
 
-__all__ = ["ColmapConfig", "DataParserConfig", "LlffConfig", "TownConfig", "TransformsConfig"]
+__all__ = [
+    "BlockNerfConfig",
+    "ColmapConfig",
+    "DataParserConfig",
+    "LlffConfig",
+    "MegaNerfConfig",
+    "PhotoTourismConfig",
+    "TownConfig",
+    "TransformsConfig",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,3 +105,49 @@ class TownConfig(DataParserConfig):
         from .town import TownParser
 
         return TownParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockNerfConfig(DataParserConfig):
+    """San Francisco Mission Bay: TFRecord files with exposure and rays of every pixel."""
+
+    cameras: tuple[int, ...] = ()
+    """Numbers of the cameras that are used; empty = all."""
+    tolerance: float = 1.0
+    """Pixels (root mean square) by which an image's rays may differ from those of the camera that is fitted to them."""
+
+    def __post_init__(self) -> None:
+        for number in self.cameras:
+            at_least("parser.cameras", number, 0)
+        positive("parser.tolerance", self.tolerance)
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .blocknerf import BlockNerfParser
+
+        return BlockNerfParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MegaNerfConfig(DataParserConfig):
+    """Mega-NeRF's layout: `train` and `val`, each with `metadata/*.pt` and `rgbs`."""
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .meganerf import MegaNerfParser
+
+        return MegaNerfParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoTourismConfig(DataParserConfig):
+    """Photographs from many hands: a COLMAP model with a table of what is for training."""
+
+    list: str = ""
+    """The table, a file of the folder; empty = its only *.tsv."""
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .phototourism import PhotoTourismParser
+
+        return PhotoTourismParser(self)

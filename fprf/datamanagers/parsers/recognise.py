@@ -4,14 +4,24 @@ from pathlib import Path
 
 from ...errors import DataError
 from ..scene import Scene
+from .blocknerf import record_files
 from .colmap import model_folder
-from .config import ColmapConfig, DataParserConfig, LlffConfig, TownConfig, TransformsConfig
+from .config import (
+    BlockNerfConfig,
+    ColmapConfig,
+    DataParserConfig,
+    LlffConfig,
+    MegaNerfConfig,
+    PhotoTourismConfig,
+    TownConfig,
+    TransformsConfig,
+)
 
 __all__ = ["parse_scene", "recognise"]
 
 
 def recognise(data: Path) -> DataParserConfig:
-    """The parser for a folder, with its defaults: transforms before LLFF before COLMAP; `town` is the embedded scene.
+    """The parser for a folder, with its defaults: transforms before LLFF before others; `town` is the embedded scene.
 
     The path `town`, where no such folder exists, is the embedded scene. Raises DataError saying what was looked for and
     what lies there.
@@ -27,10 +37,16 @@ def recognise(data: Path) -> DataParserConfig:
         return TransformsConfig()
     if (data / "poses_bounds.npy").is_file():
         return LlffConfig()
+    if (data / "train/metadata").is_dir():
+        return MegaNerfConfig()
+    if len(list(data.glob("*.tsv"))) == 1 and model_folder(data if model_folder(data) else data / "dense") is not None:
+        return PhotoTourismConfig()
     if model_folder(data) is not None:
         return ColmapConfig()
     if len(manifests) == 1:
         return TransformsConfig(file=manifests[0])
+    if record_files(data):
+        return BlockNerfConfig()
     raise DataError(
         f"{data}: no transforms.json, transforms_train.json, poses_bounds.npy or sparse/0/cameras.bin, "
         f"but {_content(data)}; choose the parser by name, or make poses with `fprf process`"

@@ -9,7 +9,7 @@ from ...interfaces import DataParser
 from ..scene import Scene
 from .config import TownConfig, TransformsConfig
 
-__all__ = ["TownParser"]
+__all__ = ["TownParser", "cache_folder"]
 
 
 class TownParser(DataParser):
@@ -39,12 +39,12 @@ class TownParser(DataParser):
         settings = TownSettings(
             seed=c.seed, palette=c.palette, views=c.views, width=c.width, height=c.height, extra=float(c.extra)
         )
-        folder = _cache() / f"town-{settings.key}"
+        folder = cache_folder() / f"town-{settings.key}"
         write_town(folder, **{k: v for k, v in asdict(settings).items() if k != "edition"})
         return folder
 
 
-def _cache() -> Path:
+def cache_folder() -> Path:
     """Where the project keeps what it can make again."""
     named = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(named) if named else Path.home() / ".cache") / "fprf"

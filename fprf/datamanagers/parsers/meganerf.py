@@ -1,0 +1,99 @@
+"""Mega-NeRF's layout (Mill 19, Quad 6k, UrbanScene3D): `train` and `val`, each with `metadata/NAME.pt` and `rgbs/NAME.jpg`.
+
+Metadata are tensors written by torch.save: `H W c2w intrinsics`. They are read without running any code that they name. Poses
+are OpenGL's, in world axes down, right, back; `coordinates.pt` tells how many metres their unit is.
+"""
+
+import pickle
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...errors import DataError
+from ...interfaces import DataParser
+from ..image_header import IMAGE_SUFFIXES
+from ..scene import Scene
+from .config import MegaNerfConfig
+from .files import name_of
+from .split import indices
+from .views import View, assemble, rigid
+
+__all__ = ["MegaNerfParser"]
+
+_LARGEST = 1 << 24
+"""Bytes of a file of metadata."""
+
+
+class MegaNerfParser(DataParser):
+    """`train` and `val` folders."""
+
+    def __init__(self, config: MegaNerfConfig) -> None:
+        self.config = config
+
+    def parse(self, data: Path, downscale: int) -> Scene:
+        """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""
+        unit = _unit(data)
+        views, held = [], []
+        for split in ("train", "val"):
+            folder = data / split / "metadata"
+            files = sorted(folder.glob("*.pt"))
+            if split == "train" and not files:
+                raise DataError(
+                    f"{folder}: no *.pt files; name the folder of a scene, with train/metadata and train/rgbs in it"
+                )
+            views += [_view(file, data / split / "rgbs", unit) for file in files]
+            held += [split == "val"] * len(files)
+        order = sorted(range(len(views)), key=lambda k: views[k].name)
+        twice = [a for a, b in pairwise(order) if views[a].name == views[b].name]
+        if twice:
+            raise DataError(f"{name_of(data)}: {views[twice[0]].name} is in train and in val; remove it from one")
+        held = [held[k] for k in order]
+        split_of = (indices([not each for each in held]), indices(held)) if any(held) else None
+        return assemble(data, [views[k] for k in order], downscale=downscale, split=split_of, reduced=True)
+
+
+def _unit(data: Path) -> float:
+    """Metres of a unit of the poses; 1 where nothing is said."""
+    path = data / "coordinates.pt"
+    if not path.is_file():
+        return 1.0
+    value = _load(path).get("pose_scale_factor", 1.0)
+    scale = float(value)
+    if not 0 < scale < 1e9:
+        raise DataError(f"{path}: pose_scale_factor is {scale}; it must be above 0: write it again")
+    return scale
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """Tensors and numbers by name; nothing else is let in."""
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DataError(f"{path}: no tensors of torch.save ({reason}); copy the file again") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: holds a {type(found).__name__}, not names and tensors; copy the file again")
+    return found
+
+
+def _view(file: Path, images: Path, unit: float) -> View:
+    found = _load(file)
+    try:
+        width, height = int(found["W"]), int(found["H"])
+        pose = np.asarray(torch.as_tensor(found["c2w"]).double().numpy())
+        fx, fy, cx, cy = (float(v) for v in torch.as_tensor(found["intrinsics"]).reshape(-1).tolist())
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError(f"{file}: W, H, c2w [3 4] and intrinsics [4] are needed ({error}); copy the file again") from error
+    if pose.shape not in ((3, 4), (4, 4)) or width < 1 or height < 1:
+        raise DataError(f"{file}: c2w is {pose.shape} and the image {width}x{height}; copy the file again")
+    pose = pose.copy()
+    pose[:3, 3] *= unit
+    path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
+    if path is None:
+        raise DataError(f"{file}: no image {images / file.stem}.jpg beside it; copy the images there")
+    return View(name=file.stem, path=path, pose=rigid(str(file), pose), size=(width, height), focal=(fx, fy), centre=(cx, cy))

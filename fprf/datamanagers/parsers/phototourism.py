@@ -1,0 +1,86 @@
+"""Photo Tourism with a list: a COLMAP model of photographs from many hands, and a table of which are for training.
+
+The table (`*.tsv`: filename, id, split, dataset) is that of NeRF in the Wild; photographs without an id or not in it are left
+out. The model lies in the folder or in `dense`.
+"""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from ...errors import DataError
+from ...interfaces import DataParser
+from ..scene import Scene
+from .colmap import ColmapParser, model_folder
+from .config import ColmapConfig, PhotoTourismConfig
+
+__all__ = ["PhotoTourismParser", "read_list"]
+
+
+class PhotoTourismParser(DataParser):
+    """A COLMAP model and its table."""
+
+    def __init__(self, config: PhotoTourismConfig) -> None:
+        self.config = config
+
+    def parse(self, data: Path, downscale: int) -> Scene:
+        """The listed photographs. Raises DataError where the table names none of the model's."""
+        table = self._table(data)
+        inner = data / "dense" if model_folder(data) is None and (data / "dense").is_dir() else data
+        scene = ColmapParser(ColmapConfig()).parse(inner, downscale)
+        roles = read_list(table)
+        named = [roles.get(path.name) for path in scene.paths]
+        kept = torch.tensor([k for k, role in enumerate(named) if role is not None], dtype=torch.int64)
+        train = torch.tensor([k for k, role in enumerate(named) if role == "train"], dtype=torch.int64)
+        if not len(train):
+            raise DataError(f"{table}: none of its training photographs is in the model of {inner}; is it another scene's?")
+        place = torch.full((len(scene.paths),), -1, dtype=torch.int64)
+        place[kept] = torch.arange(len(kept))
+        seen = scene.seen
+        if seen is not None:
+            seen = torch.stack([place[seen[:, 0]], seen[:, 1]], 1)
+            seen = seen[seen[:, 0] >= 0]
+        held = torch.tensor([k for k, role in enumerate(named) if role == "test"], dtype=torch.int64)
+        return replace(
+            scene,
+            name=data.resolve().name or "scene",
+            paths=tuple(scene.paths[k] for k in kept.tolist()),
+            cameras=scene.cameras.select(kept),
+            train=place[train],
+            test=place[held],
+            depths=None if scene.depths is None else scene.depths[kept],
+            seen=seen,
+        )
+
+    def _table(self, data: Path) -> Path:
+        if self.config.list:
+            path = data / self.config.list
+            if not path.is_file():
+                raise DataError(f"{path}: no such table; name one of the folder's with parser.list")
+            return path
+        found = sorted(data.glob("*.tsv"))
+        if len(found) != 1:
+            raise DataError(f"{data}: {len(found)} tables *.tsv; exactly one is needed, or its name in parser.list")
+        return found[0]
+
+
+def read_list(path: Path) -> dict[str, str]:
+    """`train` or `test` by file name, of the photographs that have an id. Raises DataError."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file, delimiter="\t"))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path}: cannot be read ({error}); download the table again") from error
+    found = {}
+    for number, row in enumerate(rows, 2):
+        name, split, id_ = row.get("filename"), row.get("split"), row.get("id")
+        if not name or split is None or id_ is None:
+            raise DataError(f"{path}: line {number} lacks filename, id or split; they are columns apart by tabs")
+        if not id_.strip() or id_.strip().lower() == "nan":
+            continue
+        if split not in ("train", "test"):
+            raise DataError(f"{path}: line {number}: split is {split!r}; train and test are known")
+        found[name] = split
+    return found

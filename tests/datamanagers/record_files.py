@@ -1,0 +1,102 @@
+"""TFRecord files of tf.train.Example, written without TensorFlow, and a capture in the format of Mission Bay."""
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fprf.datamanagers.parsers.checksum import crc32c, masked
+from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
+from fprf.town.layout import build_town
+from fprf.town.palettes import palette
+from fprf.town.render import render
+from fprf.town.views import walk
+
+__all__ = ["example", "record", "town_records", "varint"]
+
+
+def varint(value: int) -> bytes:
+    value &= 0xFFFFFFFFFFFFFFFF
+    out = b""
+    while value > 0x7F:
+        out += bytes([value & 0x7F | 0x80])
+        value >>= 7
+    return out + bytes([value])
+
+
+def chunk(number: int, data: bytes) -> bytes:
+    return varint(number << 3 | 2) + varint(len(data)) + data
+
+
+def example(features: dict[str, bytes | list[int] | NDArray[np.float32]], packed: bool = True) -> bytes:
+    """A serialised Example; lists of integers, arrays of floats, bytes."""
+    entries = b""
+    for name, value in features.items():
+        if isinstance(value, bytes):
+            body = chunk(1, chunk(1, value))
+        elif isinstance(value, list):
+            whole = [varint(v) for v in value]
+            body = chunk(3, chunk(1, b"".join(whole)) if packed else b"".join(varint(1 << 3) + w for w in whole))
+        else:
+            raw = value.astype("<f4").tobytes()
+            parts = [varint(1 << 3 | 5) + raw[k : k + 4] for k in range(0, len(raw), 4)]
+            body = chunk(2, chunk(1, raw) if packed else b"".join(parts))
+        entries += chunk(1, chunk(1, name.encode()) + chunk(2, body))
+    return chunk(1, entries)
+
+
+def record(data: bytes) -> bytes:
+    head = struct.pack("<Q", len(data))
+    return head + struct.pack("<I", masked(crc32c(head))) + data + struct.pack("<I", masked(crc32c(data)))
+
+
+def town_records(
+    folder: Path, *, views: int = 16, size: tuple[int, int] = (32, 24), bend: tuple[float, float] = (-0.05, 0.01)
+) -> Cameras:
+    """Two cameras of different focal length and exposure in turn along a town, in three files; the cameras, by record.
+
+    Brightness goes with the exposure; every fourth record is for validation.
+    """
+    town, look = build_town(0, 0.0), palette("day")
+    walked = walk(seed=0, views=views, width=size[0], height=size[1])
+    lens = torch.tensor([[bend[0], bend[1], 0.0, 0.0, 0.001, -0.001]], dtype=torch.float64).expand(views, 6)
+    scale = torch.tensor([1.0 if k % 2 else 1.25 for k in range(views)], dtype=torch.float64)
+    cameras = Cameras(
+        pose=torch.stack([torch.from_numpy(view.pose) for view in walked]),
+        focal=torch.tensor([[view.focal, view.focal] for view in walked], dtype=torch.float64) * scale[:, None],
+        centre=torch.tensor([[size[0] / 2 + 0.7, size[1] / 2 - 0.4]], dtype=torch.float64).expand(views, 2),
+        size=torch.tensor([size]).expand(views, 2),
+        distortion=lens,
+        lens=torch.ones(views, dtype=torch.int64),
+    )
+    held, learned = [], []
+    for k, view in enumerate(walked):
+        exposure = 0.5 if k % 2 else 1.0
+        picture = render(town, view, look).rgb
+        picture = (picture * (1.0 if k % 2 == 0 else 0.75)).astype(np.uint8)
+        origin, direction = rays_through(cameras, torch.full((size[0] * size[1],), k), pixel_grid(cameras, k))
+        done, image = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+        assert done
+        whole = example(
+            {
+                "image": image.tobytes(),
+                "image_hash": [-(k + 1) * 7919],
+                "cam_idx": [k % 2],
+                "height": [size[1]],
+                "width": [size[0]],
+                "equivalent_exposure": np.array([exposure], np.float32),
+                "ray_origins": origin.float().numpy().reshape(-1),
+                "ray_dirs": direction.float().numpy().reshape(-1),
+                "intrinsics": cameras.focal[k].float().numpy(),
+            }
+        )
+        (held if k % 4 == 3 else learned).append(record(whole))
+    folder.mkdir(parents=True, exist_ok=True)
+    half = len(learned) // 2
+    (folder / "bay_train.tfrecord-00000-of-00002").write_bytes(b"".join(learned[:half]))
+    (folder / "bay_train.tfrecord-00001-of-00002").write_bytes(b"".join(learned[half:]))
+    (folder / "bay_validation.tfrecord-00000-of-00001").write_bytes(b"".join(held))
+    return cameras
