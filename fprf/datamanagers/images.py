@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import cv2
 import numpy as np
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from ..errors import DataError
 from .image_header import ImageHeader, header_of, read_header
-from .scene import Scene
+
+if TYPE_CHECKING:  # else reading a picture would need torch
+    from .scene import Scene
 
 __all__ = ["MAX_PIXELS", "Image", "load_image", "load_images"]
 
@@ -44,7 +46,7 @@ def load_image(path: Path, size: tuple[int, int] | None = None, background: Sequ
     return np.asarray(resized, dtype=np.uint8)
 
 
-def load_images(scene: Scene, background: Sequence[float] | None = None) -> list[Image]:
+def load_images(scene: "Scene", background: Sequence[float] | None = None) -> list[Image]:
     """Every view of a scene at its camera's size, in the scene's order; sizes may differ.
 
     Raises DataError as `load_image` does, and where a file's shape has changed since the scene was parsed.

@@ -28,14 +28,12 @@ def confine(room: int) -> None:
 
 def serve(questions: TextIO, answers: TextIO) -> None:
     """{"source", "target", "side"} each; {"said": "ok" or what is wrong} each."""
-    from ..datamanagers.images import load_image
     from ..errors import FprfError
-    from ..output.images import shrink, write_image
 
     for line in questions:
         try:
             asked = json.loads(line)
-            write_image(Path(asked["target"]), shrink(load_image(Path(asked["source"])), int(asked["side"])))
+            _decode(Path(asked["source"]), Path(asked["target"]), int(asked["side"]))
             said = "ok"
         except FprfError as fault:
             # The file's own name means nothing to the one who sent it.
@@ -44,6 +42,20 @@ def serve(questions: TextIO, answers: TextIO) -> None:
             said = f"cannot be decoded ({type(fault).__name__}); export it again, or make it smaller"
         answers.write(json.dumps({"said": said}) + "\n")
         answers.flush()
+
+
+def _decode(source: Path, target: Path, side: int) -> None:
+    """The photograph as a PNG with sides of at most `side` pixels."""
+    import cv2
+
+    from ..datamanagers.images import load_image
+
+    photo = load_image(source)
+    height, width = photo.shape[:2]
+    scale = min(1.0, side / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+    target.write_bytes(cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 if __name__ == "__main__":

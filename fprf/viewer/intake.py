@@ -17,7 +17,6 @@ from queue import Empty, Queue
 from ..datamanagers.image_header import header_of
 from ..datamanagers.images import MAX_PIXELS
 from ..errors import DataError
-from ..output.atomic import write_bytes
 
 __all__ = ["LARGEST", "Intake", "check_photograph", "shown_name"]
 
@@ -25,7 +24,7 @@ LARGEST = 20 << 20
 """Bytes of a photograph."""
 SIDE = 1024
 """Longest side of what is kept of one: scenes' views are hardly larger."""
-_SECONDS = 20.0
+_SECONDS = 30.0
 """Time for one photograph, the start of the process included."""
 _NAME = 48
 
@@ -83,7 +82,7 @@ class Intake:
         with self._lock:
             self._count += 1
             source, target = self.folder / f"{self._count:04d}.part", self.folder / f"{self._count:04d}.png"
-            write_bytes(source, data)
+            source.write_bytes(data)
             try:
                 answer = self._ask({"source": str(source), "target": str(target), "side": SIDE})
             finally:

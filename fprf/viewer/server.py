@@ -69,7 +69,7 @@ class Server(Face):
 
     def show(self, client: Hashable, frame: Frame) -> None:
         """Put a picture behind a client's canvas; with its depth, where lines are to disappear behind things."""
-        handle = self._viser.get_clients().get(int(str(client)))
+        handle = self._viser.get_clients().get(client) if isinstance(client, int) else None
         if handle is None:
             return
         lined = self.panel.cameras or self.panel.blocks or bool(self._session.state.keys)

@@ -11,15 +11,17 @@ from dataclasses import replace
 from pathlib import Path
 from queue import Queue
 
+import numpy as np
+
 from ..engine.loading import Trained
 from ..errors import FprfError, UsageError
-from ..output.images import Picture
+from ..output.images import Picture, encode
 from ..output.video import write_video
 from .desk import Desk
 from .eyes import Frame, Glance, Sight
 from .film import FilmPlan, frames_of_film, lay_film, new_folder
 from .intake import Intake, shown_name
-from .looks import Card
+from .looks import Card, only
 from .stage import Eye, Stage, stage_of
 from .state import Film, State, dropped
 from .studio import Studio
@@ -75,12 +77,26 @@ class Session:
         self._face = face
 
     def warm(self) -> None:
-        """Make ready what the first photograph needs."""
-        self.intake.warm()
-        self._desk.do("warm", self._open)
+        """Make ready what the first photograph needs, while nobody waits: encoders, kernels, the process that decodes."""
+        threading.Thread(target=self.intake.warm, name="fprf-warm", daemon=True).start()
+        self._desk.spare(self._rehearse())
 
-    def _open(self) -> None:
+    def _rehearse(self) -> Iterator[None]:
+        """What a photograph goes through, with a picture of nothing."""
         self.studio.encoders  # noqa: B018  they are opened by asking for them
+        yield
+        path = self.intake.folder / "rehearsal.png"
+        ramp = np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8)
+        path.write_bytes(encode(ramp, "png"))
+        card = self.studio.card(path, "rehearsal")
+        yield
+        look = only(State().look, card)
+        self.studio.restyle(look)
+        yield
+        eye = self.stage.eye(self.trained.known.cameras, 0)
+        yield from self._sight.look(None, Glance(eye, replace(self.state, look=look).shown, 32))
+        self._sight.forget(None)
+        self.studio.forget(card)
 
     def see(self, client: Hashable, eye: Eye) -> None:
         """A client's camera is here now."""

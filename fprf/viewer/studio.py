@@ -86,6 +86,11 @@ class Studio:
         assert there is not None  # else it would have settled
         return mixed(here, there, look.at)
 
+    def forget(self, card: Card) -> None:
+        """Nobody will ask for this photograph again."""
+        self._dictionaries = OrderedDict((key, value) for key, value in self._dictionaries.items() if key[0] is not card)
+        self._styles = OrderedDict((look, value) for look, value in self._styles.items() if card not in dict(look.mix))
+
     def restyle(self, look: Look) -> Restyle | None:
         """What a renderer needs of the look."""
         styled = self.styled(look)

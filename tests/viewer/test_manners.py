@@ -1,0 +1,91 @@
+import math
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import DataError
+from fprf.viewer.manners import check_message
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0, 0, 0],
+    "position": [0, 0.5, 1],
+    "fov": 1.2,
+    "near": 0.01,
+    "far": 1000.0,
+    "image_height": 720,
+    "image_width": 1280,
+    "look_at": [0, 0, 0],
+    "up_direction": [0, 0, 1],
+}
+CONTROL = {"type": "GuiUpdateMessage", "uuid": "a-b-c", "updates": {"value": 0.5}}
+CLICK = {
+    "type": "ScenePointerMessage",
+    "event_type": "click",
+    "ray_origin": [0, 0, 0],
+    "ray_direction": [0, 0, 1],
+    "screen_pos": [[0.5, 0.5]],
+    "modifier": None,
+}
+
+
+@pytest.mark.parametrize("message", [CAMERA, CONTROL, CLICK, {**CONTROL, "updates": {"value": "alone"}}])
+def test_what_the_page_sends_passes(message: dict[str, Any]) -> None:
+    check_message(message)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        None,
+        [],
+        "text",
+        {},
+        {1: 2},
+        {"type": ["GuiUpdateMessage"]},
+        {"type": "ShareUrlRequest"},
+        {"type": "FileTransferStartUpload", "size_bytes": 10**12},
+        {"type": "RunJavascriptMessage", "source": "1"},
+        {"type": "GuiSetPanelPositionMessage"},
+        {**CAMERA, "fov": math.nan},
+        {**CAMERA, "position": [math.inf, 0, 0]},
+        {**CAMERA, "position": [0, 0]},
+        {**CAMERA, "position": "abc"},
+        {**CAMERA, "image_width": True},
+        {**CAMERA, "image_width": 10**40},
+        {**CAMERA, "wxyz": None},
+        {**CONTROL, "updates": {"update_cb": []}},
+        {**CONTROL, "updates": {"value": 1, "removed": True}},
+        {**CONTROL, "updates": [1]},
+        {**CONTROL, "uuid": 3},
+        {**CONTROL, "updates": {"value": "x" * 5000}},
+        {**CONTROL, "updates": {"value": [0.0] * 65}},
+        {**CONTROL, "updates": {"value": [[[[1]]]]}},
+        {**CONTROL, "updates": {"value": b"bytes"}},
+        {**CLICK, "event_type": "rect-select"},
+        {**CLICK, "ray_origin": [0, 0]},
+    ],
+)
+def test_anything_else_does_not(message: object) -> None:
+    with pytest.raises(DataError, match="message"):
+        check_message(message)
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.binary(max_size=4),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=60)
+@given(st.dictionaries(st.sampled_from([*CAMERA, *CONTROL, *CLICK, "else"]), values), st.sampled_from([CAMERA, CONTROL, CLICK]))
+def test_it_refuses_or_passes_but_never_breaks(changes: dict[str, Any], base: dict[str, Any]) -> None:
+    for message in ({**base, **changes}, {**base, **changes, "type": base["type"]}):
+        try:
+            check_message(message)
+        except DataError:
+            continue
+        assert message["type"] in ("ViewerCameraMessage", "GuiUpdateMessage", "ScenePointerMessage")
