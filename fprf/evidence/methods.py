@@ -28,8 +28,8 @@ __all__ = ["FLAT", "GLOBAL", "PLAIN", "Shown", "dictionary_of", "in_scene", "lin
 PLAIN = "no change"
 FLAT = "2d"
 """The recommended stylizer on every picture alone, as if there were no scene."""
-GLOBAL = ("reinhard", "histogram", "adain", FLAT)
-"""What the recommended stylizer shall beat: methods without regions or without a scene."""
+GLOBAL = ("reinhard", "histogram", "adain")
+"""What the recommended stylizer shall beat: colours of each picture alone, and features without regions."""
 _SHARP = 0.01
 """Relative temperature at which a point takes one code alone."""
 

@@ -9,14 +9,19 @@ from torch import Tensor
 
 from ..evaluation.colour_difference import delta_e
 from ..evaluation.metrics import image_metrics, mean_metrics
+from ..style.transport import monge
 from ..town.classes import CLASSES
 
-__all__ = ["Row", "best_class_maps", "mean_rows", "score"]
+__all__ = ["Labelled", "Row", "best_class_maps", "mean_rows", "score", "true_class_maps"]
 
 Row = dict[str, float | None]
 Picture = Annotated[Tensor, "H W 3"]
+Labelled = Sequence[tuple[Picture, Annotated[Tensor, "H W"]]]
+"""Pictures with the true class of every pixel."""
 _RIDGE = 1e-4
 """Variance added before a class's colours are inverted: a class of one colour is only moved."""
+_GAIN = 3.0
+"""No direction of colour is amplified more, as in `style.colours`."""
 
 
 def score(
@@ -30,15 +35,13 @@ def score(
     return row, {CLASSES[k]: float(apart[kinds == k].mean()) for k in sorted(set(kinds.tolist()))}
 
 
-def best_class_maps(
-    plain: Sequence[Picture], truth: Sequence[Picture], labels: Sequence[Annotated[Tensor, "H W"]]
-) -> list[Picture]:
+def best_class_maps(plain: Labelled, truth: Sequence[Picture]) -> list[Picture]:
     """The plain pictures after the affine map of colours of each true class that is nearest to the truth (least squares).
 
     It knows the truth: a bound on what moving the colours of classes as wholes can reach, with this reconstruction.
     """
-    here, there = (torch.cat([image.reshape(-1, 3) for image in side]).double() for side in (plain, truth))
-    kinds = torch.cat([each.flatten() for each in labels])
+    here, kinds = _flat(plain)
+    there = torch.cat([image.reshape(-1, 3) for image in truth]).double()
     moved = torch.empty_like(here)
     for kind in set(kinds.tolist()):
         inside = kinds == kind
@@ -47,8 +50,24 @@ def best_class_maps(
         spread = (a - middle).T @ (a - middle) / len(a) + _RIDGE * torch.eye(3, dtype=torch.float64)
         matrix = torch.linalg.solve(spread, (a - middle).T @ (b - target) / len(a))
         moved[inside] = (a - middle) @ matrix + target
-    parts = torch.split(moved.clamp(0, 1).float(), [image.shape[0] * image.shape[1] for image in plain])
-    return [part.reshape(image.shape) for part, image in zip(parts, plain, strict=True)]
+    return _pictures(moved, plain)
+
+
+def true_class_maps(plain: Labelled, references: Labelled) -> list[Picture]:
+    """The plain pictures with the colours of each true class carried to those of the same class in the references.
+
+    What perfect matching would give. Classes that no reference shows take all colours of the references.
+    """
+    here, kinds = _flat(plain)
+    there, known = _flat(references)
+    floor = _RIDGE * torch.eye(3, dtype=torch.float64)
+    moved = torch.empty_like(here)
+    for kind in set(kinds.tolist()):
+        a = here[kinds == kind]
+        b = there[known == kind] if bool((known == kind).any()) else there
+        spread, wide = (torch.cov(x.T, correction=0).reshape(3, 3) + floor for x in (a, b))
+        moved[kinds == kind] = (a - a.mean(0)) @ monge(spread[None], wide[None], gain=_GAIN)[0] + b.mean(0)
+    return _pictures(moved, plain)
 
 
 def mean_rows(tables: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
@@ -60,3 +79,13 @@ def mean_rows(tables: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
             values = [value for table in tables if (value := table[method][key]) is not None]
             found[method][key] = math.fsum(values) / len(values) if values else None
     return found
+
+
+def _flat(pictures: Labelled) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
+    colours = torch.cat([image.reshape(-1, 3) for image, _ in pictures]).double()
+    return colours, torch.cat([labels.flatten() for _, labels in pictures])
+
+
+def _pictures(colours: Annotated[Tensor, "N 3"], like: Labelled) -> list[Picture]:
+    parts = torch.split(colours.clamp(0, 1).float(), [image.shape[0] * image.shape[1] for image, _ in like])
+    return [part.reshape(image.shape) for part, (image, _) in zip(parts, like, strict=True)]
