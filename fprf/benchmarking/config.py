@@ -6,7 +6,7 @@ from typing import Literal
 
 from ..checks import at_least, positive
 
-__all__ = ["BenchConfig", "MemoryConfig", "ParetoConfig", "ProfileConfig", "ScalingConfig", "SpeedConfig"]
+__all__ = ["BenchConfig", "MemoryConfig", "ParetoConfig", "ProfileConfig", "ScalingConfig", "SpeedConfig", "StressConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,3 +114,22 @@ class ScalingConfig(BenchConfig):
         for name in ("images", "downscales", "styles", "points"):
             for value in getattr(self, name):
                 at_least(name, value, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StressConfig(BenchConfig):
+    """Every stage on adversarial inputs, each against a reference and a bound."""
+
+    steps: int = 60
+    """Steps to train it."""
+    mutations: int = 200
+    """Mutated files for each reader."""
+    flips: int = 200
+    """Flipped bits in a file of tensors."""
+    markdown: Path | None = None
+    """The rows as a Markdown table; none = don't."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("mutations", "flips"):
+            at_least(name, getattr(self, name), 1)

@@ -7,7 +7,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ..benchmarking.config import BenchConfig, MemoryConfig, ParetoConfig, ProfileConfig, ScalingConfig, SpeedConfig
+from ..benchmarking.config import (
+    BenchConfig,
+    MemoryConfig,
+    ParetoConfig,
+    ProfileConfig,
+    ScalingConfig,
+    SpeedConfig,
+    StressConfig,
+)
 from ..errors import UsageError
 from . import evidence
 from .parsing import load_method, parse
@@ -22,6 +30,7 @@ NAMES: dict[str, BenchConfig] = {
     "pareto": ParetoConfig(),
     "memory": MemoryConfig(),
     "scaling": ScalingConfig(),
+    "stress": StressConfig(),
 }
 """Defaults of each benchmark; `fprf.benchmarking.NAME` has a function of its name."""
 

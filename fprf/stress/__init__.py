@@ -1,0 +1,1 @@
+"""Adversarial inputs for every stage, each against a reference and a bound: the report of `fprf bench stress`."""

@@ -1,0 +1,169 @@
+"""What must hold for whole renders of a trained run: precision, place and unit of the world, order of whatever has none."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..benchmarking.views import exact, view_rays
+from ..config import RenderConfig
+from ..datamanagers.scene import Scene
+from ..engine.loading import Trained
+from ..engine.model import Facts, Model, background_of
+from ..engine.restyle import restyle
+from ..plugins.stylizers.config import RegionOtConfig
+from ..rendering.bounds import find_space
+from ..rendering.cameras import Cameras
+from ..rendering.renderer import render_rays
+from ..style.look import Restyle
+from ..types import Rays, Want
+from .check import Check
+
+__all__ = ["decibels", "invariants"]
+
+OFFSET = (1e6, -3e6, 5e5)
+"""Metres: of the size of UTM coordinates."""
+
+
+def invariants(trained: Trained, scene: Scene | None, cameras: Cameras, references: Sequence[Path]) -> list[Check]:
+    """Of one view; what needs the scene's images or points is left out without them."""
+    model, facts = trained.model, trained.known.facts
+    rays = view_rays(model, cameras, 0)
+    plain = colours(model, facts, rays, trained.config.render)
+    whole = colours(model, facts, rays, replace(trained.config.render, budget=0.0))
+    rows = [
+        _row("float32, nothing skipped", "float64", decibels(whole, exact(model, facts, rays)), 100.0, "dB", at_least=True),
+        _row("as configured, samples skipped", "float64", _largest(plain, exact(model, facts, rays)), 1 / 256),
+        *_orders(trained, rays, plain),
+        *_threads(trained, rays, plain),
+    ]
+    if scene is not None:
+        rows += _worlds(trained, scene, cameras, plain)
+    return rows + _styles(trained, rays, plain, references)
+
+
+@torch.inference_mode()
+def colours(
+    model: Model, facts: Facts, rays: Rays, config: RenderConfig, look: Restyle | None = None
+) -> Annotated[Tensor, "R 3"]:
+    """Colours in [0, 1], chunk by chunk, as views are rendered."""
+    background, found = background_of(facts, rays.near.device), []
+    for start in range(0, len(rays.near), config.chunk):
+        part = Rays(*(x[start : start + config.chunk] for x in rays))
+        out = render_rays(part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=look)
+        assert out.rgb is not None
+        found.append(out.rgb)
+    return torch.cat(found).clamp(0, 1)
+
+
+def decibels(found: Tensor, truth: Tensor) -> float:
+    """PSNR; 200 where nothing differs."""
+    error = float((found.double() - truth.double()).square().mean())
+    return min(200.0, -10 * float(torch.tensor(max(error, 1e-20), dtype=torch.float64).log10()))
+
+
+def _orders(trained: Trained, rays: Rays, plain: Tensor) -> list[Check]:
+    """The same rays in another order, and in other chunks."""
+    order = torch.randperm(len(plain), generator=torch.Generator().manual_seed(0)).to(plain.device)
+    shuffled = colours(trained.model, trained.known.facts, Rays(*(x[order] for x in rays)), trained.config.render)
+    small = replace(trained.config.render, chunk=max(1, len(plain) // 7))
+    parts = colours(trained.model, trained.known.facts, rays, small)
+    return [
+        _row("rays in another order", "the same image", _largest(shuffled, plain[order]), 1e-6),
+        _row("rays in other chunks", "the same image", _largest(parts, plain), 1e-6),
+    ]
+
+
+def _threads(trained: Trained, rays: Rays, plain: Tensor) -> list[Check]:
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(colours(trained.model, trained.known.facts, rays, trained.config.render))
+    finally:
+        torch.set_num_threads(before)
+    return [_row("1 and 2 threads", "the same bits", _largest(*found), 0.0)]
+
+
+def _worlds(trained: Trained, scene: Scene, cameras: Cameras, plain: Tensor) -> list[Check]:
+    """The capture moved and scaled as a whole: its space is found anew, the model lives in that."""
+    rows = []
+    model = trained.model
+    for name, scale, offset in (
+        ("world 1e6 m away", 1.0, OFFSET),
+        ("world 1e6 times larger", 1e6, (0.0, 0.0, 0.0)),
+        ("world 1e6 times smaller", 1e-6, (0.0, 0.0, 0.0)),
+        ("views in another order", 1.0, None),
+    ):
+        if offset is None:
+            order = torch.randperm(len(scene.paths), generator=torch.Generator().manual_seed(1))
+            inverse = torch.argsort(order)
+            other = replace(
+                scene,
+                paths=tuple(scene.paths[i] for i in order.tolist()),
+                cameras=scene.cameras.select(order),
+                train=inverse[scene.train],
+                test=inverse[scene.test],
+                depths=None if scene.depths is None else scene.depths[order],
+                seen=None,
+            )
+            view = cameras
+        else:
+            other = _moved(scene, scale, torch.tensor(offset, dtype=torch.float64))
+            view = _placed(cameras, scale, torch.tensor(offset, dtype=torch.float64))
+        own = model.space
+        model.space = find_space(other)
+        try:
+            found = colours(model, trained.known.facts, view_rays(model, view, 0), trained.config.render)
+        finally:
+            model.space = own
+        rows.append(_row(name, "the same image", _largest(found, plain), 1e-3))
+    return rows
+
+
+def _styles(trained: Trained, rays: Rays, plain: Tensor, references: Sequence[Path]) -> list[Check]:
+    model, facts, config = trained.model, trained.known.facts, trained.config.render
+    there = restyle(trained, references, RegionOtConfig()).restyle
+    back = restyle(trained, references[::-1], RegionOtConfig()).restyle
+    none = restyle(trained, references, RegionOtConfig(), strength=0.0).restyle
+    styled, turned, still = (colours(model, facts, rays, config, look) for look in (there, back, none))
+    return [
+        _row("references in another order", "the same image", _largest(turned, styled), 1e-6),
+        _row("strength 0", "the plain image, bit for bit", _largest(still, plain), 0.0),
+        _row("restyled, float32, nothing skipped", "float64", _styled_error(trained, rays, there), 60.0, "dB", at_least=True),
+    ]
+
+
+def _styled_error(trained: Trained, rays: Rays, look: Restyle) -> float:
+    whole = replace(trained.config.render, budget=0.0)
+    found = colours(trained.model, trained.known.facts, rays, whole, look)
+    return decibels(found, exact(trained.model, trained.known.facts, rays, look))
+
+
+def _moved(scene: Scene, scale: float, offset: Annotated[Tensor, "3"]) -> Scene:
+    return replace(
+        scene,
+        cameras=_placed(scene.cameras, scale, offset),
+        points=None if scene.points is None else scale * scene.points.double() + offset,
+        depths=None if scene.depths is None else scale * scene.depths,
+    )
+
+
+def _placed(cameras: Cameras, scale: float, offset: Annotated[Tensor, "3"]) -> Cameras:
+    pose = cameras.pose.clone()
+    pose[:, :, 3] = scale * pose[:, :, 3] + offset
+    return replace(cameras, pose=pose)
+
+
+def _largest(found: Tensor, truth: Tensor) -> float:
+    return float((found.double() - truth.double()).abs().max())
+
+
+def _row(name: str, reference: str, measured: float, bound: float, unit: str = "of [0, 1]", *, at_least: bool = False) -> Check:
+    return Check(
+        stage="pipeline", input=name, reference=reference, measured=measured, bound=bound, unit=unit, at_least=at_least
+    )
