@@ -32,21 +32,7 @@ from ..testing import cases
 __all__ = ["Outcome", "Target", "fuzz", "mutated", "targets"]
 
 SIDE = 24
-WORDS = (b"NaN", b"1e400", b"-1", b"0", b"null", b"true", b"[]", b"{}", b'"', b"../../etc/passwd", b"\x00", b"\xff\xfe", b"9" * 40)
-    b"NaN",
-    b"1e400",
-    b"-1",
-    b"0",
-    b"null",
-    b"[]",
-    b"{}",
-    b'"',
-    b"../../etc/passwd",
-    b"\x00",
-    b"\xff\xfe",
-    b"9" * 40,
-    b"true",
-)
+WORDS = (b"NaN", b"1e400", b"-1", b"0", b"null", b"true", b"[]", b"{}", b"../../etc/passwd", b"\x00", b"\xff\xfe", b"9" * 40)
 NUMBERS = tuple(struct.pack("<Q", value) for value in (0, 1, 2**28, 2**31, 2**63, 2**64 - 1))
 NUMBERS += tuple(struct.pack("<d", value) for value in (0.0, -1.0, 1e300, float("nan"), float("inf")))
 
