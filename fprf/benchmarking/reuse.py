@@ -33,6 +33,9 @@ _FAST = 100.0
 _FOLDED = 1.5
 """How many times faster the folded layers should be."""
 SIDES = ("folded", "plain")
+HEAD = 4096
+"""Samples whose hidden units go on to shares, so many times: a cache holds them."""
+TIMES = 20
 
 
 def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, StylizerConfig]) -> list[Row]:
@@ -88,12 +91,18 @@ def folding_rows(config: SpeedConfig, subject: Subject) -> list[Row]:
         rays = view_rays(trained.model, camera, 0)
         points = march(rays, trained.model.parts, budget=trained.config.render.budget).kept.point
     small, plain, folding = found.model.semantic, styled.restyle.stylizer, found.look.stylizer
-    pairs = {"semantics and matching, dictionary folded": ((small, folding, points), (field, plain, points), None)}
+    pairs = {"semantics and matching, dictionary folded": ((small, folding, points, 1), (field, plain, points, 1), None)}
     if isinstance(field, SemanticPlanes) and isinstance(small, ProjectedPlanes):
         with torch.inference_mode():
-            units = field.planes.network(points, weights(field.network)[:-1], [None] * (len(small.maps) - 1)).relu()
+            # What a cache holds: in the field, units never leave it.
+            units = field.planes.network(points[:HEAD], weights(field.network)[:-1], [None] * (len(small.maps) - 1)).relu()
+            units = units.repeat(-(-HEAD // max(1, len(units))), 1)[:HEAD]
         heads = _Head(list(small.maps)[-1]), _Head(weights(field.network)[-1])
-        pairs["the same from the field's hidden units on"] = ((heads[0], folding, units), (heads[1], plain, units), _FOLDED)
+        pairs[f"the same from hidden units to shares, {TIMES} x {HEAD} samples"] = (
+            (heads[0], folding, units, TIMES),
+            (heads[1], plain, units, TIMES),
+            _FOLDED,
+        )
     calls = {f"{side} {name}": partial(_shares, *pair[i]) for name, pair in pairs.items() for i, side in enumerate(SIDES)}
     seconds = watch_of(config, trained).in_turn(calls)
     about = f"{len(points)} samples of a view, {len(styled.dictionary.keys)} codes, {known.facts.dim} semantic channels"
@@ -131,5 +140,7 @@ class _Head(nn.Module):
 
 
 @torch.inference_mode()
-def _shares(field: nn.Module, stylizer: Stylizer, points: Tensor) -> Tensor:
-    return stylizer.match(field(points))
+def _shares(field: nn.Module, stylizer: Stylizer, points: Tensor, times: int) -> Tensor:
+    for _ in range(times):
+        shares = stylizer.match(field(points))
+    return shares
