@@ -1,6 +1,7 @@
 """On the town with its true depth: what is consistent scores nothing, faults score by their size."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import cv2
 import pytest
@@ -112,7 +113,7 @@ def test_faults_rank_by_their_size(
     path: Cameras,
 ) -> None:
     found = [0.0, *(score(day, fault(day, size), depths, path) for size in sizes)]
-    assert all(after > 1.3 * before + 0.01 for before, after in zip(found, found[1:], strict=False)), found
+    assert all(after > 1.3 * before + 0.01 for before, after in pairwise(found)), found
 
 
 def test_faults_of_a_recoloured_film_are_seen_too(day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
