@@ -21,6 +21,7 @@ from ..style.references import read_reference
 from ..style.regional import RegionWeight, regional
 from ..style.scene import SceneStyle
 from ..style.wishes import labels
+from .first_use import check_stylizer
 from .loading import Trained, load_style
 from .orders import Orders, take_orders
 from .regions import Regions
@@ -119,6 +120,7 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
     chosen = style.stylizer
     stylizer = regional(dictionary, scene, orders.allowed, chosen)
     partly = bool((orders.strength != 1).any())
+    check_stylizer(chosen, stylizer, dictionary, scene)
     device = next(trained.model.parameters()).device
     stylizer = stylizer.to(device)
     colours = colour_maps(stylizer, dictionary, scene, trained.model.decoder, features=chosen.features, share=chosen.colours)

@@ -1,0 +1,242 @@
+"""Faults 9, 10 and 11: a dozen packages that misbehave, installed all at once; everybody else is unaffected."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from fake_packages import Packages, packages_in
+from tiny_world import World
+from torch import Tensor, nn
+
+from fprf import cli
+from fprf.commands.train import train_scene
+from fprf.engine.first_use import check_parts, check_stylizer
+from fprf.engine.model import build_model
+from fprf.errors import PluginError
+from fprf.fields.config import PlanesConfig
+from fprf.interfaces import Stylizer
+from fprf.plugins.decoders.config import DecoderConfig
+from fprf.plugins.stylizers.config import StylizerConfig
+from fprf.style.scene import own_style
+from fprf.testing import cases
+from fprf.types import FieldSample, Want
+
+CONFIG = '''
+from dataclasses import dataclass
+from fprf.plugins.encoders.config import EncoderConfig
+
+@dataclass(frozen=True, kw_only=True)
+class C(EncoderConfig):
+    """A stranger's encoder."""
+
+    def build(self):
+        {build}
+'''
+BROKEN = {
+    "raises": "raise RuntimeError('broken at import')",
+    "exits": "import sys; sys.exit(3)",
+    "dies": "import os; os._exit(4)",
+    "prints": "print('hello from a plug-in')\n" + CONFIG.format(build="raise NotImplementedError"),
+    "slow": "import time; time.sleep(30)",
+    "syntax": "def f(:",
+    "absent": "import a_package_that_is_not_there",
+    "wrong-type": "C = 3",
+    "no-attribute": "x = 1",
+    "warns": "import warnings; warnings.warn('old'); raise Warning('as an error')",
+    "recursive": "def f(): f()\nf()",
+    "unbuilt": CONFIG.format(build="return None"),
+}
+
+
+def install(packages: Packages) -> None:
+    """Each in a package of its own; two of one name; one with damaged metadata besides."""
+    for name, source in BROKEN.items():
+        module = f"broken_{name.replace('-', '_')}"
+        packages.install(f"acme-{name}", {"fprf.encoders": {name: f"{module}:C"}}, code={module: source})
+    for k in (1, 2):
+        packages.install(f"acme-clash-{k}", {"fprf.encoders": {"clash": f"broken_unbuilt:C{k}"}})
+    packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
+
+
+def run(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    words = [sys.executable, "-m", "fprf", *args]
+    return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=240)
+
+
+def test_help_and_the_list_with_all_of_them_installed(tmp_path: Path) -> None:
+    with packages_in(tmp_path) as packages:
+        install(packages)
+    shown = run(tmp_path, "--help")
+    assert shown.returncode == 0 and "usage: fprf VERB" in shown.stdout and not shown.stderr
+    listed = run(tmp_path, "plugins")
+    assert listed.returncode == 0 and all(name in listed.stdout for name in BROKEN) and "hello" not in listed.stdout
+    assert "clash" in listed.stdout and "vgg19" in listed.stdout
+
+
+@pytest.mark.parametrize("name", [name for name in BROKEN if name not in ("dies", "slow", "unbuilt", "prints")])
+def test_one_that_is_asked_for_is_named_with_its_package(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with packages_in(tmp_path) as packages:
+        install(packages)
+        assert cli.main(["train", "fprf-lite", "--content.encoder", name]) == 2
+        assert cli.main(["train", "fprf-lite", "--content.encoder", "clash"]) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: ") and name in first and f"acme-{name} 1" in first
+    assert "acme-clash-1" in second and "acme-clash-2" in second
+
+
+def test_training_with_all_of_them_installed(world: World, tmp_path: Path) -> None:
+    with packages_in(tmp_path) as packages:
+        install(packages)
+        train_scene(replace(world.config, output=tmp_path / "run", steps=1), "fprf-lite", quiet=True)
+
+
+@pytest.mark.fault
+def test_the_verbs_of_a_user_with_all_of_them_installed(world: World, tmp_path: Path) -> None:
+    """And the two that no process survives, or waits for, only when they are asked for."""
+    with packages_in(tmp_path) as packages:
+        install(packages)
+    checked = run(tmp_path, "plugins")
+    assert checked.returncode == 0
+    shown = run(tmp_path, "train", "fprf-lite", "--help")
+    assert shown.returncode == 0 and "--content.encoder" in shown.stdout
+    photo = str(world.references[0])
+    styled = run(tmp_path, "stylize", str(world.run), "--references", photo, "--output", str(tmp_path / "styled"))
+    assert styled.returncode == 0, styled.stderr
+    assert run(tmp_path, "train", "fprf-lite", "--content.encoder", "dies").returncode == 4
+
+
+class Field(nn.Module):
+    """A content field with one thing wrong."""
+
+    def __init__(self, inner: nn.Module, wrong: str) -> None:
+        super().__init__()
+        self.inner, self.wrong = inner, wrong
+
+    def density(self, points: Tensor) -> FieldSample:
+        if self.wrong == "writes":
+            points.mul_(2)
+        if self.wrong == "raises":
+            raise ZeroDivisionError("two\nlines")
+        found = self.inner.density(points)
+        density = {
+            "shape": found.density[:, None],
+            "dtype": found.density.double(),
+            "device": found.density.to("meta"),
+            "nan": found.density * float("nan"),
+            "below": found.density - 1e3,
+            "type": found.density.tolist(),
+        }.get(self.wrong, found.density)
+        return FieldSample(density, found.latent)
+
+    def content(self, latent: Tensor, view: Tensor) -> Tensor:
+        found = self.inner.content(latent, view)
+        return found[:, 1:] if self.wrong == "channels" else found
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("shape", r"density: expected float32 \[5\] on cpu, found float32 \[5 1\] on cpu"),
+        ("dtype", r"density: expected float32 \[5\] on cpu, found float64 \[5\]"),
+        ("device", r"density: .*on meta"),
+        ("nan", "density: expected finite numbers, found 5 of 5 that are not"),
+        ("below", r"density: expected numbers in \[0, inf\], found -"),
+        ("type", r"density: expected float32 \[5\] on cpu, found list"),
+        ("writes", "density: expected an input that is left alone"),
+        ("raises", r"density: expected an answer, found ZeroDivisionError: two;"),
+        ("channels", r"content: expected float32 \[5 \d+\] on cpu"),
+    ],
+)
+def test_a_field_that_breaks_its_contract_is_named(world: World, wrong: str, told: str) -> None:
+    facts = world.prepared.facts
+    parts = build_model(world.config, facts).parts
+    check_parts(world.config, parts, facts.channels, facts.dim)
+    with pytest.raises(PluginError, match=r"fprf\.fields: 'planes' \(fprf\..*from fprf .*\): " + told) as caught:
+        check_parts(world.config, parts._replace(field=Field(parts.field, wrong)), facts.channels, facts.dim)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("part", ["decoder", "semantic", "sampler"])
+def test_other_parts_that_break_it_are_named(world: World, part: str) -> None:
+    facts = world.prepared.facts
+    parts = build_model(world.config, facts).parts
+    inner = getattr(parts, part)
+
+    class Wrong(nn.Module):
+        def forward(self, first: Tensor, **named: object) -> object:
+            found = inner(first, **named)
+            return found._replace(t=found.t.flip(1)) if part == "sampler" else found + 5
+
+    broken = parts._replace(**{part: Wrong()})
+    if part == "semantic":
+        broken = parts._replace(semantic=Only(inner))
+    with pytest.raises(PluginError, match={"decoder": "decoders", "semantic": "fields", "sampler": "samplers"}[part]):
+        check_parts(world.config, broken, facts.channels, facts.dim)
+
+
+class Only(nn.Module):
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(self, points: Tensor) -> Tensor:
+        return self.inner(points)[:3]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MineConfig(StylizerConfig):
+    """A stranger's, without an entry point."""
+
+
+class Mine(Stylizer):
+    def __init__(self, wrong: str) -> None:
+        super().__init__()
+        self.wrong = wrong
+
+    @property
+    def needs(self) -> Want:
+        return Want.COLOUR if self.wrong == "needs" else Want.CONTENT
+
+    def forward(self, content: Tensor, semantic: Tensor | None) -> Tensor:
+        if self.wrong == "writes":
+            content += 1
+        return content / 0 if self.wrong == "inf" else content
+
+    def match(self, semantic: Tensor) -> Tensor:
+        return torch.ones(len(semantic), 1 if self.wrong == "codes" else 4) / (1 if self.wrong == "sum" else 4)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("needs", "needs: expected Want.CONTENT"),
+        ("writes", "features: expected an input that is left alone"),
+        ("inf", "features: expected finite numbers"),
+        ("codes", r"matches: expected float32 \[5 4\] on cpu, found float32 \[5 1\]"),
+        ("sum", "matches: expected rows that sum to 1, found a sum of 4"),
+    ],
+)
+def test_a_stylizer_that_breaks_its_contract_is_named(wrong: str, told: str) -> None:
+    scene = cases.scene(4, 8, 4)
+    codes = own_style(scene)
+    check_stylizer(MineConfig(), Mine(""), codes, scene)
+    with pytest.raises(PluginError, match=r"test_broken_plugins:MineConfig: " + told):
+        check_stylizer(MineConfig(), Mine(wrong), codes, scene)
+
+
+def test_built_ins_are_asked_in_no_time_and_left_as_they_are(world: World) -> None:
+    facts = world.prepared.facts
+    assert isinstance(world.config.content.field, PlanesConfig) and isinstance(world.config.content.decoder, DecoderConfig)
+    model = build_model(world.config, facts)
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    check_parts(world.config, model.parts, facts.channels, facts.dim)
+    assert all(torch.equal(before[name], tensor) for name, tensor in model.state_dict().items())
+    assert all(parameter.grad is None for parameter in model.parameters())

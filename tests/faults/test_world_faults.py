@@ -1,0 +1,128 @@
+"""Faults 1, 12, 14 and 17: kills, images that are gone, signals from outside, places and names of all kinds."""
+
+import importlib.util
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from tiny_world import World, flags, parameters
+
+from fprf import cli
+from fprf.engine import checkpoint
+from fprf.engine.run import Run
+
+
+def kills() -> ModuleType:
+    """`benchmarks/kills.py`, which is in no package."""
+    spec = importlib.util.spec_from_file_location("kills", Path(__file__).parents[2] / "benchmarks" / "kills.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.fault
+def test_kills_at_random_moments_leave_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a process of its own: threads of this one would not survive a fork."""
+    script = Path(__file__).parents[2] / "benchmarks" / "kills.py"
+    words = [sys.executable, str(script), "--kills", "5", "--steps", "25", "--output", str(tmp_path / "kills.json")]
+    subprocess.run(words, check=True, timeout=280, env=os.environ | {"TMPDIR": str(tmp_path)}, capture_output=True)
+    import json
+
+    found = json.loads((tmp_path / "kills.json").read_text())
+    assert found["kills"] >= 5 and found["bitwise_equal"] == found["runs"] > 0
+    assert not found["unfinished_files_left"] and not found["other_failures"]
+
+
+def test_the_runner_of_kills_sees_what_is_left(world: World, tmp_path: Path) -> None:
+    module = kills()
+    shutil.copytree(world.run, tmp_path / "run")
+    assert module.contents(tmp_path / "run") == module.contents(world.run) and module.strays(tmp_path / "run") == []
+    (tmp_path / "run" / "checkpoints" / "step-0000020").mkdir()
+    (tmp_path / "run" / ".tmpAbCdEf").touch()
+    assert sorted(module.strays(tmp_path / "run")) == [".tmpAbCdEf", "checkpoints/step-0000020"]
+    style = tmp_path / "run" / "style.safetensors"
+    style.write_bytes(style.read_bytes()[:-1] + b"\x7f")
+    assert module.contents(tmp_path / "run") != module.contents(world.run)
+
+
+@pytest.mark.parametrize("harm", ["gone", "empty", "cut", "text", "rotated"])
+def test_an_image_that_is_gone_or_changed_is_named(
+    world: World, tmp_path: Path, harm: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    town = tmp_path / "town"
+    shutil.copytree(world.town, town)
+    image = sorted((town / "images").iterdir())[3]
+    raw = image.read_bytes()
+    if harm == "gone":
+        image.unlink()
+    elif harm == "rotated":
+        import cv2
+
+        image.write_bytes(cv2.imencode(".png", cv2.imread(str(image)).swapaxes(0, 1))[1].tobytes())
+    else:
+        image.write_bytes({"empty": b"", "cut": raw[: len(raw) // 2], "text": b"not an image"}[harm])
+    args = [str(town) if arg == str(world.town) else arg for arg in flags(world, tmp_path / "run")]
+    assert cli.main(["train", "fprf-lite", *args]) == 2
+    (error,) = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("{")]
+    assert error.startswith("error: ") and image.name in error
+    assert not checkpoint.steps(tmp_path / "run" / "checkpoints")
+
+
+def start(args: Sequence[str], **environment: str) -> subprocess.Popen[str]:
+    words = [sys.executable, "-m", "fprf", *args]
+    return subprocess.Popen(words, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.fault
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_from_outside_saves_and_ends_with_130(world: World, tmp_path: Path, number: int) -> None:
+    args = flags(world, tmp_path / "run")
+    args[args.index("--steps") + 1] = "100000"
+    process = start(["train", "fprf-lite", *args])
+    try:
+        end = time.monotonic() + 200
+        while not (tmp_path / "run" / "events.jsonl").exists() and time.monotonic() < end:
+            time.sleep(0.2)
+        time.sleep(2)
+        process.send_signal(number)
+        _, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and error.endswith("interrupted\n")
+    (step,) = checkpoint.steps(tmp_path / "run" / "checkpoints")
+    assert step > 0 and checkpoint.load(tmp_path / "run" / "checkpoints", step).step == step
+
+
+@pytest.mark.fault
+def test_places_names_clocks_and_languages_of_all_kinds(world: World, tmp_path: Path) -> None:
+    """A folder of spaces, other scripts and 200 letters; the C locale, another time zone, no HOME, no terminal."""
+    place = tmp_path / "with space" / "ünïcode 場面 'quotes'" / ("x" * 200)
+    place.mkdir(parents=True)
+    shutil.copytree(world.town, place / "town")
+    args = [str(place / "town") if arg == str(world.town) else arg for arg in flags(world, place / "run")]
+    environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "LANG", "TERM")}
+    environment |= {"LC_ALL": "C", "TZ": "Pacific/Kiritimati", "PYTHONUTF8": "0", "XDG_CACHE_HOME": str(place / "cache")}
+    done = subprocess.run([sys.executable, "-m", "fprf", "train", "fprf-lite", *args], env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode(errors="replace")
+    here, there = parameters(Run(place / "run"), 15), parameters(Run(world.run), 15)
+    assert all(torch.equal(here[name], there[name]) for name in there)
+
+
+def test_a_clock_that_jumps_changes_nothing(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fprf.commands.train import train_scene
+
+    ticks = iter(range(0, -(10**9), -3600))
+    monkeypatch.setattr(time, "time", lambda: float(next(ticks)))
+    train_scene(replace(world.config, output=tmp_path / "run"), "fprf-lite", quiet=True)
+    here, there = parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15)
+    assert all(torch.equal(here[name], there[name]) for name in there)
