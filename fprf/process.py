@@ -28,7 +28,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 
 def settle() -> None:
-    """Both, unless the user decided otherwise."""
+    """All of it, unless the user decided otherwise."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")  # else damaged images are told twice: by it, and by us in one line
     wait_briefly(os.environ)
     keep_memory()
 
