@@ -1,12 +1,13 @@
 """What can be turned when an image is rendered, one knob at a time, and the presets of `--quality`."""
 
+import copy
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..config import RenderConfig
 from ..engine.loading import Trained
@@ -14,6 +15,7 @@ from ..engine.model import Facts, Model
 from ..engine.quality import PRESETS, QualityConfig, at_quality
 from ..engine.restyle import Styled
 from ..engine.views import render_view
+from ..fields.planes import Planes
 from ..interfaces import SemanticField
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
@@ -21,7 +23,7 @@ from ..style.look import Restyle
 from .naive import plain_planes, replaced
 from .views import plainly, view_rays
 
-__all__ = ["BUDGETS", "SAMPLES", "Setting", "as_rendered", "plain_settings", "styled_settings"]
+__all__ = ["BUDGETS", "SAMPLES", "Setting", "as_rendered", "half_planes", "plain_settings", "styled_settings"]
 
 BUDGETS = {"0": 0.0, "1/4096": 1 / 4096, "1/1024": 1 / 1024, "1/512": 1 / 512, "1/256": 1 / 256, "1/64": 1 / 64, "1/16": 1 / 16}
 SAMPLES = (0.25, 0.5, 0.75, 1.5, 2.0, 4.0)
@@ -44,9 +46,11 @@ class Setting(NamedTuple):
         return f"{self.knob} {self.value}"
 
 
-def plain_settings(trained: Trained) -> Iterator[Setting]:
-    """Everything but the style."""
+def plain_settings(trained: Trained, styled: Styled) -> Iterator[Setting]:
+    """Everything but the style; and the style at strength 0, which must cost nothing and change nothing."""
     yield from _settings(trained, None)
+    nothing = replace(styled.restyle, strength=0.0)
+    yield Setting("style", "at strength 0", _drawer(trained.model, trained.known.facts, trained.config.render, nothing))
 
 
 def styled_settings(trained: Trained, styled: Styled, stylizer: StylizerConfig) -> Iterator[Setting]:
@@ -80,6 +84,8 @@ def _settings(trained: Trained, look: Restyle | None) -> Iterator[Setting]:
         yield Setting("resolution", f"x {size:g}", _drawer(model, facts, replace(render, resolution=size), look))
     yield Setting("kernels", "none, plain torch", _plain_drawer(model, facts, render, look, nullcontext))
     yield Setting("kernels", "none, grid_sample", _plain_drawer(model, facts, render, look, lambda: plain_planes(model)))
+    stored = half_planes(model)
+    yield Setting("precision", "planes stored in float16", _drawer(stored, facts, render, look))
     yield Setting("precision", "plain, bfloat16", _plain_drawer(model, facts, render, look, lambda: half_networks(model)))
 
 
@@ -123,6 +129,16 @@ def half_networks(model: Model) -> Iterator[None]:
         if model.semantic is not None:
             stack.enter_context(replaced(model.semantic, "forward", around))
         yield
+
+
+def half_planes(model: Model) -> Model:
+    """A copy whose planes are stored in half precision; kernels for the CPU read float32, so there they are only rounded."""
+    made = copy.deepcopy(model).requires_grad_(False)
+    for module in made.modules():
+        if isinstance(module, Planes):
+            half = module.table.half()
+            module.table = nn.Parameter(half if half.device.type == "cuda" else half.float(), requires_grad=False)
+    return made
 
 
 class _Leading(SemanticField):

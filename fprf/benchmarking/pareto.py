@@ -22,14 +22,14 @@ from ..rendering.cameras import Cameras
 from ..style.look import Restyle
 from .config import ParetoConfig
 from .front import Point, front
-from .knobs import as_rendered, plain_settings, styled_settings
+from .knobs import BUDGETS, as_rendered, plain_settings, styled_settings
 from .plot import Panel, draw
 from .points import Scenes, measure
 from .report import Outcome, document, table
 from .subject import Subject, device_of, find, settings, size_of, small_view, watch_of
 from .timing import Watch
 from .train_knobs import trained_points
-from .views import exact, view_rays
+from .views import count, exact, view_rays
 
 __all__ = ["pareto"]
 
@@ -48,7 +48,7 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
     styled = restyle(trained, subject.references, stylizer)
     curves: dict[str, list[Point]] = {}
     for name, look, chosen, photographs in (
-        ("plain", None, plain_settings(trained), truth),
+        ("plain", None, plain_settings(trained, styled), truth),
         ("stylised, region-ot", styled.restyle, styled_settings(trained, styled, stylizer), None),
     ):
         scenes = Scenes(cameras, photographs, [_exact(trained, camera, look) for camera in cameras])
@@ -58,7 +58,9 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
         curves["plain"] += _other_run(load_run(other, config.device), [known.names[v] for v in views], by_photographs, watch)
     if config.train_minutes is not None:
         curves["trained"] = trained_points(config.train_minutes, subject, by_photographs, watch, folder, progress)
-    return _outcome(config, subject, curves, missing, cameras[0])
+    rays = view_rays(trained.model, cameras[0], 0)
+    counters = {name: count(trained.model.parts, rays, budget).shares for name, budget in BUDGETS.items()}
+    return _outcome(config, subject, curves, missing, cameras[0], counters)
 
 
 def _told(progress: Progress, name: str, done: int, total: int) -> None:
@@ -101,7 +103,14 @@ def _loss(point: Point) -> float | None:
     return None if point.psnr is None else -point.psnr
 
 
-def _outcome(config: ParetoConfig, subject: Subject, curves: dict[str, list[Point]], missing: str, camera: Cameras) -> Outcome:
+def _outcome(
+    config: ParetoConfig,
+    subject: Subject,
+    curves: dict[str, list[Point]],
+    missing: str,
+    camera: Cameras,
+    counters: dict[str, dict[str, float]],
+) -> Outcome:
     panels, fronts, tables = [], {}, []
     for name, points in curves.items():
         by_error, by_truth = front(points, lambda p: p.rms), front(points, _loss)
@@ -113,7 +122,11 @@ def _outcome(config: ParetoConfig, subject: Subject, curves: dict[str, list[Poin
             panels.append(Panel(f"{name}: against photographs", points, by_truth, lambda p: p.psnr, "PSNR, dB", log=False))
     trained = subject.trained
     about = settings(config, trained, missing) | {"view": size_of(camera), "views": config.views}
-    extra = {"points": {name: [p.json() for p in points] for name, points in curves.items()}, "fronts": fronts}
+    extra = {
+        "points": {name: [p.json() for p in points] for name, points in curves.items()},
+        "fronts": fronts,
+        "counters_by_budget": counters,
+    }
     made = document("pareto", [], device=device_of(trained), settings=about, extra=extra)
     plot = config.plot or (config.output.with_suffix(".png") if config.output is not None else None)
     if plot is not None:

@@ -24,6 +24,7 @@ VARIANTS: dict[str, Callable[[Any], Any]] = {
     "render.train_budget": lambda budget: 0.0 if budget else 1 / 512,
     "semantic.samples": lambda samples: 48 if samples < 48 else 2,
     "semantic.dim": lambda dim: max(1, dim // 2),
+    "semantic.field.resolutions": lambda resolutions: (*resolutions, 2 * resolutions[-1]),
     "datamanager.semantic_share": lambda share: 1.0 if share < 1 else 0.25,
     "datamanager.rays": lambda rays: 2 * rays,
     "loss.penalty_every": lambda every: 1 if every > 1 else 8,

@@ -71,7 +71,7 @@ def test_pareto(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     document = bench(world, "pareto", tmp_path / "pareto.json", "--also", str(world.run))
     plain, styled = document["points"].values()
     knobs = {point["knob"] for point in plain}
-    assert knobs >= {"run", "quality", "budget", "samples", "chunk", "resolution", "precision", "kernels", "method"}
+    assert knobs >= {"run", "quality", "budget", "samples", "chunk", "resolution", "precision", "kernels", "method", "style"}
     assert "semantic channels" in {point["knob"] for point in styled}
     by_name = {f"{point['knob']} {point['value']}": point for point in plain}
     assert by_name["budget 0"]["largest_error"] < 1e-4
@@ -79,6 +79,10 @@ def test_pareto(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         assert by_name[f"budget {text}"]["largest_error"] <= budget + 1e-5
     assert by_name["quality standard"]["rms_error"] == by_name["budget 1/512"]["rms_error"]
     assert by_name["run as trained"]["psnr"] == pytest.approx(by_name["method fprf-lite"]["psnr"])
+    assert by_name["style at strength 0"]["rms_error"] == by_name["run as trained"]["rms_error"]
+    assert 0 < by_name["precision planes stored in float16"]["rms_error"] < 1e-2
+    kept = [counters["kept_samples_share"] for counters in document["counters_by_budget"].values()]
+    assert kept[-1] > 0 and kept == sorted(kept, reverse=True)
     for name, front in document["fronts"].items():
         assert front["rms_error"] and {*front["rms_error"]} <= {f"{p['knob']} {p['value']}" for p in document["points"][name]}
     assert cv2.imread(str(tmp_path / "pareto.png")).std() > 5
