@@ -66,7 +66,8 @@
       title: `${row.name}\nclick: this one alone; shift-click: in or out of the mix` });
     const weight = make("input", { type: "range", min: 0, max: 2, step: 0.05, title: "weight in the mix" });
     weight.setAttribute("aria-label", `weight of ${row.name}`);
-    const node = make("div", { className: "fprf-card" }, picture, make("span", { textContent: row.name }), weight,
+    const swatch = make("i", { hidden: true, title: "its colour in the map" });
+    const node = make("div", { className: "fprf-card" }, picture, make("span", {}, swatch, row.name), weight,
       make("button", { textContent: "×", title: "remove", onclick: () => tell("/fprf/shelf", { card: row.card, action: "remove" }) }));
     picture.onclick = (event) => tell("/fprf/shelf", event.shiftKey
       ? { card: row.card, action: "weight", weight: node.classList.contains("on") ? 0 : 1 }
@@ -75,7 +76,7 @@
       node.moved = Date.now();
       steady(`weight ${row.card}`, () => ask("/fprf/shelf", { card: row.card, action: "weight", weight: +weight.value }));
     };
-    return Object.assign(node, { weight });
+    return Object.assign(node, { weight, swatch });
   };
   const fillShelf = (rows) => {
     const now = new Set(rows.map((row) => row.card));
@@ -84,6 +85,9 @@
       if (!cards.has(row.card)) { cards.set(row.card, card(row)); shelf.insertBefore(cards.get(row.card), add); }
       const node = cards.get(row.card);
       node.classList.toggle("on", row.weight > 0);
+      node.swatch.hidden = !row.colour;
+      node.swatch.style.display = row.colour ? "" : "none";
+      node.swatch.style.background = row.colour ?? "";
       if (Date.now() - (node.moved ?? 0) > 800) node.weight.value = row.weight;
     }
   };

@@ -16,6 +16,7 @@ from typing import Any
 
 from ..errors import UsageError
 from ..output.images import encode
+from ..output.maps import palette
 from .gate import Answer, Request
 from .looks import Card, Verb, only, ordered, weighed
 from .session import Session
@@ -175,8 +176,13 @@ def described(state: State) -> dict[str, Any]:
     """The state as the page needs it."""
     weights = dict(state.look.mix)
     picked = state.picked
+    hues = palette(len(weights)).mul(255).round().int().tolist() if state.map == "matches" else []
+    colours = {card: "rgb({}, {}, {})".format(*hue) for card, hue in zip(weights, hues, strict=False)}
     return {
-        "shelf": [{"card": card.number, "name": card.name, "weight": weights.get(card, 0.0)} for card in state.shelf],
+        "shelf": [
+            {"card": card.number, "name": card.name, "weight": weights.get(card, 0.0), "colour": colours.get(card)}
+            for card in state.shelf
+        ],
         "wipe": state.wipe,
         "picking": state.picking,
         "picked": None

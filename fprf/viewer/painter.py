@@ -26,8 +26,8 @@ __all__ = ["MAPS", "Layers", "Map", "Painter", "Shown", "compose"]
 Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
 MAPS: tuple[Map, ...] = ("none", "matches", "regions", "depth")
 
-_DIM = 0.35
-"""Brightness of what does not belong to the region that is picked."""
+_DIM = 0.45
+"""Brightness of what does not belong to the region that is picked; it is grey, too."""
 _UNSURE = 0.45
 """Brightness of a region's colour where a pixel belongs to many."""
 
@@ -151,8 +151,8 @@ def compose(layers: Layers, shown: Shown) -> Picture:
     """One picture. What was not painted is left out."""
     picture = layers.pictures["look"]
     if layers.share is not None and shown.region is not None:
-        light = _DIM + (1 - _DIM) * layers.share[..., None]
-        picture = np.rint(picture * light).astype(np.uint8)
+        grey = _DIM * picture.mean(-1, keepdims=True)
+        picture = np.rint(grey + (picture - grey) * layers.share[..., None]).astype(np.uint8)
     if shown.map in layers.pictures:
         over = layers.pictures[shown.map]
         picture = np.rint(picture * (1 - shown.cover) + over * shown.cover).astype(np.uint8)

@@ -35,6 +35,10 @@ _FRESH, _FINAL = 70, 92
 """JPEG qualities of pictures on the way and of those that stay."""
 
 
+_ORBIT = 0.5
+"""Page units from a camera to the point that a drag turns it about."""
+
+
 class _Server(viser.ViserServer):  # type: ignore[misc]  # viser is not there where types are checked
     """Never asks a service elsewhere to share the scene, whatever a page says."""
 
@@ -55,7 +59,7 @@ class Server(Face):
         self._viser.gui.set_panel_label(session.trained.known.name)
         self._viser.scene.set_up_direction(session.stage.up)
         self._viser.scene.world_axes.visible = False
-        self._start_here()
+        self._home = self._start_here()
         self._lock = threading.Lock()
         self.panel = Panel(self._viser.gui, session, self._fly, self._eye_of, self._draw)
         self._viser.on_client_connect(self._arrived)
@@ -99,7 +103,8 @@ class Server(Face):
                 self._session.see(client.client_id, self._eye_of(client))
 
         client.camera.on_update(moved)
-        await moved(client.camera)
+        self._fly(client, self._home)
+        self._session.see(client.client_id, self._home._replace(aspect=self._eye_of(client).aspect))
 
     async def _gone(self, client: viser.ClientHandle) -> None:
         self._session.leave(client.client_id)
@@ -122,31 +127,33 @@ class Server(Face):
         scene.on_click()(clicked)
 
     def _fly(self, client: viser.ClientHandle, eye: Eye) -> None:
+        camera = self._session.stage.cameras([eye], (16, 16))
+        ahead = -camera.pose[0, :, 2].numpy()
         with client.atomic():
             client.camera.position = np.asarray(eye.position)
-            client.camera.wxyz = np.asarray(eye.wxyz)
+            client.camera.look_at = np.asarray(eye.position) + _ORBIT * ahead
+            client.camera.up_direction = np.asarray(self._session.stage.up)
             client.camera.fov = eye.fov
         client.flush()
 
-    def _start_here(self) -> None:
+    def _start_here(self) -> Eye:
         """New clients begin at a captured view, the middle one of those that training did not see."""
         known, stage = self._session.trained.known, self._session.stage
         views = known.test or known.train
-        view = views[len(views) // 2]
-        eye = stage.eye(known.cameras, view)
-        pose = known.cameras.pose[view]
-        camera = self._viser.initial_camera
+        eye = stage.eye(known.cameras, views[len(views) // 2])
+        camera = self._viser.initial_camera  # where "reset view" leads
         camera.position = np.asarray(eye.position)
-        camera.look_at = np.asarray(eye.position) - pose[:, 2].numpy() * 0.5
+        camera.look_at = np.asarray(eye.position) - known.cameras.pose[views[len(views) // 2], :, 2].numpy() * _ORBIT
         camera.up = np.asarray(stage.up)
         camera.fov = eye.fov
+        return eye
 
     def _draw(self, panel: Panel) -> None:
         """Lines over the scene, as the controls say."""
         session = self._session
         known, stage = session.trained.known, session.stage
         cameras = known.cameras.select(torch.tensor(known.train)) if panel.cameras else None
-        self._lines("cameras", None if cameras is None else camera_lines(stage, cameras, 0.06), (94, 161, 255))
+        self._lines("cameras", None if cameras is None else camera_lines(stage, cameras, 0.04), (94, 161, 255))
         boxes = None
         if panel.blocks and known.facts.space.kind == "open":
             boxes = box_lines(stage, known.facts.space, load_boxes(session.trained.run.root))
