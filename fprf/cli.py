@@ -37,11 +37,13 @@ VERBS = {
     "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("RUN", "look at a scene in the browser; drop a photograph on it to restyle it"),
+    "report": Verb("RUN", "how training went: charts of loss, PSNR, speed, time per part"),
     "bench": Verb("speed|profile|pareto|... [RUN]", "time and error, where time goes, memory, scaling"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
     "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),
     "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
+    "completion": Verb("bash|zsh|fish", "a script by which a shell completes verbs and flags"),
     "doctor": Verb("[RUN|DIR]", "look over this machine, a run or a scene folder"),
 }
 

@@ -19,9 +19,12 @@ from .flags import Flag, explain, flags_of, spell
 if TYPE_CHECKING:
     from ..config import TrainConfig
 
-__all__ = ["load_method", "methods", "parse"]
+__all__ = ["LIST_FLAGS", "load_method", "methods", "parse"]
 
 C = TypeVar("C")
+
+LIST_FLAGS = "--list-flags"
+"""Asks any verb for its flags, one a line: for shells that complete them."""
 
 _COLUMNS = 100
 
@@ -33,6 +36,9 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     `none` empties whatever may be None. Fields named in `positional` are given without a flag, in that order, and must
     be given. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one line.
     """
+    if LIST_FLAGS in args:
+        print("\n".join(sorted({*flags_of(default), *(f"--{slot.path.replace('_', '-')}" for slot in slots(default))})))
+        raise SystemExit(0)
     config, rest = resolve(default, args)
     for slot in slots(config):
         if isinstance(slot.value, Missing):

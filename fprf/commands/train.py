@@ -87,10 +87,14 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
             log(event)
 
         spent = time.perf_counter() - start
+        folder.log({"part": "preparing", "seconds": round(spent, 3)})
         model = config.executor.build().map(lambda block: trainer.train(config, prepared, folder, report, spent=spent), [0])[0]
+        trained = time.perf_counter()
+        folder.log({"part": "training", "seconds": round(trained - start - spent, 3)})
         display.say("measuring the scene's own style")
         style = style_pass.measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
         folder.save_tensors("style", to_tensors(style))
+        folder.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
         display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
     return output
 

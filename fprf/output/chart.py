@@ -1,0 +1,114 @@
+"""Curves and bars as SVG text, coloured by the page's own style: a chart is data, so nothing has to be installed to draw it."""
+
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+from .figures import number
+
+__all__ = ["Series", "bars", "lines", "spark", "ticks"]
+
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 560, 260, 58, 12, 12, 34
+_COLOURS = ("#2f6fd0", "#d9730d", "#2e8b57", "#b0417e", "#8a6d1d", "#5b5bd6", "#00838f", "#a33b2f")
+_MOST_POINTS = 400
+"""Points that a line is drawn with; more would only be thicker."""
+_LEVELS = "▁▂▃▄▅▆▇█"
+
+
+class Series(NamedTuple):
+    """One line: points that are not known are left out."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float | None]
+
+
+def ticks(low: float, high: float, most: int = 5) -> list[float]:
+    """Round numbers within [low, high], evenly spaced: 1, 2 or 5 times a power of ten apart; at most `most` + 1."""
+    if not high > low:
+        return [low]
+    raw = (high - low) / most
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw * (1 - 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def lines(title: str, series: Sequence[Series], x_label: str, y_label: str, *, log: bool = False) -> str:
+    """A chart of lines over a common axis. `log` spaces y by its logarithm and leaves out what is not above 0."""
+    drawn = [(each.name, _points(each, log)) for each in series]
+    drawn = [(name, points) for name, points in drawn if points]
+    if not drawn:
+        return ""
+    xs, ys = ([point[axis] for _, points in drawn for point in points] for axis in (0, 1))
+    x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
+    if y1 - y0 < 1e-12 * max(1.0, abs(y1)):
+        y0, y1 = y0 - 0.5, y1 + 0.5
+    x1 = x1 if x1 > x0 else x0 + 1
+    across = (_WIDTH - _LEFT - _RIGHT) / (x1 - x0)
+    up = (_HEIGHT - _TOP - _BOTTOM) / (y1 - y0)
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return _LEFT + (x - x0) * across, _HEIGHT - _BOTTOM - (y - y0) * up
+
+    parts = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(title)}">']
+    for value in ticks(y0, y1):
+        _, y = place(x0, value)
+        shown = number(10**value if log else value)
+        parts.append(f'<line class="rule" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{shown}</text>')
+    for value in ticks(x0, x1):
+        x, _ = place(value, y0)
+        parts.append(f'<text x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 18}" text-anchor="middle">{value:,.4g}</text>')
+    parts.append(f'<text class="axis" x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 2}" text-anchor="end">{escape(x_label)}</text>')
+    for k, (name, points) in enumerate(drawn):
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*point) for point in points))
+        colour = _COLOURS[k % len(_COLOURS)]
+        parts.append(f'<polyline points="{path}" stroke="{colour}"><title>{escape(name)}</title></polyline>')
+    parts.append("</svg>")
+    return f"<figure><figcaption>{escape(title)}, {escape(y_label)}</figcaption>{''.join(parts)}{_legend(drawn)}</figure>"
+
+
+def bars(rows: Sequence[tuple[str, float, str]]) -> str:
+    """Horizontal bars with (name, value, what is written beside it); lengths are relative to the largest value."""
+    longest = max((value for _, value, _ in rows), default=0.0) or 1.0
+    drawn = "".join(
+        f'<div class="bar-row"><dt>{escape(name)}</dt><dd><i style="width:{100 * max(0.0, value) / longest:.2f}%"></i>'
+        f"<span>{escape(text)}</span></dd></div>"
+        for name, value, text in rows
+    )
+    return f'<dl class="bars">{drawn}</dl>' if rows else ""
+
+
+def spark(values: Sequence[float | None], width: int = 24) -> str:
+    """A line of blocks, low to high, for a terminal; what is not known is left out."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return ""
+    count = min(width, len(known))
+    means = []
+    for k in range(count):
+        part = known[k * len(known) // count : (k + 1) * len(known) // count]
+        means.append(sum(part) / len(part))
+    low, high = min(means), max(means)
+    scale = (len(_LEVELS) - 1) / (high - low) if high > low else 0.0
+    return "".join(_LEVELS[round((value - low) * scale)] for value in means)
+
+
+def _points(series: Series, log: bool) -> list[tuple[float, float]]:
+    known = [(x, y) for x, y in zip(series.x, series.y, strict=True) if y is not None and (y > 0 or not log)]
+    stride = max(1, math.ceil(len(known) / _MOST_POINTS))
+    kept = known[::stride]
+    if known and kept[-1] != known[-1]:
+        kept.append(known[-1])
+    return [(x, math.log10(y)) for x, y in kept] if log else kept
+
+
+def _legend(drawn: Sequence[tuple[str, object]]) -> str:
+    if len(drawn) < 2:
+        return ""
+    items = "".join(
+        f'<li><i style="background:{_COLOURS[k % len(_COLOURS)]}"></i>{escape(name)}</li>' for k, (name, _) in enumerate(drawn)
+    )
+    return f'<ul class="legend">{items}</ul>'
