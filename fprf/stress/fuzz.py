@@ -8,6 +8,7 @@ something to a parser. Draws are functions of (seed, round): a failure is found 
 
 import json
 import random
+import re
 import struct
 import time
 import tracemalloc
@@ -33,6 +34,9 @@ __all__ = ["Outcome", "Target", "fuzz", "mutated", "targets"]
 
 SIDE = 24
 WORDS = (b"NaN", b"1e400", b"-1", b"0", b"null", b"true", b"[]", b"{}", b"../../etc/passwd", b"\x00", b"\xff\xfe", b"9" * 40)
+VALUES = (b"0", b"-1", b"1e300", b"1e-300", b"null", b'"x"', b"[]", b"{}", b"true", b"0.5", b"65536", b"1e999", b"123456789012")
+"""What stands in the place of a number of a text."""
+_NUMBER = re.compile(rb"-?\d+(\.\d+)?")
 NUMBERS = tuple(struct.pack("<Q", value) for value in (0, 1, 2**28, 2**31, 2**63, 2**64 - 1))
 NUMBERS += tuple(struct.pack("<d", value) for value in (0.0, -1.0, 1e300, float("nan"), float("inf")))
 
@@ -62,11 +66,14 @@ class Outcome(NamedTuple):
 
 
 def mutated(data: bytes, draw: random.Random) -> bytes:
-    """The bytes with one to four harms."""
+    """The bytes with one to four harms, mostly one."""
     raw = bytearray(data)
-    for _ in range(draw.randint(1, 4)):
-        at, kind = draw.randrange(len(raw) + 1), draw.randrange(7)
-        if kind == 0 and raw:
+    for _ in range(draw.choice((1, 1, 1, 2, 4))):
+        at, kind = draw.randrange(len(raw) + 1), draw.randrange(9)
+        if kind > 6 and (found := list(_NUMBER.finditer(raw))):
+            start, stop = draw.choice(found).span()
+            raw[start:stop] = draw.choice(VALUES)
+        elif kind == 0 and raw:
             raw[at % len(raw)] ^= 1 << draw.randrange(8)
         elif kind == 1:
             del raw[at:]
