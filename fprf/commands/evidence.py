@@ -8,21 +8,21 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ..evidence.config import EvidenceConfig, RestyleConfig
+from ..evidence.config import EvidenceConfig, PeerConfig, RestyleConfig
 from .parsing import load_method, parse
 from .progress import Display
 from .train import train_scene
 
 __all__ = ["NAMES", "run"]
 
-NAMES: dict[str, EvidenceConfig] = {"restyle": RestyleConfig()}
+NAMES: dict[str, EvidenceConfig] = {"restyle": RestyleConfig(), "peer": PeerConfig()}
 """Defaults of each report."""
 _WIDTH = 150
 
 
 def run(name: str, args: list[str]) -> int:
     """`fprf bench NAME ...`: 0 when the figures are printed and written where they should be."""
-    return {"restyle": _restyle}[name](args)
+    return {"restyle": _restyle, "peer": _peer}[name](args)
 
 
 def _restyle(args: list[str]) -> int:
@@ -46,6 +46,22 @@ def _restyle(args: list[str]) -> int:
     if config.sheet is not None:
         write_image(config.sheet, restyle_sheet(cases))
     _write(config, document, lambda: restyle_page(document, picture=_beside(config.page, config.sheet)))
+    return 0
+
+
+def _peer(args: list[str]) -> int:
+    about_it = about(PeerConfig())
+    config = parse(PeerConfig(), args, prog="fprf bench peer", description=about_it, positional=("frames",))
+    from ..evidence.peer import peer
+    from ..evidence.peer_page import peer_page
+    from ..evidence.provenance import provenance
+
+    with Display() as display:
+        document = peer(config, display.count)
+    document["provenance"] = provenance(config.device)
+    page = peer_page(document)
+    print(page)
+    _write(config, document, lambda: page)
     return 0
 
 

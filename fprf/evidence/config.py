@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from ..checks import at_least, between, positive
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 
-__all__ = ["EvidenceConfig", "RestyleConfig"]
+__all__ = ["EvidenceConfig", "PeerConfig", "RestyleConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,3 +58,27 @@ class RestyleConfig(EvidenceConfig):
         between("blend", self.blend, 0.0, 1.0)
         at_least("palettes", len(self.palettes), 1)
         at_least("seeds", len(self.seeds), 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerConfig(EvidenceConfig):
+    """Stylised frames of any system, scored by the same code; see docs/evidence/protocol.md."""
+
+    frames: Path = Path()
+    """Folder of the stylised frames, in the order of their names: a path for consistency."""
+    cameras: Path = Path("transforms.json")
+    """Their cameras: a transforms.json whose file_path have the frames' stems. Pinholes."""
+    plain: Path | None = None
+    """Folder of the same frames before they were stylised, by the same names: what consistency is relative to."""
+    depth: Path | None = None
+    """Folder of NAME.npz (array `depth`) or NAME.npy: [H W], in the unit of the poses; 0 or infinite = nothing there."""
+    depth_along: Literal["ray", "axis"] = "ray"
+    """What the depths are: distances along each pixel's ray, or along the camera's axis."""
+    run: Path | None = None
+    """A run of ours on the same scene: renders the plain frames and depths that are not given."""
+    truth: Path | None = None
+    """Folder of the true frames, where they are known, by the same names."""
+    references: tuple[Path, ...] = ()
+    """Photographs that gave the style."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto: where a run is rendered."""
