@@ -3,7 +3,7 @@
 # tri-plane kernel against the memory's speed. Writes one JSON with rows and goals.
 #
 #   benchmarks/gpu.sh --scene DIR [--minutes 3] [--method fprf] [--long STEPS] [--output FILE] [-- FLAGS OF fprf train]
-#   benchmarks/gpu.sh --dry-run        the same steps on a CPU, at a tiny size, on the embedded scene
+#   benchmarks/gpu.sh --dry            the same steps on a CPU, at a tiny size, on the embedded scene
 #
 # --scene is an LLFF capture with a folder images_4; encoder weights are named after the `--`, for example
 #   -- --content.encoder.weights vgg19.safetensors --semantic.encoder.weights dino.safetensors
@@ -19,7 +19,7 @@ while [ $# -gt 0 ]; do
         --method) method=$2; shift 2 ;;
         --long) long=$2; shift 2 ;;
         --output) output=$2; shift 2 ;;
-        --dry-run) dry=1; shift ;;
+        --dry | --dry-run) dry=1; shift ;;
         --) shift; break ;;
         -h | --help) sed -n '2,/^set -/p' "$0" | sed -n 's/^# \{0,1\}//p'; exit 0 ;;
         *) echo "error: $1: no such flag; $0 --help lists them" >&2; exit 2 ;;
@@ -37,9 +37,9 @@ if [ "$dry" = 1 ]; then
     [ "$long" = 0 ] || long=40
     export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 else
-    if [ -z "$scene" ]; then echo "error: --scene is missing; name an LLFF capture, or try --dry-run" >&2; exit 2; fi
+    if [ -z "$scene" ]; then echo "error: --scene is missing; name an LLFF capture, or try --dry" >&2; exit 2; fi
     if ! python -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
-        echo "error: torch sees no CUDA device here; try --dry-run" >&2
+        echo "error: torch sees no CUDA device here; try --dry" >&2
         exit 2
     fi
     data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images images_4)

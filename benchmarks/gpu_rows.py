@@ -15,6 +15,7 @@ import torch
 from rich.console import Console
 
 from fprf.benchmarking.report import Row, document, rows_table
+from fprf.ops import triplane_numba, triplane_triton
 from fprf.output.atomic import write_json
 
 FRAME = 1008 * 756
@@ -69,6 +70,12 @@ def size_of(metrics: dict[str, Any]) -> str:
     return f"{metrics['method']} on {metrics['scene']}, {metrics['train_steps']} steps, {metrics['views']} views judged"
 
 
+def kernels(device: torch.device) -> str:
+    """Which form of the tri-planes ran."""
+    points, table = torch.zeros(1, 3, device=device), torch.zeros(12, 8, device=device)
+    return "triton" if triplane_triton.usable(points, table) else "numba" if triplane_numba.usable(points, table) else "plain"
+
+
 def read(path: Path) -> Any:
     return json.loads(path.read_text())
 
@@ -83,7 +90,8 @@ def main() -> None:
     found = rows(options.work)
     profile = read(options.work / "profile.json")["parts"]
     extra = {"speed": speed["rows"], "counters": speed["counters"], "profile": profile}
-    write_json(options.output, document("gpu", found, device=device, settings=speed["settings"], extra=extra))
+    settings = speed["settings"] | {"tri_planes": kernels(device)}
+    write_json(options.output, document("gpu", found, device=device, settings=settings, extra=extra))
     console = Console(highlight=False, width=120)
     console.print(rows_table("on this device", found))
     console.print(f"written to {options.output}")
