@@ -26,7 +26,7 @@ def provenance(device: str) -> dict[str, object]:
 def commit(folder: Path) -> str | None:
     """Short hash of the checkout that a folder lies in, with `+` where known files were changed; None outside of one."""
     try:
-        found = subprocess.run(  # nosec B607: git as the user has it; fixed words
+        found = subprocess.run(  # nosec B607  # git as the user has it; fixed words
             ["git", "-C", str(folder), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
             capture_output=True,
             text=True,

@@ -97,7 +97,8 @@ def fuzz(target: Target, rounds: int, seed: int, *, watch_memory: bool = False) 
     slowest, faults = 0.0, []
     try:
         for number in range(rounds):
-            target.file.write_bytes(mutated(whole, random.Random(f"{target.name} {seed} {number}")))
+            draw = random.Random(f"{target.name} {seed} {number}")  # nosec B311  # no secrets
+            target.file.write_bytes(mutated(whole, draw))
             if watch_memory:
                 tracemalloc.start()
             start = time.perf_counter()

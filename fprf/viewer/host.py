@@ -18,7 +18,7 @@ __all__ = ["Host"]
 _STARTING = b"""<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="1"><title>fprf</title>
 <body style="font:16px system-ui;display:grid;place-items:center;height:90vh;background:#16181d;color:#dde">
 Loading the scene ..."""
-_ANYWHERE = ("0.0.0.0", "::")  # nosec B104: recognised, never the default
+_ANYWHERE = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
 
 
 class Host:

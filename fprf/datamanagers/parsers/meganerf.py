@@ -4,7 +4,7 @@ Metadata are tensors written by torch.save: `H W c2w intrinsics`. They are read 
 are OpenGL's, in world axes down, right, back; `coordinates.pt` tells how many metres their unit is.
 """
 
-import pickle  # nosec B403: the name of an exception; nothing is unpickled but tensors
+import pickle  # nosec B403  # the name of an exception; nothing is unpickled but tensors
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

@@ -76,7 +76,7 @@ def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
     verbosity = logging.get_verbosity()
     logging.set_verbosity_error()  # else it lists the blocks that are left out
     try:
-        config = AutoConfig.from_pretrained(name)  # nosec B615: `name` says which revision; the identity hashes the weights
+        config = AutoConfig.from_pretrained(name)  # nosec B615  # `name` says which revision; the identity hashes the weights
         if config.model_type not in TYPES[family]:
             raise ValueError(f"it is of type {config.model_type}, not {' or '.join(TYPES[family])}")
         blocks = int(config.num_hidden_layers)

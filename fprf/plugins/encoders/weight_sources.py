@@ -102,8 +102,8 @@ def _download(source: WeightSource) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f"{source.file}.{os.getpid()}.partial")
     try:
-        # nosec B310: the origins are ours, https, and what comes is hashed before it is used
-        with urllib.request.urlopen(source.origin, timeout=TIMEOUT_SECONDS) as response, partial.open("wb") as file:  # nosec
+        # The origins are ours, https, and what comes is hashed before it is used.
+        with urllib.request.urlopen(source.origin, timeout=TIMEOUT_SECONDS) as response, partial.open("wb") as file:  # nosec B310
             while piece := response.read(CHUNK):
                 file.write(piece)
         _check_hash(partial, source.file, source)
