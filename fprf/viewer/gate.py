@@ -80,6 +80,7 @@ class Gate:
         self._routes, self._largest = routes, largest
         self._inner: tuple[tuple[str, int], Callable[[bytes], None]] | None = None
         self._loop = asyncio.new_event_loop()
+        self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._bodies = asyncio.Semaphore(_BODIES)
         self._thread = threading.Thread(target=self._loop.run_forever, name="fprf-gate", daemon=True)
@@ -88,7 +89,7 @@ class Gate:
         """Listen. Raises UsageError where the address or the port cannot be had; `port` 0 takes a free one and becomes it."""
         self._thread.start()
         try:
-            server = asyncio.run_coroutine_threadsafe(
+            self._server = asyncio.run_coroutine_threadsafe(
                 asyncio.start_server(self._meet, self.access.host, self.port, limit=_HEAD), self._loop
             ).result()
         except OSError as error:
@@ -96,7 +97,7 @@ class Gate:
             raise UsageError(
                 f"--host {self.access.host} --port {self.port}: cannot listen there ({error.strerror}); choose another port"
             ) from error
-        self.port = server.sockets[0].getsockname()[1]
+        self.port = self._server.sockets[0].getsockname()[1]
 
     def lead(self, routes: Mapping[tuple[str, str], Handler], inner: tuple[str, int], check: Callable[[bytes], None]) -> None:
         """From now on to these pages, and over WebSockets to `inner`; `check` raises for messages that are not passed on."""
@@ -111,6 +112,8 @@ class Gate:
             self._loop.close()
 
     async def _end(self) -> None:
+        if self._server is not None:
+            self._server.close()
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()

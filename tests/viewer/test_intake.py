@@ -1,0 +1,133 @@
+import io
+import json
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fprf.errors import DataError
+from fprf.viewer import decode
+from fprf.viewer.intake import LARGEST, SIDE, Intake, check_photograph, shown_name
+
+
+def png(width: int, height: int) -> bytes:
+    drawn = np.random.default_rng(0).integers(0, 255, (height, width, 3), dtype=np.uint8)
+    return bytes(cv2.imencode(".png", drawn)[1].tobytes())
+
+
+def claimed(width: int, height: int) -> bytes:
+    """The head of a PNG that says it is so large, and ends."""
+    head = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+
+
+@pytest.fixture(scope="module")
+def intake() -> Iterator[Intake]:
+    with Intake(seconds=120) as found:
+        yield found
+
+
+def test_a_photograph_becomes_a_png_of_ours(intake: Intake) -> None:
+    path = intake.take(png(60, 40))
+    assert path.parent == intake.folder and path.suffix == ".png"
+    assert cv2.imread(str(path)).shape == (40, 60, 3)
+    large = intake.take(png(SIDE * 2, 100))
+    assert cv2.imread(str(large)).shape == (50, SIDE, 3)
+    assert sorted(intake.folder.glob("*.part")) == []
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"", "no PNG"),
+        (b"GIF89a" + b"x" * 100, "no PNG"),
+        (b"<svg xmlns='x'/>", "no PNG"),
+        (claimed(100_000, 100_000), "100000x100000"),
+        (claimed(0, 10), "0x10"),
+        (b"\x89PNG\r\n\x1a\n" + b"x" * (LARGEST + 1), f"at most {LARGEST}"),
+    ],
+)
+def test_by_its_header_it_is_refused_before_anything_is_decoded(data: bytes, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        check_photograph(data)
+
+
+@pytest.mark.parametrize(
+    "data", [claimed(30, 20), png(30, 20)[:-40], b"\xff\xd8\xff" + b"\xc0\0\x0b\x08\0\x10\0\x10" + b"\0" * 40]
+)
+def test_damaged_ones_are_told_and_the_next_one_goes(intake: Intake, data: bytes) -> None:
+    with pytest.raises(DataError, match="photograph: ") as told:
+        intake.take(data)
+    assert str(intake.folder) not in str(told.value)
+    assert intake.take(png(20, 20)).is_file()
+
+
+def test_a_decoder_that_died_is_replaced(intake: Intake) -> None:
+    intake.take(png(20, 20))
+    process = intake._process
+    assert process is not None
+    process.kill()
+    process.wait()
+    assert intake.take(png(20, 20)).is_file() and intake._process is not process
+
+
+def test_one_that_takes_too_long_is_ended() -> None:
+    with Intake(seconds=0.0) as hasty, pytest.raises(DataError, match="not decoded within"):
+        hasty.take(png(20, 20))
+    assert not hasty.folder.exists()
+
+
+def test_the_decoder_answers_line_by_line_and_survives_everything(tmp_path: Path) -> None:
+    (tmp_path / "good.png").write_bytes(png(40, 20))
+    (tmp_path / "bad.png").write_bytes(b"nothing")
+    asked = [
+        {"source": str(tmp_path / "bad.png"), "target": str(tmp_path / "x.png"), "side": 8},
+        {"source": str(tmp_path / "good.png"), "target": str(tmp_path / "y.png"), "side": 10},
+        {"source": str(tmp_path / "good.png"), "target": str(tmp_path / "no" / "where.png"), "side": 10},
+    ]
+    lines = [json.dumps(each) for each in asked]
+    answers = io.StringIO()
+    decode.serve(io.StringIO("\n".join([*lines, "not json", "{}"]) + "\n"), answers)
+    said = [json.loads(line)["said"] for line in answers.getvalue().splitlines()]
+    assert len(said) == 5 and said[1] == "ok" and "no PNG" in said[0] and str(tmp_path) not in said[0]
+    assert cv2.imread(str(tmp_path / "y.png")).shape == (5, 10, 3)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="limits are a matter of Unix")
+def test_memory_beyond_the_room_is_refused() -> None:
+    child = os.fork()
+    if child == 0:
+        decode.confine(64 << 20)
+        try:
+            np.ones(256 << 20, np.uint8)
+        except MemoryError:
+            os._exit(7)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        ("autumn.jpg", "autumn.jpg"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\photos\\a b.png", "a b.png"),
+        ("<script>alert(1)</script>.png", "script_.png"),
+        ("", "photograph"),
+        ("....", "photograph"),
+        ("line\nbreak\x00.png", "linebreak.png"),
+        ("Übung-ñ.jpeg", "Übung-ñ.jpeg"),
+    ],
+)
+def test_names_are_shown_plain(given: str, shown: str) -> None:
+    assert shown_name(given) == shown
+
+
+def test_long_names_are_cut_in_their_middle() -> None:
+    found = shown_name("x" * 300 + ".jpg")
+    assert len(found) <= 48 and found.endswith(".jpg") and "…" in found

@@ -1,0 +1,154 @@
+import asyncio
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from tiny_world import World
+
+from fprf.errors import DataError, UsageError
+from fprf.viewer.gate import Answer, Request
+from fprf.viewer.looks import Card
+from fprf.viewer.page import Page, built_page, described
+from fprf.viewer.session import Session
+from fprf.viewer.state import State
+from fprf.viewer.studio import Picked
+
+
+@pytest.fixture
+def page(world: World) -> Iterator[Page]:
+    with Session(world.load(), State(pixels=64)) as session:
+        yield Page(session, b"<html>")
+
+
+def ask(page: Page, method: str, path: str, query: dict[str, str] | None = None, body: bytes = b"") -> Answer:
+    async def answered() -> Answer:
+        return await page.routes[(method, path)](Request(method, path, query or {}, {}, body))
+
+    return asyncio.run(answered())
+
+
+def post(page: Page, path: str, **asked: object) -> Any:
+    return json.loads(ask(page, "POST", path, body=json.dumps(asked).encode()).body)
+
+
+def dropped(page: Page, world: World, which: int = 0) -> Card:
+    path = world.references[which]
+    found = json.loads(ask(page, "POST", "/fprf/photograph", {"name": path.name}, path.read_bytes()).body)
+    return next(card for card in page._session.state.shelf if card.number == found["card"])
+
+
+def test_our_part_is_put_into_visers_page() -> None:
+    built = built_page("<html><head><title>x</title></head><body></body></html>", "<town>").decode()
+    assert built.index("/fprf/page.js") < built.index("</head>") and "<title>&lt;town&gt;</title>" in built
+    with pytest.raises(ValueError):
+        built_page("no head here", "x")
+
+
+@pytest.mark.parametrize(
+    ("path", "kind", "some"), [("/fprf/page.js", "text/javascript", b"drop"), ("/fprf/page.css", "text/css", b".fprf")]
+)
+def test_script_and_sheet_are_served(page: Page, path: str, kind: str, some: bytes) -> None:
+    answer = ask(page, "GET", path)
+    assert answer.kind.startswith(kind) and some in answer.body
+    assert ask(page, "GET", "/").body == b"<html>"
+
+
+def test_a_photograph_is_dropped_weighed_shown_and_removed(page: Page, world: World) -> None:
+    one, two = dropped(page, world), dropped(page, world, 1)
+    session = page._session
+    assert session.state.look.mix == ((two, 1.0),)
+    post(page, "/fprf/shelf", card=one.number, action="weight", weight=0.5)
+    assert session.state.look.mix == ((one, 0.5), (two, 1.0))
+    post(page, "/fprf/shelf", card=one.number, action="alone")
+    assert session.state.look.mix == ((one, 1.0),)
+    picture = cv2.imdecode(np.frombuffer(ask(page, "GET", "/fprf/card", {"card": str(one.number)}).body, np.uint8), 1)
+    assert picture.shape == (40, 56, 3)
+    post(page, "/fprf/shelf", card=one.number, action="remove")
+    assert session.state.shelf == (two,) and session.state.look.plain
+
+
+def test_regions_get_their_orders(page: Page, world: World) -> None:
+    one, two = dropped(page, world), dropped(page, world, 1)
+    session = page._session
+    with pytest.raises(UsageError, match="none is picked"):
+        post(page, "/fprf/region", verb="keep")
+    session.change(lambda state: replace(state, picked=Picked(1, 0.2, ())))
+    post(page, "/fprf/region", verb="pin", card=one.number)  # it joins the mix
+    assert session.state.look.mix == ((one, 1.0), (two, 1.0))
+    assert {(o.region, o.verb, o.card) for o in session.state.look.orders} == {(1, "pin", one)}
+    row = described(session.state)["picked"]
+    assert row["orders"] == [{"verb": "pin", "card": one.number}]
+    post(page, "/fprf/region", verb="keep")
+    assert [o.verb for o in session.state.look.orders] == ["keep"]
+    post(page, "/fprf/region", verb="free")
+    assert session.state.look.orders == frozenset()
+
+
+def test_the_wipe_moves_only_where_there_is_one(page: Page) -> None:
+    post(page, "/fprf/wipe", at=0.2)
+    assert page._session.state.wipe is None
+    page._session.change(lambda state: replace(state, wipe=0.5))
+    post(page, "/fprf/wipe", at=0.2)
+    assert page._session.state.wipe == 0.2
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/fprf/shelf", b"{"),
+        ("/fprf/shelf", b"[]"),
+        ("/fprf/shelf", b'{"card": 99, "action": "alone"}'),
+        ("/fprf/shelf", b'{"card": "../x", "action": "alone"}'),
+        ("/fprf/shelf", b"[" * 4000),
+        ("/fprf/shelf", b'"' + b"x" * 5000 + b'"'),
+        ("/fprf/region", b'{"verb": "explode"}'),
+        ("/fprf/wipe", b'{"at": 2}'),
+        ("/fprf/wipe", b'{"at": NaN}'),
+        ("/fprf/wipe", b'{"at": true}'),
+        ("/fprf/wipe", b"{}"),
+        ("/fprf/photograph", b"not a photograph"),
+    ],
+)
+def test_nonsense_is_refused_in_one_line_and_changes_nothing(page: Page, path: str, body: bytes) -> None:
+    before = page._session.state
+    with pytest.raises((UsageError, DataError)):
+        ask(page, "POST", path, body=body)
+    assert page._session.state == before
+
+
+def test_actions_that_are_none_are_refused(page: Page, world: World) -> None:
+    card = dropped(page, world)
+    for asked in ({"action": "explode"}, {"action": "weight", "weight": -1}, {"action": "weight", "weight": "x"}):
+        with pytest.raises(UsageError):
+            post(page, "/fprf/shelf", card=card.number, **asked)
+
+
+def test_who_waits_is_answered_when_something_is_new(page: Page) -> None:
+    async def wait() -> tuple[dict[str, Any], dict[str, Any]]:
+        handler = page.routes[("GET", "/fprf/state")]
+        first = json.loads((await handler(Request("GET", "/fprf/state", {}, {}))).body)
+        waiting = asyncio.create_task(handler(Request("GET", "/fprf/state", {"after": str(first["version"])}, {})))
+        await asyncio.sleep(0.05)
+        assert not waiting.done()
+        page.say("a line to read")
+        return first, json.loads((await asyncio.wait_for(waiting, 60)).body)
+
+    first, second = asyncio.run(wait())
+    assert first["said"] == [] and second["said"] == ["a line to read"] and second["version"] == first["version"] + 1
+    assert first["shelf"] == [] and first["film"] == {"done": 0, "total": 0, "ready": False}
+    with pytest.raises(UsageError):
+        ask(page, "GET", "/fprf/state", {"after": "x"})
+
+
+def test_the_map_tells_the_colours_of_photographs(page: Page, world: World) -> None:
+    dropped(page, world)
+    page._session.change(lambda state: replace(state, map="matches"))
+    assert described(page._session.state)["shelf"][0]["colour"] == "rgb(230, 159, 0)"
+
+
+def test_no_film_is_no_page(page: Page) -> None:
+    assert ask(page, "GET", "/fprf/film").status == 404
