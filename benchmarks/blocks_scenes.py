@@ -1,0 +1,72 @@
+"""A capture in blocks against the same capture in one field, both trained for the same seconds in all.
+
+    python benchmarks/blocks_scenes.py SCENE [--minutes 3] [--sides blocks single] [--output FILE] -- [any field]
+
+The flags behind `--` are those of `fprf train fprf-lite`; the single field takes them too, but for the blocks. Features are
+extracted before the clock runs, which counts what the processor does (see `large_scene.py`).
+"""
+
+import argparse
+import json
+import statistics
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from large_scene import psnr, trained_seconds, use_processor_time
+
+from fprf.commands.parsing import load_method, parse
+from fprf.commands.train import train_scene
+from fprf.engine.lay_out import lay_out, load_boxes, plan_scene
+from fprf.engine.loading import load_run
+from fprf.fields.layouts import SingleConfig
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--minutes", type=float, default=3.0)
+    parser.add_argument("--sides", nargs="+", choices=("blocks", "single"), default=("blocks", "single"))
+    parser.add_argument("--scratch", type=Path, default=Path("runs/blocks_scenes"))
+    parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
+    own = sys.argv[1 : sys.argv.index("--")] if "--" in sys.argv else sys.argv[1:]
+    options = parser.parse_args(own)
+    rest = sys.argv[len(own) + 2 :]
+    method, _ = load_method("fprf-lite")
+    flags = ["--data", str(options.scene), "--minutes", str(options.minutes), *rest]
+    blocks = parse(method, flags, prog="blocks_scenes", description="")
+    scratch = options.scratch.resolve() / options.scene.name
+    sides = {
+        "blocks": replace(blocks, output=scratch / "blocks", steps=10**6),
+        "single": replace(blocks, output=scratch / "single", steps=10**6, blocks=SingleConfig()),
+    }
+    scene, plan = plan_scene(blocks)
+    lay_out(blocks, scene, plan)
+    use_processor_time()
+    result: dict[str, Any] = {
+        "images": len(scene.paths),
+        "size": scene.cameras.size[0].tolist(),
+        "minutes_each_side": options.minutes,
+        "threads": torch.get_num_threads(),
+        "flags": rest,
+    }
+    for name in options.sides:
+        root = sides[name].output
+        assert root is not None
+        train_scene(sides[name], "fprf-lite", quiet=True)
+        values = psnr(load_run(root, "cpu"), scratch / f"{name}-views")
+        result[name] = {"psnr": statistics.mean(values), "psnr_of_views": values, **trained_seconds(root)}
+        if name == "blocks":
+            result[name]["blocks"] = len(load_boxes(root).low)
+        print(name, json.dumps(result[name]), flush=True)
+    if {"blocks", "single"} <= result.keys():
+        result["blocks_minus_single_db"] = result["blocks"]["psnr"] - result["single"]["psnr"]
+    if options.output is not None:
+        known = json.loads(options.output.read_text()) if options.output.is_file() else {}
+        options.output.write_text(json.dumps(known | {options.scene.name: result}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
