@@ -1,0 +1,42 @@
+"""The notebook, cell by cell, on the tiny run: plain Python, no Jupyter."""
+
+import ast
+import json
+import os
+from pathlib import Path
+
+import cv2
+import pytest
+from tiny_world import World
+
+NOTEBOOK = Path(__file__).resolve().parents[2] / "docs" / "tour.ipynb"
+
+
+def cells(kind: str) -> list[str]:
+    return ["".join(cell["source"]) for cell in json.loads(NOTEBOOK.read_text("utf-8"))["cells"] if cell["cell_type"] == kind]
+
+
+def test_every_cell_runs_in_order(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    os.symlink(world.run, tmp_path / "runs" / "town-fprf-lite")
+    for name, reference in zip(("autumn.jpg", "night.jpg"), world.references, strict=True):
+        cv2.imwrite(name, cv2.imread(str(reference)))
+    names: dict[str, object] = {}
+    for number, source in enumerate(cells("code"), 1):
+        exec(compile(source, f"cell {number}", "exec"), names)
+    told = capsys.readouterr().out
+    assert "10 captured views, the first is 0000" in told and "film.mp4:" in told and "'night.jpg'" in told
+    made = {path.name for path in tmp_path.iterdir()}
+    assert {"plain.png", "wide.png", "autumn.png", "mine.json", "film.mp4"} <= made
+
+
+def test_the_notebook_is_clean_and_every_import_is_used() -> None:
+    whole = json.loads(NOTEBOOK.read_text("utf-8"))
+    assert whole["nbformat"] == 4 and len(cells("markdown")) >= 5
+    assert not [cell for cell in whole["cells"] if cell.get("outputs") or cell.get("execution_count")], "clear its outputs"
+    tree = ast.parse("\n".join(cells("code")))
+    imported = {alias.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    assert imported <= {"fprf", "torch"}
