@@ -8,21 +8,21 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ..evidence.config import EvidenceConfig, PeerConfig, RestyleConfig
+from ..evidence.config import EvidenceConfig, PaperConfig, PeerConfig, RestyleConfig
 from .parsing import load_method, parse
 from .progress import Display
 from .train import train_scene
 
 __all__ = ["NAMES", "run"]
 
-NAMES: dict[str, EvidenceConfig] = {"restyle": RestyleConfig(), "peer": PeerConfig()}
+NAMES: dict[str, EvidenceConfig] = {"restyle": RestyleConfig(), "peer": PeerConfig(), "paper": PaperConfig()}
 """Defaults of each report."""
 _WIDTH = 150
 
 
 def run(name: str, args: list[str]) -> int:
     """`fprf bench NAME ...`: 0 when the figures are printed and written where they should be."""
-    return {"restyle": _restyle, "peer": _peer}[name](args)
+    return {"restyle": _restyle, "peer": _peer, "paper": _paper}[name](args)
 
 
 def _restyle(args: list[str]) -> int:
@@ -60,6 +60,21 @@ def _peer(args: list[str]) -> int:
         document = peer(config, display.count)
     document["provenance"] = provenance(config.device)
     page = peer_page(document)
+    print(page)
+    _write(config, document, lambda: page)
+    return 0
+
+
+def _paper(args: list[str]) -> int:
+    config = parse(PaperConfig(), args, prog="fprf bench paper", description=about(PaperConfig()))
+    from ..evidence.paper import paper
+    from ..evidence.paper_page import paper_page
+    from ..evidence.provenance import provenance
+
+    with Display() as display:
+        document = paper(config, load_method(config.method)[0], display.count)
+    document["provenance"] = provenance(config.device)
+    page = paper_page(document)
     print(page)
     _write(config, document, lambda: page)
     return 0

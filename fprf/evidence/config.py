@@ -7,7 +7,7 @@ from typing import Literal
 from ..checks import at_least, between, positive
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 
-__all__ = ["EvidenceConfig", "PeerConfig", "RestyleConfig"]
+__all__ = ["EvidenceConfig", "PaperConfig", "PeerConfig", "RestyleConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,3 +82,38 @@ class PeerConfig(EvidenceConfig):
     """Photographs that gave the style."""
     device: str = "auto"
     """cpu, cuda, mps, or auto: where a run is rendered."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperConfig(EvidenceConfig):
+    """A table of the paper, from short trainings of one scene: the method as it is, and with one thing changed."""
+
+    table: Literal["reconstruction", "time", "ablation", "multi-reference", "guided-filter", "clusters"] = "reconstruction"
+    """Which."""
+    data: Path = Path("town")
+    """Scene folder; the embedded town is also restyled, and judged by its truth."""
+    downscale: int = 1
+    """Images at 1/downscale of their size."""
+    method: str = "fprf-lite"
+    """Method that is changed."""
+    steps: int = 400
+    """Steps of each training."""
+    trainings: tuple[int, ...] = (0,)
+    """Seeds: every row is the mean over trainings with these."""
+    views: int = 4
+    """Held-out views that are judged."""
+    palettes: tuple[str, ...] = ("autumn", "night")
+    """Lights that a town is restyled in, with three references."""
+    clusters: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
+    """Style codes per reference, of the table of that name."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        at_least("downscale", self.downscale, 1)
+        at_least("steps", self.steps, 1)
+        at_least("trainings", len(self.trainings), 1)
+        at_least("views", self.views, 1)
+        at_least("palettes", len(self.palettes), 1)
+        for value in self.clusters:
+            at_least("clusters", value, 1)

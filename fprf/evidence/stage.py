@@ -25,7 +25,7 @@ from ..town.render import geometry, render
 from ..town.trace import View
 from ..town.write import TownSettings, is_town
 
-__all__ = ["Stage", "Truth", "set_stage", "short_path", "town_settings", "town_view", "true_views"]
+__all__ = ["Stage", "Truth", "set_stage", "short_path", "town_folder", "town_settings", "town_view", "true_views"]
 
 _STEP = 0.12
 """Metres between frames of the path: 7 frames on, near things have moved by a quarter of a small picture."""
@@ -61,7 +61,10 @@ class Stage(NamedTuple):
 
 
 def set_stage(trained: Trained, *, views: int, frames: int, longest: int) -> Stage:
-    """Held-out views, evenly spread, and a path that begins at one of them. Raises UsageError where the run shows no town."""
+    """Held-out views, evenly spread, and a path that begins at one of them (no frames, no path).
+
+    Raises UsageError where the run shows no town.
+    """
     settings = town_settings(trained)
     town = build_town(settings.seed, settings.extra)
     known = trained.known
@@ -83,14 +86,22 @@ def set_stage(trained: Trained, *, views: int, frames: int, longest: int) -> Sta
     return Stage(trained, settings, town, judged, cached(judged), true(judged), path, cached(path), true(path))
 
 
-def town_settings(trained: Trained) -> TownSettings:
-    """Which town a run was trained on. Raises UsageError where it was none, DataError where its record cannot be read."""
+def town_folder(trained: Trained) -> Path | None:
+    """Where the town lies that a run was trained on; None where it was another scene."""
     config = trained.config
     scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
     folder = scene.paths[0].parents[1]
-    if not is_town(folder):
-        raise UsageError(f"{trained.run.root}: trained on {trained.known.name}, whose looks in other light nobody knows; "
-                         "train the embedded town, for example with `fprf train fprf-lite --data town`")  # fmt: skip
+    return folder if is_town(folder) else None
+
+
+def town_settings(trained: Trained) -> TownSettings:
+    """Which town a run was trained on. Raises UsageError where it was none, DataError where its record cannot be read."""
+    folder = town_folder(trained)
+    if folder is None:
+        raise UsageError(
+            f"{trained.run.root}: trained on {trained.known.name}, whose looks in other light nobody knows; "
+            "train the embedded town, for example with `fprf train fprf-lite --data town`"
+        )
     return _read_settings(folder)
 
 
@@ -115,7 +126,7 @@ def short_path(start: Cameras, frames: int) -> Cameras:
     """A few steps onward from a camera, slowly turning to the left: neighbouring frames see nearly the same."""
     path = start.select(torch.zeros(frames, dtype=torch.int64))
     pose = path.pose.clone()
-    ahead = -pose[0, :2, 2]
+    ahead = -start.pose[0, :2, 2]
     ahead = ahead / ahead.norm().clamp_min(1e-9)
     for k in range(frames):
         turn = pose.new_tensor(

@@ -1,0 +1,221 @@
+"""The paper's tables on any scene: a method as it is, and with one thing changed, trained equally long and judged alike.
+
+Of every training: PSNR and SSIM of held-out views. The town is restyled as well, with three references in each palette, and
+judged by its truth. Styles that need no training of their own (numbers of clusters, of references) are compared on one.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..config import TrainConfig
+from ..datamanagers.images import load_image
+from ..engine.loading import Trained
+from ..engine.prepare import Prepared, prepare
+from ..engine.restyle import Encoders
+from ..engine.run import Run
+from ..engine.style_pass import measure_style
+from ..engine.trainer import Report, train
+from ..engine.views import render_view
+from ..errors import UsageError
+from ..evaluation.metrics import image_metrics, mean_metrics
+from ..output.images import to_uint8, write_image
+from ..plugins.decoders.config import ResidualDecoderConfig
+from ..plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig, StylizerConfig
+from ..style.dictionary import StyleDictionary
+from .codes import code_classes, match_rates, winners
+from .config import PaperConfig
+from .methods import dictionary_of, in_scene
+from .references import Reference, photograph, places
+from .scene_decoder import SceneDecoderConfig
+from .scores import Row, mean_rows, score
+from .stage import Stage, set_stage, town_folder, true_views
+
+__all__ = ["TRAINED", "Short", "paper", "short_training"]
+
+Progress = Callable[[int, int, str], None]
+Change = Callable[[TrainConfig], TrainConfig]
+SEEDS = (7, 11, 13)
+"""Towns of the references."""
+
+
+def _same(config: TrainConfig) -> TrainConfig:
+    return config
+
+
+def _scene_decoder(config: TrainConfig) -> TrainConfig:
+    return replace(config, content=replace(config.content, decoder=SceneDecoderConfig()))
+
+
+def _residual(config: TrainConfig) -> TrainConfig:
+    return replace(config, content=replace(config.content, decoder=ResidualDecoderConfig()))
+
+
+def _no_content_loss(config: TrainConfig) -> TrainConfig:
+    return replace(config, loss=replace(config.loss, content=0.0))
+
+
+def _no_guide(config: TrainConfig) -> TrainConfig:
+    """Features between cells are interpolated, the picture does not guide them."""
+    manager = config.datamanager
+    return replace(config, datamanager=replace(manager, guided=replace(manager.guided, radius=0.0)))
+
+
+TRAINED: Mapping[str, Mapping[str, Change]] = {
+    "reconstruction": {
+        "frozen decoder": _same,
+        "frozen and residual": _residual,
+        "decoder trained with the scene": _scene_decoder,
+    },
+    "ablation": {
+        "as it is": _same,
+        "without content loss": _no_content_loss,
+        "without pre-trained decoder": _scene_decoder,
+        "without either": lambda config: _scene_decoder(_no_content_loss(config)),
+    },
+    "guided-filter": {"with guided filter": _same, "without": _no_guide},
+}
+"""By table: what each of its rows changes."""
+
+
+class Short(NamedTuple):
+    """A short training, in memory."""
+
+    trained: Trained
+    prepared: Prepared
+    encoders: Encoders
+    seconds: float
+
+
+def paper(config: PaperConfig, method: TrainConfig, progress: Progress) -> dict[str, Any]:
+    """The document of one table; `method` is the config that `config.method` names."""
+    base = replace(method, data=config.data, downscale=config.downscale, device=config.device)
+    base = replace(base, steps=config.steps, minutes=None, output=None)
+    tables = []
+    with tempfile.TemporaryDirectory(prefix="fprf-paper-") as made:
+        for k, seed in enumerate(config.trainings):
+            folder = Path(made) / str(k)
+            tables.append(_table(config, replace(base, seed=seed), folder, progress))
+    return {
+        "benchmark": "paper",
+        "table": config.table,
+        "settings": {
+            "data": config.data.name,
+            "method": config.method,
+            "steps": config.steps,
+            "trainings": list(config.trainings),
+            "views": config.views,
+            "palettes": list(config.palettes),
+            "downscale": config.downscale,
+        },
+        "rows": mean_rows(tables),
+    }
+
+
+def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Short:
+    """Prepare, train and measure the scene's style, without a run folder that others could read."""
+    prepared = prepare(config)
+    run = Run(folder)
+    run.root.mkdir(parents=True)
+    run.save_known(prepared.scene, config.data, prepared.facts)
+    last: list[Report] = []
+
+    def report(event: Report) -> None:
+        last[:] = [event]
+        progress(event.step, config.steps, "training")
+
+    start = time.perf_counter()
+    model = train(config, prepared, run, report).requires_grad_(False).eval()
+    spent = time.perf_counter() - start
+    scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
+    trained = Trained(run, config, "", run.load_known(), model, config.steps, spent)
+    semantic = None if config.semantic.encoder is None else config.semantic.encoder.build()
+    return Short(trained, prepared, Encoders(config.content.encoder.build(), semantic, prepared.basis, scene), spent)
+
+
+def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progress) -> dict[str, Row]:
+    if config.table in TRAINED:
+        rows = {}
+        for k, (name, change) in enumerate(TRAINED[config.table].items()):
+            short = short_training(change(base), folder / str(k), progress)
+            rows[name] = _held_out(short, config.views) | {"train_seconds": short.seconds}
+            if town_folder(short.trained) is not None:
+                rows[name] |= _restyled(config, short, folder / f"references-{k}", RegionToneConfig(), "three", 10)
+        return rows
+    short = short_training(base, folder / "run", progress)
+    if town_folder(short.trained) is None:
+        raise UsageError(f"--table {config.table}: judged by a town's truth; --data is {config.data}, leave it out")
+    styles: dict[str, tuple[StylizerConfig, str, int]]
+    if config.table == "clusters":
+        styles = {f"{n} clusters": (RegionToneConfig(), "three", n) for n in config.clusters}
+    elif config.table == "multi-reference":
+        kinds = {"adain": AdainConfig(), "local-adain": LocalAdainConfig(), "region-tone": RegionToneConfig()}
+        styles = {f"{name}, {count}": (kind, count, 10) for count in ("one", "three") for name, kind in kinds.items()}
+    else:
+        kinds = {"adain": AdainConfig(), "local-adain": LocalAdainConfig(), "region-tone": RegionToneConfig()}
+        styles = {f"{name}, three references": (kind, "three", 10) for name, kind in kinds.items()}
+    rows = {}
+    for name, (stylizer, references, clusters) in styles.items():
+        rows[name] = _restyled(config, short, folder / "references", stylizer, references, clusters)
+    if config.table == "time":
+        rows = {"training": {"train_seconds": short.seconds}, **rows}
+    return rows
+
+
+def _held_out(short: Short, views: int) -> Row:
+    known, scene = short.trained.known, short.prepared.scene
+    chosen = (known.test or known.train)[:views]
+    found = []
+    for view in chosen:
+        render = render_view(short.trained.model, known.facts, known.cameras, view, short.trained.config.render).rgb
+        size = (render.shape[1], render.shape[0])
+        truth = torch.from_numpy(load_image(scene.paths[view], size, known.facts.background)).float() / 255
+        found.append(image_metrics(render, truth))
+    return dict(mean_metrics(found))
+
+
+def _restyled(config: PaperConfig, short: Short, folder: Path, stylizer: StylizerConfig, references: str, clusters: int) -> Row:
+    """Figures of a style of the town, means over the palettes: nearness to the truth, match rate, seconds."""
+    trained, encoders = short.trained, short.encoders
+    side = int(trained.known.cameras.size.amax())
+    stage = set_stage(trained, views=config.views, frames=0, longest=side)
+    width, height = (int(v) for v in trained.known.cameras.size[0])
+    rows: list[dict[str, Row]] = []
+    for light in config.palettes:
+        shown = [photograph(place, light) for place in places(SEEDS, (width, height))[references]]
+        paths = [folder / f"{references}-{reference.name}.png" for reference in shown]
+        for path, reference in zip(paths, shown, strict=True):
+            write_image(path, to_uint8(reference.image))
+        dictionary, spent = dictionary_of(trained, paths, encoders, clusters=clusters, blend=0.3)
+        found = in_scene(trained, stage.shown, stylizer, dictionary, encoders, paths)
+        labels = [each.labels for each in stage.truth]
+        near, _ = score(found.pictures, true_views(stage, light), labels)
+        row: Row = {f"styled_{name}": value for name, value in near.items()}
+        row["match_inside"] = _match(short, found.taken, dictionary, paths, shown, stage)
+        row |= {"style_seconds": spent + found.style_seconds, "view_seconds": found.view_seconds}
+        rows.append({"": row})
+    return mean_rows(rows)[""]
+
+
+def _match(
+    short: Short,
+    taken: Sequence[Tensor] | None,
+    dictionary: StyleDictionary,
+    paths: Sequence[Path],
+    shown: Sequence[Reference],
+    stage: Stage,
+) -> float | None:
+    """Match rate inside of things; None where nothing is matched."""
+    if taken is None:
+        return None
+    known = {path.name: reference for path, reference in zip(paths, shown, strict=True)}
+    classes = code_classes(dictionary, known, short.encoders, short.trained.config.datamanager.guided)
+    truth = [each.labels for each in stage.truth]
+    found = [winners(share, classes).view(like.shape) for share, like in zip(taken, truth, strict=True)]
+    return match_rates(found, truth, shown).match_inside

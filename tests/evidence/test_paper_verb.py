@@ -1,0 +1,78 @@
+"""`fprf bench paper` on the tiny town."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_world import World
+
+from fprf import cli
+from fprf.evidence.paper import TRAINED
+from fprf.evidence.scene_decoder import SceneDecoderConfig
+from fprf.plugins.encoders.config import BundledContentConfig
+
+SMALL = ["--steps", "2", "--views", "1", "--palettes", "night", "--device", "cpu"]
+
+
+def table(world: World, name: str, output: Path, *more: str) -> dict[str, Any]:
+    args = ["bench", "paper", "--table", name, "--data", str(world.town), *SMALL, "--output", str(output), *more]
+    assert cli.main(args) == 0
+    document: dict[str, Any] = json.loads(output.read_text())
+    assert document["table"] == name and document["settings"]["steps"] == 2
+    return document
+
+
+def test_rows_are_trainings_with_one_thing_changed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "page.md"
+    rows = table(world, "ablation", tmp_path / "a.json", "--page", str(page))["rows"]
+    assert list(rows) == list(TRAINED["ablation"])
+    for row in rows.values():
+        assert row["psnr"] > 5 and row["train_seconds"] > 0 and row["styled_psnr"] > 3 and 0 <= row["match_inside"] <= 1
+    assert rows["as it is"]["psnr"] != rows["without pre-trained decoder"]["psnr"]
+    text = page.read_text()
+    assert text.startswith("# Ablation") and "without either" in text and text in capsys.readouterr().out
+
+
+def test_the_same_seeds_give_the_same_rows(world: World, tmp_path: Path) -> None:
+    first, second = (table(world, "guided-filter", tmp_path / f"{k}.json")["rows"] for k in range(2))
+    for name in ("with guided filter", "without"):
+        assert {k: v for k, v in first[name].items() if not k.endswith("seconds")} == {
+            k: v for k, v in second[name].items() if not k.endswith("seconds")
+        }
+    assert first["with guided filter"]["styled_psnr"] != first["without"]["styled_psnr"]
+
+
+def test_clusters_share_one_training(world: World, tmp_path: Path) -> None:
+    rows = table(world, "clusters", tmp_path / "a.json", "--clusters", "1", "3")["rows"]
+    assert list(rows) == ["1 clusters", "3 clusters"]
+    assert all("psnr" not in row and row["style_seconds"] > 0 for row in rows.values())
+    assert rows["1 clusters"]["styled_psnr"] != rows["3 clusters"]["styled_psnr"]
+
+
+def test_tables_of_styles_need_a_town(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = shared / "data/scenes/street_lund"
+    if not scene.is_dir():
+        pytest.skip("no such scene")
+    args = ["bench", "paper", "--table", "clusters", "--data", str(scene), "--downscale", "16", *SMALL]
+    assert cli.main(args) == 2
+    assert "judged by a town's truth" in capsys.readouterr().err
+
+
+def test_a_decoder_of_the_scene_starts_grey_and_learns() -> None:
+    encoder = BundledContentConfig().build()
+    decoder = SceneDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels, seed=3)
+    again = SceneDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels, seed=3)
+    content = torch.randn(50, encoder.channels)
+    assert torch.equal(decoder(content), torch.full((50, 3), 0.5)) and decoder.unaided(content) is None
+    assert all(torch.equal(a, b) for a, b in zip(decoder.parameters(), again.parameters(), strict=True))
+    target = content[:, :3].sigmoid()
+    optimizer = torch.optim.Adam(decoder.parameters(), lr=1e-2)
+    for _ in range(150):
+        optimizer.zero_grad()
+        loss = (decoder(content) - target).square().mean()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    assert float(loss) < 0.005
+    assert torch.equal(decoder.restyled(content, content, 1.0), decoder(content))
