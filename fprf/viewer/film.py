@@ -28,7 +28,7 @@ from .eyes import CHUNK
 from .looks import Look, settled, style_of
 from .stage import Eye, Stage
 
-__all__ = ["FilmPlan", "Key", "frames_of_film", "lay_film", "new_folder", "path_of"]
+__all__ = ["FilmPlan", "Key", "frames_of_film", "lay_film", "new_folder", "path_of", "taken"]
 
 LONGEST = 600.0
 """Seconds of a film."""
@@ -117,6 +117,12 @@ def frames_of_film(
     finally:
         while not _put(out, None):
             out.get()
+
+
+def taken(frames: "Queue[Picture | None]") -> Iterator[Picture]:
+    """The frames of a queue, up to None."""
+    while (frame := frames.get()) is not None:
+        yield frame
 
 
 def _put(out: "Queue[Picture | None]", picture: Picture | None) -> bool:

@@ -19,7 +19,7 @@ from ..output.images import Picture, encode
 from ..output.video import write_video
 from .desk import Desk
 from .eyes import Frame, Glance, Sight
-from .film import FilmPlan, frames_of_film, lay_film, new_folder
+from .film import FilmPlan, frames_of_film, lay_film, new_folder, taken
 from .intake import Intake, shown_name
 from .looks import Card, only
 from .stage import Eye, Stage, stage_of
@@ -56,6 +56,7 @@ class Session:
         self.state = state
         self._face: Face | None = None
         self._eyes: dict[Hashable, Eye] = {}
+        self._cards: frozenset[Card] = frozenset()
         self._lock = threading.RLock()
         self._sight = Sight(trained, self.studio, self.stage, self._show)
         self._desk: Desk[Glance] = Desk(self._sight.look, self._fault)
@@ -96,7 +97,7 @@ class Session:
         eye = self.stage.eye(self.trained.known.cameras, 0)
         yield from self._sight.look(None, Glance(eye, replace(self.state, look=look).shown, 32))
         self._sight.forget(None)
-        self.studio.forget(card)
+        self.studio.keep(self.state.all_cards)
 
     def see(self, client: Hashable, eye: Eye) -> None:
         """A client's camera is here now."""
@@ -141,12 +142,22 @@ class Session:
             try:
                 card = self.studio.card(path, _free(name, self.state))
                 self.change(lambda state: dropped(state, card))
+                self._tidy(card)
                 done.set_result(card)
             except Exception as error:
                 done.set_exception(error)
 
         self._desk.do(("add", path), encode)
         return done.result()
+
+    def _tidy(self, card: Card) -> None:
+        """Photographs that left the shelf, and that no look needs, go with what was made of them: some 6 MB each."""
+        held = self.state.all_cards
+        for gone in {*self._cards, card} - held:
+            if gone.path.parent == self.intake.folder:
+                gone.path.unlink(missing_ok=True)
+        self._cards = held
+        self.studio.keep(held)
 
     def pick(self, client: Hashable, place: tuple[float, float]) -> None:
         """A click at shares of a client's width and height: the region there is picked; of nothing, none is."""
@@ -183,10 +194,10 @@ class Session:
             frames: Queue[Picture | None] = Queue(2)
             failed: list[Exception] = []
             self._desk.spare(_watched(frames_of_film(folder, self.trained, frames, self._progress), failed))
-            write_video(folder / "film.mp4", iter(frames.get, None), plan.fps)
+            write_video(folder / "film.mp4", taken(frames), plan.fps)
             if failed:
                 raise failed[0]
-        except (FprfError, OSError) as error:
+        except Exception as error:  # whatever it is, the next film can be made
             self.change(lambda state: replace(state, film=Film()))
             self._say(f"film: {error}", client)
             return
@@ -215,7 +226,7 @@ class Session:
         return told
 
     def _show(self, client: Hashable, frame: Frame) -> None:
-        if self._face is not None:
+        if self._face is not None and client is not None:  # a rehearsal has no one to show itself to
             self._face.show(client, frame)
 
     def _say(self, text: str, client: Hashable | None = None) -> None:

@@ -79,6 +79,11 @@ class State:
         looks += [look.towards for look in looks if look.towards is not None]
         return frozenset(card for look in looks for card, _ in look.mix)
 
+    @property
+    def all_cards(self) -> frozenset[Card]:
+        """Every photograph that can still be asked for."""
+        return self.in_use | frozenset(self.shelf)
+
 
 def dropped(state: State, card: Card) -> State:
     """A new photograph: on the shelf, and the style, or part of it. The oldest one that nobody needs makes room."""

@@ -5,7 +5,7 @@ stylizer alone.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -86,10 +86,10 @@ class Studio:
         assert there is not None  # else it would have settled
         return mixed(here, there, look.at)
 
-    def forget(self, card: Card) -> None:
-        """Nobody will ask for this photograph again."""
-        self._dictionaries = OrderedDict((key, value) for key, value in self._dictionaries.items() if key[0] is not card)
-        self._styles = OrderedDict((look, value) for look, value in self._styles.items() if card not in dict(look.mix))
+    def keep(self, cards: Collection[Card]) -> None:
+        """Nobody will ask for any other photograph again."""
+        self._dictionaries = OrderedDict((key, value) for key, value in self._dictionaries.items() if key[0] in cards)
+        self._styles = OrderedDict((look, value) for look, value in self._styles.items() if {*dict(look.mix)} <= {*cards})
 
     def restyle(self, look: Look) -> Restyle | None:
         """What a renderer needs of the look."""

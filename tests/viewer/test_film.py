@@ -13,7 +13,7 @@ from tiny_world import World
 from fprf import cli
 from fprf.errors import ConfigError, UsageError
 from fprf.output.images import Picture
-from fprf.viewer.film import FilmPlan, Key, frames_of_film, lay_film, new_folder, path_of
+from fprf.viewer.film import FilmPlan, Key, frames_of_film, lay_film, new_folder, path_of, taken
 from fprf.viewer.looks import Look, ordered
 from fprf.viewer.stage import stage_of
 from fprf.viewer.studio import Studio
@@ -38,7 +38,7 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(world: World, tmp_path
     told: list[tuple[int, int]] = []
     for _ in frames_of_film(folder, studio.trained, out, lambda done, total: told.append((done, total))):
         pass
-    frames = list(iter(out.get, None))
+    frames = list(taken(out))
     assert len(frames) == 7 and told == [(i + 1, 7) for i in range(7)]
     args = ["render", str(tmp_path / "run"), "--path", str(folder / "path.json"), "--keyframes", str(folder / "keys.json")]
     assert cli.main([*args, "--output", str(tmp_path / "frames")]) == 0

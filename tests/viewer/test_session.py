@@ -13,7 +13,7 @@ from fprf.viewer.eyes import Frame
 from fprf.viewer.film import FilmPlan, Key
 from fprf.viewer.looks import Look
 from fprf.viewer.session import Face, Session
-from fprf.viewer.state import State
+from fprf.viewer.state import SHELF, State
 
 
 class Listener(Face):
@@ -151,3 +151,12 @@ def test_the_rehearsal_leaves_nothing_behind(opened: tuple[Session, Listener]) -
     session._desk.spare(last())
     assert done.wait(120)
     assert session.state == State(pixels=64) and listener.frames == [] and not session.studio._styles
+
+
+def test_photographs_that_left_the_shelf_leave_nothing(opened: tuple[Session, Listener], world: World) -> None:
+    session, _ = opened
+    data = world.references[0].read_bytes()
+    for _ in range(SHELF + 3):
+        session.drop(data, "x.png")
+    assert len(list(session.intake.folder.glob("*.png"))) == SHELF == len(session.state.shelf)
+    assert {key[0] for key in session.studio._dictionaries} <= session.state.all_cards

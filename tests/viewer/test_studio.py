@@ -71,7 +71,9 @@ def test_styles_are_kept_and_bounded(world: World) -> None:
     for step in range(30):
         studio.styled(replace(first, strength=0.01 * (step + 1)))
     assert len(studio._styles) <= 24 and len(studio._dictionaries) == 1
-    studio.forget(a)
+    studio.keep([a])
+    assert studio._styles and studio._dictionaries
+    studio.keep([])
     assert not studio._styles and not studio._dictionaries
 
 
