@@ -165,7 +165,7 @@ def _refused(x: Tensor) -> bool:
 def _whole(scene: SceneStyle) -> SceneStyle:
     """The scene with the mean and covariance that its regions have together."""
     mean, whole = whole_style(own_style(scene, 0.0))
-    return scene._replace(mean=mean, covariance=whole)
+    return scene._replace(mean=mean.float(), covariance=whole.float())
 
 
 def _extremes() -> dict[str, tuple[SceneStyle, SceneStyle]]:
