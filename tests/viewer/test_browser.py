@@ -1,0 +1,116 @@
+"""The whole viewer: a process, a browser, real drops and clicks. Skipped where viser, playwright or Chromium are not there."""
+
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from browser import Front, front, served
+from tiny_world import World
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+@pytest.fixture
+def run(world: World, tmp_path: Path) -> Path:
+    shutil.copytree(world.run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def opened(run: Path) -> Iterator[tuple[Front, int]]:
+    with served(run, "--pixels", "128") as (address, pid), front(address) as found:
+        found.rest()
+        yield found, pid
+        assert found.errors == []
+
+
+def memory(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+
+
+def turn(found: Front, times: int) -> None:
+    mouse = found.page.mouse
+    for i in range(times):
+        x, y = 150 + 7 * (i % 11), 200 + 5 * (i % 7)
+        mouse.move(x, y)
+        mouse.down()
+        mouse.move(x + 30 - 60 * (i % 2), y + 6, steps=2)
+        mouse.up()
+
+
+def test_a_drop_a_click_a_wipe_and_a_pin(opened: tuple[Front, int], world: World) -> None:
+    found, _ = opened
+    found.drop(world.references[0])
+    state = found.until(lambda state: len(state["shelf"]) == 1)
+    assert state["shelf"][0]["name"] == "dusk.png" and state["shelf"][0]["weight"] == 1
+    found.page.locator(".fprf-card img").first.wait_for()
+    boxes = found.page.locator("input[type=checkbox]:visible")
+    boxes.nth(0).click(force=True)
+    found.until(lambda state: state["wipe"] == 0.5)
+    handle = found.page.locator("#fprf-wipe").bounding_box()
+    found.page.mouse.move(handle["x"] + 15, 300)
+    found.page.mouse.down()
+    found.page.mouse.move(160, 300, steps=4)
+    found.page.mouse.up()
+    found.until(lambda state: state["wipe"] == pytest.approx(0.25, abs=0.01))
+    boxes.nth(0).click(force=True)
+    boxes.nth(1).click(force=True)
+    found.until(lambda state: state["picking"] and state["wipe"] is None)
+    found.page.mouse.click(200, 200)
+    picked = found.until(lambda state: state["picked"] is not None)["picked"]
+    assert sum(row["share"] for row in picked["taken"]) == pytest.approx(1, abs=1e-3)
+    found.page.locator("#fprf-region button", has_text="keep as it is").click()
+    found.until(lambda state: state["picked"]["orders"] == [{"verb": "keep", "card": None}])
+
+
+def test_what_is_no_photograph_is_told_on_the_page(opened: tuple[Front, int], tmp_path: Path) -> None:
+    found, _ = opened
+    wrong = tmp_path / "wrong.png"
+    wrong.write_bytes(b"not a photograph")
+    found.page.set_input_files("#fprf-files", str(wrong))
+    found.page.locator("#fprf-said .bad", has_text="no PNG, JPEG").wait_for()
+    assert found.state()["shelf"] == []
+
+
+def test_many_moves_and_drops_leave_no_memory_behind(opened: tuple[Front, int], world: World) -> None:
+    found, pid = opened
+    for i in range(14):  # the shelf is full then
+        found.drop(world.references[i % 2])
+    turn(found, 20)
+    found.rest()
+    before = memory(pid)
+    turn(found, 200)
+    found.rest()
+    for i in range(50):
+        found.drop(world.references[i % 2])
+    found.rest()
+    assert memory(pid) <= 1.05 * before
+    assert len(found.state()["shelf"]) == 12
+
+
+def test_bad_clients_end_themselves_alone(opened: tuple[Front, int], world: World) -> None:
+    found, _ = opened
+    port = urlsplit(found.page.url).port
+    assert port is not None
+    head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    head += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: viser-v0.0.0\r\n\r\n"
+    for nonsense in (b"\x82\xfe\xff\xff" + b"x" * 70_000, b"\x82\x84aaaaaaaa", b"\x00" * 1000, b"\x82\xff" + b"\xff" * 8):
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as wire:
+            wire.sendall(head.encode() + nonsense)
+            while wire.recv(65536):
+                pass
+    found.drop(world.references[1])
+    found.until(lambda state: len(state["shelf"]) == 1)
+
+
+def test_with_a_token_the_address_opens_and_without_it_nothing(run: Path) -> None:
+    with served(run, "--token", "a-token-of-sixteen-characters") as (address, _), front(address) as found:
+        found.rest()
+        assert "token" not in found.page.url
+        assert found.page.request.get(found.page.url).status in (200, 403)
+        with socket.create_connection(("127.0.0.1", urlsplit(found.page.url).port or 0), timeout=60) as wire:
+            wire.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{urlsplit(address).port}\r\n\r\n".encode())
+            assert wire.recv(100).startswith(b"HTTP/1.1 403")
