@@ -22,6 +22,7 @@ from fprf.commands.train import train_scene
 from fprf.engine.lay_out import lay_out, load_boxes, plan_scene
 from fprf.engine.loading import load_run
 from fprf.fields.layouts import SingleConfig
+from fprf.process import keep_memory
 
 
 def main() -> None:
@@ -33,6 +34,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
     own = sys.argv[1 : sys.argv.index("--")] if "--" in sys.argv else sys.argv[1:]
     options = parser.parse_args(own)
+    keep_memory()  # as the command line does: else large gradients are mapped anew in every step
     rest = sys.argv[len(own) + 2 :]
     method, _ = load_method("fprf-lite")
     flags = ["--data", str(options.scene), "--minutes", str(options.minutes), *rest]

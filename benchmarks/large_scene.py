@@ -39,6 +39,7 @@ from fprf.fields.config import PlanesConfig
 from fprf.fields.layouts import SingleConfig, StreetConfig
 from fprf.methods import fprf_lite
 from fprf.output.images import to_uint8, write_image
+from fprf.process import keep_memory
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.town.write import write_town
@@ -95,7 +96,9 @@ def psnr(trained: Trained, folder: Path | None = None) -> list[float]:
         size = scene.cameras.size[view].tolist()
         if [truth.shape[1], truth.shape[0]] != size:
             truth = torch.from_numpy(load_image(scene.paths[view], (size[0], size[1]))).float() / 255
-        image = render_view(trained.model, trained.known.facts, scene.cameras, view, trained.config.render).rgb
+        tones = trained.model.tones
+        factor = None if tones is None else tones(torch.tensor([view]))[0].detach()
+        image = render_view(trained.model, trained.known.facts, scene.cameras, view, trained.config.render, factor=factor).rgb
         found.append(float(-10 * (image - truth).square().mean().log10()))
         if folder is not None and len(found) % 10 == 1:
             write_image(folder / f"{view:04d}.png", to_uint8(torch.cat([truth, image], 1)))
@@ -167,6 +170,7 @@ def main() -> None:
     parser.add_argument("--scratch", type=Path, default=Path("runs/large_scene"))
     parser.add_argument("--output", type=Path, default=here / "benchmarks/results/large_scene.json")
     options = parser.parse_args()
+    keep_memory()  # as the command line does: else large gradients are mapped anew in every step
     options.scratch = options.scratch.resolve()
     os.environ.setdefault("XDG_CACHE_HOME", str(options.scratch / "cache"))
     torch.manual_seed(0)

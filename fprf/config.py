@@ -76,9 +76,11 @@ class LossConfig:
     """Proposals must bound the field's weights from above."""
     distortion: float = 1e-3
     """Weights should gather at one place along a ray."""
+    depth: float = 0.1
+    """Rays through points of the reconstruction should end there (where `datamanager.depth_share` draws such rays)."""
 
     def __post_init__(self) -> None:
-        for name in ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion"):
+        for name in ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion", "depth"):
             at_least(f"loss.{name}", getattr(self, name), 0.0)
         at_least("loss.penalty_every", self.penalty_every, 1)
         if self.rgb == self.content == self.semantic == 0:
@@ -187,6 +189,9 @@ class TrainConfig:
     """Weights of the training terms."""
     optimizer: OptimizerConfig = OptimizerConfig()
     """How parameters move."""
+    tones: bool = False
+    """Learn how bright and how coloured each view was taken, from its exposure where the capture says; the scene is what they
+    have in common."""
     render: RenderConfig = RenderConfig()
     """Rendering and skipping."""
     statistics: StatisticsConfig = StatisticsConfig()

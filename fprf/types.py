@@ -99,6 +99,8 @@ class Batch(NamedTuple):
     content: Annotated[Tensor, "R C"] | None = None
     semantic: Annotated[Tensor, "Q D"] | None = None
     """Semantic targets of the first Q rays of the batch (Q <= R)."""
+    distance: Annotated[Tensor, "R"] | None = None
+    """World distance along the rays that go through points of the reconstruction, NaN for the others."""
 
 
 class Rendered(NamedTuple):

@@ -37,6 +37,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "checkpoint_minutes": (1e-9, "saving"),
     "datamanager.rays": (128, "training"),
     "datamanager.semantic_share": (0.75, "training"),
+    "datamanager.depth_share": (0.25, "training"),
     "datamanager.guided.radius": (0.3, "targets"),
     "datamanager.guided.eps": (0.1, "targets"),
     "datamanager.guided.stride": (2, "targets"),
@@ -72,6 +73,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "loss.penalty_every": (3, "training"),
     "loss.interlevel": (0.25, "training"),
     "loss.distortion": (0.5, "training"),
+    "loss.depth": (0.9, "points"),
     "optimizer.rate": (1e-3, "training"),
     "optimizer.hold": (2, "training"),
     "optimizer.final": (0.5, "training"),
@@ -83,6 +85,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "render.resolution": (0.5, "render"),
     "render.chunk": (100, "chunks"),
     "render.background": ((1.0, 0.0, 1.0), "background"),
+    "tones": (True, "facts"),
     "statistics.rays": (64, "style"),
     "statistics.regions": (1, "style"),
 }
@@ -204,6 +207,23 @@ def test_it_names_a_file(path: str, world: World) -> None:
     }
     with pytest.raises(Exception, match=r"w\.safetensors"):
         builds[path]()
+
+
+def test_tones_are_facts_of_the_scene(world: World) -> None:
+    assert shown("facts") == ["tones"]
+    first, second = (prepare(config).facts for config in (world.config, changed(world.config, "tones", True)))
+    assert first.exposure == () and len(second.exposure) == 10 and len(second.held) == 2
+
+
+def test_a_loss_on_points_changes_the_training(world: World, tmp_path: Path) -> None:
+    """It counts where rays are drawn through points of the reconstruction."""
+    base = changed(replace(world.config, steps=5), "datamanager.depth_share", 0.25)
+    there = replace(world, prepared=prepare(base))
+    first, second = (
+        checkpoint.load(trained_for(there, tmp_path / name, config).checkpoints, 5).model
+        for name, config in (("a", base), ("b", changed(base, "loss.depth", SECOND["loss.depth"][0])))
+    )
+    assert differ(first, second) and shown("points") == ["loss.depth"]
 
 
 def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,12 +8,13 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..blocks.sightings import find_sightings
 from ..errors import DataError
 from ..interfaces import DataManager, Encoder
 from ..types import Batch
@@ -34,6 +35,15 @@ def generator_of(seed: int, step: int) -> torch.Generator:
     """The CPU generator of a step's pixels."""
     name = f"fprf pixels {seed} {step}".encode()
     return torch.Generator().manual_seed(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1)
+
+
+class _Marks(NamedTuple):
+    """Pixels that show a point of the reconstruction."""
+
+    at: Annotated[Tensor, "O"]
+    """int64 among all training pixels."""
+    distance: Annotated[Tensor, "O"]
+    """World distance along the ray."""
 
 
 class RayBatches(DataManager):
@@ -69,6 +79,7 @@ class RayBatches(DataManager):
         self._slots = {view: slot for slot, view in enumerate(self._views)}
         self._pixels = self._load()
         self._chosen = None if seen is None else self._choose(seen)
+        self._marks = self._marked() if config.depth_share > 0 else None
         self.content_store: FeatureStore | None = None
         self.semantic_store: FeatureStore | None = None
         if content is not None:
@@ -84,8 +95,16 @@ class RayBatches(DataManager):
         """The pixels of a step; the first `semantic_share` of them carry semantics."""
         chosen = self._chosen
         room = len(self._pixels) if chosen is None else len(chosen)
-        at = torch.randint(room, (self._config.rays,), generator=generator_of(self._seed, step))
+        generator = generator_of(self._seed, step)
+        at = torch.randint(room, (self._config.rays,), generator=generator)
         at = at if chosen is None else chosen[at].long()
+        distance = None
+        if self._marks is not None:
+            # The last rays: the first ones carry semantics, which must stay an even sample.
+            count = round(self._config.depth_share * len(at))
+            mark = torch.randint(len(self._marks.at), (count,), generator=generator)
+            at = torch.cat([at[: len(at) - count], self._marks.at[mark]])
+            distance = torch.cat([torch.full((len(at) - count,), torch.nan), self._marks.distance[mark]])
         slot = torch.searchsorted(self._ends, at, right=True)
         width, height = self._sizes[slot].unbind(1)
         local = at - (self._ends[slot] - width * height)
@@ -99,6 +118,7 @@ class RayBatches(DataManager):
             rgb=rgb,
             content=content.at(view, pixel, rgb) if content is not None else None,
             semantic=semantic.at(view[:share], pixel[:share], rgb[:share]) if semantic is not None and share else None,
+            distance=distance,
         )
 
     def image(self, view: int) -> Annotated[Tensor, "H W 3"]:
@@ -124,6 +144,23 @@ class RayBatches(DataManager):
         if not len(found):
             raise DataError(f"{self._scene.name}: none of {len(self._views)} training views shows what is to be learnt")
         return found.int() if len(self._pixels) < 2**31 else found
+
+    def _marked(self) -> _Marks | None:
+        """Where sparse points are seen in the training views, among the pixels that are learnt from."""
+        sightings = find_sightings(self._scene)
+        if sightings is None:
+            return None
+        slots = torch.full((len(self._scene.cameras),), -1, dtype=torch.int64)
+        slots[self._scene.train] = torch.arange(len(self._views))
+        slot, pixel = slots[sightings.view], sightings.pixel.long()
+        width, height = self._sizes[slot].unbind(1)
+        at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
+        kept = torch.ones(len(at), dtype=torch.bool)
+        if self._chosen is not None:
+            allowed = torch.zeros(len(self._pixels), dtype=torch.bool)
+            allowed[self._chosen.long()] = True
+            kept = allowed[at]
+        return _Marks(at[kept], sightings.distance[kept].float()) if bool(kept.any()) else None
 
     def _load(self) -> Annotated[Tensor, "P 3"]:
         """All training pixels, uint8, view after view."""

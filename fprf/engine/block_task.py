@@ -127,5 +127,7 @@ def _built(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: i
     own = {name: tensor.clone() for name, tensor in finished.items()}  # training writes to them, the file stays
     restore(around.member, "member", own)
     restore(around.model.decoder, "decoder", own)
+    if around.model.tones is not None:
+        restore(around.model.tones, "tones", own)
     around.member.requires_grad_(True)
     return inset(config, facts, boxes, block, around)

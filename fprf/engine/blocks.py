@@ -34,7 +34,8 @@ from ..rendering.renderer import Parts
 from ..types import Boxes
 from . import tensorfiles
 from .decoder import build_decoder
-from .model import Facts, Model
+from .model import Facts, Model, tones_of
+from .tones import Tones
 
 __all__ = [
     "SURROUNDINGS",
@@ -86,7 +87,9 @@ def member_of(config: TrainConfig, facts: Facts, chart: Chart) -> Member:
     )
 
 
-def assemble(config: TrainConfig, facts: Facts, members: Members, router: Router, decoder: Decoder) -> Model:
+def assemble(
+    config: TrainConfig, facts: Facts, members: Members, router: Router, decoder: Decoder, tones: Tones | None
+) -> Model:
     """A model whose points are routed to members."""
     return Model(
         Parts(
@@ -95,7 +98,8 @@ def assemble(config: TrainConfig, facts: Facts, members: Members, router: Router
             BlockedField(members, router),
             BlockedSemantic(members, router) if facts.dim else None,
             decoder,
-        )
+        ),
+        tones,
     )
 
 
@@ -103,23 +107,27 @@ def surroundings(config: TrainConfig, facts: Facts, boxes: Boxes) -> Built:
     """The coarse scene that everything starts from."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = member_of(config, facts, surroundings_of(boxes))
-    return Built(assemble(config, facts, Held([member]), Everywhere(), decoder), member)
+    return Built(assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts)), member)
 
 
 def inset(config: TrainConfig, facts: Facts, boxes: Boxes, block: int, around: Built) -> Built:
-    """A block inside of a copy of its surroundings; the decoder is theirs, as they learnt it."""
+    """A block inside of a copy of its surroundings; decoder and tones are theirs, as they learnt them."""
     chart = chart_of(boxes, block)
     member = member_of(config, facts, chart)
     inherit(member, around.member)
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)
+    tones = copy.deepcopy(around.model.tones)
     held = Held([member, copy.deepcopy(around.member)])
-    return Built(assemble(config, facts, held, Inset(chart), decoder), member)
+    still = None if tones is None else tones.requires_grad_(False)
+    return Built(assemble(config, facts, held, Inset(chart), decoder, still), member)
 
 
 def save_finished(folder: Path, built: Built, *, asked: dict[str, Any], step: int, seconds: float) -> None:
     """Write the kept member and the decoder, then that the block is done."""
     tensors = {f"member.{name}": t for name, t in built.member.state_dict().items()}
     tensors |= {f"decoder.{name}": t for name, t in built.model.decoder.state_dict().items()}
+    if built.model.tones is not None:
+        tensors |= {f"tones.{name}": t for name, t in built.model.tones.state_dict().items()}
     manifest = tensorfiles.save(folder / "block.safetensors", tensors)
     write_json(folder / "done.json", {"format": _FORMAT, "asked": asked, "step": step, "seconds": seconds, "tensors": manifest})
 
@@ -150,7 +158,7 @@ def load_finished(folder: Path, *, verify: bool = True) -> Finished:
 
 
 def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
-    """Give a `member` or `decoder` its tensors of a finished block, as they are: mapped from the file, not copied."""
+    """Give a `member`, `decoder` or `tones` its tensors of a finished block, as they are: mapped from the file, not copied."""
     own = {name.removeprefix(f"{kind}."): t for name, t in tensors.items() if name.startswith(f"{kind}.")}
     now = module.state_dict()
     wrong = [name for name, t in now.items() if name not in own or own[name].shape != t.shape]

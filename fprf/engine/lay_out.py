@@ -149,7 +149,7 @@ def asked_of(
         "space": [facts.space.centre, facts.space.rotation, facts.space.scale, facts.space.near, facts.space.far],
         "views": views,
         "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
-        "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background],
+        "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background, facts.exposure],
     }
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode() + rays["seen"].numpy().tobytes())
     for view in views:

@@ -68,9 +68,11 @@ def _load_blocks(
     finished = load_finished(folder_of(run.root, SURROUNDINGS))
     restore(around.member, "member", finished.tensors)
     restore(around.model.decoder, "decoder", finished.tensors)
+    if around.model.tones is not None:
+        restore(around.model.tones, "tones", finished.tensors)
     limit = None if max_memory is None else int(max_memory * _MIB)
     shelf = Shelf(run.root, boxes, around.member.to(device), device=device, limit=limit)
-    model = assemble(config, facts, shelf, Blend(boxes), around.model.decoder)
+    model = assemble(config, facts, shelf, Blend(boxes), around.model.decoder, around.model.tones)
     model.requires_grad_(False)
     done = [read_done(folder_of(run.root, block)) for block in range(len(boxes.low))]
     steps = [int(each["step"]) for each in done if each is not None]

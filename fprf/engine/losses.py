@@ -1,15 +1,21 @@
 """The training terms (paper, Eq. 3 and 4, and K-Planes' regularisers). A term of weight 0 is never computed."""
 
+from typing import Annotated
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ..config import LossConfig
-from ..rendering.stepfun import distortion, interlevel
+from ..rendering.stepfun import distortion, interlevel, midpoints
 from ..types import Batch, Rendered, Want
 from .model import Facts, Model
 
-__all__ = ["terms", "total", "wanted"]
+__all__ = ["NEARBY", "ending", "terms", "total", "wanted"]
+
+
+NEARBY = 0.1
+"""Share of its distance by which a ray's end may miss a point: what a reconstruction is uncertain by, and samples are apart."""
 
 
 def wanted(config: LossConfig, batch: Batch) -> Want:
@@ -46,12 +52,31 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
         result["interlevel"] = torch.stack(parts).sum()
     if config.distortion > 0:
         result["distortion"] = distortion(sampled.s, weights)
+    if config.depth > 0 and batch.distance is not None and facts.space.kind != "ndc":
+        # NDC's ray parameter is no distance; captures that face one way are not short of parallax either.
+        found = ending(sampled.t, weights, batch.distance * facts.space.scale)
+        if found is not None:
+            result["depth"] = found
     due = step % config.penalty_every == 0 and (config.variation > 0 or config.proposal_variation > 0)
     penalties = model.penalties() if due else {}
     for name, weight in (("variation", config.variation), ("proposal_variation", config.proposal_variation)):
         if weight > 0 and name in penalties:
             result[name] = penalties[name]
     return result
+
+
+def ending(t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], distance: Annotated[Tensor, "R"]) -> Tensor | None:
+    """How far rays of known distance (space units, NaN = unknown) are from ending there; None where none is known.
+
+    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1].
+    """
+    known = torch.isfinite(distance).nonzero()[:, 0]
+    if not len(known):
+        return None
+    middle = midpoints(t.index_select(0, known)) / distance.index_select(0, known)[:, None]
+    w = weights.index_select(0, known)
+    there, before = (middle - 1).abs() <= NEARBY, middle < 1 - NEARBY
+    return ((1 - (w * there).sum(-1)).square() + (w * before).sum(-1).square()).mean()
 
 
 def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
@@ -65,6 +90,7 @@ def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
         "semantic": config.semantic,
         "interlevel": config.interlevel,
         "distortion": config.distortion,
+        "depth": config.depth,
         "variation": config.variation * config.penalty_every,
         "proposal_variation": config.proposal_variation * config.penalty_every,
     }

@@ -10,8 +10,9 @@ from ..config import TrainConfig
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from .decoder import build_decoder
+from .tones import Tones
 
-__all__ = ["Facts", "Model", "build_model"]
+__all__ = ["Facts", "Model", "build_model", "tones_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,18 +34,23 @@ class Facts:
     """The same for semantics."""
     background: tuple[float, float, float] | None
     """Colour behind everything, if anything can be seen through."""
+    exposure: tuple[float, ...] = ()
+    """Logarithm of each view's exposure over their mean (see `tones.relative`); empty where tones are not learnt."""
+    held: tuple[int, ...] = ()
+    """Views that tones are not learnt from."""
 
 
 class Model(nn.Module):
     """Sampler, fields and decoder of one scene."""
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: Parts, tones: Tones | None = None) -> None:
         super().__init__()
         self.space = parts.space
         self.sampler = parts.sampler
         self.field = parts.field
         self.semantic = parts.semantic
         self.decoder = parts.decoder
+        self.tones = tones
 
     @property
     def parts(self) -> Parts:
@@ -66,6 +72,11 @@ def background_of(facts: Facts, device: torch.device) -> Annotated[Tensor, "3"] 
     return None if facts.background is None else torch.tensor(facts.background, device=device)
 
 
+def tones_of(facts: Facts) -> Tones | None:
+    """Tones at their start; None where they are not learnt."""
+    return Tones(torch.tensor(facts.exposure), facts.held) if facts.exposure else None
+
+
 def build_model(config: TrainConfig, facts: Facts) -> Model:
     """The model at its seeded start. Raises WeightsError where no decoder fits the content encoder."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
@@ -77,5 +88,6 @@ def build_model(config: TrainConfig, facts: Facts) -> Model:
             config.content.field.build(channels=facts.channels, seed=config.seed + 1),
             semantic,
             decoder,
-        )
+        ),
+        tones_of(facts),
     )

@@ -19,6 +19,7 @@ from ..rendering.bounds import find_space
 from ..rendering.space import Space
 from .decoder import build_decoder
 from .model import Facts
+from .tones import relative
 
 __all__ = ["Prepared", "behind", "cache_folder", "device_of", "facts_of", "prepare"]
 
@@ -90,6 +91,8 @@ def facts_of(
         content_scale=content_store.scale if content_store is not None else 1.0,
         semantic_scale=semantic_store.scale if semantic_store is not None else 1.0,
         background=behind(config, scene),
+        exposure=relative(scene.exposure, len(scene.paths)) if config.tones else (),
+        held=tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist()))) if config.tones else (),
     )
 
 

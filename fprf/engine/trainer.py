@@ -23,6 +23,7 @@ from .model import Facts, Model, background_of, build_model
 from .prepare import Prepared, device_of
 from .run import Run
 from .schedule import progress, rate
+from .tones import toned
 
 __all__ = ["Loop", "Report", "optimizer_of", "step_generator", "train"]
 
@@ -176,6 +177,7 @@ class Loop:
             semantic_samples=self.config.semantic.samples,
             content_moves_density=self.config.content.moves_density,
         )
+        rendered = toned(rendered, self.model.tones, batch.view)
         with record_function("fprf.losses"):
             parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
             loss = total(self.config.loss, parts)
@@ -219,4 +221,5 @@ class Loop:
         if self.device.type == "cpu":
             return batch
         content, semantic = (x.to(self.device) if x is not None else None for x in (batch.content, batch.semantic))
-        return Batch(batch.view, batch.pixel, batch.rgb.to(self.device), content, semantic)
+        distance = batch.distance.to(self.device) if batch.distance is not None else None
+        return Batch(batch.view, batch.pixel, batch.rgb.to(self.device), content, semantic, distance)

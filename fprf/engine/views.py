@@ -44,13 +44,22 @@ def view_rays(
 
 @torch.inference_mode()
 def render_view(
-    model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig, restyle: Restyle | None = None
+    model: Model,
+    facts: Facts,
+    cameras: Cameras,
+    view: int,
+    config: RenderConfig,
+    restyle: Restyle | None = None,
+    factor: Annotated[Tensor, "3"] | None = None,
 ) -> View:
-    """Colour and depth of one view, in chunks of `config.chunk` rays; below `config.resolution` 1 from fewer of them."""
+    """Colour and depth of one view, in chunks of `config.chunk` rays; below `config.resolution` 1 from fewer of them.
+
+    Colours are multiplied by `factor`, if one is given: how a camera took them (`tones`).
+    """
     if config.resolution < 1:
         small = cameras.select(torch.tensor([view])).scaled(1 / config.resolution)
         whole = replace(config, resolution=1.0)
-        return _enlarged(render_view(model, facts, small, 0, whole, restyle), cameras.size[view].tolist())
+        return _enlarged(render_view(model, facts, small, 0, whole, restyle, factor), cameras.size[view].tolist())
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
     rgb, depth, opacity, kept, samples = [], [], [], 0, 0
@@ -65,7 +74,7 @@ def render_view(
     width, height = (int(v) for v in cameras.size[view])
     metric = model.space.metric(origin, direction, torch.cat(depth))
     return View(
-        torch.cat(rgb).view(height, width, 3).clamp(0, 1),
+        (torch.cat(rgb) * (1.0 if factor is None else factor.cpu())).view(height, width, 3).clamp(0, 1),
         metric.view(height, width),
         torch.cat(opacity).view(height, width),
         kept / max(1, samples),

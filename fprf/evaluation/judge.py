@@ -36,7 +36,9 @@ def judge(
     for i, view in enumerate(views):
         progress(i, len(views), "rendering")
         start = time.perf_counter()
-        render = render_view(trained.model, facts, cameras, view, trained.config.render)
+        tones = trained.model.tones  # of a view that was held out, what its exposure says
+        factor = None if tones is None else tones(torch.tensor([view]))[0].detach()
+        render = render_view(trained.model, facts, cameras, view, trained.config.render, factor=factor)
         seconds += time.perf_counter() - start
         renders.append(render)
         width, height = (int(v) for v in cameras.size[view])

@@ -43,7 +43,7 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     if not (long > 1e-9).all() or len(grid) < 16:
         raise ValueError("rays without a direction, or too few of them")
     ray /= long
-    pixel = grid + 0.5
+    pixel = grid.astype(np.float64) + 0.5
     turn = _axes(ray, grid)
     local = ray @ turn.T
     if not (local[:, 2] > 0.02).all():

@@ -1,0 +1,68 @@
+"""Rays through points of the reconstruction: where they should end."""
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.engine.losses import NEARBY, ending
+
+EDGES = torch.linspace(0.0, 10.0, 101)
+
+
+def rays(count: int) -> Tensor:
+    return EDGES.expand(count, -1)
+
+
+def spike(*at: float) -> Tensor:
+    """All weight of each ray in the interval around a distance."""
+    weights = torch.zeros(len(at), 100)
+    for row, t in enumerate(at):
+        weights[row, int(t * 10)] = 1.0
+    return weights
+
+
+def test_a_ray_that_ends_at_its_point_costs_nothing() -> None:
+    found = ending(rays(3), spike(1.0, 5.0, 9.5), torch.tensor([1.0, 5.0, 9.5]))
+    assert found is not None and float(found) == 0.0
+
+
+def test_before_the_point_costs_two_behind_it_one() -> None:
+    before, behind = (ending(rays(1), spike(t), torch.tensor([5.0])) for t in (3.0, 8.0))
+    assert before is not None and behind is not None
+    assert float(before) == 2.0 and float(behind) == 1.0
+
+
+def test_an_empty_ray_costs_one_and_wants_weight_at_its_point_alone() -> None:
+    weights = torch.zeros(1, 100, requires_grad=True)
+    found = ending(rays(1), weights, torch.tensor([5.0]))
+    assert found is not None and float(found.detach()) == 1.0
+    found.backward()
+    assert weights.grad is not None
+    middle = (EDGES[1:] + EDGES[:-1]) / 2
+    near = (middle / 5 - 1).abs() <= NEARBY
+    assert bool((weights.grad[0, near] < 0).all()) and bool((weights.grad[0, ~near] == 0).all())
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0.5, 9.5) | st.just(float("nan")), min_size=1, max_size=6), st.integers(0, 1000))
+def test_only_known_rays_count_and_the_mean_is_theirs(distances: list[float], seed: int) -> None:
+    count = len(distances)
+    weights = torch.rand(count, 100, generator=torch.Generator().manual_seed(seed))
+    weights = weights / weights.sum(1, keepdim=True)
+    distance = torch.tensor(distances)
+    found = ending(rays(count), weights, distance)
+    each = [float(one) for k in range(count) if (one := ending(rays(1), weights[k : k + 1], distance[k : k + 1])) is not None]
+    if not each:
+        assert found is None
+        return
+    assert found is not None and 0 <= float(found) <= 2
+    torch.testing.assert_close(found, torch.tensor(each).mean(), atol=1e-5, rtol=1e-4)
+
+
+def test_it_does_not_depend_on_the_scale_of_space() -> None:
+    weights = torch.rand(4, 100, generator=torch.Generator().manual_seed(1)) / 100
+    distance = torch.tensor([1.03, 4.04, 5.02, 7.01])
+    one, other = ending(rays(4), weights, distance), ending(rays(4) * 8, weights, distance * 8)
+    assert one is not None and other is not None
+    torch.testing.assert_close(one, other)
