@@ -17,11 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from ..interfaces import Decoder, Stylizer
+from ..ops import mixture
 from ..types import Want
 from .controls import blend_strength
 from .dictionary import StyleDictionary, blend_codes
-from .regional import RegionWeight
-from .scene import SceneStyle
+from .scene import SceneStyle, membership, region_units
 from .statistics import double, mix
 from .transport import monge, symmetric_root
 
@@ -38,24 +38,35 @@ _QUIET = 2e-4
 class ColourMaps(nn.Module):
     """An affine map of colours for each region, mixed by membership."""
 
+    semantic_mean: Annotated[Tensor, "D"]
+    units: Annotated[Tensor, "K D"]
+    matrix: Annotated[Tensor, "K 3 3"]
+    bias: Annotated[Tensor, "K 3"]
+    origin: Annotated[Tensor, "3"]
+
     def __init__(
         self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float = 1.0
     ) -> None:
         super().__init__()
+        units, self.softness = region_units(scene.keys, scene.semantic_mean)
+        self.register_buffer("semantic_mean", scene.semantic_mean.float())
+        self.register_buffer("units", units.float())
         # The identity is taken out: what is small stays exact, and a map that changes nothing is nothing.
-        change = share * torch.cat([matrix - torch.eye(3).to(matrix), bias[:, None]], 1)
-        self.weight = RegionWeight(scene, change.flatten(1))
+        self.register_buffer("matrix", (share * (matrix - torch.eye(3).to(matrix))).float())
+        self.register_buffer("bias", (share * bias).float())
+        self.register_buffer("origin", torch.zeros(3))
 
     @property
     def needs(self) -> Want:
         """Semantics only where there is more than one region."""
-        return Want.CONTENT | Want.SEMANTIC if self.weight.divided else Want.CONTENT
+        return Want.CONTENT | Want.SEMANTIC if len(self.units) > 1 else Want.CONTENT
 
     def forward(self, colour: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N 3"]:
         """What is to be added to colours in [0, 1] so that they lie in the style and in [0, 1]."""
-        change = self.weight(colour[:, :0] if semantic is None else semantic).to(colour).view(-1, 4, 3)
-        moved: Tensor = torch.einsum("nc,ncd->nd", colour, change[:, :3]) + change[:, 3]
-        return (colour + moved).clamp(0, 1) - colour
+        seen = colour[:, :0] if semantic is None else semantic
+        belongs = membership(seen.to(self.units), self.semantic_mean, self.units, self.softness)
+        change = mixture.affine(colour.to(self.units), belongs, self.matrix, self.bias, centre=self.origin).to(colour)
+        return (colour + change).clamp(0, 1) - colour
 
 
 @torch.no_grad()
