@@ -90,6 +90,8 @@ class PaperConfig(EvidenceConfig):
 
     table: Literal["reconstruction", "time", "ablation", "multi-reference", "guided-filter", "clusters"] = "reconstruction"
     """Which."""
+    run: Path | None = None
+    """Run folder of a town, for the tables that train nothing but one scene; none = that one is trained first."""
     data: Path = Path("town")
     """Scene folder; the embedded town is also restyled, and judged by its truth."""
     downscale: int = 1

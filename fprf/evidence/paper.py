@@ -16,9 +16,10 @@ from torch import Tensor
 
 from ..config import TrainConfig
 from ..datamanagers.images import load_image
-from ..engine.loading import Trained
-from ..engine.prepare import Prepared, prepare
-from ..engine.restyle import Encoders
+from ..datamanagers.parsers.recognise import parse_scene
+from ..engine.loading import Trained, load_run
+from ..engine.prepare import prepare
+from ..engine.restyle import Encoders, open_encoders
 from ..engine.run import Run
 from ..engine.style_pass import measure_style
 from ..engine.trainer import Report, train
@@ -85,10 +86,9 @@ TRAINED: Mapping[str, Mapping[str, Change]] = {
 
 
 class Short(NamedTuple):
-    """A short training, in memory."""
+    """A training, in memory."""
 
     trained: Trained
-    prepared: Prepared
     encoders: Encoders
     seconds: float
 
@@ -97,6 +97,9 @@ def paper(config: PaperConfig, method: TrainConfig, progress: Progress) -> dict[
     """The document of one table; `method` is the config that `config.method` names."""
     base = replace(method, data=config.data, downscale=config.downscale, device=config.device)
     base = replace(base, steps=config.steps, minutes=None, output=None)
+    steps = config.steps
+    if config.run is not None and config.table not in TRAINED:
+        steps = load_run(config.run, "cpu").step
     tables = []
     with tempfile.TemporaryDirectory(prefix="fprf-paper-") as made:
         for k, seed in enumerate(config.trainings):
@@ -108,7 +111,7 @@ def paper(config: PaperConfig, method: TrainConfig, progress: Progress) -> dict[
         "settings": {
             "data": config.data.name,
             "method": config.method,
-            "steps": config.steps,
+            "steps": steps,
             "trainings": list(config.trainings),
             "views": config.views,
             "palettes": list(config.palettes),
@@ -136,7 +139,7 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
     trained = Trained(run, config, "", run.load_known(), model, config.steps, spent)
     semantic = None if config.semantic.encoder is None else config.semantic.encoder.build()
-    return Short(trained, prepared, Encoders(config.content.encoder.build(), semantic, prepared.basis, scene), spent)
+    return Short(trained, Encoders(config.content.encoder.build(), semantic, prepared.basis, scene), spent)
 
 
 def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progress) -> dict[str, Row]:
@@ -144,13 +147,13 @@ def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progr
         rows = {}
         for k, (name, change) in enumerate(TRAINED[config.table].items()):
             short = short_training(change(base), folder / str(k), progress)
-            rows[name] = _held_out(short, config.views) | {"train_seconds": short.seconds}
+            rows[name] = _held_out(short.trained, config.views) | {"train_seconds": short.seconds}
             if town_folder(short.trained) is not None:
                 rows[name] |= _restyled(config, short, folder / f"references-{k}", RegionToneConfig(), "three", 10)
         return rows
-    short = short_training(base, folder / "run", progress)
+    short = short_training(base, folder / "run", progress) if config.run is None else _finished(config.run, config.device)
     if town_folder(short.trained) is None:
-        raise UsageError(f"--table {config.table}: judged by a town's truth; --data is {config.data}, leave it out")
+        raise UsageError(f"--table {config.table}: judged by a town's truth; --run or --data is another scene, leave it out")
     styles: dict[str, tuple[StylizerConfig, str, int]]
     if config.table == "clusters":
         styles = {f"{n} clusters": (RegionToneConfig(), "three", n) for n in config.clusters}
@@ -168,12 +171,19 @@ def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progr
     return rows
 
 
-def _held_out(short: Short, views: int) -> Row:
-    known, scene = short.trained.known, short.prepared.scene
+def _finished(root: Path, device: str) -> Short:
+    """A run that is trained already."""
+    trained = load_run(root, device)
+    return Short(trained, open_encoders(trained), trained.seconds)
+
+
+def _held_out(trained: Trained, views: int) -> Row:
+    known, config = trained.known, trained.config
+    scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
     chosen = (known.test or known.train)[:views]
     found = []
     for view in chosen:
-        render = render_view(short.trained.model, known.facts, known.cameras, view, short.trained.config.render).rgb
+        render = render_view(trained.model, known.facts, known.cameras, view, config.render).rgb
         size = (render.shape[1], render.shape[0])
         truth = torch.from_numpy(load_image(scene.paths[view], size, known.facts.background)).float() / 255
         found.append(image_metrics(render, truth))
