@@ -99,14 +99,14 @@ def _parts(run: Path, histories: "Sequence[History]") -> list[tuple[str, float]]
             parts[name] = parts.get(name, 0.0) + seconds
     if "training" not in parts:  # runs of before the parts were told
         parts["training"] = sum(history.seconds[-1] for history in histories if history.seconds)
-    measured = _json(run / "metrics.json").get("render_seconds")
-    if isinstance(measured, int | float):
-        parts["rendering for eval"] = float(measured)
+    judged = _json(run / "metrics.json").get("render_seconds")
+    if isinstance(judged, int | float):
+        parts["rendering for eval"] = float(judged)
     for file in sorted(run.glob("styles/*/style.json")):
         made = _json(file).get("made")
-        seconds = made.get("dictionary_seconds") if isinstance(made, dict) else None
-        if isinstance(seconds, int | float):
-            parts[f"style {file.parent.name}"] = float(seconds)
+        built = made.get("dictionary_seconds") if isinstance(made, dict) else None
+        if isinstance(built, int | float):
+            parts[f"style {file.parent.name}"] = float(built)
     return list(parts.items())
 
 

@@ -18,7 +18,8 @@ __all__ = ["Cameras", "pixel_grid", "project", "rays_through", "sees"]
 
 @dataclass(frozen=True)
 class Cameras:
-    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant, k1..k4)."""
+    """V views. `lens` is 0 pinhole, 1 OpenCV (k1..k4 radial, p1 p2 tangential), 2 fisheye (equidistant, k1..k4),
+    3 panorama (equirectangular: pixels are angles)."""
 
     pose: Annotated[Tensor, "V 3 4"]
     """Camera to world, float64."""

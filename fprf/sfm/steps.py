@@ -122,7 +122,7 @@ def _alike(place: Place, names: Sequence[str], config: SfmConfig) -> list[pairs.
 class _Watch(NamedTuple):
     """How a step is seen from outside."""
 
-    count: Callable[[], int]
+    seen: Callable[[], int]
     total: int
     what: str
     progress: Progress
@@ -144,7 +144,7 @@ def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], wat
         process = subprocess.Popen([*_COMMAND, str(path)], stdout=out, stderr=log, stdin=subprocess.DEVNULL)
         try:
             while process.poll() is None:
-                watch.progress(max(0, min(watch.total - 1, watch.count())), watch.total, watch.what)
+                watch.progress(max(0, min(watch.total - 1, watch.seen())), watch.total, watch.what)
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_POLL)
         finally:

@@ -45,7 +45,7 @@ def test_paths_have_about_the_frames_asked_for(world: World, path: str) -> None:
 def test_frames_in_a_folder_and_depth(run: Path, tmp_path: Path) -> None:
     common = ["render", str(run), "--path", "spiral", "--frames", "3"]
     assert cli.main([*common, "--output", str(tmp_path / "plain")]) == 0
-    assert cli.main([*common, "--depth", "--output", str(tmp_path / "depth")]) == 0
+    assert cli.main([*common, "--show", "depth", "--output", str(tmp_path / "depth")]) == 0
     plain, depth = pictures(tmp_path / "plain"), pictures(tmp_path / "depth")
     assert list(plain) == list(depth) == ["00000.png", "00001.png", "00002.png"]
     assert not any(np.array_equal(plain[name], depth[name]) for name in plain)
@@ -85,6 +85,10 @@ def test_a_camera_path_file(run: Path, tmp_path: Path) -> None:
         (["--path", "spirale"], "--path spirale: neither a file nor one of spiral, orbit, interpolate, dataset"),
         (["--frames", "0"], "--frames: 0 must be at least 1"),
         (["--fps", "0"], "--fps: 0.0 must be at least 1"),
+        (["--show", "match", "--path", "orbit"], "--show match: needs a style that holds throughout"),
+        (["--show", "colour", "normals", "--lens", "stereo"], "--show: a stereo panorama shows colour and depth only"),
+        (["--eyes", "0"], "--eyes: 0.0 must be above 0"),
+        (["--styles", "dusk", "--path", "orbit"], "--styles dusk: write NAME=PHOTO,PHOTO or NAME=STYLE.json"),
         (["--references", "absent.png", "--path", "orbit"], "absent.png"),
     ],
 )
@@ -93,3 +97,78 @@ def test_mistakes(run: Path, args: list[str], told: str, capsys: pytest.CaptureF
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("error: ") and err.count("\n") == 1 and told in err
     assert not (tmp_path / "out").exists()
+
+
+def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: World, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "dataset", "--split", "test", "--output"]
+    dusk = f"dusk={world.references[0]}"
+    assert cli.main([*common, str(tmp_path / "one"), "--styles", dusk]) == 0
+    assert cli.main([*common, str(tmp_path / "plain")]) == 0
+    assert cli.main([*common, str(tmp_path / "two"), "--styles", "plain", dusk]) == 0
+    assert cli.main([*common, str(tmp_path / "all"), "--styles", dusk, "--show", "colour", "depth", "normals", "match"]) == 0
+    assert cli.main([*common, str(tmp_path / "wipe"), "--styles", "plain", dusk, "--layout", "wipe"]) == 0
+    one, plain, two, whole, wipe = (pictures(tmp_path / name) for name in ("one", "plain", "two", "all", "wipe"))
+    for name in one:
+        assert two[name].shape == (24, 66, 3) and whole[name].shape == (24, 134, 3) and wipe[name].shape == (24, 32, 3)
+        assert np.array_equal(two[name][:, :32], plain[name]) and np.array_equal(two[name][:, 34:], one[name])
+        assert np.array_equal(whole[name][:, :32], one[name])
+        assert np.array_equal(wipe[name][:, :7], plain[name][:, :7]) and np.array_equal(wipe[name][:, -7:], one[name][:, -7:])
+
+
+def test_frames_that_are_there_are_not_made_again(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "frames"
+    common = ["render", str(run), "--path", "orbit", "--frames", "4", "--output", str(out)]
+    assert cli.main(common) == 0
+    whole = pictures(out)
+    stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.png")}
+    (out / "00002.png").unlink()
+    capsys.readouterr()
+    assert cli.main(common) == 0
+    assert "3 of 4 frames are there already" in capsys.readouterr().out
+    after = {path.name: path.stat().st_mtime_ns for path in out.glob("*.png")}
+    assert [name for name in stamps if stamps[name] != after[name]] == ["00002.png"]
+    assert all(np.array_equal(whole[name], picture) for name, picture in pictures(out).items())
+    assert cli.main([*common, "--show", "depth"]) == 0
+    assert "are there already" not in capsys.readouterr().out, "other frames are other frames"
+    assert not any(np.array_equal(whole[name], picture) for name, picture in pictures(out).items())
+
+
+def test_an_interrupted_film_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fprf.output.images as images
+
+    written, write = [], images.write_image
+
+    def interrupted(path: Path, picture: np.ndarray) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path.name)
+        write(path, picture)
+
+    film = tmp_path / "x.mp4"
+    args = ["render", str(run), "--path", "orbit", "--frames", "4", "--output", str(film)]
+    monkeypatch.setattr(images, "write_image", interrupted)
+    assert cli.main(args) == 130 and not film.exists()
+    monkeypatch.setattr(images, "write_image", lambda path, picture: (written.append(path.name), write(path, picture)))
+    assert cli.main(args) == 0 and film.is_file()
+    assert written == ["00000.png", "00001.png", "00002.png", "00003.png"] and not (tmp_path / "x.frames").exists()
+
+
+def test_exr_holds_everything_as_numbers(run: Path, world: World, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "dataset", "--split", "test", "--format", "exr", "--output"]
+    assert cli.main([*common, str(tmp_path / "exr"), "--styles", "plain", f"dusk={world.references[0]}"]) == 0
+    names = [path.name for path in sorted((tmp_path / "exr").glob("*.exr"))]
+    assert names == ["0000.exr", "0008.exr"]
+    head = (tmp_path / "exr" / "0000.exr").read_bytes()[:900]
+    listed = [b"A", b"N.X", b"N.Y", b"N.Z", b"Z", b"dusk.B", b"dusk.G", b"dusk.R", b"plain.B", b"plain.G", b"plain.R"]
+    assert [head.index(name + b"\0\2\0\0\0") for name in listed] == sorted(head.index(name + b"\0\2\0\0\0") for name in listed)
+
+
+def test_panoramas_for_one_eye_and_two(run: Path, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "orbit", "--frames", "1", "--across", "32", "--output"]
+    assert cli.main([*common, str(tmp_path / "mono"), "--lens", "panorama"]) == 0
+    assert cli.main([*common, str(tmp_path / "stereo"), "--lens", "stereo"]) == 0
+    assert cli.main([*common, str(tmp_path / "same"), "--lens", "stereo", "--eyes", "1e-9"]) == 0
+    (mono,), (stereo,), (same,) = (pictures(tmp_path / name).values() for name in ("mono", "stereo", "same"))
+    assert mono.shape == (16, 32, 3) and stereo.shape == same.shape == (32, 32, 3)
+    assert np.abs(same[:16].astype(int) - mono).max() <= 1 and np.abs(same[16:].astype(int) - mono).max() <= 1
+    assert not np.array_equal(stereo[:16], stereo[16:])
