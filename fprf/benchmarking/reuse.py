@@ -36,6 +36,8 @@ SIDES = ("folded", "plain")
 HEAD = 4096
 """Samples whose hidden units go on to shares, so many times: a cache holds them."""
 TIMES = 20
+_Way = tuple[nn.Module, Stylizer, Tensor, int]
+"""A field or a layer, what matches its outputs, its inputs, how often."""
 
 
 def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, StylizerConfig]) -> list[Row]:
@@ -91,7 +93,9 @@ def folding_rows(config: SpeedConfig, subject: Subject) -> list[Row]:
         rays = view_rays(trained.model, camera, 0)
         points = march(rays, trained.model.parts, budget=trained.config.render.budget).kept.point
     small, plain, folding = found.model.semantic, styled.restyle.stylizer, found.look.stylizer
-    pairs = {"semantics and matching, dictionary folded": ((small, folding, points, 1), (field, plain, points, 1), None)}
+    pairs: dict[str, tuple[_Way, _Way, float | None]] = {
+        "semantics and matching, dictionary folded": ((small, folding, points, 1), (field, plain, points, 1), None)
+    }
     if isinstance(field, SemanticPlanes) and isinstance(small, ProjectedPlanes):
         with torch.inference_mode():
             # What a cache holds: in the field, units never leave it.
@@ -103,7 +107,8 @@ def folding_rows(config: SpeedConfig, subject: Subject) -> list[Row]:
             (heads[1], plain, units, TIMES),
             _FOLDED,
         )
-    calls = {f"{side} {name}": partial(_shares, *pair[i]) for name, pair in pairs.items() for i, side in enumerate(SIDES)}
+    ways = {f"{side} {name}": way for name, pair in pairs.items() for side, way in zip(SIDES, pair[:2], strict=True)}
+    calls = {name: partial(_shares, *way) for name, way in ways.items()}
     seconds = watch_of(config, trained).in_turn(calls)
     about = f"{len(points)} samples of a view, {len(styled.dictionary.keys)} codes, {known.facts.dim} semantic channels"
     rows = []
