@@ -96,7 +96,8 @@ def test_bad_clients_end_themselves_alone(opened: tuple[Front, int], world: Worl
     port = urlsplit(found.page.url).port
     assert port is not None
     head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    head += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: viser-v0.0.0\r\n\r\n"
+    head += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    head += "Sec-WebSocket-Protocol: viser-v0.0.0\r\n\r\n"
     for nonsense in (b"\x82\xfe\xff\xff" + b"x" * 70_000, b"\x82\x84aaaaaaaa", b"\x00" * 1000, b"\x82\xff" + b"\xff" * 8):
         with socket.create_connection(("127.0.0.1", port), timeout=60) as wire:
             wire.sendall(head.encode() + nonsense)
