@@ -91,10 +91,12 @@ def _threads(trained: Trained, rays: Rays, plain: Tensor) -> list[Check]:
 
 def _worlds(trained: Trained, scene: Scene, cameras: Cameras, plain: Tensor) -> list[Check]:
     """The capture moved and scaled as a whole: its space is found anew, the model lives in that."""
-    # The first and the last view say which way a capture runs, and so which of two equal spaces it has.
-    inner = torch.randperm(len(scene.paths) - 2, generator=torch.Generator().manual_seed(1)) + 1
-    order = torch.cat([torch.tensor([0]), inner, torch.tensor([len(scene.paths) - 1])])
-    worlds = [("views between the first and the last in another order", _reordered(scene, order), cameras)]
+    worlds = []
+    if len(scene.paths) > 2:
+        # The first and the last view say which way a capture runs, and so which of two equal spaces it has.
+        inner = torch.randperm(len(scene.paths) - 2, generator=torch.Generator().manual_seed(1)) + 1
+        order = torch.cat([torch.tensor([0]), inner, torch.tensor([len(scene.paths) - 1])])
+        worlds.append(("views between the first and the last in another order", _reordered(scene, order), cameras))
     for name, scale, offset in (
         ("world 1e6 m away", 1.0, torch.tensor(OFFSET, dtype=torch.float64)),
         ("world 1e6 times larger", 1e6, torch.zeros(3, dtype=torch.float64)),

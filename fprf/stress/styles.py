@@ -35,7 +35,7 @@ def statistics() -> list[Check]:
         rows.append(_row("statistics", f"mean {ratio:g} deviations away", "two passes in float64", error, 1e-12))
         order = torch.randperm(len(x), generator=torch.Generator().manual_seed(2))
         parts = empty(8)
-        for piece in order.split(777):
+        for piece in torch.split(order, 777):
             parts = merge(parts, moments(x[piece], mass[piece]))
         error = max(relative(parts.mean, found.mean), scaled(parts.scatter, found.scatter))
         rows.append(_row("statistics", f"mean {ratio:g} deviations away", "the same in 52 parts, shuffled", error, 1e-12))
