@@ -32,7 +32,7 @@ class ViewConfig(QualityConfig):
     token: str | None = None
     """What the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
     pixels: int = 640
-    """Longest side of the sharpest picture."""
+    """Longest side of the sharpest picture, 64 to 2048."""
     max_memory: float | None = None
     """MiB that blocks of a large scene may take; none = no limit."""
     device: str = "auto"
@@ -42,7 +42,7 @@ class ViewConfig(QualityConfig):
         super().__post_init__()
         at_least("port", self.port, 0)
         between("port", float(self.port), 0.0, 65535.0)
-        at_least("pixels", self.pixels, 64)
+        between("pixels", float(self.pixels), 64.0, 2048.0)
 
 
 def run(args: list[str]) -> int:

@@ -51,7 +51,7 @@ class Look:
     temperature: float = 0.4
     """Of the matching of regions and codes, relative; low = each region takes from what is most like it."""
     clusters: int = 10
-    blend: float = 0.3
+    blend: float = 0.1
     luminance: float = 0.0
     orders: frozenset[Order] = frozenset()
     towards: "Look | None" = None

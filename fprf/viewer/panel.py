@@ -13,7 +13,7 @@ from .film import FilmPlan, Key, path_of
 from .painter import MAPS, Map
 from .session import Session
 from .stage import Eye, fitted
-from .state import Film, Landing, State, kept
+from .state import LEAST, MOST, Film, Landing, State, kept
 
 __all__ = ["Panel"]
 
@@ -105,13 +105,13 @@ class Panel:
             self._picking = self._gui.add_checkbox("click picks a region", state.picking, hint=_HINTS["picking"])
             self._cameras = self._gui.add_checkbox("captured cameras", False)
             self._blocks = self._gui.add_checkbox("block boxes", False)
-            self._pixels = self._gui.add_slider("sharpness", 160, 1920, 32, state.pixels, hint="longest side in pixels")
+            self._pixels = self._gui.add_slider("sharpness", LEAST, MOST, 32, state.pixels, hint="longest side in pixels")
             view = self._gui.add_slider("fly to view", 0, max(1, len(names) - 1), 1, 0)
         self._on(self._map, lambda value: lambda state: replace(state, map=cast(Map, value)))
         self._on(self._cover, lambda value: lambda state: replace(state, cover=float(value)))
         self._on(self._wipe, lambda value: lambda state: replace(state, wipe=_wiped(state, bool(value))))
         self._on(self._picking, lambda value: lambda state: replace(state, picking=bool(value), picked=None))
-        self._on(self._pixels, lambda value: lambda state: replace(state, pixels=min(1920, int(value))))
+        self._on(self._pixels, lambda value: lambda state: replace(state, pixels=int(value)))
         for control in (self._cameras, self._blocks):
             control.on_update(lambda event: self._draw(self))
 

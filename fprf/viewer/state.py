@@ -4,20 +4,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from ..checks import at_least, between
+from ..checks import between
 from ..errors import UsageError
 from .film import Key
 from .looks import Card, Look, only, weighed
 from .painter import MAPS, Map, Shown
 from .studio import Picked
 
-__all__ = ["SHELF", "Film", "Landing", "State", "dropped", "kept", "removed"]
+__all__ = ["LEAST", "MOST", "SHELF", "Film", "Landing", "State", "dropped", "kept", "removed"]
 
 Landing: TypeAlias = Literal["alone", "in the mix"]
 """What becomes of a photograph that is dropped: it is the style, or joins the others."""
 
 SHELF = 12
 """Photographs on the shelf; the oldest that is not in use makes room."""
+LEAST, MOST = 64, 2048
+"""Longest side of the sharpest picture, in pixels."""
 _KEYS = 64
 
 
@@ -62,7 +64,7 @@ class State:
         between("cover", self.cover, 0.0, 1.0)
         if self.wipe is not None:
             between("wipe", self.wipe, 0.0, 1.0)
-        at_least("pixels", self.pixels, 64)
+        between("pixels", self.pixels, LEAST, MOST)
         if len(self.keys) > _KEYS:
             raise UsageError(f"film: at most {_KEYS} keys; remove one first")
 

@@ -116,7 +116,7 @@ def test_what_is_shown_and_what_must_be_painted() -> None:
     assert state.shown.layers == {"look", "matches", "plain", "region 2"}
 
 
-@pytest.mark.parametrize("wrong", [{"map": "x"}, {"wipe": 1.5}, {"pixels": 3}, {"cover": -1.0}])
+@pytest.mark.parametrize("wrong", [{"map": "x"}, {"wipe": 1.5}, {"pixels": 3}, {"pixels": 5000}, {"cover": -1.0}])
 def test_a_state_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises((UsageError, ConfigError)):
         replace(State(), **wrong)  # type: ignore[arg-type]
