@@ -10,6 +10,7 @@ from ..config import TrainConfig
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from .decoder import build_decoder
+from .first_use import check_parts
 from .tones import Tones
 
 __all__ = ["Facts", "Model", "build_model", "tones_of"]
@@ -78,16 +79,18 @@ def tones_of(facts: Facts) -> Tones | None:
 
 
 def build_model(config: TrainConfig, facts: Facts) -> Model:
-    """The model at its seeded start. Raises WeightsError where no decoder fits the content encoder."""
+    """The model at its seeded start.
+
+    Raises WeightsError where no decoder fits the content encoder, PluginError where a part breaks its contract at once.
+    """
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     semantic = config.semantic.field.build(channels=facts.dim, seed=config.seed + 2) if facts.dim else None
-    return Model(
-        Parts(
-            facts.space,
-            config.sampler.build(seed=config.seed),
-            config.content.field.build(channels=facts.channels, seed=config.seed + 1),
-            semantic,
-            decoder,
-        ),
-        tones_of(facts),
+    parts = Parts(
+        facts.space,
+        config.sampler.build(seed=config.seed),
+        config.content.field.build(channels=facts.channels, seed=config.seed + 1),
+        semantic,
+        decoder,
     )
+    check_parts(config, parts, facts.channels, facts.dim)
+    return Model(parts, tones_of(facts))
