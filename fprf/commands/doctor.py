@@ -4,7 +4,7 @@ import os
 import platform
 import shlex
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -14,14 +14,17 @@ from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
+from ..errors import CheckpointError
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import slots
 from .parsing import parse
 
-__all__ = ["Finding", "machine", "run", "run_folder", "scene_folder"]
+__all__ = ["Finding", "machine", "run", "run_folder", "scene_folder", "speed"]
 
 _MIB = 1 << 20
+_LEAST_DISK = 1 << 30
+"""Bytes below which a training may fail for want of room."""
 
 
 class Finding(NamedTuple):
@@ -71,13 +74,46 @@ def machine() -> Iterator[Finding]:
     yield Finding("fprf", f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield from _packages()
     yield from _guarded("torch", _torch)
-    yield Finding("disk", f"{shutil.disk_usage(Path.cwd()).free / 1024**3:.1f} GiB free here")
+    yield from speed(os.environ)
+    yield _disk(shutil.disk_usage(Path.cwd()).free)
     yield from _weights()
     count = sum(len(registry.installed(group)) for group in registry.groups())
     bad = registry.unreadable()
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
     for complaint in bad:
         yield Finding("plug-ins", complaint, "reinstall or uninstall that package")
+
+
+def speed(environment: Mapping[str, str]) -> Iterator[Finding]:
+    """What makes this machine slower than it could be: fewer threads than cores, other programs, a GPU that torch misses."""
+    cores = _cores()
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        threads = environment.get(name, "")
+        if threads.isdecimal() and int(threads) < cores:
+            yield Finding("threads", f"{name}={threads}, {cores} cores are usable", f"unset {name}", optional=True)
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    if busy > cores + 1:
+        found = f"{busy:.0f} programs want the {cores} cores: everything here takes that much longer"
+        yield Finding("load", found, "top    # and end what is not needed", optional=True)
+    if Path("/proc/driver/nvidia/version").is_file() and "+cpu" in _version("torch"):
+        remedy = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu126"
+        yield Finding("cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True)
+
+
+def _disk(free: int) -> Finding:
+    remedy = 'rm -r "${XDG_CACHE_HOME:-$HOME/.cache}/fprf/features"    # they are made again when needed'
+    return Finding("disk", f"{free / 1024**3:.1f} GiB free here", remedy if free < _LEAST_DISK else "")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
 
 
 def scene_folder(data: Path) -> Iterator[Finding]:
@@ -125,8 +161,24 @@ def run_folder(folder: Path) -> Iterator[Finding]:
     measure = f"fprf eval {shlex.quote(str(folder))}"
     measured = (folder / "metrics.json").is_file()
     yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else measure, True)
+    yield from _trouble(folder)
     size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     yield Finding("size", f"{size / _MIB:.1f} MiB")
+
+
+def _trouble(folder: Path) -> Iterator[Finding]:
+    """What training noted on the way: skipped steps, damaged checkpoints."""
+    from ..engine.events import read_history
+
+    if not (folder / "events.jsonl").is_file():
+        return
+    try:
+        notes = [note for history in read_history(folder) for note in history.notes]
+    except CheckpointError:
+        return
+    if notes:
+        more = f" and {len(notes) - 1} more" if len(notes) > 1 else ""
+        yield Finding("events", notes[-1] + more, f"fprf report {shlex.quote(str(folder))}", True)
 
 
 def _packages() -> Iterator[Finding]:
@@ -146,8 +198,7 @@ def _packages() -> Iterator[Finding]:
 def _torch() -> Iterator[Finding]:
     import torch
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Finding("processor", f"{platform.machine()}, {cores} cores usable, {torch.get_num_threads()} threads")
+    yield Finding("processor", f"{platform.machine()}, {_cores()} cores usable, {torch.get_num_threads()} threads")
     if torch.cuda.is_available():
         for at in range(torch.cuda.device_count()):
             device = torch.cuda.get_device_properties(at)

@@ -6,7 +6,7 @@ import pytest
 from fake_packages import packages_in
 
 from fprf.commands import doctor
-from fprf.commands.doctor import Finding, machine, run, run_folder, scene_folder
+from fprf.commands.doctor import Finding, machine, run, run_folder, scene_folder, speed
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
@@ -137,3 +137,29 @@ def test_damaged_metadata_of_a_stranger_is_a_problem(tmp_path: Path) -> None:
         packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
         found = [finding for finding in machine() if finding.what == "plug-ins"]
     assert found[-1].remedy == "reinstall or uninstall that package"
+
+
+def test_what_is_slow_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_cores", lambda: 8)
+    monkeypatch.setattr(doctor.os, "getloadavg", lambda: (3.0, 3.0, 3.0))
+    assert [f for f in speed({"OMP_NUM_THREADS": "8", "NUMBA_NUM_THREADS": "none"}) if f.what != "cuda"] == []
+    (threads,) = (finding for finding in speed({"OMP_NUM_THREADS": "2"}) if finding.what == "threads")
+    assert threads == Finding("threads", "OMP_NUM_THREADS=2, 8 cores are usable", "unset OMP_NUM_THREADS", True)
+    monkeypatch.setattr(doctor.os, "getloadavg", lambda: (24.0, 3.0, 3.0))
+    (load,) = (finding for finding in speed({}) if finding.what == "load")
+    assert load.found.startswith("24 programs want the 8 cores") and load.optional
+
+
+def test_a_full_disk_is_a_problem() -> None:
+    assert doctor._disk(50 << 30) == Finding("disk", "50.0 GiB free here")
+    full = doctor._disk(100 << 20)
+    assert full.remedy.startswith("rm -r ") and "fprf" in full.remedy and not full.optional
+
+
+def test_what_training_noted_is_told(trained: Path) -> None:
+    assert "events" not in _by_name(run_folder(trained))
+    (trained / "events.jsonl").write_text('{"step": 1, "seconds": 1}\n{"damaged": "step-5"}\n{"step": 7, "skipped": "rgb"}\n')
+    finding = _by_name(run_folder(trained))["events"]
+    assert finding == Finding("events", "step: 7, skipped: rgb and 1 more", f"fprf report '{trained}'", True)
+    (trained / "events.jsonl").write_text("{")
+    assert "events" not in _by_name(run_folder(trained))
