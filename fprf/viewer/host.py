@@ -1,5 +1,6 @@
 """The viewer put together: the gate at once, then the scene behind it. Imports little before the gate is open."""
 
+import contextlib
 import importlib
 import threading
 from collections.abc import Callable, Sequence
@@ -26,8 +27,7 @@ class Host:
 
     def __init__(self, access: Access, port: int) -> None:
         # viser takes a while to import and needs nothing of ours.
-        early = threading.Thread(target=importlib.import_module, args=("viser",), daemon=True)
-        early.start()
+        threading.Thread(target=_early, daemon=True).start()
         self._ends: list[Callable[[], None]] = []
         self._gate = Gate(access, port, {("GET", "/"): _starting}, largest=20 << 20)
         self._gate.open()
@@ -73,6 +73,11 @@ class Host:
         for path in references:
             session.drop(path.read_bytes(), path.name)
         session.warm()
+
+
+def _early() -> None:
+    with contextlib.suppress(ImportError):  # told when it is needed
+        importlib.import_module("viser")
 
 
 async def _starting(request: Request) -> Answer:

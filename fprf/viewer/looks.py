@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 from ..checks import at_least, between, positive
 from ..output.images import Picture
-from ..plugins.stylizers.config import RegionOtConfig
+from ..plugins.stylizers.config import RegionToneConfig
 from ..style.config import StyleConfig
 from ..style.dictionary import Reference
 
@@ -48,7 +48,7 @@ class Look:
     mix: tuple[tuple[Card, float], ...] = ()
     """Photographs with their weights, above 0, in the order of the shelf; none = the scene as it is."""
     strength: float = 1.0
-    temperature: float = 0.4
+    temperature: float = 0.2
     """Of the matching of regions and codes, relative; low = each region takes from what is most like it."""
     clusters: int = 10
     blend: float = 0.1
@@ -114,7 +114,7 @@ def settled(look: Look) -> Look:
     return replace(start, strength=start.strength * (1 - look.at)) if end.plain else look
 
 
-def style_of(look: Look, stylizer: RegionOtConfig | None = None) -> StyleConfig:
+def style_of(look: Look, stylizer: RegionToneConfig | None = None) -> StyleConfig:
     """The look as a style, without what it goes towards; references in the order of the mix."""
     number = {card: i for i, (card, _) in enumerate(look.mix)}
     wishes: dict[str, list[str]] = {"pin": [], "forbid": [], "keep": []}
@@ -126,7 +126,7 @@ def style_of(look: Look, stylizer: RegionOtConfig | None = None) -> StyleConfig:
     return StyleConfig(
         references=tuple(card.path for card, _ in look.mix),
         weights=tuple(weight for _, weight in look.mix),
-        stylizer=replace(stylizer or RegionOtConfig(), temperature=look.temperature),
+        stylizer=replace(stylizer or RegionToneConfig(), temperature=look.temperature),
         clusters=look.clusters,
         blend=look.blend,
         strength=look.strength,
