@@ -27,7 +27,7 @@ from .engine.views import render_view
 from .errors import UsageError
 from .output.images import Picture, to_uint8, write_image
 from .plugins.registry import nearest
-from .plugins.stylizers.config import RegionOtConfig, StylizerConfig
+from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
 from .rendering.motions import make_path, upwards
 from .rendering.paths import look_at, pinhole
@@ -137,7 +137,7 @@ class TrainedScene:
         strength: float = 1.0,
         luminance: float = 0.0,
         clusters: int = 10,
-        blend: float = 0.3,
+        blend: float = 0.1,
         stylizer: StylizerConfig | None = None,
         pin: Sequence[str] = (),
         forbid: Sequence[str] = (),
@@ -156,7 +156,7 @@ class TrainedScene:
                 luminance=luminance,
                 clusters=clusters,
                 blend=blend,
-                stylizer=RegionOtConfig() if stylizer is None else stylizer,
+                stylizer=RegionToneConfig() if stylizer is None else stylizer,
                 pin=tuple(pin),
                 forbid=tuple(forbid),
                 keep=tuple(keep),

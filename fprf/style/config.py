@@ -28,7 +28,7 @@ class StyleConfig:
     """What moves the scene's features."""
     clusters: int = 10
     """Local styles (codes) per reference, at least 1."""
-    blend: float = 0.3
+    blend: float = 0.1
     """Share of the overall style in each local one, in [0, 1], on both sides: 0 = local, 1 = global."""
     strength: float = 1.0
     """0 leaves the scene bit for bit as it is, 1 is the full style."""

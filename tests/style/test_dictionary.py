@@ -153,7 +153,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("fprf.output.atomic.os.fsync", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(DataError, match="No space"):
         save_dictionary(file, build_dictionary([reference("new")]))
     assert load_dictionary(file).names == ("old",)
     assert len(list(tmp_path.iterdir())) == 1

@@ -28,7 +28,7 @@ def full(folder: Path) -> StyleFile:
         masks=(NO_MASK, photo(folder / "mask.png")),
         stylizer=LocalAdainConfig(temperature=0.2, similarity="dot"),
         clusters=7,
-        blend=0.1,
+        blend=0.4,
         strength=0.9,
         luminance=0.25,
         pin=("sky=a.jpg",),

@@ -165,7 +165,7 @@ class RegionToneConfig(StylizerConfig):
     """How much of the change of features (contrast, texture) counts, in [0, 1]."""
     colours: float = 1.0
     """How far the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
-    temperature: float = 0.4
+    temperature: float = 0.2
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     similarity: Literal["cosine", "dot"] = "cosine"
     """Score of a match: cosine of centred features, or the paper's dot product."""

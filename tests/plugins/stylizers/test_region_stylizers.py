@@ -48,7 +48,7 @@ def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
     stylizer = config(temperature=temperature).build(dictionary=d, scene=scene)
     assert stylizer.needs == Want.CONTENT | Want.SEMANTIC
     share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean)).double()
-    own = own_style(scene, 0.3)
+    own = own_style(scene, d.blend)
     here, there = plain_table(scene, own, temperature), plain_table(scene, d, temperature)
     f, expected = content.double(), torch.zeros(600, 6, dtype=torch.float64)
     for k in range(len(scene.keys)):
