@@ -151,6 +151,7 @@ def joined(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequ
     at once, but for the order.
     """
     counts = torch.tensor([len(part.keys) for part in parts])
+    coloured = all(part.colour_mean is not None for part in parts)
 
     def together(name: str) -> Tensor:
         return torch.cat([getattr(part, name) for part in parts])
@@ -164,6 +165,8 @@ def joined(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequ
         weight=torch.tensor(weights, dtype=torch.float32).repeat_interleave(counts),
         names=tuple(names),
         blend=parts[0].blend,
+        colour_mean=together("colour_mean") if coloured else None,
+        colour_covariance=together("colour_covariance") if coloured else None,
     )
 
 

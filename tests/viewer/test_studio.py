@@ -58,7 +58,7 @@ def test_joining_is_building_at_once(world: World) -> None:
     wanted = build_dictionary(references, clusters=3)
     for name in found.names:
         mine, its = found.reference == found.names.index(name), wanted.reference == wanted.names.index(name)
-        for field in ("keys", "mean", "covariance", "share", "weight"):
+        for field in ("keys", "mean", "covariance", "share", "weight", "colour_mean", "colour_covariance"):
             assert torch.equal(getattr(found, field)[mine], getattr(wanted, field)[its])
 
 
