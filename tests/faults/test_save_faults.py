@@ -252,9 +252,9 @@ print("latest", checkpoint.load_latest(folder / "run" / "checkpoints")[0] is not
 
 
 @pytest.mark.fault
-@pytest.mark.parametrize(("size", "reason"), [("900k", "No space left on device"), ("8m", "Read-only file system")])
+@pytest.mark.parametrize(("size", "reason"), [("112k", "No space left on device"), ("8m", "Read-only file system")])
 def test_a_disk_that_is_full_or_read_only(world: World, tmp_path: Path, size: str, reason: str) -> None:
-    """A real one, in a name space of its own: 900 KiB hold two checkpoints and no third; 8 MiB are mounted read-only."""
+    """A real one, in a name space of its own: 112 KiB hold a checkpoint or two and no more; 8 MiB are mounted read-only."""
     if subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
         pytest.skip("may not mount here")
     (tmp_path / "disk").mkdir()
