@@ -40,7 +40,9 @@ def check_parts(config: TrainConfig, parts: Parts, channels: int, dim: int) -> N
     _look(content.decoder, "colours", colour, (POINTS, 3), low=0.0, high=1.0)
     if parts.semantic is not None:
         _look(semantic, "semantics", _asked(semantic, "semantics", parts.semantic, points), (POINTS, dim))
-    near, far = (torch.full((POINTS,), edge) for edge in (parts.space.near, parts.space.far))
+    # In NDC near is a depth in the world, and rays go from 0 to 1.
+    ends = (0.0, 1.0) if parts.space.kind == "ndc" else (parts.space.near, parts.space.far)
+    near, far = (torch.full((POINTS,), edge) for edge in ends)
     rays = Rays(torch.zeros(POINTS, 3), view, view, near, far)
     sampled = _asked(
         config.sampler,

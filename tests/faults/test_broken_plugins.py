@@ -164,6 +164,15 @@ def test_a_field_that_breaks_its_contract_is_named(world: World, wrong: str, tol
     assert "\n" not in str(caught.value)
 
 
+def test_parts_are_asked_in_the_terms_of_their_space(world: World) -> None:
+    """In NDC near and far are no ends of rays: near lies beyond far there."""
+    facts = world.prepared.facts
+    parts = build_model(world.config, facts).parts
+    for kind, near, far in (("ndc", 3.0, 1.0), ("contraction", 0.1, 100.0), ("box", 0.5, 4.0)):
+        space = replace(parts.space, kind=kind, near=near, far=far)
+        check_parts(world.config, parts._replace(space=space), facts.channels, facts.dim)
+
+
 @pytest.mark.parametrize("part", ["decoder", "semantic", "sampler"])
 def test_other_parts_that_break_it_are_named(world: World, part: str) -> None:
     facts = world.prepared.facts
