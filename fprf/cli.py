@@ -36,7 +36,7 @@ VERBS = {
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
     "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
-    "view": Verb("RUN", "look at a scene in the browser; drop a photograph on it to restyle it"),
+    "view": Verb("RUN", "in the browser: drop a photograph on the scene to restyle it"),
     "report": Verb("RUN", "how training went: charts of loss, PSNR, speed, time per part"),
     "bench": Verb("speed|profile|pareto|... [RUN]", "time and error, where time goes, memory, scaling"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),

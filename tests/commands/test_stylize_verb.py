@@ -171,7 +171,7 @@ def test_all_splits_and_stylizers(run: Path, world: World, tmp_path: Path) -> No
         (["--references", "A", "--weights", "0"], "--weights: 0.0 must be at least 1e-06"),
         (["--references", "A", "--strength", "2"], "--strength: 2.0 must lie in [0.0, 1.0]"),
         (["--references", "A", "--clusters", "0"], "--clusters: 0 must be at least 1"),
-        (["--references", "A", "--stylizer", "region-to"], "did you mean 'region-ot'"),
+        (["--references", "A", "--stylizer", "region-to"], "did you mean 'region-tone'"),
         (["--references", "A", "--stylizer", "adain", "--stylizer.gain", "2"], "stylizer is adain"),
         (["--references"], "--references"),
     ],
