@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ...interfaces import Stylizer
     from ...style.dictionary import StyleDictionary
     from ...style.scene import SceneStyle
+    from .region import RegionMaps, RegionPlan
 
 __all__ = [
     "AdainConfig",
@@ -104,62 +105,56 @@ class LocalAdainConfig(StylizerConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionAdainConfig(StylizerConfig):
+class _RegionConfig(StylizerConfig):
+    """What all two-sided stylizers have: points belong to scene regions, regions match style codes."""
+
+    heeds_regions: ClassVar[bool] = True
+
+    temperature: float = 0.4
+    """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
+    similarity: Literal["cosine", "dot"] = "cosine"
+    """Score of a match: cosine of centred features, or the paper's dot product."""
+    gain: float = 8.0
+    """Largest amplification of any channel or direction, at least 1, so that the noise of flat regions stays small."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive("stylizer.temperature", self.temperature)
+        at_least("stylizer.gain", self.gain, 1.0)
+
+    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
+        """The two-sided stylizer towards these references, with this kind of maps."""
+        from .region import TwoSidedStylizer, plan_regions
+
+        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
+        return TwoSidedStylizer(plan, scene, self._maps(plan, scene))
+
+    def _maps(self, plan: RegionPlan, scene: SceneStyle) -> RegionMaps:
+        """AdaIN's."""
+        from .region import ChannelMaps
+
+        return ChannelMaps(plan, scene, self.gain)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionAdainConfig(_RegionConfig):
     """Two-sided AdaIN: points belong to scene regions, regions match style codes, channel by channel."""
 
-    heeds_regions: ClassVar[bool] = True
 
-    temperature: float = 0.4
-    """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
-    similarity: Literal["cosine", "dot"] = "cosine"
-    """Score of a match: cosine of centred features, or the paper's dot product."""
-    gain: float = 8.0
-    """Largest amplification of any channel, at least 1, so that the noise of flat regions stays small."""
+@dataclass(frozen=True, kw_only=True)
+class RegionOtConfig(_RegionConfig):
+    """Two-sided optimal transport: regions match style codes, all channels move together."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive("stylizer.temperature", self.temperature)
-        at_least("stylizer.gain", self.gain, 1.0)
+    def _maps(self, plan: RegionPlan, scene: SceneStyle) -> RegionMaps:
+        """Matrices."""
+        from .region import MatrixMaps
 
-    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        """Two-sided AdaIN towards these references."""
-        from .region import ChannelMaps, TwoSidedStylizer, plan_regions
-
-        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
-        return TwoSidedStylizer(plan, scene, ChannelMaps(plan, scene, self.gain))
+        return MatrixMaps(plan, scene, self.gain)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegionOtConfig(StylizerConfig):
-    """Two-sided optimal transport : regions match style codes, all channels move together."""
-
-    heeds_regions: ClassVar[bool] = True
-
-    temperature: float = 0.4
-    """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
-    similarity: Literal["cosine", "dot"] = "cosine"
-    """Score of a match: cosine of centred features, or the paper's dot product."""
-    gain: float = 8.0
-    """Largest amplification in any direction, at least 1, so that the noise of flat regions stays small."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive("stylizer.temperature", self.temperature)
-        at_least("stylizer.gain", self.gain, 1.0)
-
-    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        """Two-sided transport towards these references."""
-        from .region import MatrixMaps, TwoSidedStylizer, plan_regions
-
-        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
-        return TwoSidedStylizer(plan, scene, MatrixMaps(plan, scene, self.gain))
-
-
-@dataclass(frozen=True, kw_only=True)
-class RegionToneConfig(StylizerConfig):
+class RegionToneConfig(_RegionConfig):
     """Two-sided (recommended): half of AdaIN's change, then each region's colours as a whole to those of its match."""
-
-    heeds_regions: ClassVar[bool] = True
 
     features: float = 0.5
     """How much of the change of features (contrast, texture) counts, in [0, 1]."""
@@ -167,19 +162,3 @@ class RegionToneConfig(StylizerConfig):
     """How far the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
     temperature: float = 0.2
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
-    similarity: Literal["cosine", "dot"] = "cosine"
-    """Score of a match: cosine of centred features, or the paper's dot product."""
-    gain: float = 8.0
-    """Largest amplification of any channel, at least 1, so that the noise of flat regions stays small."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        positive("stylizer.temperature", self.temperature)
-        at_least("stylizer.gain", self.gain, 1.0)
-
-    def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        """Two-sided AdaIN towards these references; what `features` and `colours` say is done around it."""
-        from .region import ChannelMaps, TwoSidedStylizer, plan_regions
-
-        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
-        return TwoSidedStylizer(plan, scene, ChannelMaps(plan, scene, self.gain))
