@@ -1,9 +1,10 @@
 """A capture in blocks against the same capture in one field, both trained for the same seconds in all.
 
-    python benchmarks/blocks_scenes.py SCENE [--minutes 3] [--sides blocks single] [--output FILE] -- [any field]
+    python benchmarks/blocks_scenes.py SCENE [--minutes 3] [--sides blocks single] [--name NAME] [--output FILE] -- [any field]
 
-The flags behind `--` are those of `fprf train fprf-lite`; the single field takes them too, but for the blocks. Features are
-extracted before the clock runs, which counts what the processor does (see `large_scene.py`).
+The flags behind `--` are those of `fprf train fprf-lite`; the single field takes them too, but for the blocks, and has as many
+parameters as all blocks and their surroundings together (`--same-planes` leaves its planes as they are). Features are extracted
+before the clock runs, which counts what the processor does (see `large_scene.py`).
 """
 
 import argparse
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from large_scene import psnr, trained_seconds, use_processor_time
+from large_scene import parameters, psnr, trained_seconds, use_processor_time, widened
 
 from fprf.commands.parsing import load_method, parse
 from fprf.commands.train import train_scene
@@ -30,6 +31,8 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("--minutes", type=float, default=3.0)
     parser.add_argument("--sides", nargs="+", choices=("blocks", "single"), default=("blocks", "single"))
+    parser.add_argument("--same-planes", action="store_true", help="give the single field the planes of one block")
+    parser.add_argument("--name", help="of the entry in the JSON file; the scene's by default")
     parser.add_argument("--scratch", type=Path, default=Path("runs/blocks_scenes"))
     parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
     own = sys.argv[1 : sys.argv.index("--")] if "--" in sys.argv else sys.argv[1:]
@@ -39,12 +42,14 @@ def main() -> None:
     method, _ = load_method("fprf-lite")
     flags = ["--data", str(options.scene), "--minutes", str(options.minutes), *rest]
     blocks = parse(method, flags, prog="blocks_scenes", description="")
-    scratch = options.scratch.resolve() / options.scene.name
+    name = options.name or options.scene.name
+    scratch = options.scratch.resolve() / name
+    scene, plan = plan_scene(blocks)
+    wide = 1.0 if options.same_planes else (len(plan.boxes.low) + 1) ** 0.5
     sides = {
         "blocks": replace(blocks, output=scratch / "blocks", steps=10**6),
-        "single": replace(blocks, output=scratch / "single", steps=10**6, blocks=SingleConfig()),
+        "single": replace(widened(blocks, wide), output=scratch / "single", steps=10**6, blocks=SingleConfig()),
     }
-    scene, plan = plan_scene(blocks)
     lay_out(blocks, scene, plan)
     use_processor_time()
     result: dict[str, Any] = {
@@ -54,20 +59,25 @@ def main() -> None:
         "threads": torch.get_num_threads(),
         "flags": rest,
     }
-    for name in options.sides:
-        root = sides[name].output
+    for side in options.sides:
+        root = sides[side].output
         assert root is not None
-        train_scene(sides[name], "fprf-lite", quiet=True)
-        values = psnr(load_run(root, "cpu"), scratch / f"{name}-views")
-        result[name] = {"psnr": statistics.mean(values), "psnr_of_views": values, **trained_seconds(root)}
-        if name == "blocks":
-            result[name]["blocks"] = len(load_boxes(root).low)
-        print(name, json.dumps(result[name]), flush=True)
+        train_scene(sides[side], "fprf-lite", quiet=True)
+        values = psnr(load_run(root, "cpu"), scratch / f"{side}-views")
+        result[side] = {
+            "psnr": statistics.mean(values),
+            "psnr_of_views": values,
+            "parameters": parameters(sides[side], root),
+            **trained_seconds(root),
+        }
+        if side == "blocks":
+            result[side]["blocks"] = len(load_boxes(root).low)
+        print(name, side, json.dumps(result[side]), flush=True)
     if {"blocks", "single"} <= result.keys():
         result["blocks_minus_single_db"] = result["blocks"]["psnr"] - result["single"]["psnr"]
     if options.output is not None:
         known = json.loads(options.output.read_text()) if options.output.is_file() else {}
-        options.output.write_text(json.dumps(known | {options.scene.name: result}, indent=1) + "\n")
+        options.output.write_text(json.dumps(known | {name: result}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -35,10 +35,11 @@ from fprf.engine.lay_out import lay_out, load_boxes, plan_scene
 from fprf.engine.loading import Trained, load_run
 from fprf.engine.restyle import apply_style
 from fprf.engine.views import render_view
-from fprf.fields.config import PlanesConfig
+from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.layouts import SingleConfig, StreetConfig
 from fprf.methods import fprf_lite
 from fprf.output.images import to_uint8, write_image
+from fprf.plugins.samplers.config import ProposalConfig
 from fprf.process import keep_memory
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
@@ -71,16 +72,21 @@ def configs(options: argparse.Namespace) -> tuple[TrainConfig, TrainConfig]:
         blocks=StreetConfig(segments=n),
     )
     # Parameters go with the square of the nodes; the surroundings are one block more.
-    wide = (n + 1) ** 0.5
-    single = replace(
-        blocks,
-        output=options.scratch / "single",
-        blocks=SingleConfig(),
-        sampler=replace(lite.sampler, resolutions=(round(wide * nodes[-1] / 2),)),
-        content=replace(lite.content, field=PlanesConfig(resolutions=_times(nodes, wide), channels=16, hidden=64, layers=1)),
-        semantic=replace(lite.semantic, field=replace(lite.semantic.field, resolutions=_times((nodes[0], nodes[-2]), wide))),
-    )
+    single = replace(widened(blocks, (n + 1) ** 0.5), output=options.scratch / "single", blocks=SingleConfig())
     return blocks, single
+
+
+def widened(config: TrainConfig, factor: float) -> TrainConfig:
+    """The config with so many times the nodes along every side of its planes."""
+    sampler, field, semantic = config.sampler, config.content.field, config.semantic.field
+    assert isinstance(sampler, ProposalConfig) and isinstance(field, PlanesConfig)
+    assert isinstance(semantic, SemanticPlanesConfig)
+    return replace(
+        config,
+        sampler=replace(sampler, resolutions=_times(sampler.resolutions, factor)),
+        content=replace(config.content, field=replace(field, resolutions=_times(field.resolutions, factor))),
+        semantic=replace(config.semantic, field=replace(semantic, resolutions=_times(semantic.resolutions, factor))),
+    )
 
 
 def _times(nodes: tuple[int, ...], factor: float) -> tuple[int, ...]:
