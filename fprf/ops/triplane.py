@@ -8,7 +8,8 @@ One table means one parameter, one optimiser state and one pass.
 The torch form is the reference for every device and dtype; in float32 fused kernels take over, those of `triplane_numba` on
 the CPU and those of `triplane_triton` on a GPU. All keep coordinates and arithmetic in the dtype of the points, never half
 (half coordinates cost 3.5e-2 of the feature at 512 nodes); a table that nobody trains may be stored in half. Gradients go to
-the table; points are constants, since samplers do not learn through them.
+the table, and to points that ask for them (poses that are refined); on a GPU the latter are found in the plain form. A sample
+has a kink at each node: there its slope is that of the cell above.
 """
 
 import math
@@ -27,6 +28,7 @@ __all__ = [
     "fused",
     "lookup",
     "lookup_reference",
+    "point_slopes_reference",
     "rows",
     "split",
     "variation",
@@ -50,7 +52,7 @@ def split(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> lis
 def lookup_reference(
     points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
 ) -> Annotated[Tensor, "N scales*F"]:
-    """The plain form: four gathers a plane, differentiable in the table by autograd."""
+    """The plain form: four gathers a plane, differentiable in table and points by autograd."""
     scales = []
     for planes, r in zip(split(table, resolutions), resolutions, strict=True):
         # NaN falls on the lower border, as in the fused form: an index must never leave the table.
@@ -68,6 +70,19 @@ def lookup_reference(
         assert product is not None
         scales.append(product)
     return torch.cat(scales, -1)
+
+
+def point_slopes_reference(
+    points: Annotated[Tensor, "N 3"],
+    table: Annotated[Tensor, "rows F"],
+    resolutions: Sequence[int],
+    grad: Annotated[Tensor, "N scales*F"],
+) -> Annotated[Tensor, "N 3"]:
+    """Gradient of the points for one of the features, in the plain form; 0 along an axis on which a point lies outside."""
+    with torch.enable_grad():
+        given = points.detach().requires_grad_()
+        (found,) = torch.autograd.grad(lookup_reference(given, table.detach(), resolutions), given, grad)
+    return found
 
 
 def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
@@ -107,6 +122,24 @@ def _form(points: Tensor, table: Tensor) -> _Form | None:
     return triplane_numba if triplane_numba.usable(points, table) else None
 
 
+def _point_slopes(
+    form: _Form,
+    points: Tensor,
+    table: Tensor,
+    resolutions: Sequence[int],
+    grad: Tensor | None,
+    raw: Tensor | None,
+    weight: Tensor,
+) -> Tensor:
+    """Gradient of the points for the features' gradient grad + raw weight; what is None is not added."""
+    if form is triplane_numba:
+        return triplane_numba.point_slopes(points, table, resolutions, grad, raw, weight)
+    parts = [] if grad is None else [grad]
+    if raw is not None and weight is not None:
+        parts.append(raw[:, None] * weight)
+    return point_slopes_reference(points, table, resolutions, torch.stack(parts).sum(0))
+
+
 def fused(points: Tensor, table: Tensor) -> bool:
     """Whether `density` and `density_alone` may be called: there are kernels for this device and these dtypes."""
     return _form(points, table) is not None
@@ -120,9 +153,14 @@ class _Lookup(torch.autograd.Function):
         return form.forward(points, table, resolutions)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         points, table = ctx.saved_tensors
-        return None, ctx.form.backward(points, table, ctx.resolutions, grads[0].contiguous()), None, None
+        to_points, to_table, grad = None, None, grads[0].contiguous()
+        if ctx.needs_input_grad[0]:
+            to_points = _point_slopes(ctx.form, points, table, ctx.resolutions, grad, None, None)
+        if ctx.needs_input_grad[1]:
+            to_table = ctx.form.backward(points, table, ctx.resolutions, grad)
+        return to_points, to_table, None, None
 
 
 class _Density(torch.autograd.Function):
@@ -139,15 +177,18 @@ class _Density(torch.autograd.Function):
         return density, latent
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[None, Tensor | None, None, Tensor | None, None, None]:
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, Tensor | None, None, Tensor | None, None, None]:
         points, table, weight, density, latent = ctx.saved_tensors
         thick, feature = grads
         if thick is None and feature is None:
             return None, None, None, None, None, None
         # As `exp_gradient`: no gradient explodes or dies where the density is cut off.
         raw = None if thick is None else thick * density.clamp_min(math.exp(-ctx.limit))
-        found = ctx.form.backward(points, table, ctx.resolutions, feature, raw, weight)
-        return None, found, None, None if raw is None else ctx.form.summed(raw, latent), None, None
+        given, needs = (points, table, ctx.resolutions, feature, raw, weight), ctx.needs_input_grad
+        to_points = _point_slopes(ctx.form, *given) if needs[0] else None
+        to_table = ctx.form.backward(*given) if needs[1] else None
+        to_weight = ctx.form.summed(raw, latent) if needs[3] and raw is not None else None
+        return to_points, to_table, None, to_weight, None, None
 
 
 class _Variation(torch.autograd.Function):
@@ -170,7 +211,7 @@ def lookup(
     form = _form(points, table)
     if form is None:
         return lookup_reference(points, table, resolutions)
-    result: Tensor = _Lookup.apply(points.detach().contiguous(), table, tuple(resolutions), form)  # type: ignore[no-untyped-call]
+    result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions), form)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -185,7 +226,7 @@ def density(
 
     The gradient of the density is that of exp between -limit and limit, and the one at the nearer of them beyond.
     """
-    form, given = _form(points, table), points.detach().contiguous()
+    form, given = _form(points, table), points.contiguous()
     assert form is not None, "callers ask `fused`"
     found: tuple[Tensor, Tensor] = _Density.apply(given, table, tuple(resolutions), weight, limit, form)  # type: ignore[no-untyped-call]
     return found

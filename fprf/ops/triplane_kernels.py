@@ -8,9 +8,30 @@ import numpy as np
 
 from .exponential import exp_lanes
 from .lanes import BLOCK, WIDE
-from .vector import LANES, dot, product_backward, product_backward_wide, product_forward, product_forward_wide, scaled
+from .vector import (
+    LANES,
+    dot,
+    product_backward,
+    product_backward_wide,
+    product_forward,
+    product_forward_wide,
+    product_slopes,
+    scaled,
+)
 
-__all__ = ["GROUP", "PARTS", "backward", "cells", "density", "features", "forward", "summed", "variation", "variation_gradient"]
+__all__ = [
+    "GROUP",
+    "PARTS",
+    "backward",
+    "cells",
+    "density",
+    "features",
+    "forward",
+    "point_slopes",
+    "summed",
+    "variation",
+    "variation_gradient",
+]
 
 GROUP = 16
 """Channels of one backward task: a cache line of float32."""
@@ -153,6 +174,45 @@ def backward(points, table, channels, sizes, starts, grad, raw, weight, slices, 
                         product_backward(
                             table, slope, out, a + s, b + s, c + s, o + n * apart + s, mine, channels, size * channels, u, v, w
                         )
+
+
+@_jit
+def point_slopes(points, table, channels, sizes, starts, grad, raw, weight, out):
+    """out [N 3] = gradient of the points, for the features' gradient grad[n, c] + raw[n] weight[c]; what is empty is not added.
+
+    Along an axis on which a point lies outside of the planes, or nowhere, it is 0: there the border's value holds.
+    """
+    scales, total = len(sizes), len(points) // 3
+    width = scales * channels
+    for task in numba.prange((total + BLOCK - 1) // BLOCK):
+        first = task * BLOCK
+        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
+        mixed, none, sums = np.empty(BLOCK * channels, np.float32), np.zeros(LANES, np.float32), np.empty(3 * LANES, np.float32)
+        count = min(BLOCK, total - first)
+        out[3 * first : 3 * (first + count)] = np.float32(0)
+        for scale in range(scales):
+            size = sizes[scale]
+            half, last = np.float32(0.5) * np.float32(size - 1), np.float32(size - 1)
+            cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
+            slope, o, apart = grad, (first * scales + scale) * channels, width
+            if len(raw) > 0:
+                _slopes(grad, raw, weight, first, count, width, scale * channels, channels, none, mixed)
+                slope, o, apart = mixed, 0, channels
+            for n in range(count):
+                a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
+                u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
+                sums[:] = np.float32(0)
+                for s in range(0, channels, LANES):
+                    product_slopes(
+                        table, slope, sums, a + s, b + s, c + s, o + n * apart + s, channels, size * channels, u, v, w
+                    )
+                for axis in range(3):
+                    at = (points[3 * (first + n) + axis] + np.float32(1)) * half
+                    if at >= np.float32(0) and at <= last:
+                        found = np.float32(0)
+                        for lane in range(LANES):
+                            found += sums[axis * LANES + lane]
+                        out[3 * (first + n) + axis] += half * found
 
 
 @_jit_sum

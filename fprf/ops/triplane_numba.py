@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .backend import compiled
 
-__all__ = ["backward", "density", "forward", "layout", "summed", "usable", "variation", "variation_gradient"]
+__all__ = ["backward", "density", "forward", "layout", "point_slopes", "summed", "usable", "variation", "variation_gradient"]
 
 _LANES = 8
 _SLICES = 4
@@ -101,6 +101,32 @@ def backward(
         out.view(-1).numpy(),
     )
     return out.sum(0) if slices > 1 else out[0]
+
+
+def point_slopes(
+    points: Tensor,
+    table: Tensor,
+    resolutions: Sequence[int],
+    grad: Tensor | None,
+    raw: Tensor | None = None,
+    weight: Tensor | None = None,
+) -> Tensor:
+    """Gradient of the points [N 3], for what `backward` is given."""
+    from . import triplane_kernels as kernels
+
+    sizes, starts = layout(resolutions)
+    flat, channels = table.detach().contiguous().view(-1).numpy(), table.shape[1]
+    out = torch.empty(len(points), 3)
+    kernels.point_slopes(
+        points.detach().view(-1).numpy(),
+        flat,
+        channels,
+        sizes,
+        starts,
+        *(_EMPTY if x is None else x.detach().contiguous().view(-1).numpy() for x in (grad, raw, weight)),
+        out.view(-1).numpy(),
+    )
+    return out
 
 
 def summed(raw: Tensor, latent: Tensor) -> Tensor:

@@ -10,9 +10,18 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from .lanes import FUSE, WIDE, address, load, splat, store
+from .lanes import FUSE, WIDE, address, load, number, splat, store
 
-__all__ = ["LANES", "dot", "product_backward", "product_backward_wide", "product_forward", "product_forward_wide", "scaled"]
+__all__ = [
+    "LANES",
+    "dot",
+    "product_backward",
+    "product_backward_wide",
+    "product_forward",
+    "product_forward_wide",
+    "product_slopes",
+    "scaled",
+]
 
 LANES = 8
 """Channels come in groups of so many: one AVX register of float32. `_wide` takes lanes.WIDE at once."""
@@ -90,6 +99,35 @@ def _backward(lanes):
         return signature, generate
 
     return product_backward
+
+
+@intrinsic
+def product_slopes(typing, table, grad, sums, a, b, c, o, step, stride, u, v, w):
+    """Add to sums[0], [LANES] and [2 LANES] onwards grad[o :] times the slopes of `product_forward` along u, v and w."""
+    signature = types.void(table, grad, sums, a, b, c, o, step, stride, u, v, w)
+
+    def generate(context, build, signature, args):
+        table, grad, sums, a, b, c, o, step, stride, u, v, w = args
+        shares = _shares(build, (u, v, w), LANES)
+        values, slopes = [], []
+        for base, across, down in zip((a, b, c), (0, 0, 1), (1, 2, 2), strict=True):
+            places = _corners(context, build, signature.args[0], table, base, step, stride)
+            corners = [load(build, place, LANES) for place in places]
+            rows = [_mix(build, *corners[first : first + 2], shares[across]) for first in (0, 2)]
+            rises = [build.fsub(corners[first + 1], corners[first]) for first in (0, 2)]
+            values.append(_mix(build, *rows, shares[down]))
+            slopes.append({across: _mix(build, *rises, shares[down]), down: build.fsub(rows[1], rows[0])})
+        x, y, z = values
+        g = load(build, address(context, build, signature.args[1], grad, o), LANES)
+        others = (build.fmul(y, z), build.fmul(x, z), build.fmul(x, y))
+        for axis in range(3):
+            parts = [build.fmul(s[axis], rest, flags=FUSE) for s, rest in zip(slopes, others, strict=True) if axis in s]
+            place = address(context, build, signature.args[2], sums, number(axis * LANES))
+            total = build.fmul(g, build.fadd(*parts, flags=FUSE), flags=FUSE)
+            store(build, build.fadd(load(build, place, LANES), total, flags=FUSE), place)
+        return context.get_dummy_value()
+
+    return signature, generate
 
 
 product_forward, product_backward = _forward(LANES), _backward(LANES)

@@ -214,12 +214,6 @@ def test_the_plain_form_differentiates(resolutions: tuple[int, ...]) -> None:
     assert torch.autograd.gradcheck(lambda t: variation(t, resolutions), (table,))
 
 
-def test_points_are_constants() -> None:
-    points, table = points_of(9).requires_grad_(True), table_of((4,), 8).requires_grad_(True)
-    lookup(points, table, (4,)).sum().backward()
-    assert points.grad is None and table.grad is not None
-
-
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
 def test_one_thread_and_two_give_the_same_bits() -> None:
     resolutions = (16, 64, 182)
