@@ -1,20 +1,25 @@
-"""Training that is killed at random moments, again and again, and what is left of it.
+"""Training that is killed again and again after its first checkpoint, many times within a save, and what is left of it.
 
-    python benchmarks/kills.py [--kills 100] [--steps 60] [--seed 0] [--output benchmarks/results/kills.json]
+    python benchmarks/kills.py [--kills 100] [--steps 300] [--seed 0] [--output benchmarks/results/kills.json]
 
-A whole `fprf train` of a tiny town (features, basis, training, statistics; a checkpoint after every step, so that many kills
-hit one) is run once undisturbed. Then the same is started and killed with SIGKILL after a random time, started again, and so
-on until it ends; and all that until there were as many kills as asked for. Every end must be bitwise the undisturbed one:
-parameters, moments, scene statistics; nothing unfinished may be left in the folder.
+A whole `fprf train` of a tiny town (features, basis, training, statistics; a checkpoint after every step, so that saving is
+half of the time) is run once undisturbed. Then the same is started and killed with SIGKILL, started again, and so on until it
+ends; and all that until there were as many kills as asked for. Of every ten kills one falls anywhere between the start of the
+process and its first save, four at a random moment after it, and five as soon after such a moment as a half-written file is
+seen. Every end must be bitwise the undisturbed one: parameters, moments, scene statistics; nothing unfinished may be left.
 """
 
 import argparse
+import contextlib
+import importlib
 import json
 import os
 import random
 import shutil
 import signal
+import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -36,6 +41,11 @@ from fprf.town.write import write_town
 KILLED = -9
 PARTS = (lay_out, prepare, style_pass, trainer)
 """What a training imports when it begins: here already, so that children start at once."""
+SPAN = 0.7
+"""Seconds after a process's first save within which it is killed."""
+START = 1.0
+"""Seconds in which an early kill falls: a start takes about as long."""
+KINDS = ("early", *("later",) * 4, *("saving",) * 5)
 
 
 def tiny(data: Path, steps: int) -> TrainConfig:
@@ -55,8 +65,9 @@ def tiny(data: Path, steps: int) -> TrainConfig:
     )
 
 
-def in_child(work: Callable[[], object], kill_after: float | None = None) -> int:
-    """Run in a forked process, which is killed after so many seconds; its exit code, or minus the signal."""
+def in_child(work: Callable[[], object], due: Callable[[float], bool] = lambda seconds: False) -> int:
+    """Run in a forked process, which is killed once `due` of its seconds says so; its exit code, or minus the signal."""
+    start = time.monotonic()
     process = os.fork()
     if process == 0:
         code = 1
@@ -67,15 +78,48 @@ def in_child(work: Callable[[], object], kill_after: float | None = None) -> int
             traceback.print_exc()
         finally:
             os._exit(code)
-    end = None if kill_after is None else time.monotonic() + kill_after
     while True:
         done, status = os.waitpid(process, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(status)
-        if end is not None and time.monotonic() > end:
+        if due(time.monotonic() - start):
             os.kill(process, signal.SIGKILL)
-            end = None
-        time.sleep(0.002)
+            return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+        time.sleep(0.0005)
+
+
+def import_as(work: Callable[[], object], note: Path) -> None:
+    """Import here all that `work` imports, so that forked processes find it: most of a start would go to imports."""
+
+    def tell() -> None:
+        work()
+        note.write_text("\n".join(sys.modules))
+
+    if in_child(tell):
+        raise SystemExit("the undisturbed run failed")
+    for name in note.read_text().split("\n"):
+        with contextlib.suppress(Exception):
+            importlib.import_module(name)
+    if threading.active_count() > 1:
+        raise SystemExit("an import started a thread, which forked processes would miss")
+
+
+def moment(run: Path, kind: str, draw: random.Random, pace: float) -> Callable[[float], bool]:
+    """When to kill a process: a function that says, of its age in seconds, whether it is time."""
+    checkpoints = run / "checkpoints"
+    first, wait = max(saved(checkpoints), default=0), draw.uniform(0, pace if kind == "early" else SPAN)
+    begun: list[float] = []
+
+    def due(seconds: float) -> bool:
+        if kind == "early":
+            return seconds > wait
+        if not begun and max(saved(checkpoints), default=0) > first:
+            begun.append(seconds)
+        if not begun or seconds < begun[0] + wait:
+            return False
+        return kind == "later" or saving(run)
+
+    return due
 
 
 def contents(run: Path) -> dict[str, bytes]:
@@ -89,9 +133,16 @@ def contents(run: Path) -> dict[str, bytes]:
 
 def strays(run: Path) -> list[str]:
     """Hidden files, and folders of checkpoints without a manifest."""
-    found = [p for p in run.rglob(".*") if p.is_file()]
-    found += [p for p in run.glob("checkpoints/*") if not (p / "manifest.json").is_file()]
-    return [str(p.relative_to(run)) for p in found]
+    with contextlib.suppress(FileNotFoundError):  # the process that is watched writes and removes
+        found = [p for p in run.rglob(".*") if p.is_file()]
+        found += [p for p in run.glob("checkpoints/*") if not (p / "manifest.json").is_file()]
+        return [str(p.relative_to(run)) for p in found]
+    return []
+
+
+def saving(run: Path) -> bool:
+    """Whether a checkpoint is half written."""
+    return any(name.startswith("checkpoints") for name in strays(run))
 
 
 def measure(
@@ -105,55 +156,53 @@ def measure(
     def train(name: str) -> Callable[[], object]:
         return lambda: train_scene(replace(config, output=folder / name), "fprf-lite", quiet=True)
 
-    if in_child(train("warm-up")) or in_child(train("straight")):  # the first one makes the features
-        raise SystemExit("the undisturbed run failed")
+    import_as(train("warm-up"), folder / "modules")  # this one makes the features, too
     start = time.monotonic()
-    in_child(lambda: train_scene(replace(config, output=folder / "timed"), "fprf-lite", quiet=True))
+    if in_child(train("straight")):
+        raise SystemExit("the undisturbed run failed")
     usual = time.monotonic() - start
     wanted, draw = contents(folder / "straight"), random.Random(seed)
-    pace = usual
-    done = runs = equal = 0
-    progress: list[int] = []
+    runs = equal = cut_saves = 0
+    killed: list[tuple[str, int]] = []
     left: list[str] = []
     failures: list[int] = []
-    while done < kills:
+    while len(killed) < kills and not failures:
         run = folder / f"killed-{runs}"
         while True:
-            start = time.monotonic()
-            code = in_child(train(run.name), kill_after=draw.uniform(0.05, 1.3 * pace))
+            kind = KINDS[len(killed) % len(KINDS)] if killed else "later"
+            code = in_child(train(run.name), moment(run, kind, draw, START))
             if code == 0:
-                pace = min(pace, time.monotonic() - start)  # the machine may have been busier before
                 break
             if code != KILLED:
                 failures.append(code)
                 break
-            done += 1
-            progress.append(max(saved(run / "checkpoints"), default=0))
+            killed.append((kind, max(saved(run / "checkpoints"), default=0)))
+            cut_saves += saving(run)
         runs += 1
-        if failures:
-            break
-        equal += contents(run) == wanted
-        left += strays(run)
-        say(f"{done} kills, {equal} of {runs} runs bitwise equal")
+        if not failures:
+            equal += contents(run) == wanted
+            left += strays(run)
+        say(f"{len(killed)} kills, {equal} of {runs} runs bitwise equal")
         shutil.rmtree(run)
     return {
-        "kills": done,
+        "kills": len(killed),
         "runs": runs,
         "bitwise_equal": equal,
         "unfinished_files_left": left,
         "other_failures": failures,
+        "kills_past_the_first_checkpoint": sum(step > 0 for _, step in killed),
+        "kills_that_cut_a_save": cut_saves,
         "undisturbed_seconds": round(usual, 2),
         "steps": steps,
         "checkpoint_every_steps": 1,
-        "kills_before_the_first_checkpoint": sum(step == 0 for step in progress),
-        "steps_reached_at_kills": progress,
+        "newest_checkpoint_at_kills": [step for _, step in killed],
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path)
     asked = parser.parse_args()
@@ -161,7 +210,7 @@ def main() -> None:
         found = measure(Path(folder), kills=asked.kills, steps=asked.steps, seed=asked.seed, say=print)
     command = f"python benchmarks/kills.py --kills {asked.kills} --steps {asked.steps} --seed {asked.seed}"
     document = {"command": command, **found}
-    print(json.dumps({k: v for k, v in document.items() if k != "steps_reached_at_kills"}, indent=1))
+    print(json.dumps({k: v for k, v in document.items() if k != "newest_checkpoint_at_kills"}, indent=1))
     if asked.output is not None:
         write_json(asked.output, document)
 

@@ -24,6 +24,8 @@ __all__ = ["read_camera_path", "write_camera_path"]
 
 _FPS = 24.0
 """What Nerfstudio assumes where a file does not say."""
+_FAR = 1e30
+"""Numbers of a pose lie below: an integer of JSON may be larger than any float."""
 _STRAY = 1e-3
 """How far a rotation may be from orthonormal: viewers round to a few digits."""
 
@@ -107,7 +109,7 @@ def _number(path: Path, where: str, value: object, low: float, high: float) -> f
 
 def _size(path: Path, content: dict[str, object], name: str) -> int:
     value = content.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != round(value) or not 1 <= value <= 65536:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 <= value <= 65536 or value != round(value):
         _wrong(path, name, "a whole number of pixels from 1 to 65536", value)
     return int(value)
 
@@ -116,8 +118,8 @@ def _pose(path: Path, where: str, value: object) -> Annotated[Tensor, "3 4"]:
     """16 numbers, or 4 rows of them, as a pose whose rotation is exactly orthonormal."""
     rows = value if isinstance(value, list) else []
     flat = [number for row in rows for number in (row if isinstance(row, list) else [row])]
-    if len(flat) != 16 or not all(isinstance(number, int | float) and math.isfinite(number) for number in flat):
-        _wrong(path, where, "16 finite numbers, row by row", value)
+    if len(flat) != 16 or not all(isinstance(number, int | float) and abs(number) < _FAR for number in flat):
+        _wrong(path, where, "16 finite numbers, row by row, below 1e30", value)
     pose = torch.tensor(flat, dtype=torch.float64).reshape(4, 4)[:3]
     left, scales, right = torch.linalg.svd(pose[:, :3])
     turn = left @ right

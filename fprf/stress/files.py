@@ -9,7 +9,8 @@ from ..engine import tensorfiles
 from ..errors import FprfError
 from ..testing import cases
 from .check import Check
-from .fuzz import fuzz, targets
+from .fuzz import fuzz
+from .readers import targets
 
 __all__ = ["damage", "readers"]
 

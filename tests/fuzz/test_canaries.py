@@ -13,7 +13,7 @@ import fprf
 from fprf.datamanagers.parsers.files import read_npy, read_npz
 from fprf.errors import FprfError
 from fprf.plugins.encoders.weight_sources import WeightSource, read_tensors
-from fprf.stress.fuzz import targets
+from fprf.stress.readers import targets
 
 
 class Canary:

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from fprf.datamanagers.parsers.config import ColmapConfig
 from fprf.errors import DataError
-from fprf.stress.fuzz import Target, fuzz, mutated, targets
+from fprf.stress.fuzz import Target, fuzz, mutated
+from fprf.stress.readers import targets
 
 NAMES = [
     *(f"COLMAP {kind}.{suffix}" for suffix in ("bin", "txt") for kind in ("cameras", "images", "points3D")),
@@ -23,6 +24,11 @@ NAMES = [
     "config.json",
     "sealed tensors",
     "style dictionary",
+    "checkpoint manifest",
+    "archive of arrays",
+    "list of photographs",
+    "tf.train.Example",
+    "metadata of Mega-NeRF",
 ]
 
 

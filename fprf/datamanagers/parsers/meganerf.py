@@ -4,7 +4,6 @@ Metadata are tensors written by torch.save: `H W c2w intrinsics`. They are read 
 are OpenGL's, in world axes down, right, back; `coordinates.pt` tells how many metres their unit is.
 """
 
-import pickle  # nosec B403  # the name of an exception; nothing is unpickled but tensors
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -61,7 +60,10 @@ def _unit(data: Path) -> float:
     if not path.is_file():
         return 1.0
     value = _load(path).get("pose_scale_factor", 1.0)
-    scale = float(value)
+    try:
+        scale = float(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise DataError(f"{path}: pose_scale_factor is no number ({_first_line(error)}); write it again") from error
     if not 0 < scale < 1e9:
         raise DataError(f"{path}: pose_scale_factor is {scale}; it must be above 0: write it again")
     return scale
@@ -73,12 +75,17 @@ def _load(path: Path) -> dict[str, Any]:
         if path.stat().st_size > _LARGEST:
             raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError(f"{path}: no tensors of torch.save ({reason}); copy the file again") from error
+    except DataError:
+        raise
+    except Exception as error:  # the unpickler raises whatever the bytes lead it to
+        raise DataError(f"{path}: no tensors of torch.save ({_first_line(error)}); copy the file again") from error
     if not isinstance(found, dict):
         raise DataError(f"{path}: holds a {type(found).__name__}, not names and tensors; copy the file again")
     return found
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _view(file: Path, images: Path, unit: float) -> View:
@@ -87,8 +94,9 @@ def _view(file: Path, images: Path, unit: float) -> View:
         width, height = int(found["W"]), int(found["H"])
         pose = np.asarray(torch.as_tensor(found["c2w"]).double().numpy())
         fx, fy, cx, cy = (float(v) for v in torch.as_tensor(found["intrinsics"]).reshape(-1).tolist())
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise DataError(f"{file}: W, H, c2w [3 4] and intrinsics [4] are needed ({error}); copy the file again") from error
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+        told = f"{file}: W, H, c2w [3 4] and intrinsics [4] are needed ({_first_line(error)}); copy the file again"
+        raise DataError(told) from error
     if pose.shape not in ((3, 4), (4, 4)) or width < 1 or height < 1:
         raise DataError(f"{file}: c2w is {pose.shape} and the image {width}x{height}; copy the file again")
     pose = pose.copy()

@@ -1,0 +1,220 @@
+"""A valid file of each kind that somebody else may hand us, with its reader: what `fuzz` mutates."""
+
+import json
+import struct
+import zipfile
+from io import BytesIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from ..datamanagers.images import load_image
+from ..datamanagers.parsers.checksum import crc32c, masked
+from ..datamanagers.parsers.colmap_model import read_model
+from ..datamanagers.parsers.config import ColmapConfig, LlffConfig, MegaNerfConfig, TransformsConfig
+from ..datamanagers.parsers.files import read_npz
+from ..datamanagers.parsers.phototourism import read_list
+from ..datamanagers.parsers.tfrecord import read_examples
+from ..engine import checkpoint, tensorfiles
+from ..plugins.codec import load_config
+from ..rendering.camera_path import read_camera_path
+from ..style.dictionary import load_dictionary, save_dictionary
+from ..style.files import read_style
+from ..testing import cases
+from .fuzz import Target
+
+__all__ = ["targets"]
+
+SIDE = 24
+
+
+def targets(folder: Path) -> list[Target]:
+    """One for each kind of file, written into `folder`."""
+    found = [*_colmap(folder / "colmap", binary=True), *_colmap(folder / "colmap-text", binary=False)]
+    found += [_transforms(folder / "transforms"), _llff(folder / "llff")]
+    found += [_image(folder / "images", suffix) for suffix in ("png", "jpg", "webp", "bmp", "tiff")]
+    found += [_camera_path(folder / "paths"), _style(folder / "styles"), _config(folder / "configs")]
+    found += _tensors(folder / "tensors")
+    return [*found, _checkpoint(folder / "checkpoints"), *_tables(folder / "tables"), _meganerf(folder / "meganerf")]
+
+
+def _pictures(folder: Path, count: int) -> list[str]:
+    folder.mkdir(parents=True)
+    names = [f"{k}.png" for k in range(count)]
+    for k, name in enumerate(names):
+        _paint(folder / name, k)
+    return names
+
+
+def _paint(path: Path, seed: int) -> None:
+    pixels = np.random.default_rng(seed).integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
+    path.write_bytes(cv2.imencode(path.suffix, pixels)[1].tobytes())
+
+
+def _colmap(folder: Path, *, binary: bool) -> list[Target]:
+    names = _pictures(folder / "images", 3)
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    suffix = "bin" if binary else "txt"
+    for kind, data in (_colmap_binary if binary else _colmap_text)(names).items():
+        (model / f"{kind}.{suffix}").write_bytes(data)
+    parser = ColmapConfig().build()
+    return [
+        Target(
+            f"COLMAP {kind}.{suffix}", model / f"{kind}.{suffix}", lambda: parser.parse(folder, 1), lambda: read_model(model)
+        )
+        for kind in ("cameras", "images", "points3D")
+    ]
+
+
+def _colmap_binary(names: list[str]) -> dict[str, bytes]:
+    cameras = struct.pack("<Q", 1) + struct.pack("<IiQQ", 1, 1, SIDE, SIDE) + struct.pack("<4d", 30, 30, SIDE / 2, SIDE / 2)
+    images = struct.pack("<Q", len(names))
+    for k, name in enumerate(names):
+        images += struct.pack("<I7dI", k + 1, 1, 0, 0, 0, 0.3 * k, 0, 0, 1) + name.encode() + b"\0"
+        images += struct.pack("<Q", 12) + b"".join(struct.pack("<ddq", 3, 4, point) for point in range(12))
+    points = struct.pack("<Q", 12)
+    for k in range(12):
+        points += struct.pack("<Q3d3Bd", k, k % 3 - 1.0, k % 4 - 1.5, 4 + 0.2 * k, 1, 2, 3, 0.5) + struct.pack("<QII", 1, 1, k)
+    return {"cameras": cameras, "images": images, "points3D": points}
+
+
+def _colmap_text(names: list[str]) -> dict[str, bytes]:
+    cameras = f"# a comment\n1 PINHOLE {SIDE} {SIDE} 30 30 {SIDE / 2} {SIDE / 2}\n"
+    features = " ".join(f"3 4 {point}" for point in range(12))
+    images = "".join(f"{k + 1} 1 0 0 0 {0.3 * k} 0 0 1 {name}\n{features}\n" for k, name in enumerate(names))
+    points = "".join(f"{k} {k % 3 - 1} {k % 4 - 1.5} {4 + 0.2 * k} 1 2 3 0.5 1 {k}\n" for k in range(12))
+    return {"cameras": cameras.encode(), "images": images.encode(), "points3D": points.encode()}
+
+
+def _transforms(folder: Path) -> Target:
+    frames = []
+    for k, name in enumerate(_pictures(folder / "images", 3)):
+        pose = [[1, 0, 0, 0.3 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose, "near": 1.0, "far": 9.0})
+    document = {"w": SIDE, "h": SIDE, "fl_x": 30.0, "fl_y": 30.0, "cx": SIDE / 2, "cy": SIDE / 2, "k1": 0.01, "frames": frames}
+    file = folder / "transforms.json"
+    file.write_text(json.dumps(document))
+    parser = TransformsConfig().build()
+    return Target("transforms.json", file, lambda: parser.parse(folder, 1))
+
+
+def _llff(folder: Path) -> Target:
+    names = _pictures(folder / "images", 3)
+    rows = np.zeros((len(names), 17))
+    for k, row in enumerate(rows):
+        row[:15] = np.array([[0, 1, 0, 0.3 * k, SIDE], [-1, 0, 0, 0, SIDE], [0, 0, 1, 0, 30]]).ravel()
+        row[15:] = 1, 9
+    np.save(folder / "poses_bounds.npy", rows)
+    parser = LlffConfig().build()
+    return Target("poses_bounds.npy", folder / "poses_bounds.npy", lambda: parser.parse(folder, 1))
+
+
+def _image(folder: Path, suffix: str) -> Target:
+    folder.mkdir(exist_ok=True)
+    file = folder / f"picture.{suffix}"
+    _paint(file, 0)
+    return Target(f"image, {suffix}", file, lambda: load_image(file))
+
+
+def _camera_path(folder: Path) -> Target:
+    folder.mkdir()
+    file = folder / "path.json"
+    frames = [{"camera_to_world": [1, 0, 0, k, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "fov": 60, "aspect": 1} for k in range(3)]
+    file.write_text(json.dumps({"camera_type": "perspective", "render_width": 9, "render_height": 9, "camera_path": frames}))
+    return Target("camera path", file, lambda: read_camera_path(file))
+
+
+def _style(folder: Path) -> Target:
+    folder.mkdir()
+    file = folder / "style.json"
+    _paint(folder / "a.png", 0)
+    file.write_text(json.dumps({"format": 1, "style": {"references": ["a.png"], "strength": 0.5, "clusters": 4}}))
+    return Target("style.json", file, lambda: read_style(file))
+
+
+def _config(folder: Path) -> Target:
+    from ..methods import fprf_lite
+    from ..plugins.codec import save_config
+
+    folder.mkdir()
+    save_config(folder / "config.json", fprf_lite(), "fprf-lite")
+    return Target("config.json", folder / "config.json", lambda: load_config(folder / "config.json"))
+
+
+def _tensors(folder: Path) -> list[Target]:
+    folder.mkdir()
+    sealed, codes = folder / "style.safetensors", folder / "dictionary.safetensors"
+    tensorfiles.save_sealed(sealed, {"mean": torch.arange(6.0), "keys": torch.ones(3, 4)})
+    save_dictionary(codes, cases.dictionary(3, 4, 2))
+    return [
+        Target("sealed tensors", sealed, lambda: tensorfiles.load_sealed(sealed)),
+        Target("style dictionary", codes, lambda: load_dictionary(codes)),
+    ]
+
+
+def _checkpoint(folder: Path) -> Target:
+    """The manifest as those before the checksum were: else nothing but the checksum would be tried."""
+    step = folder / "step-0000003"
+    tensors = {"planes": torch.arange(6.0).reshape(2, 3)}
+    files = {name: tensorfiles.save(step / f"{name}.safetensors", tensors) for name in ("model", "optimizer")}
+    file = step / "manifest.json"
+    file.write_text(json.dumps({"format": 1, "step": 3, "seconds": 1.5, "files": files}))
+    return Target("checkpoint manifest", file, lambda: checkpoint.load(folder, 3))
+
+
+def _tables(folder: Path) -> list[Target]:
+    """An archive of NumPy, a list of photographs, a record of TFRecord's (its checksums made to fit each mutation)."""
+    folder.mkdir()
+    archive, table, example = folder / "points.npz", folder / "list.tsv", folder / "example"
+    stream = BytesIO()
+    np.save(stream, np.arange(12.0).reshape(4, 3))
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("points.npy", stream.getvalue())
+    rows = ("filename\tid\tsplit\tdataset", "a.jpg\t1\ttrain\tx", "b.jpg\t2\ttest\tx", "c.jpg\t\ttrain\tx", "")
+    table.write_text("\n".join(rows))
+    example.write_bytes(_example())
+    return [
+        Target("archive of arrays", archive, lambda: read_npz(archive, "points")),
+        Target("list of photographs", table, lambda: read_list(table)),
+        Target("tf.train.Example", example, lambda: _read_record(example)),
+    ]
+
+
+def _example() -> bytes:
+    """Three features: a name, two floats, an integer."""
+
+    def inner(number: int, data: bytes) -> bytes:
+        return bytes([number << 3 | 2, len(data)]) + data
+
+    features = b""
+    for name, value in (
+        (b"name", inner(1, inner(1, b"a.png"))),
+        (b"origin", inner(2, inner(1, struct.pack("<2f", 1.5, -2.0)))),
+        (b"width", inner(3, inner(1, bytes([0xAC, 0x02])))),
+    ):
+        features += inner(1, inner(1, name) + inner(2, value))
+    return inner(1, features)
+
+
+def _read_record(file: Path) -> object:
+    data = file.read_bytes()
+    size = struct.pack("<Q", len(data))
+    record = file.with_suffix(".record")
+    record.write_bytes(size + struct.pack("<I", masked(crc32c(size))) + data + struct.pack("<I", masked(crc32c(data))))
+    example = next(read_examples(record))
+    return example.blob("name"), example.numbers("origin", 2), example.integer("width")
+
+
+def _meganerf(folder: Path) -> Target:
+    metadata, images = folder / "train" / "metadata", folder / "train" / "rgbs"
+    for place in (metadata, images):
+        place.mkdir(parents=True)
+    for k in range(2):
+        _paint(images / f"{k}.png", k)
+        pose = torch.tensor([[1, 0, 0, 0.3 * k], [0, 1, 0, 0], [0, 0, 1, 0]])
+        torch.save({"H": SIDE, "W": SIDE, "c2w": pose, "intrinsics": torch.tensor([30.0, 30, 12, 12])}, metadata / f"{k}.pt")
+    parser = MegaNerfConfig().build()
+    return Target("metadata of Mega-NeRF", metadata / "0.pt", lambda: parser.parse(folder, 1))
