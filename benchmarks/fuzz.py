@@ -15,6 +15,7 @@ import select
 import signal
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +69,15 @@ def add(total: dict[str, Any], part: dict[str, Any]) -> None:
         total[name] = max(total[name], part[name])
 
 
-def watch(target: Target, total: dict[str, Any], rounds: int, seed: int, silence: float = SILENCE) -> None:
-    """One child from where `total` stands, until it is done, dies or falls silent."""
+def watch(
+    target: Target,
+    total: dict[str, Any],
+    rounds: int,
+    seed: int,
+    silence: float = SILENCE,
+    keep: Callable[[], None] = lambda: None,
+) -> None:
+    """One child from where `total` stands, until it is done, dies or falls silent; `keep` is called now and then."""
     whole = target.file.read_bytes()
     from_child, to = os.pipe()
     child = os.fork()
@@ -88,6 +96,8 @@ def watch(target: Target, total: dict[str, Any], rounds: int, seed: int, silence
             if not line:
                 break
             add(total, json.loads(line))
+            if total["rounds"] % (10 * CHUNK) == 0:
+                keep()
     if not ready:
         os.kill(child, signal.SIGKILL)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -99,19 +109,23 @@ def watch(target: Target, total: dict[str, Any], rounds: int, seed: int, silence
 
 
 def measure(folder: Path, rounds: int, seed: int, only: list[str], output: Path | None) -> dict[str, Any]:
-    """All readers, the quick ones first."""
+    """All readers, one after the other."""
     command = f"python benchmarks/fuzz.py --rounds {rounds} --seed {seed}"
     document: dict[str, Any] = {"command": command, "rounds": rounds, "seed": seed, "readers": {}}
     if output is not None and output.exists() and (old := json.loads(output.read_text()))["seed"] == seed:
         document["readers"] = old["readers"]
+
+    def keep() -> None:
+        if output is not None:
+            write_json(output, document)
+
     chosen = [target for target in targets(folder) if not only or target.name in only]
     for target in chosen:
         total = document["readers"].setdefault(target.name, fresh())
         while total["rounds"] < rounds:
-            watch(target, total, rounds, seed)
+            watch(target, total, rounds, seed, keep=keep)
             print(target.name, json.dumps(total), flush=True)
-            if output is not None:
-                write_json(output, document)
+            keep()
     return document
 
 

@@ -1,0 +1,172 @@
+"""A long training in which one batch in a hundred is spoilt, beside the same training without.
+
+    python benchmarks/poisoned.py [--steps 30000] [--share 0.01] [--seeds 0 1] [--output benchmarks/results/poisoned.json]
+
+The toy is a town of ten pictures and a model of a few thousand numbers (`kills.py` trains the same). Which batches are spoilt,
+and how, are functions of (seed, step): colours, features or pixels that are NaN or infinite, in one ray or in all; colours
+whose square overflows. Every step must leave finite parameters and moments; at the end both models are compared on all views.
+"""
+
+import argparse
+import json
+import math
+import os
+import random
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from kills import tiny
+
+from fprf.config import TrainConfig
+from fprf.datamanagers.images import load_images
+from fprf.engine import checkpoint
+from fprf.engine.model import Model
+from fprf.engine.prepare import Prepared, prepare
+from fprf.engine.run import Run
+from fprf.engine.trainer import Report, train
+from fprf.engine.views import render_view
+from fprf.evaluation.metrics import psnr
+from fprf.interfaces import DataManager
+from fprf.output.atomic import write_json
+from fprf.town.write import write_town
+from fprf.types import Batch
+
+NAN, INF = float("nan"), float("inf")
+
+
+def _one(values: torch.Tensor, value: float) -> torch.Tensor:
+    """The values, one number of them replaced."""
+    spoilt = values.clone()
+    spoilt.view(-1)[len(spoilt.view(-1)) // 2] = value
+    return spoilt
+
+
+def _field(name: str, change: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Batch], Batch]:
+    """Batches without that field lose their colours instead."""
+
+    def spoil(batch: Batch) -> Batch:
+        value = getattr(batch, name)
+        if value is None:
+            return batch._replace(rgb=torch.full_like(batch.rgb, NAN))
+        return batch._replace(**{name: change(value)})
+
+    return spoil
+
+
+POISONS: dict[str, Callable[[Batch], Batch]] = {
+    "one colour NaN": _field("rgb", lambda x: _one(x, NAN)),
+    "all colours infinite": _field("rgb", lambda x: torch.full_like(x, INF)),
+    "colours of 1e25": _field("rgb", lambda x: torch.full_like(x, 1e25)),
+    "one content feature NaN": _field("content", lambda x: _one(x, NAN)),
+    "one semantic feature infinite": _field("semantic", lambda x: _one(x, -INF)),
+    "one pixel NaN": _field("pixel", lambda x: _one(x, NAN)),
+    "all pixels infinite": _field("pixel", lambda x: torch.full_like(x, INF)),
+}
+
+
+def poison(seed: int, step: int, share: float) -> str | None:
+    """What spoils a step's batch, or None."""
+    draw = random.Random(f"poison {seed} {step}")
+    return draw.choice(list(POISONS)) if draw.random() < share else None
+
+
+class Poisoned(DataManager):
+    """Batches of another, some of them spoilt."""
+
+    def __init__(self, inner: DataManager, seed: int, share: float) -> None:
+        self.inner, self.seed, self.share = inner, seed, share
+        self.content_store, self.semantic_store = inner.content_store, inner.semantic_store
+        self.given: Counter[str] = Counter()
+
+    def batch(self, step: int) -> Batch:
+        batch, name = self.inner.batch(step), poison(self.seed, step, self.share)
+        if name is None:
+            return batch
+        self.given[name] += 1
+        return POISONS[name](batch)
+
+    def image(self, view: int) -> torch.Tensor:
+        return self.inner.image(view)
+
+
+def quality(config: TrainConfig, prepared: Prepared, model: Model) -> dict[str, float]:
+    """Mean PSNR (dB) over the views that were held out, and over all."""
+    cameras, images = prepared.scene.cameras, load_images(prepared.scene)
+    found = [
+        psnr(render_view(model, prepared.facts, cameras, view, config.render).rgb, torch.from_numpy(image).float() / 255)
+        for view, image in enumerate(images)
+    ]
+    held = [found[view] for view in prepared.scene.test.tolist()]
+    return {"held_out": sum(held) / len(held), "all": sum(found) / len(found)}
+
+
+def trained(config: TrainConfig, prepared: Prepared, folder: Path) -> dict[str, Any]:
+    """Train; what came of it."""
+    folder.mkdir()
+    last: list[Report] = []
+    bad = 0
+
+    def report(event: Report) -> None:
+        nonlocal bad
+        last[:] = [event]
+        bad += not all(math.isfinite(value) for value in (event.psnr, *event.losses.values()))
+
+    start = time.process_time()
+    model = train(config, prepared, Run(folder), report)
+    seconds = time.process_time() - start
+    saved = checkpoint.load(folder / "checkpoints", checkpoint.steps(folder / "checkpoints")[-1])
+    numbers = [*saved.model.values(), *saved.optimizer.values()]
+    path = folder / "events.jsonl"
+    events = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return {
+        "psnr": quality(config, prepared, model),
+        "not_finite": sum(int((~torch.isfinite(x)).sum()) for x in numbers if x.is_floating_point()),
+        "numbers_looked_at": sum(x.numel() for x in numbers),
+        "reports_not_finite": bad,
+        "skipped": last[0].skipped,
+        "gone_back": sum("gone_back_to" in event for event in events),
+        "cpu_seconds": round(seconds, 1),
+        "ms_a_step": round(1e3 * seconds / config.steps, 2),
+    }
+
+
+def measure(folder: Path, steps: int, share: float, seeds: list[int]) -> list[dict[str, Any]]:
+    os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
+    write_town(folder / "town", seed=0, palette="day", views=10, width=32, height=24)
+    rows = []
+    for seed in seeds:
+        config = replace(tiny(folder / "town", steps), seed=seed, checkpoint_minutes=0.5)
+        config = replace(config, datamanager=replace(config.datamanager, rays=128))
+        prepared = prepare(config)
+        clean = trained(config, prepared, folder / f"clean-{seed}")
+        manager = Poisoned(prepared.manager, seed, share)
+        spoilt = trained(config, prepared._replace(manager=manager), folder / f"poisoned-{seed}")
+        loss = {name: clean["psnr"][name] - spoilt["psnr"][name] for name in clean["psnr"]}
+        rows.append({"seed": seed, "lost_db": loss, "spoilt": dict(manager.given), "clean": clean, "poisoned": spoilt})
+        print(json.dumps(rows[-1], indent=1), flush=True)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--share", type=float, default=0.01)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--output", type=Path)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="fprf-poisoned-") as folder:
+        rows = measure(Path(folder), asked.steps, asked.share, asked.seeds)
+    seeds = " ".join(map(str, asked.seeds))
+    command = f"python benchmarks/poisoned.py --steps {asked.steps} --share {asked.share:g} --seeds {seeds}"
+    if asked.output is not None:
+        write_json(asked.output, {"command": command, "runs": rows})
+
+
+if __name__ == "__main__":
+    main()
