@@ -192,6 +192,9 @@ class TrainConfig:
     tones: bool = False
     """Learn how bright and how coloured each view was taken, from its exposure where the capture says; the scene is what they
     have in common."""
+    poses: float = 0.0
+    """Refine the cameras' poses with the scene, at this share of the learning rate (in radians, and in distances that views
+    commonly see); 0 = they are as the capture says, 0.05 suits poses that are off by some pixels."""
     render: RenderConfig = RenderConfig()
     """Rendering and skipping."""
     statistics: StatisticsConfig = StatisticsConfig()
@@ -204,3 +207,4 @@ class TrainConfig:
         if self.minutes is not None:
             positive("minutes", self.minutes)
         positive("checkpoint_minutes", self.checkpoint_minutes)
+        between("poses", self.poses, 0.0, 1.0)

@@ -86,6 +86,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "render.chunk": (100, "chunks"),
     "render.background": ((1.0, 0.0, 1.0), "background"),
     "tones": (True, "facts"),
+    "poses": (0.05, "facts"),
     "statistics.rays": (64, "style"),
     "statistics.regions": (1, "style"),
 }
@@ -209,10 +210,14 @@ def test_it_names_a_file(path: str, world: World) -> None:
         builds[path]()
 
 
-def test_tones_are_facts_of_the_scene(world: World) -> None:
-    assert shown("facts") == ["tones"]
-    first, second = (prepare(config).facts for config in (world.config, changed(world.config, "tones", True)))
+def test_tones_and_poses_are_facts_of_the_scene(world: World) -> None:
+    assert shown("facts") == ["tones", "poses"]
+    first, second, third = (
+        prepare(config).facts
+        for config in (world.config, *(changed(world.config, path, SECOND[path][0]) for path in shown("facts")))
+    )
     assert first.exposure == () and len(second.exposure) == 10 and len(second.held) == 2
+    assert first.centres == second.centres == () and len(third.centres) == 10 and len(third.held) == 2 and third.reach > 0
 
 
 def test_a_loss_on_points_changes_the_training(world: World, tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.scene import Scene
+from ..datamanagers.sightings import find_sightings
 from ..errors import ConfigError
 from ..fields.layouts import LayoutConfig
 from ..rendering.space import Space
 from ..types import Boxes
-from .sightings import find_sightings
 from .space import open_space, site_of
 from .visibility import pixel_mask, tile_rays, visible
 

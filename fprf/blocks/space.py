@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.scene import Scene
+from ..datamanagers.sightings import Sightings
 from ..errors import DataError
 from ..rendering.bounds import FAR, NEAR, ROUNDING, axes
 from ..rendering.cameras import Cameras
 from ..rendering.space import Space
 from ..types import Site
-from .sightings import Sightings
 
 __all__ = ["level_axes", "open_space", "site_of"]
 

@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..datamanagers.scene import Scene
+from ..datamanagers.sightings import TILES, Sightings, tile_of
 from ..rendering.cameras import rays_through
 from ..rendering.space import Space
 from ..types import Boxes
-from .sightings import TILES, Sightings, tile_of
 from .windows import local
 
 __all__ = ["BEYOND", "Tiles", "meets", "pixel_mask", "tile_rays", "visible"]

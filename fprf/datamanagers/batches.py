@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..blocks.sightings import find_sightings
 from ..errors import DataError
 from ..interfaces import DataManager, Encoder
 from ..types import Batch
@@ -23,6 +22,7 @@ from .config import RayBatchesConfig
 from .features import FeatureStore, Progress, extract
 from .images import load_image, load_images
 from .scene import Scene
+from .sightings import find_sightings
 
 __all__ = ["RayBatches", "generator_of"]
 

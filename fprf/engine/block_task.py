@@ -65,7 +65,7 @@ def train_block(task: BlockTask, report: Callable[[Report], None]) -> bool:
     config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
     _begin(folder, asked["task"])
     manager = _manager(run, config, facts, own, folder)
-    built = _built(root, config, facts, boxes, task.block)
+    built = _built(root, config, facts, boxes, task.block, own.train)
     block_run = Run(folder)
     train(config, Prepared(own, manager, facts, None), block_run, report, model=built.model)
     step, seconds = reached(block_run.checkpoints)
@@ -118,7 +118,7 @@ def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: 
     )
 
 
-def _built(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: int) -> Built:
+def _built(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: int, views: Tensor) -> Built:
     """The model of a block, inside of its finished surroundings."""
     around = surroundings(config, facts, boxes)
     if block == SURROUNDINGS:
@@ -129,5 +129,7 @@ def _built(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: i
     restore(around.model.decoder, "decoder", own)
     if around.model.tones is not None:
         restore(around.model.tones, "tones", own)
+    if around.model.poses is not None:
+        restore(around.model.poses, "poses", own)
     around.member.requires_grad_(True)
-    return inset(config, facts, boxes, block, around)
+    return inset(config, facts, boxes, block, around, views)

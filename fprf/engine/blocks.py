@@ -16,8 +16,9 @@ four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
 import copy
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from ..blocks.charts import Chart, chart_of, surroundings_of
@@ -34,7 +35,9 @@ from ..rendering.renderer import Parts
 from ..types import Boxes
 from . import tensorfiles
 from .decoder import build_decoder
-from .model import Facts, Model, tones_of
+from .first_use import check_parts
+from .model import Facts, Model, poses_of, tones_of
+from .poses import Poses
 from .tones import Tones
 
 __all__ = [
@@ -88,7 +91,13 @@ def member_of(config: TrainConfig, facts: Facts, chart: Chart) -> Member:
 
 
 def assemble(
-    config: TrainConfig, facts: Facts, members: Members, router: Router, decoder: Decoder, tones: Tones | None
+    config: TrainConfig,
+    facts: Facts,
+    members: Members,
+    router: Router,
+    decoder: Decoder,
+    tones: Tones | None,
+    poses: Poses | None = None,
 ) -> Model:
     """A model whose points are routed to members."""
     return Model(
@@ -100,18 +109,26 @@ def assemble(
             decoder,
         ),
         tones,
+        poses,
     )
 
 
 def surroundings(config: TrainConfig, facts: Facts, boxes: Boxes) -> Built:
-    """The coarse scene that everything starts from."""
+    """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
     member = member_of(config, facts, surroundings_of(boxes))
-    return Built(assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts)), member)
+    model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(config, facts))
+    check_parts(config, model.parts, facts.channels, facts.dim)
+    return Built(model, member)
 
 
-def inset(config: TrainConfig, facts: Facts, boxes: Boxes, block: int, around: Built) -> Built:
-    """A block inside of a copy of its surroundings; decoder and tones are theirs, as they learnt them."""
+def inset(
+    config: TrainConfig, facts: Facts, boxes: Boxes, block: int, around: Built, views: Annotated[Tensor, "M"] | None = None
+) -> Built:
+    """A block inside of a copy of its surroundings; decoder and tones are theirs, as they learnt them.
+
+    Poses start as theirs too, and are refined further from the `views` that the block learns from.
+    """
     chart = chart_of(boxes, block)
     member = member_of(config, facts, chart)
     inherit(member, around.member)
@@ -119,7 +136,11 @@ def inset(config: TrainConfig, facts: Facts, boxes: Boxes, block: int, around: B
     tones = copy.deepcopy(around.model.tones)
     held = Held([member, copy.deepcopy(around.member)])
     still = None if tones is None else tones.requires_grad_(False)
-    return Built(assemble(config, facts, held, Inset(chart), decoder, still), member)
+    poses = around.model.poses
+    if poses is not None:
+        others = set(range(len(facts.centres))) - set([] if views is None else views.tolist())
+        poses = poses.going_on(torch.tensor(facts.centres, dtype=torch.float64), tuple(sorted(others)))
+    return Built(assemble(config, facts, held, Inset(chart), decoder, still, poses), member)
 
 
 def save_finished(folder: Path, built: Built, *, asked: dict[str, Any], step: int, seconds: float) -> None:
@@ -128,6 +149,8 @@ def save_finished(folder: Path, built: Built, *, asked: dict[str, Any], step: in
     tensors |= {f"decoder.{name}": t for name, t in built.model.decoder.state_dict().items()}
     if built.model.tones is not None:
         tensors |= {f"tones.{name}": t for name, t in built.model.tones.state_dict().items()}
+    if built.model.poses is not None:
+        tensors |= {f"poses.{name}": t for name, t in built.model.poses.state_dict().items()}
     manifest = tensorfiles.save(folder / "block.safetensors", tensors)
     write_json(folder / "done.json", {"format": _FORMAT, "asked": asked, "step": step, "seconds": seconds, "tensors": manifest})
 
@@ -158,7 +181,7 @@ def load_finished(folder: Path, *, verify: bool = True) -> Finished:
 
 
 def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
-    """Give a `member`, `decoder` or `tones` its tensors of a finished block, as they are: mapped from the file, not copied."""
+    """Give a `member`, `decoder`, `tones` or `poses` its tensors of a finished block: mapped from the file, not copied."""
     own = {name.removeprefix(f"{kind}."): t for name, t in tensors.items() if name.startswith(f"{kind}.")}
     now = module.state_dict()
     wrong = [name for name, t in now.items() if name not in own or own[name].shape != t.shape]

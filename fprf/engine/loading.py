@@ -1,5 +1,6 @@
 """A trained run, ready to render."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -56,7 +57,7 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     checkpoint.restore(saved, model, None)
     model.requires_grad_(False)
     model = model.to(device_of(device)).eval()
-    return Trained(run, config, method, known, model, saved.step, saved.seconds, tuple(damaged))
+    return Trained(run, config, method, _where_refined(known, model), model, saved.step, saved.seconds, tuple(damaged))
 
 
 def _load_blocks(
@@ -70,9 +71,11 @@ def _load_blocks(
     restore(around.model.decoder, "decoder", finished.tensors)
     if around.model.tones is not None:
         restore(around.model.tones, "tones", finished.tensors)
+    if around.model.poses is not None:
+        restore(around.model.poses, "poses", finished.tensors)
     limit = None if max_memory is None else int(max_memory * _MIB)
     shelf = Shelf(run.root, boxes, around.member.to(device), device=device, limit=limit)
-    model = assemble(config, facts, shelf, Blend(boxes), around.model.decoder, around.model.tones)
+    model = assemble(config, facts, shelf, Blend(boxes), around.model.decoder, around.model.tones, around.model.poses)
     model.requires_grad_(False)
     done = [read_done(folder_of(run.root, block)) for block in range(len(boxes.low))]
     steps = [int(each["step"]) for each in done if each is not None]
@@ -82,7 +85,12 @@ def _load_blocks(
         raise CheckpointError(
             f"{run.root}: {len(done) - len(steps)} of {len(done)} blocks are not finished; go on with `{again}`"
         )
-    return Trained(run, config, method, known, model.to(device).eval(), min(steps), seconds)
+    return Trained(run, config, method, _where_refined(known, model), model.to(device).eval(), min(steps), seconds)
+
+
+def _where_refined(known: Known, model: Model) -> Known:
+    """What is known of the scene, its cameras where training has put them."""
+    return known if model.poses is None else replace(known, cameras=model.poses.refined(known.cameras))
 
 
 def load_style(run: Run) -> tuple[SceneStyle, Basis | None]:

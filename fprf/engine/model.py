@@ -11,9 +11,10 @@ from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from .decoder import build_decoder
 from .first_use import check_parts
+from .poses import Poses
 from .tones import Tones
 
-__all__ = ["Facts", "Model", "build_model", "tones_of"]
+__all__ = ["Facts", "Model", "background_of", "build_model", "poses_of", "tones_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,13 +39,17 @@ class Facts:
     exposure: tuple[float, ...] = ()
     """Logarithm of each view's exposure over their mean (see `tones.relative`); empty where tones are not learnt."""
     held: tuple[int, ...] = ()
-    """Views that tones are not learnt from."""
+    """Views that neither tones nor poses are learnt from."""
+    centres: tuple[tuple[float, float, float], ...] = ()
+    """Of the cameras, in the world, as the capture says; empty where poses are not refined."""
+    reach: float = 1.0
+    """World distance that views commonly see: the unit in which cameras are shifted."""
 
 
 class Model(nn.Module):
     """Sampler, fields and decoder of one scene."""
 
-    def __init__(self, parts: Parts, tones: Tones | None = None) -> None:
+    def __init__(self, parts: Parts, tones: Tones | None = None, poses: Poses | None = None) -> None:
         super().__init__()
         self.space = parts.space
         self.sampler = parts.sampler
@@ -52,6 +57,7 @@ class Model(nn.Module):
         self.semantic = parts.semantic
         self.decoder = parts.decoder
         self.tones = tones
+        self.poses = poses
 
     @property
     def parts(self) -> Parts:
@@ -78,6 +84,13 @@ def tones_of(facts: Facts) -> Tones | None:
     return Tones(torch.tensor(facts.exposure), facts.held) if facts.exposure else None
 
 
+def poses_of(config: TrainConfig, facts: Facts) -> Poses | None:
+    """Poses as the capture says; None where they are not refined."""
+    if not facts.centres:
+        return None
+    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=config.poses)
+
+
 def build_model(config: TrainConfig, facts: Facts) -> Model:
     """The model at its seeded start.
 
@@ -93,4 +106,4 @@ def build_model(config: TrainConfig, facts: Facts) -> Model:
         decoder,
     )
     check_parts(config, parts, facts.channels, facts.dim)
-    return Model(parts, tones_of(facts))
+    return Model(parts, tones_of(facts), poses_of(config, facts))

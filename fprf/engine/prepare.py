@@ -13,6 +13,7 @@ from ..datamanagers.batches import WHITE
 from ..datamanagers.features import FeatureStore
 from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
+from ..datamanagers.sightings import find_sightings
 from ..errors import PluginError
 from ..interfaces import DataManager, Encoder
 from ..rendering.bounds import find_space
@@ -21,7 +22,7 @@ from .decoder import build_decoder
 from .model import Facts
 from .tones import relative
 
-__all__ = ["Prepared", "behind", "cache_folder", "device_of", "facts_of", "prepare"]
+__all__ = ["Prepared", "behind", "cache_folder", "device_of", "facts_of", "prepare", "reach_of"]
 
 
 class Prepared(NamedTuple):
@@ -92,8 +93,18 @@ def facts_of(
         semantic_scale=semantic_store.scale if semantic_store is not None else 1.0,
         background=behind(config, scene),
         exposure=relative(scene.exposure, len(scene.paths)) if config.tones else (),
-        held=tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist()))) if config.tones else (),
+        held=tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist()))) if config.tones or config.poses else (),
+        centres=tuple((float(x), float(y), float(z)) for x, y, z in scene.cameras.pose[:, :, 3]) if config.poses else (),
+        reach=reach_of(scene, space) if config.poses else 1.0,
     )
+
+
+def reach_of(scene: Scene, space: Space) -> float:
+    """World distance that training views commonly see: of their sparse points, else a unit of the space."""
+    sightings = find_sightings(scene)
+    if sightings is not None:
+        return float(sightings.distance.median())
+    return space.near if space.kind == "ndc" else 1 / space.scale
 
 
 def behind(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | None:

@@ -15,6 +15,7 @@ from ..rendering.renderer import march
 from ..style.scene import SceneStyle, scene_style
 from ..style.statistics import empty, merge, moments
 from .model import Model
+from .poses import refined
 
 __all__ = ["POINTS", "lattice", "measure_style"]
 
@@ -38,7 +39,11 @@ def lattice(cameras: Cameras, views: Annotated[Tensor, "V"], rays: int) -> tuple
 
 @torch.inference_mode()
 def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"]) -> SceneStyle:
-    """Content statistics over the training views and the scene's semantic regions, on the CPU."""
+    """Content statistics over the training views and the scene's semantic regions, on the CPU.
+
+    `cameras` are the capture's; the model's own poses, if it has any, are taken into account here.
+    """
+    cameras = refined(model.poses, cameras)
     device = next(model.parameters()).device
     view, pixel = lattice(cameras, views, config.statistics.rays)
     whole = None

@@ -20,6 +20,7 @@ from .guards import CLEAR_EVERY, PATIENCE, clear_denormals, unfit_gradients, unf
 from .interrupts import held_back
 from .losses import terms, total, wanted
 from .model import Facts, Model, background_of, build_model
+from .poses import moving
 from .prepare import Prepared, device_of
 from .run import Run
 from .schedule import progress, rate
@@ -214,7 +215,11 @@ class Loop:
                 self.seen[name] = SMOOTHING * self.seen.get(name, 0.0) + (1 - SMOOTHING)
 
     def _rays(self, batch: Batch) -> Rays:
-        rays = self.model.space.rays(*self.through(batch.view.cpu(), batch.pixel.cpu()))
+        origin, direction = self.through(batch.view.cpu(), batch.pixel.cpu())
+        if self.model.poses is not None:
+            rays = moving(self.model.space.rays(*self.model.poses(batch.view, origin, direction)))
+        else:
+            rays = self.model.space.rays(origin, direction)
         return rays if self.device.type == "cpu" else Rays(*(x.to(self.device) for x in rays))
 
     def _to_device(self, batch: Batch) -> Batch:

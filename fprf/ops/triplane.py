@@ -129,7 +129,7 @@ def _point_slopes(
     resolutions: Sequence[int],
     grad: Tensor | None,
     raw: Tensor | None,
-    weight: Tensor,
+    weight: Tensor | None,
 ) -> Tensor:
     """Gradient of the points for the features' gradient grad + raw weight; what is None is not added."""
     if form is triplane_numba:

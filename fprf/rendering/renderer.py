@@ -69,7 +69,7 @@ def march(
 ) -> March:
     """Sample, weigh, and keep what matters."""
     space = parts.space
-    sampled = parts.sampler(rays, space=space, step=step, generator=generator)
+    sampled = parts.sampler(_fixed(rays), space=space, step=step, generator=generator)
     # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
     # veil there. Weighing gradients by the square of the distance makes every piece of space count alike (Philip and
     # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
@@ -106,12 +106,22 @@ def march(
 
 def _march_compiled(rays: Rays, parts: Parts, sampled: Sampled, budget: float, veiled: bool) -> March:
     """The same, ray by ray."""
-    point = compiled.place(rays, sampled.t, parts.space.warp)
+    if compiled.still(rays.origin, rays.direction):
+        point = compiled.place(rays, sampled.t, parts.space.warp)
+    else:
+        middle = midpoints(sampled.t)
+        points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
+        point = parts.space.locate(points.view(-1, 3)).view(points.shape)
     sample = parts.field.density(point.view(-1, 3))
     fair = _fairness(rays, midpoints(sampled.t)) if veiled else None
     found = compiled.weigh(sample.density.view(point.shape[:2]), sampled.t, budget, fair=fair)
     kept = Kept(*compiled.gather(found, point, sample.latent, rays.view, fair), found.start)
     return March(sampled, found.weights, found.depth, found.opacity, found.through, kept)
+
+
+def _fixed(rays: Rays) -> Rays:
+    """The rays without gradients: neither where samples lie nor what things are moves a pose."""
+    return rays if compiled.still(rays.origin, rays.direction) else Rays(*(x.detach() for x in rays))
 
 
 def _fairness(rays: Rays, middle: Annotated[Tensor, "R S"]) -> Annotated[Tensor, "R S"]:
@@ -161,7 +171,7 @@ def render_rays(
             if step is not None and (alone := parts.decoder.unaided(features)) is not None:
                 unaided = composite(kept, alone, count) + behind
     if Want.SEMANTIC in want and parts.semantic is not None:
-        semantic = _semantics(marched, rays, parts, count if semantic_rays is None else semantic_rays, semantic_samples)
+        semantic = _semantics(marched, _fixed(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples)
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
     return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts, unaided)
 

@@ -9,8 +9,8 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from ..datamanagers.scene import Scene
 from ..rendering.cameras import Cameras, project
+from .scene import Scene
 
 __all__ = ["Sightings", "find_sightings", "tile_of"]
 

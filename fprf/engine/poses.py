@@ -1,0 +1,112 @@
+"""Where each view was taken from, a little off what the capture says: a turn and a shift a view, learnt with the scene.
+
+Conventions. A move is [turn, shift]: a rotation vector in world axes about the camera's own centre (radians), and the centre's
+shift in units of `reach`, the distance that views commonly see. So one step of the optimiser moves a pixel about as far by
+either. A scene can be shifted, turned and scaled with all its cameras without any image changing: these seven directions (to
+first order, about the mean of the cameras that are learnt from) are taken out of every move, so the scene stays where the
+capture put it. Views that are held out never move.
+
+The surroundings of a scene of blocks find the moves of all views. Each block starts from those and goes on with its own views,
+without those seven directions of its own, so neighbours stay together; rendering uses what the surroundings found.
+"""
+
+from dataclasses import replace
+from typing import Annotated
+
+import torch
+from torch import Tensor, nn
+
+from ..rendering.cameras import Cameras
+from ..types import Rays
+
+__all__ = ["Poses", "moving", "refined", "rotated"]
+
+_TINY = 1e-24
+"""Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
+
+
+class Poses(nn.Module):
+    """Moves of V views."""
+
+    known: Tensor
+    learned: Tensor
+    gauge: Tensor
+
+    def __init__(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...], *, reach: float, pace: float) -> None:
+        """`centres` are the cameras' in the world; `held` are views that are not learnt from. One unit of the parameters is
+        `pace` radians, or reaches: how fast poses are learnt beside everything else.
+        """
+        super().__init__()
+        views = len(centres)
+        learned = torch.ones(views, dtype=torch.bool)
+        learned[list(held)] = False
+        self.reach, self.pace = reach, pace
+        self.offset = nn.Parameter(torch.zeros(views, 6))
+        self.register_buffer("known", torch.zeros(views, 6))
+        self.register_buffer("learned", learned, persistent=False)
+        self.register_buffer("gauge", _gauge(centres[learned].double() / reach).float(), persistent=False)
+
+    def moves(self) -> Annotated[Tensor, "V 6"]:
+        """Turn and shift of each view."""
+        free = self.offset[self.learned].reshape(-1)
+        free = free - self.gauge @ (self.gauge.T @ free)
+        moves: Tensor = self.known.index_add(0, self.learned.nonzero()[:, 0], self.pace * free.view(-1, 6))
+        return moves
+
+    def forward(
+        self, view: Annotated[Tensor, "R"], origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"]
+    ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
+        """World rays (float64, unit directions) of the views as they are now."""
+        move = self.moves().to(origin).index_select(0, view.to(origin.device))
+        return origin + self.reach * move[:, 3:], rotated(direction, move[:, :3])
+
+    def refined(self, cameras: Cameras) -> Cameras:
+        """The cameras where they are now."""
+        with torch.no_grad():
+            move = self.moves().to(cameras.pose)
+            turned = [rotated(cameras.pose[:, :, axis], move[:, :3]) for axis in range(3)]
+            return replace(cameras, pose=torch.stack([*turned, cameras.pose[:, :, 3] + self.reach * move[:, 3:]], -1))
+
+    def going_on(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...]) -> "Poses":
+        """Poses that start as these are now, and learn from other views."""
+        found = Poses(centres, held, reach=self.reach, pace=self.pace)
+        with torch.no_grad():
+            found.known.copy_(self.moves())
+        return found
+
+
+def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+    """Vectors turned by rotation vectors (Rodrigues), differentiable at 0 too."""
+    square = turn.square().sum(-1, keepdim=True)
+    angle = (square + _TINY).sqrt()
+    across = torch.linalg.cross(turn, x)
+    # (1 - cos a) / a^2 by the half angle: 1 - cos would cancel.
+    half = torch.sin(angle / 2) / (angle / 2)
+    moved: Tensor = x + torch.sin(angle) / angle * across + 0.5 * half.square() * torch.linalg.cross(turn, across)
+    return moved
+
+
+def moving(rays: Rays) -> Rays:
+    """Rays whose origin and direction alone lead gradients: samples are placed, and looks shaded, as if poses were fixed."""
+    return Rays(rays.origin, rays.direction, rays.view.detach(), rays.near.detach(), rays.far.detach())
+
+
+def refined(poses: Poses | None, cameras: Cameras) -> Cameras:
+    """The cameras as a model has them."""
+    return cameras if poses is None else poses.refined(cameras)
+
+
+def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
+    """An orthonormal basis, G <= 7, of the moves that shift, turn or scale all cameras as one."""
+    place = centres - centres.mean(0) if len(centres) else centres
+    none, axes = torch.zeros_like(place), torch.eye(3, dtype=place.dtype)
+    columns = [torch.cat([none, axis.expand_as(place)], -1) for axis in axes]
+    columns += [torch.cat([axis.expand_as(place), torch.linalg.cross(axis.expand_as(place), place)], -1) for axis in axes]
+    columns.append(torch.cat([none, place], -1))
+    matrix = torch.stack([column.reshape(-1) for column in columns], -1)
+    if not matrix.numel():
+        return matrix
+    basis, size, _ = torch.linalg.svd(matrix, full_matrices=False)
+    # One view alone can be put anywhere; views in one place cannot be told to scale.
+    found: Tensor = basis[:, size > 1e-9 * size[0]]
+    return found
