@@ -6,14 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UsageError
+from .beside import VIEW, linger, open_view, take_view
 from .blocks import show_plan, train_blocks
-from .parsing import load_method, methods, parse
+from .parsing import LIST_FLAGS, load_method, methods, parse
 
 if TYPE_CHECKING:
     from ..config import TrainConfig
+    from ..engine.model import Model
     from ..engine.prepare import Prepared
     from ..engine.run import Run
     from ..engine.trainer import Report
+    from ..viewer.aside import Aside
 
 __all__ = ["EventLog", "default_output", "run", "train_scene"]
 
@@ -33,13 +36,22 @@ def run(args: list[str]) -> int:
     source = Path(args[0])
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
-    flags = [arg for arg in args[1:] if arg != PLAN]
-    about = f"Train a scene with {method}; {PLAN} alone shows its blocks and what they will cost, and runs nothing."
+    rest, place = take_view(args[1:])
+    flags = [arg for arg in rest if arg != PLAN]
+    if LIST_FLAGS in flags:
+        print(f"{PLAN}\n{VIEW}")
+    about = (
+        f"Train a scene with {method}. {PLAN} alone shows its blocks and what they will cost, and runs nothing;\n"
+        f"{VIEW} [[HOST:]PORT] shows training live in the browser, at http://127.0.0.1:8080 if nothing is said."
+    )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
-    if len(flags) < len(args) - 1:
+    if len(flags) < len(rest):
         show_plan(config, method, config.output or default_output(config, method))
-    else:
+    elif place is None:
         train_scene(config, method)
+    else:
+        with open_view(place) as view:
+            train_scene(config, method, view=view)
     return 0
 
 
@@ -48,14 +60,17 @@ def default_output(config: "TrainConfig", method: str) -> Path:
     return Path("runs") / f"{config.data.resolve().name or 'scene'}-{method}"
 
 
-def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> Path:
+def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False, view: "Aside | None" = None) -> Path:
     """Train to the end and return the run folder. An existing run there is resumed if its config fits.
+
+    `view` shows how it goes; where there is a terminal, and somebody looks at the end, it stays until they leave.
 
     Raises DataError where another process is training there.
     """
     from ..engine import prepare, style_pass, trainer
     from ..engine.lay_out import plan_scene
     from ..engine.lock import held
+    from ..engine.model import build_model
     from ..engine.run import Run
     from ..style.scene import to_tensors
     from .progress import Display
@@ -66,6 +81,8 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
     folder = Run(output)
     with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
+        if view is not None:
+            display.say(f"live at {view.address}")
         _check_same(folder, config)
         if config.blocks.cuts:
             scene, plan = plan_scene(config)
@@ -85,10 +102,20 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
         def report(event: "Report") -> None:
             display.training(event)
             log(event)
+            if view is not None:
+                view(event)
+
+        def train(model: "Model | None") -> "Model":
+            return trainer.train(config, prepared, folder, report, spent=spent, model=model)
 
         spent = time.perf_counter() - start
         folder.log({"part": "preparing", "seconds": round(spent, 3)})
-        model = config.executor.build().map(lambda block: trainer.train(config, prepared, folder, report, spent=spent), [0])[0]
+        if view is None:
+            model = config.executor.build().map(train, [None])[0]
+        else:  # here, where its parameters can be looked at
+            model = build_model(config, prepared.facts).to(prepare.device_of(config.device))
+            view.begin(output, model, config.device)
+            model = train(model)
         trained = time.perf_counter()
         folder.log({"part": "training", "seconds": round(trained - start - spent, 3)})
         display.say("measuring the scene's own style")
@@ -96,6 +123,8 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False) -> P
         folder.save_tensors("style", to_tensors(style))
         folder.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
         display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
+    if view is not None:
+        linger(view, display)
     return output
 
 

@@ -33,6 +33,7 @@ __all__ = [
     "apply_style",
     "dress",
     "encode_photograph",
+    "encoders_of",
     "mixed",
     "open_encoders",
     "restyle",
@@ -73,7 +74,12 @@ class Styled(NamedTuple):
 @torch.inference_mode()
 def open_encoders(trained: Trained) -> Encoders:
     """The encoders that a scene was trained with. Raises WeightsError where those at hand are others."""
-    scene, basis = load_style(trained.run)
+    return encoders_of(trained, *load_style(trained.run))
+
+
+@torch.inference_mode()
+def encoders_of(trained: Trained, scene: SceneStyle, basis: Basis | None) -> Encoders:
+    """The same for a style and a basis that are at hand."""
     config, facts = trained.config, trained.known.facts
     content = config.content.encoder.build()
     semantic = config.semantic.encoder.build() if config.semantic.encoder is not None and basis is not None else None

@@ -63,6 +63,12 @@ class Desk(Generic[Request]):
             self._spare.append(work)
             self._change.notify()
 
+    @property
+    def idle(self) -> bool:
+        """Nobody waits for anything; spare work does not count."""
+        with self._change:
+            return not (self._fresh or self._active or self._errands)
+
     def close(self, timeout: float = 5.0) -> None:
         """Stop after the step at hand; work that is left is dropped."""
         with self._change:

@@ -86,13 +86,15 @@ class Sight:
             self._show(client, Frame(compose(layers, glance.shown), layers, glance.eye, True, time.perf_counter() - start))
             return
         styled = self._studio.styled(glance.shown.look)
+        # Encoders need not be opened, nor a style be known, to show the scene as it is.
+        scene = self._studio.encoders.scene if glance.shown.of_regions else None
         sizes = rungs(fitted(glance.eye.aspect, glance.pixels))
         kept = [size for size in sizes if size in memory.parts]
         first = max(self._fresh.first(sizes), self._again.first(kept) if kept else 0)
         for size in sizes[first:]:
             begun = time.perf_counter()
             again = size in memory.parts
-            painter = Painter(self._trained.model.decoder, self._studio.encoders.scene, styled, glance.shown, size)
+            painter = Painter(self._trained.model.decoder, scene, styled, glance.shown, size)
             parts: list[Part] = []
             for part in memory.parts[size] if again else self._render(glance.eye, size):
                 yield from painter.paint([part])

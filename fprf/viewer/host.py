@@ -13,6 +13,8 @@ from .gate import Answer, Gate, Request
 
 if TYPE_CHECKING:
     from ..engine.loading import Trained
+    from .session import Session
+    from .studio import Opener
 
 __all__ = ["Host"]
 
@@ -25,11 +27,13 @@ _ANYWHERE = ("0.0.0.0", "::")  # nosec B104  # recognised, never the default
 class Host:
     """Use as a context manager. Raises UsageError where the port cannot be had."""
 
-    def __init__(self, access: Access, port: int) -> None:
-        # viser takes a while to import and needs nothing of ours.
-        threading.Thread(target=_early, daemon=True).start()
+    def __init__(self, access: Access, port: int, *, eager: bool = True) -> None:
+        if eager:  # viser takes a while to import and needs nothing of ours
+            threading.Thread(target=_early, daemon=True).start()
+        self.visited = threading.Event()
+        self._session: Session | None = None
         self._ends: list[Callable[[], None]] = []
-        self._gate = Gate(access, port, {("GET", "/"): _starting}, largest=20 << 20)
+        self._gate = Gate(access, port, {("GET", "/"): self._starting}, largest=20 << 20)
         self._gate.open()
         self._ends.append(self._gate.close)
 
@@ -54,8 +58,22 @@ class Host:
         """Whether other machines can come."""
         return not is_loopback(self._gate.access.host)
 
-    def open(self, load: "Callable[[], Trained]", references: Sequence[Path], pixels: int) -> None:
-        """Load the scene and let clients in. Raises what `load` raises, and DataError for an unreadable photograph."""
+    async def _starting(self, request: Request) -> Answer:
+        self.visited.set()
+        return Answer(200, "text/html; charset=utf-8", _STARTING)
+
+    def say(self, text: str) -> None:
+        """A line for all pages."""
+        if self._session is not None:
+            self._session.say(text)
+
+    def open(
+        self, load: "Callable[[], Trained]", references: Sequence[Path], pixels: int, opened: "Opener | None" = None
+    ) -> "Session":
+        """Load the scene and let clients in; `opened` brings photographs into its terms.
+
+        Raises what `load` raises, and DataError for an unreadable photograph.
+        """
         trained = load()
         from .page import Page
         from .server import Server, built_index, check_bytes
@@ -63,7 +81,7 @@ class Host:
         from .state import Landing, State
 
         landing: Landing = "in the mix" if len(references) > 1 else "alone"
-        session = Session(trained, State(pixels=pixels, landing=landing))
+        session = Session(trained, State(pixels=pixels, landing=landing), opened)
         session.__enter__()
         self._ends.append(session.close)
         page = Page(session, built_index(trained.known.name))
@@ -72,13 +90,12 @@ class Host:
         self._gate.lead(page.routes, server.inner, check_bytes)
         for path in references:
             session.drop(path.read_bytes(), path.name)
-        session.warm()
+        if opened is None:
+            session.warm()
+        self._session = session
+        return session
 
 
 def _early() -> None:
     with contextlib.suppress(ImportError):  # told when it is needed
         importlib.import_module("viser")
-
-
-async def _starting(request: Request) -> Answer:
-    return Answer(200, "text/html; charset=utf-8", _STARTING)

@@ -4,7 +4,7 @@ Looks never change and can be compared and hashed: equal looks are the same styl
 lie at the end of a fade. `style_of` says a look in the terms of `style.json`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
@@ -15,7 +15,7 @@ from ..plugins.stylizers.config import RegionToneConfig
 from ..style.config import StyleConfig
 from ..style.dictionary import Reference
 
-__all__ = ["Card", "Look", "Order", "Verb", "only", "ordered", "settled", "style_of", "weighed"]
+__all__ = ["Card", "Look", "Order", "Verb", "moved", "only", "ordered", "settled", "style_of", "weighed"]
 
 Verb: TypeAlias = Literal["pin", "forbid", "keep"]
 
@@ -112,6 +112,13 @@ def settled(look: Look) -> Look:
     if look.at == 1 or start.plain:
         return replace(end, strength=end.strength * look.at)
     return replace(start, strength=start.strength * (1 - look.at)) if end.plain else look
+
+
+def moved(look: Look, regions: Sequence[int]) -> Look:
+    """The look with its wishes about regions by their new numbers."""
+    orders = frozenset(order._replace(region=regions[order.region]) for order in look.orders)
+    towards = None if look.towards is None else moved(look.towards, regions)
+    return replace(look, orders=orders, towards=towards)
 
 
 def style_of(look: Look, stylizer: RegionToneConfig | None = None) -> StyleConfig:

@@ -140,6 +140,20 @@
         make("button", { textContent: "free", onclick: () => tell("/fprf/region", { verb: "free" }) })));
   };
 
+  // Training, where it goes on
+  const training = make("div", { id: "fprf-training", className: "fprf" }, make("b"), make("span"), make("i"));
+  const fillTraining = (now) => {
+    training.classList.toggle("on", now !== null);
+    if (!now) return;
+    const over = now.share >= 1;
+    const left = now.seconds_left === null ? "" : ` · ${Math.floor(now.seconds_left / 60)}:${String(Math.round(now.seconds_left) % 60).padStart(2, "0")} left`;
+    const quality = now.psnr === null ? "" : ` · ${now.psnr.toFixed(1)} dB`;
+    training.classList.toggle("over", over);
+    training.children[0].textContent = over ? "trained" : "training";
+    training.children[1].textContent = over ? `${now.step} steps` : `step ${now.step}${quality}${left}`;
+    training.children[2].style.width = `${100 * now.share}%`;
+  };
+
   // What has changed
   let version = -1;
   let film = false;
@@ -153,6 +167,7 @@
         version = state.version;
         fillShelf(state.shelf);
         fillRegion(state.picked, state.shelf);
+        fillTraining(state.training);
         wipe.classList.toggle("on", state.wipe !== null);
         if (state.wipe !== null && !held) place(state.wipe);
         if (state.film.ready && !film && version > 0) {
@@ -167,7 +182,7 @@
   };
   const begin = () => {
     shelf.append(add);
-    document.body.append(veil, shelf, wipe, region, told, picker);
+    document.body.append(veil, shelf, wipe, region, training, told, picker);
     follow();
   };
   if (document.body) begin(); else window.addEventListener("DOMContentLoaded", begin);

@@ -9,7 +9,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html import escape
 from importlib.resources import files
 from typing import Any
@@ -198,6 +198,7 @@ def described(state: State) -> dict[str, Any]:
             ],
         },
         "map": state.map,
+        "training": None if state.training is None else asdict(state.training),
         "film": {"done": state.film.done, "total": state.film.total, "ready": state.film.path is not None},
     }
 

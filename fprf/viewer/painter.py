@@ -45,6 +45,11 @@ class Shown(NamedTuple):
     """A region to be made out; the others are dimmed."""
 
     @property
+    def of_regions(self) -> bool:
+        """Regions of the scene are shown."""
+        return self.map == "regions" or self.region is not None
+
+    @property
     def layers(self) -> frozenset[str]:
         """What must be painted for it."""
         wanted = {"look"}
@@ -73,7 +78,8 @@ class Painter:
     """Paints chunks of a view. `styled` is the look on the scene, None for the scene as it is."""
 
     decoder: Decoder
-    scene: SceneStyle
+    scene: SceneStyle | None
+    """May be None where no region is shown."""
     styled: Styled | None
     shown: Shown
     size: tuple[int, int]
@@ -112,8 +118,7 @@ class Painter:
         if self.shown.map == "regions":
             self._add("regions", self._regions(part))
         if self.shown.region is not None:
-            belongs = self._belongs(part, torch.eye(len(self.scene.share))[:, self.shown.region, None])
-            self._share.append(belongs[:, 0].float().numpy())
+            self._share.append(self._belongs(part)[:, self.shown.region].float().numpy())
         self._depth.append(part.depth)
         self._opacity.append(part.opacity)
 
@@ -127,14 +132,15 @@ class Painter:
         return _row(match_image(attention[None], codes.reference, codes.names, part.opacity[None], kept.clamp(0, 1)[None]))
 
     def _regions(self, part: Part) -> Picture:
-        share = self._belongs(part, torch.eye(len(self.scene.share)))
+        share = self._belongs(part)
         most, region = share.max(-1)
         light = (_UNSURE + (1 - _UNSURE) * most) * part.opacity
         return _row(to_uint8((palette(share.shape[1])[region] * light[:, None])[None]))
 
-    def _belongs(self, part: Part, values: Tensor) -> Tensor:
-        """Numbers of regions at pixels."""
-        weight = RegionWeight(self.scene, values).to(part.content.device)
+    def _belongs(self, part: Part) -> Tensor:
+        """How much each pixel belongs to each region."""
+        assert self.scene is not None
+        weight = RegionWeight(self.scene, torch.eye(len(self.scene.share))).to(part.content.device)
         semantic = part.content[:, :0] if part.semantic is None else part.semantic
         return part.mean(weight(semantic))
 

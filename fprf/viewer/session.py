@@ -22,9 +22,10 @@ from .eyes import Frame, Glance, Sight
 from .film import FilmPlan, frames_of_film, lay_film, new_folder, taken
 from .intake import Intake, shown_name
 from .looks import Card, only
+from .moment import likest
 from .stage import Eye, Stage, stage_of
-from .state import Film, State, dropped
-from .studio import Studio
+from .state import Film, State, dropped, renumbered
+from .studio import Opener, Studio
 
 __all__ = ["Face", "Session"]
 
@@ -48,10 +49,10 @@ class Face(ABC):
 class Session:
     """Use as a context manager, which ends its threads and processes."""
 
-    def __init__(self, trained: Trained, state: State) -> None:
+    def __init__(self, trained: Trained, state: State, opened: Opener | None = None) -> None:
         self.trained = trained
         self.stage: Stage = stage_of(trained.known.cameras)
-        self.studio = Studio(trained)
+        self.studio = Studio(trained, opened)
         self.intake = Intake()
         self.state = state
         self._face: Face | None = None
@@ -112,6 +113,36 @@ class Session:
         self._desk.leave(client)
         self._desk.do(("forget", client), lambda: self._sight.forget(client))
 
+    @property
+    def watched(self) -> bool:
+        """Whether anybody is here."""
+        return bool(self._eyes)
+
+    @property
+    def idle(self) -> bool:
+        """Everybody has the sharpest picture."""
+        return self._desk.idle
+
+    def renew(self, apply: Callable[[], object], opened: Opener | None = None) -> None:
+        """Change the model's numbers, between two steps of the desk; all that was made of the old ones is made again."""
+
+        def now() -> None:
+            apply()
+            self._sight.forget_all()
+            before = self.studio.renew(opened)
+            if before is not None and self.state.needs_regions:
+                regions = likest(before, self.studio.encoders.scene).tolist()
+                self.change(lambda state: renumbered(state, regions))
+            self._ask_again()
+            if self.state.picked is not None:
+                self.choose(self.state.picked.region)
+
+        self._desk.do("renew", self._told(now, None))
+
+    def say(self, text: str) -> None:
+        """A line for all to read."""
+        self._say(text)
+
     def change(self, to: Callable[[State], State], client: Hashable | None = None) -> bool:
         """Replace the state; all clients see it. What cannot be is said to the client, and nothing changes."""
         try:
@@ -119,8 +150,7 @@ class Session:
                 before, self.state = self.state, to(self.state)
                 now = self.state
                 if (before.shown, before.pixels) != (now.shown, now.pixels):
-                    for each, eye in self._eyes.items():
-                        self._desk.ask(each, Glance(eye, now.shown, now.pixels))
+                    self._ask_again()
         except FprfError as error:
             self._say(str(error), client)
             return False
@@ -224,6 +254,12 @@ class Session:
                 self._say(str(error), client)
 
         return told
+
+    def _ask_again(self) -> None:
+        """Pictures for everybody."""
+        with self._lock:
+            for client, eye in self._eyes.items():
+                self._desk.ask(client, Glance(eye, self.state.shown, self.state.pixels))
 
     def _show(self, client: Hashable, frame: Frame) -> None:
         if self._face is not None and client is not None:  # a rehearsal has no one to show itself to

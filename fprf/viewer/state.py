@@ -1,5 +1,6 @@
 """All that the page shows and its controls hold, as one value that is replaced and never changed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -7,11 +8,12 @@ from typing import Literal, TypeAlias
 from ..checks import between
 from ..errors import UsageError
 from .film import Key
-from .looks import Card, Look, only, weighed
+from .looks import Card, Look, moved, only, weighed
 from .painter import MAPS, Map, Shown
 from .studio import Picked
+from .training import Training
 
-__all__ = ["LEAST", "MOST", "SHELF", "Film", "Landing", "State", "dropped", "kept", "removed"]
+__all__ = ["LEAST", "MOST", "SHELF", "Film", "Landing", "State", "dropped", "kept", "removed", "renumbered"]
 
 Landing: TypeAlias = Literal["alone", "in the mix"]
 """What becomes of a photograph that is dropped: it is the style, or joins the others."""
@@ -57,6 +59,8 @@ class State:
     film: Film = Film()
     pixels: int = 640
     """Longest side of the sharpest picture."""
+    training: Training | None = None
+    """How it goes, where the scene is being trained."""
 
     def __post_init__(self) -> None:
         if self.map not in MAPS:
@@ -75,16 +79,25 @@ class State:
         return Shown(self.look, self.map, self.cover, self.wipe, region)
 
     @property
+    def needs_regions(self) -> bool:
+        """Whether some region is spoken of by its number."""
+        return self.picked is not None or any(look.orders for look in self._looks)
+
+    @property
     def in_use(self) -> frozenset[Card]:
         """Photographs that some look needs."""
-        looks = [self.look, *(look for _, look in self.saved), *(key.look for key in self.keys)]
-        looks += [look.towards for look in looks if look.towards is not None]
-        return frozenset(card for look in looks for card, _ in look.mix)
+        return frozenset(card for look in self._looks for card, _ in look.mix)
 
     @property
     def all_cards(self) -> frozenset[Card]:
         """Every photograph that can still be asked for."""
         return self.in_use | frozenset(self.shelf)
+
+    @property
+    def _looks(self) -> list[Look]:
+        """All that somebody may return to."""
+        looks = [self.look, *(look for _, look in self.saved), *(key.look for key in self.keys)]
+        return looks + [look.towards for look in looks if look.towards is not None]
 
 
 def dropped(state: State, card: Card) -> State:
@@ -120,3 +133,11 @@ def kept(state: State, name: str) -> State:
     if len(others) >= _KEYS:
         raise UsageError(f"keep look: at most {_KEYS} are kept; remove one first")
     return replace(state, saved=(*others, (name, look)))
+
+
+def renumbered(state: State, regions: Sequence[int]) -> State:
+    """With every region by its new number: regions were found anew."""
+    picked = None if state.picked is None else state.picked._replace(region=regions[state.picked.region])
+    saved = tuple((name, moved(look, regions)) for name, look in state.saved)
+    keys = tuple(key._replace(look=moved(key.look, regions)) for key in state.keys)
+    return replace(state, look=moved(state.look, regions), picked=picked, saved=saved, keys=keys)

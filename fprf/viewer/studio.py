@@ -5,10 +5,10 @@ stylizer alone.
 """
 
 from collections import OrderedDict
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
@@ -24,11 +24,14 @@ from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.regional import RegionWeight
+from ..style.scene import SceneStyle
 from ..style.wishes import labels
 from .looks import Card, Look, settled, style_of
 
-__all__ = ["Picked", "Studio", "joined", "names_of"]
+__all__ = ["Opener", "Picked", "Studio", "joined", "names_of"]
 
+Opener: TypeAlias = Callable[[Trained, Encoders | None], Encoders]
+"""Opens the encoders of a scene with its style; those that were opened before may be kept."""
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
@@ -51,9 +54,11 @@ class Picked(NamedTuple):
 class Studio:
     """Encoders are opened when they are first needed, which takes a fraction of a second."""
 
-    def __init__(self, trained: Trained) -> None:
+    def __init__(self, trained: Trained, opened: Opener | None = None) -> None:
         self.trained = trained
+        self._opened: Opener = opened or (lambda trained, before: open_encoders(trained))
         self._encoders: Encoders | None = None
+        self._stale = False
         self._cards = 0
         self._dictionaries: OrderedDict[tuple[Card, int, float], StyleDictionary] = OrderedDict()
         self._styles: OrderedDict[Look, Styled] = OrderedDict()
@@ -61,9 +66,17 @@ class Studio:
     @property
     def encoders(self) -> Encoders:
         """Those of the scene. Raises WeightsError where those at hand are others."""
-        if self._encoders is None:
-            self._encoders = open_encoders(self.trained)
+        if self._encoders is None or self._stale:
+            self._encoders = self._opened(self.trained, self._encoders)
+            self._stale = False
         return self._encoders
+
+    def renew(self, opened: Opener | None = None) -> SceneStyle | None:
+        """The model has changed, and with it the scene's style: the one from before, if there was one."""
+        self._opened = opened or self._opened
+        self._stale = True
+        self._styles.clear()
+        return None if self._encoders is None else self._encoders.scene
 
     @property
     def regions(self) -> int:

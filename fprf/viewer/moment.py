@@ -1,0 +1,54 @@
+"""A run in the middle of its training: its model without a checkpoint, and its style before training has measured it."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..datamanagers.basis import Basis
+from ..engine.loading import Trained
+from ..engine.model import build_model
+from ..engine.prepare import device_of
+from ..engine.restyle import Encoders, encoders_of
+from ..engine.run import Run
+from ..engine.style_pass import measure_style
+from ..style.matching import unit
+from ..style.scene import SceneStyle
+
+__all__ = ["begun", "encoders_now", "likest"]
+
+_RAYS = 2**14
+"""Rays that the style of a moment is measured with: 0.2 s instead of seconds, and it changes soon."""
+
+
+def begun(root: Path, device: str) -> Trained:
+    """A run whose config.json and scene.json are written, with its model at its seeded start. Raises CheckpointError."""
+    run = Run(root)
+    config, method = run.load_config()
+    known = run.load_known()
+    model = build_model(config, known.facts).requires_grad_(False)
+    return Trained(run, config, method, known, model.to(device_of(device)).eval(), 0, 0.0)
+
+
+def encoders_now(trained: Trained, before: Encoders | None) -> Encoders:
+    """The encoders with the scene's style as it is now; those that were opened `before` are kept.
+
+    Raises DataError where the scene renders empty still, NumericsError where its features are not finite.
+    """
+    config, known = trained.config, trained.known
+    few = replace(config, statistics=replace(config.statistics, rays=min(_RAYS, config.statistics.rays)))
+    scene = measure_style(few, trained.model, known.cameras, torch.tensor(known.train))
+    if before is not None:
+        return before._replace(scene=scene)
+    basis = None if scene.keys.shape[1] == 0 else Basis.from_tensors(trained.run.load_tensors("basis"))
+    return encoders_of(trained, scene, basis)
+
+
+def likest(before: SceneStyle, now: SceneStyle) -> Annotated[Tensor, "K"]:
+    """For each region from before the one that is most like it now: regions are found anew, in any order."""
+    if before.keys.shape[1] == 0:
+        return torch.zeros(len(before.keys), dtype=torch.int64)
+    scores = unit(before.keys, before.semantic_mean) @ unit(now.keys, now.semantic_mean).T
+    return scores.argmax(-1)
