@@ -1,0 +1,91 @@
+"""Held-out views whose poses are not known exactly: six numbers a view are fitted to its own image before it is judged.
+
+Where training refines poses, the scene comes to lie where the training views together put it; a view that was held out stays
+where the capture says, a little off. Fitting its pose (BARF, section 4) says what the scene is worth, not what the pose is: the
+scene is not touched, and six numbers cannot draw a picture. A figure with fitted poses says so.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..datamanagers.images import load_image
+from ..datamanagers.scene import Scene
+from ..engine.loading import Trained
+from ..engine.model import background_of
+from ..engine.poses import moving, rotated
+from ..engine.prepare import reach_of
+from ..rendering.cameras import Cameras
+from ..rendering.pixel_rays import PixelRays
+from ..rendering.renderer import render_rays
+from ..types import Rays, Want
+
+__all__ = ["AlignmentConfig", "align", "align_view"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignmentConfig:
+    """How a pose is fitted."""
+
+    steps: int = 120
+    """Steps of Adam."""
+    rays: int = 512
+    """Pixels of a step."""
+    rate: float = 2e-3
+    """Radians, and distances that views commonly see, of the first step; it falls along a cosine to nothing."""
+
+
+def align(
+    trained: Trained,
+    scene: Scene,
+    views: Sequence[int],
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    config: AlignmentConfig | None = None,
+) -> tuple[Trained, dict[int, Annotated[Tensor, "6"]]]:
+    """The run with fitted poses of some views, and how far each was moved: turn (radians) and shift (world units)."""
+    cameras, pose, moves = trained.known.cameras, trained.known.cameras.pose.clone(), {}
+    facts = trained.known.facts
+    reach = facts.reach if facts.centres else reach_of(scene, facts.space)
+    for done, view in enumerate(views):
+        progress(done, len(views), "fitting poses")
+        width, height = (int(v) for v in cameras.size[view])
+        truth = torch.from_numpy(load_image(scene.paths[view], (width, height), facts.background)).float() / 255
+        moves[view] = align_view(trained, cameras, view, truth, reach, config or AlignmentConfig())
+        turned = [rotated(pose[view, :, axis][None], moves[view][None, :3])[0] for axis in range(3)]
+        pose[view] = torch.stack([*turned, pose[view, :, 3] + moves[view][3:]], -1)
+    progress(len(views), len(views), "fitting poses")
+    return trained._replace(known=replace(trained.known, cameras=replace(cameras, pose=pose))), moves
+
+
+def align_view(
+    trained: Trained, cameras: Cameras, view: int, truth: Annotated[Tensor, "H W 3"], reach: float, config: AlignmentConfig
+) -> Annotated[Tensor, "6"]:
+    """Turn and shift (world units), float64, that bring the render of a view nearest to its image."""
+    model, facts = trained.model, trained.known.facts
+    device = next(model.parameters()).device
+    through, background = PixelRays(cameras.select(torch.tensor([view]))), background_of(facts, device)
+    tones = model.tones
+    factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()
+    pixels, generator = truth.reshape(-1, 3), torch.Generator().manual_seed(view)
+    move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([move], lr=config.rate, betas=(0.9, 0.95))
+    for step in range(config.steps):
+        optimizer.param_groups[0]["lr"] = 0.5 * config.rate * (1 + math.cos(math.pi * step / config.steps))
+        at = torch.randint(len(pixels), (config.rays,), generator=generator)
+        pixel = torch.stack([at % truth.shape[1], at // truth.shape[1]], -1) + 0.5
+        origin, direction = through(torch.zeros_like(at), pixel)
+        turned = rotated(direction, move[:3].expand_as(direction))
+        rays = moving(model.space.rays(origin + reach * move[3:], turned))
+        rays = Rays(*(x.to(device) for x in rays))
+        rendered = render_rays(rays, model.parts, want=Want.COLOUR, budget=trained.config.render.budget, background=background)
+        assert rendered.rgb is not None
+        loss = (rendered.rgb.cpu() * factor - pixels[at]).square().mean()
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        if move.grad is not None and bool(move.grad.isfinite().all()):
+            optimizer.step()
+    return move.detach() * torch.tensor([1.0, 1, 1, reach, reach, reach], dtype=torch.float64)
