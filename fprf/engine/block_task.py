@@ -29,6 +29,10 @@ from .trainer import Report, train
 __all__ = ["BlockTask", "train_block"]
 
 
+WARM_UP = 20
+"""Most steps of warm-up of a block: what it inherits is no random start, only Adam's averages are new."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class BlockTask:
     """What a worker is told; the rest lies in the run folder. Small, so that it can be sent to other machines."""
@@ -67,7 +71,11 @@ def train_block(task: BlockTask, report: Callable[[Report], None]) -> bool:
     manager = _manager(run, config, facts, own, folder)
     built = _built(root, config, facts, boxes, task.block, own.train)
     block_run = Run(folder)
-    train(config, Prepared(own, manager, facts, None), block_run, report, model=built.model)
+    prepared, lead = Prepared(own, manager, facts, None), 0
+    if task.block != SURROUNDINGS:
+        lead = load_finished(folder_of(root, SURROUNDINGS), verify=False).step
+        config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
+    train(config, prepared, block_run, report, model=built.model, lead=lead)
     step, seconds = reached(block_run.checkpoints)
     save_finished(folder, built, asked=asked, step=step, seconds=seconds)
     return True

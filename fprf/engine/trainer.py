@@ -71,10 +71,12 @@ def train(
     *,
     spent: float = 0.0,
     model: Model | None = None,
+    lead: int = 0,
 ) -> Model:
     """Train, or go on from the newest checkpoint, until the steps or the minutes are over; `spent` seconds count as used.
 
-    `model` is one at its start, where it is not simply that of the config: a block in its surroundings. An interrupt saves
+    `model` is one at its start, where it is not simply that of the config: a block in its surroundings, which was trained for
+    `lead` steps before, as far as its sampler is concerned. An interrupt saves
     first, then goes on upwards. Steps that are not finite change nothing and are logged; several in a row lead back to the
     last checkpoint. Raises NumericsError where there is none, or where that was of no use.
     """
@@ -87,7 +89,7 @@ def train(
         run.log({"damaged": line})
     if saved is not None:
         checkpoint.restore(saved, model, optimizer)
-    loop = Loop(config, prepared, model, optimizer, device)
+    loop = Loop(config, prepared, model, optimizer, device, lead)
     step, before = (saved.step, saved.seconds) if saved is not None else (0, spent)
     start = last_saved = last_report = time.perf_counter()
     clock, again = before, -1
@@ -144,8 +146,15 @@ class Loop:
     """
 
     def __init__(
-        self, config: TrainConfig, prepared: Prepared, model: Model, optimizer: torch.optim.Optimizer, device: torch.device
+        self,
+        config: TrainConfig,
+        prepared: Prepared,
+        model: Model,
+        optimizer: torch.optim.Optimizer,
+        device: torch.device,
+        lead: int = 0,
     ) -> None:
+        self.lead = lead
         self.config, self.model, self.optimizer, self.device = config, model, optimizer, device
         self.facts: Facts = prepared.facts
         self.manager = prepared.manager
@@ -172,7 +181,7 @@ class Loop:
             want=wanted(self.config.loss, batch),
             budget=self.config.render.train_budget,
             background=self.background,
-            step=step,
+            step=step + self.lead,
             generator=step_generator(self.config.seed, step, self.device),
             semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
             semantic_samples=self.config.semantic.samples,
