@@ -87,6 +87,8 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False, view
         if config.blocks.cuts:
             scene, plan = plan_scene(config)
             if plan.cut:
+                if view is not None:
+                    raise UsageError(f"{VIEW}: scenes in blocks are not shown while they are trained; leave it out")
                 train_blocks(config, method, folder, scene, plan, display, start)
                 display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
                 return output

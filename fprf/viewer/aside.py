@@ -27,6 +27,7 @@ __all__ = ["Aside", "Place"]
 
 _STARTING = 60.0
 """Seconds within which the viewer must say where it listens."""
+_LOG = "log"
 _SHARE = 0.05
 """Share of the time that copying parameters may take."""
 
@@ -51,14 +52,15 @@ class Aside:
         self._ended = threading.Event()
         self._model: Model | None = None
         self._next = 0.0
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=(Path(self._folder.name) / "log").open("w"),
-            text=True,
-            start_new_session=True,  # an interrupt at the terminal is training's
-        )
+        with (Path(self._folder.name) / _LOG).open("w") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                start_new_session=True,  # an interrupt at the terminal is training's
+            )
         self._put({"host": place.host, "port": place.port, "strict": place.strict})
         self._writer = threading.Thread(target=self._write, name="fprf-aside", daemon=True)
         self._writer.start()
@@ -85,7 +87,7 @@ class Aside:
         """Why the viewer has ended before its time, in one line; None where it has not."""
         if not self._ended.is_set():
             return None
-        lines = (Path(self._folder.name) / "log").read_text(errors="replace").split("\n")
+        lines = (Path(self._folder.name) / _LOG).read_text(errors="replace").split("\n")
         return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "it said nothing")
 
     def begin(self, root: Path, model: "Model", device: str) -> None:

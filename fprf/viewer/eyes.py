@@ -70,8 +70,9 @@ class Sight:
         """A client has gone."""
         self._memory.pop(client, None)
 
-    def forget_all(self) -> None:
-        """The model has changed."""
+    def renew(self, trained: Trained) -> None:
+        """The scene has changed."""
+        self._trained = trained
         self._memory.clear()
 
     def look(self, client: Hashable, glance: Glance) -> Iterator[None]:

@@ -20,7 +20,6 @@ from .host import Host
 from .training import Training
 
 if TYPE_CHECKING:
-    from ..engine.loading import Trained
     from .session import Session
 
 __all__ = ["Follower", "main"]
@@ -85,18 +84,17 @@ class Follower:
         """New parameters: the first ones open the page."""
         from safetensors.torch import load_file
 
+        from .moment import begun, encoders_now, filled
+
         tensors = load_file(path)
         self._wanted, self._last_new = False, time.monotonic()
-        if self._session is not None:
-            session = self._session
-            session.renew(lambda: session.trained.model.load_state_dict(tensors))
+        session = self._session
+        if session is not None:
+            session.renew(lambda: filled(session.trained, tensors))
             return
         assert self._run is not None
-        from .moment import begun, encoders_now
-
         trained = begun(*self._run)
-        trained.model.load_state_dict(tensors)
-        self._session = self._host.open(lambda: trained, (), 640, encoders_now)
+        self._session = self._host.open(lambda: filled(trained, tensors), (), 640, encoders_now)
         self._say_how(Training())
 
     def _finish(self) -> None:
@@ -106,11 +104,8 @@ class Follower:
         from ..engine.loading import load_run
         from ..engine.restyle import open_encoders
 
-        session = self._session
-        last: Trained = load_run(*self._run)
-        session.renew(
-            lambda: session.trained.model.load_state_dict(last.model.state_dict()), lambda trained, _: open_encoders(trained)
-        )
+        last = load_run(*self._run)
+        self._session.renew(lambda: last, lambda trained, before: open_encoders(trained))
         self._say_how(Training(last.step, 1.0))
 
     def _say_how(self, training: Training) -> None:

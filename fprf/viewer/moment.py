@@ -1,5 +1,6 @@
 """A run in the middle of its training: its model without a checkpoint, and its style before training has measured it."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -14,10 +15,11 @@ from ..engine.prepare import device_of
 from ..engine.restyle import Encoders, encoders_of
 from ..engine.run import Run
 from ..engine.style_pass import measure_style
+from ..errors import CheckpointError
 from ..style.matching import unit
 from ..style.scene import SceneStyle
 
-__all__ = ["begun", "encoders_now", "likest"]
+__all__ = ["begun", "encoders_now", "filled", "likest"]
 
 _RAYS = 2**14
 """Rays that the style of a moment is measured with: 0.2 s instead of seconds, and it changes soon."""
@@ -30,6 +32,15 @@ def begun(root: Path, device: str) -> Trained:
     known = run.load_known()
     model = build_model(config, known.facts).requires_grad_(False)
     return Trained(run, config, method, known, model.to(device_of(device)).eval(), 0, 0.0)
+
+
+def filled(trained: Trained, tensors: Mapping[str, Tensor]) -> Trained:
+    """The run with other numbers in its model. Raises CheckpointError where they are not of this model."""
+    try:
+        trained.model.load_state_dict(dict(tensors))
+    except RuntimeError as error:
+        raise CheckpointError(f"{trained.run.root}: its parameters are not those of its config ({error})") from error
+    return trained
 
 
 def encoders_now(trained: Trained, before: Encoders | None) -> Encoders:

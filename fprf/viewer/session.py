@@ -123,13 +123,13 @@ class Session:
         """Everybody has the sharpest picture."""
         return self._desk.idle
 
-    def renew(self, apply: Callable[[], object], opened: Opener | None = None) -> None:
-        """Change the model's numbers, between two steps of the desk; all that was made of the old ones is made again."""
+    def renew(self, load: Callable[[], Trained], opened: Opener | None = None) -> None:
+        """The scene in another state of its training, between two steps of the desk; all that was made of it is made again."""
 
         def now() -> None:
-            apply()
-            self._sight.forget_all()
-            before = self.studio.renew(opened)
+            self.trained = trained = load()
+            self._sight.renew(trained)
+            before = self.studio.renew(trained, opened)
             if before is not None and self.state.needs_regions:
                 regions = likest(before, self.studio.encoders.scene).tolist()
                 self.change(lambda state: renumbered(state, regions))

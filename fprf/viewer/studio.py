@@ -71,9 +71,9 @@ class Studio:
             self._stale = False
         return self._encoders
 
-    def renew(self, opened: Opener | None = None) -> SceneStyle | None:
-        """The model has changed, and with it the scene's style: the one from before, if there was one."""
-        self._opened = opened or self._opened
+    def renew(self, trained: Trained, opened: Opener | None = None) -> SceneStyle | None:
+        """The scene has changed, and with it its style: the one from before, if there was one."""
+        self.trained, self._opened = trained, opened or self._opened
         self._stale = True
         self._styles.clear()
         return None if self._encoders is None else self._encoders.scene

@@ -108,5 +108,5 @@ def test_work_that_is_dropped_keeps_nothing_half(watched: Watched) -> None:
 def test_a_fast_machine_begins_sharp(watched: Watched) -> None:
     watched.sight._fresh.seconds = 1e-9
     assert len(watched.look(watched.glance())) == 1
-    watched.sight.forget_all()
+    watched.sight.renew(watched.trained)
     assert replace(watched.sight._trained.config.render, chunk=10).chunk == 10

@@ -1,0 +1,76 @@
+import importlib.util
+from pathlib import Path
+
+import pytest
+from stand_in_viewers import DEAD, DEAF, GREEDY, viewer
+from tiny_world import World, flags, parameters
+
+from fprf import cli
+from fprf.commands import train
+from fprf.commands.beside import open_view, take_view
+from fprf.engine import trainer
+from fprf.engine.run import Run
+from fprf.errors import UsageError
+from fprf.viewer.aside import Aside, Place
+
+
+@pytest.mark.parametrize(
+    ("args", "rest", "place"),
+    [
+        (["--steps", "3"], ["--steps", "3"], None),
+        (["--view"], [], Place()),
+        (["--view", "--steps", "3"], ["--steps", "3"], Place()),
+        (["--steps", "3", "--view", "9000", "--seed", "1"], ["--steps", "3", "--seed", "1"], Place("127.0.0.1", 9000, True)),
+        (["--view=0.0.0.0:0"], [], Place("0.0.0.0", 0, True)),
+        (["--view", "[::1]:81"], [], Place("::1", 81, True)),
+        (["--view", ":81"], [], Place("127.0.0.1", 81, True)),
+    ],
+)
+def test_the_flag_is_taken_out_of_the_others(args: list[str], rest: list[str], place: Place | None) -> None:
+    assert take_view(args) == (rest, place)
+
+
+@pytest.mark.parametrize("args", [["--view", "everywhere"], ["--view=70000"], ["--view="], ["--view", "host:"], ["--view=²"]])
+def test_what_is_no_place_is_refused(args: list[str]) -> None:
+    with pytest.raises(UsageError, match="--view"):
+        take_view(args)
+
+
+def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'fprf\[viewer\]'"):
+        open_view(Place())
+
+
+@pytest.mark.parametrize("script", [GREEDY, DEAF, DEAD])
+def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log"
+    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(script, str(log))))
+    monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)  # look after every step
+    assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--view"]) == 0
+    here, there = parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15)
+    assert here.keys() == there.keys() and all(here[name].equal(there[name]) for name in here)
+    assert (tmp_path / "run" / "style.safetensors").read_bytes() == (world.run / "style.safetensors").read_bytes()
+    assert "live at http://here/" in capsys.readouterr().err
+    if script is GREEDY:
+        assert "snapshot" in log.read_text()
+
+
+def test_help_and_completion_know_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train", "fprf-lite", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "--view [[HOST:]PORT]" in text and max(len(line) for line in text.splitlines()) <= 110
+    assert cli.main(["train", "fprf-lite", "--list-flags"]) == 0
+    assert {"--view", "--plan", "--steps"} <= set(capsys.readouterr().out.splitlines())
+
+
+def test_scenes_in_blocks_say_so_before_any_work(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(DEAF)))
+    blocks = ["--blocks", "street", "--blocks.segments", "2"]
+    assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), *blocks, "--view"]) == 2
+    assert "--view: scenes in blocks" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "checkpoints").exists()
