@@ -114,19 +114,27 @@ class _RegionConfig(StylizerConfig):
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     similarity: Literal["cosine", "dot"] = "cosine"
     """Score of a match: cosine of centred features, or the paper's dot product."""
+    whitening: float = 0.5
+    """How far both sides' semantics are whitened before they are scored as cosines, in [0, 1]; 0 = not at all."""
+    recentred: int = 5
+    """How often the references' centre is taken again from the codes that the scene takes; 0 = the mean of all codes."""
     gain: float = 8.0
     """Largest amplification of any channel or direction, at least 1, so that the noise of flat regions stays small."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         positive("stylizer.temperature", self.temperature)
+        between("stylizer.whitening", self.whitening, 0.0, 1.0)
+        at_least("stylizer.recentred", self.recentred, 0)
         at_least("stylizer.gain", self.gain, 1.0)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The two-sided stylizer towards these references, with this kind of maps."""
+        from ...style.alignment import Matching
         from .region import TwoSidedStylizer, plan_regions
 
-        plan = plan_regions(dictionary, scene, self.temperature, self.similarity)
+        matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred)
+        plan = plan_regions(dictionary, scene, matching)
         return TwoSidedStylizer(plan, scene, self._maps(plan, scene))
 
     def _maps(self, plan: RegionPlan, scene: SceneStyle) -> RegionMaps:

@@ -16,8 +16,9 @@ from torch import Tensor, nn
 
 from ...interfaces import Stylizer
 from ...ops import mixture
+from ...style.alignment import Keys, Matching, match_keys
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
-from ...style.matching import Similarity, attention, compared, full_precision, score_spread, share_mean
+from ...style.matching import full_precision
 from ...style.scene import SceneStyle, check_fit, membership, own_style, region_units
 from ...style.statistics import deviation, double
 from ...style.transport import monge
@@ -26,19 +27,17 @@ from ...types import Want
 __all__ = ["ChannelMaps", "MatrixMaps", "RegionMaps", "RegionPlan", "TwoSidedStylizer", "plan_regions", "region_table"]
 
 
-def region_table(
-    scene: SceneStyle, dictionary: StyleDictionary, temperature: float, similarity: Similarity = "cosine"
-) -> Annotated[Tensor, "K T"]:
-    """Share of each style code in each region, float64; rows sum to 1. Temperature is relative.
+def region_table(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
+    """Share of each style code in each region, float64; rows sum to 1.
 
     A region that may not take from all references is matched with the codes of the others as if there were only these.
     """
     if dictionary.allowed is None:
-        return _matched(scene, dictionary, temperature, similarity)
+        return _matched(scene, dictionary, matching)
     table = torch.zeros(len(scene.share), len(dictionary.share), dtype=torch.float64)
     for k, chosen in enumerate(dictionary.allowed):
         part, codes = choose(dictionary, chosen)
-        table[k, codes] = _matched(scene, part, temperature, similarity)[k]
+        table[k, codes] = _matched(scene, part, matching)[k]
     return table
 
 
@@ -58,12 +57,12 @@ class RegionPlan(NamedTuple):
     style: Side
 
 
-def plan_regions(dictionary: StyleDictionary, scene: SceneStyle, temperature: float, similarity: Similarity) -> RegionPlan:
+def plan_regions(dictionary: StyleDictionary, scene: SceneStyle, matching: Matching) -> RegionPlan:
     """Match the regions with the codes. The scene's statistics are blended as the dictionary's are."""
     check_fit(dictionary, scene)
     own = own_style(scene, dictionary.blend)
-    same = _mixed(own, region_table(scene, own, temperature, similarity))
-    table = region_table(scene, dictionary, temperature, similarity)
+    same = _mixed(own, region_table(scene, own, matching))
+    table = region_table(scene, dictionary, matching)
     if len(table) > 1:
         return RegionPlan(table, same, _mixed(dictionary, table))
     # An undivided scene gets the global style: codes taken together, with what lies between them.
@@ -162,15 +161,11 @@ class TwoSidedStylizer(Stylizer):
         return membership(semantic.to(self.units), self.semantic_mean, self.units, self.softness)
 
 
-def _matched(
-    scene: SceneStyle, dictionary: StyleDictionary, temperature: float, similarity: Similarity
-) -> Annotated[Tensor, "K T"]:
+def _matched(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
+    odds = code_odds(dictionary)
     if len(scene.keys) == 1 or scene.keys.shape[1] == 0:
-        return code_odds(dictionary).expand(len(scene.keys), -1)
-    here, there = double(scene.keys), double(dictionary.keys)
-    centres = share_mean(here, double(scene.share)), share_mean(there, code_odds(dictionary))
-    queries, keys = compared(here, there, similarity, queries_centre=centres[0], keys_centre=centres[1])
-    return attention(queries, keys, temperature * score_spread(queries, keys), double(dictionary.weight))
+        return odds.expand(len(scene.keys), -1)
+    return match_keys(Keys(scene.keys, scene.share), Keys(dictionary.keys, odds), matching, dictionary.weight)
 
 
 def _mixed(d: StyleDictionary, table: Tensor) -> Side:

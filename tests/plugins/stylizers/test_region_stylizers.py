@@ -1,5 +1,8 @@
 """Two-sided stylizers against their definition, written out in float64; identity and limits."""
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -8,6 +11,7 @@ from hypothesis import strategies as st
 from fprf.errors import DataError
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig
 from fprf.plugins.stylizers.region import region_table
+from fprf.style.alignment import Matching
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import Similarity, score_spread, share_mean, unit
 from fprf.style.scene import SceneStyle, membership, own_style, region_units, scene_style
@@ -45,7 +49,7 @@ def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float, simil
 @pytest.mark.parametrize("temperature", [0.1, 0.4, 5.0])
 def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
     content, semantic, scene, d = setting()
-    stylizer = config(temperature=temperature).build(dictionary=d, scene=scene)
+    stylizer = config(temperature=temperature, whitening=0.0, recentred=0).build(dictionary=d, scene=scene)
     assert stylizer.needs == Want.CONTENT | Want.SEMANTIC
     share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean)).double()
     own = own_style(scene, d.blend)
@@ -116,7 +120,7 @@ def test_high_temperatures_move_all_regions_alike(config: Config) -> None:
 @pytest.mark.parametrize("similarity", ["cosine", "dot"])
 def test_the_table_is_the_softmax_of_the_scores(similarity: Similarity) -> None:
     _, _, scene, d = setting()
-    table = region_table(scene, d, 0.4, similarity)
+    table = region_table(scene, d, Matching(0.4, similarity))
     torch.testing.assert_close(table, plain_table(scene, d, 0.4, similarity), rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))
 
@@ -193,5 +197,6 @@ def test_every_knob_changes_something() -> None:
     content, semantic, scene, d = setting()
     for config in BOTH:
         plain = config().build(dictionary=d, scene=scene)(content, semantic)
-        for other in (config(temperature=0.1), config(similarity="dot"), config(gain=1.0)):
+        knobs: dict[str, Any] = {"temperature": 0.1, "similarity": "dot", "whitening": 0.0, "recentred": 0, "gain": 1.0}
+        for other in (replace(config(), **{name: value}) for name, value in knobs.items()):
             assert not torch.allclose(other.build(dictionary=d, scene=scene)(content, semantic), plain)
