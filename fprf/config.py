@@ -78,9 +78,21 @@ class LossConfig:
     """Weights should gather at one place along a ray."""
     depth: float = 0.1
     """Rays through points of the reconstruction should end there (where `datamanager.depth_share` draws such rays)."""
+    sky: float = 0.1
+    """Rays into the sky should meet nothing before it (where the capture has masks of its sky)."""
 
     def __post_init__(self) -> None:
-        for name in ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion", "depth"):
+        for name in (
+            "rgb",
+            "content",
+            "semantic",
+            "variation",
+            "proposal_variation",
+            "interlevel",
+            "distortion",
+            "depth",
+            "sky",
+        ):
             at_least(f"loss.{name}", getattr(self, name), 0.0)
         at_least("loss.penalty_every", self.penalty_every, 1)
         if self.rgb == self.content == self.semantic == 0:

@@ -101,6 +101,8 @@ class Batch(NamedTuple):
     """Semantic targets of the first Q rays of the batch (Q <= R)."""
     distance: Annotated[Tensor, "R"] | None = None
     """World distance along the rays that go through points of the reconstruction, NaN for the others."""
+    sky: Annotated[Tensor, "R"] | None = None
+    """Whether a mask of the capture says that the pixel shows sky; None where there is none."""
 
 
 class Rendered(NamedTuple):

@@ -9,6 +9,7 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tiny_world import World, trained_for
@@ -24,6 +25,7 @@ from fprf.engine.schedule import progress
 from fprf.engine.style_pass import measure_style
 from fprf.engine.views import render_view
 from fprf.methods import fprf_lite
+from fprf.output.images import write_image
 from fprf.plugins.codec import from_json, to_json
 
 SECOND: dict[str, tuple[Any, str]] = {
@@ -38,6 +40,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "datamanager.rays": (128, "training"),
     "datamanager.semantic_share": (0.75, "training"),
     "datamanager.depth_share": (0.25, "training"),
+    "datamanager.masks": (False, "masks"),
     "datamanager.guided.radius": (0.3, "targets"),
     "datamanager.guided.eps": (0.1, "targets"),
     "datamanager.guided.stride": (2, "targets"),
@@ -74,6 +77,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "loss.interlevel": (0.25, "training"),
     "loss.distortion": (0.5, "training"),
     "loss.depth": (0.9, "points"),
+    "loss.sky": (0.9, "masks"),
     "optimizer.rate": (1e-3, "training"),
     "optimizer.hold": (2, "training"),
     "optimizer.final": (0.5, "training"),
@@ -229,6 +233,27 @@ def test_a_loss_on_points_changes_the_training(world: World, tmp_path: Path) -> 
         for name, config in (("a", base), ("b", changed(base, "loss.depth", SECOND["loss.depth"][0])))
     )
     assert differ(first, second) and shown("points") == ["loss.depth"]
+
+
+def test_masks_count_where_there_are_some(world: World, tmp_path: Path) -> None:
+    """A scene with masks of what is used and of its sky: both fields change what is learnt."""
+    scene = world.prepared.scene
+    width, height = scene.cameras.size[0].tolist()
+    half = np.zeros((height, width, 3), np.uint8)
+    half[: height // 2] = 255
+    write_image(tmp_path / "half.png", half)
+    paths = (tmp_path / "half.png",) * len(scene.paths)
+    there = replace(scene, masks=paths, sky_masks=paths)
+    base, found = replace(world.config, steps=5), []
+    for name in ("", *shown("masks")):
+        config = changed(base, name, SECOND[name][0]) if name else base
+        manager = config.datamanager.build(
+            scene=there, content=None, semantic=None, dim=8, cache=tmp_path / "cache", seed=config.seed
+        )
+        prepared = world.prepared._replace(scene=there, manager=manager)
+        run = trained_for(replace(world, prepared=prepared), tmp_path / f"run{name}", config)
+        found.append(checkpoint.load(run.checkpoints, 5).model)
+    assert len(found) == 3 and all(differ(found[0], other) for other in found[1:])
 
 
 def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

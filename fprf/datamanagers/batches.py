@@ -5,7 +5,7 @@ ones before, a resumed run sees the same pixels, and neighbouring seeds or steps
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -20,7 +20,9 @@ from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
 from .features import FeatureStore, Progress, extract
-from .images import load_image, load_images
+from .images import load_image, load_images, load_mask
+from .pixel_file import room_for
+from .runs import Runs
 from .scene import Scene
 from .sightings import find_sightings
 
@@ -49,8 +51,9 @@ class _Marks(NamedTuple):
 class RayBatches(DataManager):
     """Pixels drawn uniformly, with replacement, from all pixels of the training views.
 
-    Images are held as uint8, one after the other; feature coefficients stay in memory-mapped files under `cache`. Transparent
-    pixels show the background, white by default. `progress(done, total, what)` is told how far features are.
+    Images are held as uint8, one after the other, in a mapped file where they are many (`pixel_file`); feature coefficients
+    stay in mapped files under `cache`. Pixels that a capture's masks leave out are never drawn. Transparent ones show the
+    background, white by default. `progress(done, total, what)` is told how far features are.
     """
 
     def __init__(
@@ -77,8 +80,10 @@ class RayBatches(DataManager):
         self._sizes = scene.cameras.size[scene.train]
         self._ends = self._sizes.prod(1).cumsum(0)
         self._slots = {view: slot for slot, view in enumerate(self._views)}
-        self._pixels = self._load()
-        self._chosen = None if seen is None else self._choose(seen)
+        self._pixels = self._load(cache)
+        masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
+        self._chosen = None if seen is None and not masks else self._choose(seen, masks)
+        self._sky = self._skies(skies) if skies else None
         self._marks = self._marked() if config.depth_share > 0 else None
         self.content_store: FeatureStore | None = None
         self.semantic_store: FeatureStore | None = None
@@ -97,7 +102,7 @@ class RayBatches(DataManager):
         room = len(self._pixels) if chosen is None else len(chosen)
         generator = generator_of(self._seed, step)
         at = torch.randint(room, (self._config.rays,), generator=generator)
-        at = at if chosen is None else chosen[at].long()
+        at = at if chosen is None else chosen.pick(at)
         distance = None
         if self._marks is not None:
             # The last rays: the first ones carry semantics, which must stay an even sample.
@@ -119,6 +124,7 @@ class RayBatches(DataManager):
             content=content.at(view, pixel, rgb) if content is not None else None,
             semantic=semantic.at(view[:share], pixel[:share], rgb[:share]) if semantic is not None and share else None,
             distance=distance,
+            sky=None if self._sky is None else self._sky.holds(at),
         )
 
     def image(self, view: int) -> Annotated[Tensor, "H W 3"]:
@@ -134,16 +140,34 @@ class RayBatches(DataManager):
         end = int(self._ends[slot])
         return self._pixels[end - width * height : end].reshape(height, width, 3)
 
-    def _choose(self, seen: Callable[[int], Tensor]) -> Annotated[Tensor, "P"]:
-        """The pixels that `seen` allows, in half the memory while their number allows."""
-        parts = []
-        for slot, view in enumerate(self._views):
-            width, height = self._sizes[slot].tolist()
-            parts.append(seen(view).reshape(-1).nonzero()[:, 0] + int(self._ends[slot]) - width * height)
-        found = torch.cat(parts)
+    def _choose(self, seen: Callable[[int], Tensor] | None, masks: Sequence[Path | None]) -> Runs:
+        """The pixels that `seen` and the capture's masks allow."""
+
+        def allowed(view: int, width: int, height: int) -> Tensor:
+            mask = torch.ones(height, width, dtype=torch.bool) if seen is None else seen(view)
+            path = masks[view] if masks else None
+            return mask if path is None else mask & torch.from_numpy(load_mask(path, (width, height)))
+
+        found = Runs.of(self._each(allowed))
         if not len(found):
             raise DataError(f"{self._scene.name}: none of {len(self._views)} training views shows what is to be learnt")
-        return found.int() if len(self._pixels) < 2**31 else found
+        return found
+
+    def _skies(self, skies: Sequence[Path | None]) -> Runs:
+        """The pixels that show sky."""
+
+        def sky(view: int, width: int, height: int) -> Tensor:
+            path = skies[view]
+            none = torch.zeros(height, width, dtype=torch.bool)
+            return none if path is None else torch.from_numpy(load_mask(path, (width, height)))
+
+        return Runs.of(self._each(sky))
+
+    def _each(self, mask: Callable[[int, int, int], Tensor]) -> Iterator[tuple[int, Annotated[Tensor, "P"]]]:
+        """Mask of each training view, of its width and height, by the number of its first pixel."""
+        for slot, view in enumerate(self._views):
+            width, height = self._sizes[slot].tolist()
+            yield int(self._ends[slot]) - width * height, mask(view, width, height).reshape(-1)
 
     def _marked(self) -> _Marks | None:
         """Where sparse points are seen in the training views, among the pixels that are learnt from."""
@@ -155,16 +179,12 @@ class RayBatches(DataManager):
         slot, pixel = slots[sightings.view], sightings.pixel.long()
         width, height = self._sizes[slot].unbind(1)
         at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
-        kept = torch.ones(len(at), dtype=torch.bool)
-        if self._chosen is not None:
-            allowed = torch.zeros(len(self._pixels), dtype=torch.bool)
-            allowed[self._chosen.long()] = True
-            kept = allowed[at]
+        kept = torch.ones(len(at), dtype=torch.bool) if self._chosen is None else self._chosen.holds(at)
         return _Marks(at[kept], sightings.distance[kept].float()) if bool(kept.any()) else None
 
-    def _load(self) -> Annotated[Tensor, "P 3"]:
-        """All training pixels, uint8, view after view."""
-        pixels = torch.empty(int(self._ends[-1]), 3, dtype=torch.uint8)
+    def _load(self, cache: Path) -> Annotated[Tensor, "P 3"]:
+        """All training pixels, uint8, view after view; many of them mapped from a file."""
+        pixels = room_for(int(self._ends[-1]), cache)
         filled = 0
         for first in range(0, len(self._views), DECODE):
             views = self._views[first : first + DECODE]

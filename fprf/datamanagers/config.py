@@ -46,6 +46,9 @@ class DataManagerConfig(PluginConfig):
 
     parser: DataParserConfig | None = None
     """Format of the scene folder; none = recognised from what lies in it."""
+    masks: bool = True
+    """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or `mask_path`), and
+    keep the sky empty where `sky_masks/` show it."""
     guided: GuidedConfig = GuidedConfig()
     """Edge-aware upsampling of the targets, and of references alike."""
 

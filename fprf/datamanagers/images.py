@@ -20,7 +20,7 @@ from .image_header import ImageHeader, header_of, read_header
 if TYPE_CHECKING:  # else reading a picture would need torch
     from .scene import Scene
 
-__all__ = ["MAX_PIXELS", "Image", "load_image", "load_images"]
+__all__ = ["MAX_PIXELS", "Image", "load_image", "load_images", "load_mask"]
 
 MAX_PIXELS = 100_000_000
 """Files that claim more are refused before they are decoded."""
@@ -44,6 +44,21 @@ def load_image(path: Path, size: tuple[int, int] | None = None, background: Sequ
     smaller = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
     resized = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     return np.asarray(resized, dtype=np.uint8)
+
+
+def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """A mask [H W] of `size` (width, height): true where the file's first channel is bright (above a half; of files that hold
+    but 0 and 1, where it is 1). The nearest pixel is taken. Raises DataError as `load_image` does.
+    """
+    header = read_header(path)
+    if header.width * header.height > MAX_PIXELS:
+        raise DataError(f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the mask")
+    if abs(size[0] * header.height - size[1] * header.width) > header.width + header.height + size[0] + size[1]:
+        raise DataError(f"{path}: {header.width}x{header.height} pixels do not fit an image of {size[0]}x{size[1]}; mend it")
+    grey = _decode(path, header).reshape(header.height, header.width, -1)[:, :, 0].astype(np.int64)
+    half = 0 if grey.max() <= 1 else 127 if grey.max() <= 255 else 32767
+    mask = np.asarray(cv2.resize((grey > half).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
+    return mask.astype(np.bool_)
 
 
 def load_images(scene: "Scene", background: Sequence[float] | None = None) -> list[Image]:

@@ -31,5 +31,9 @@ class Scene:
     """int64 pairs of a view and a point that the reconstruction found in it, where the capture says."""
     exposure: Annotated[Tensor, "V"] | None = None
     """Exposure of each view, where the capture says: light is in proportion to it. float64, above 0."""
+    masks: tuple[Path | None, ...] = ()
+    """A mask of each view, black where pixels are left out; None = all are used. Empty where the capture has none."""
+    sky_masks: tuple[Path | None, ...] = ()
+    """The same of sky, which is white."""
     alpha: bool = False
     """Images carry transparency."""

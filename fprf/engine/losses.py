@@ -1,5 +1,6 @@
 """The training terms (paper, Eq. 3 and 4, and K-Planes' regularisers). A term of weight 0 is never computed."""
 
+import math
 from typing import Annotated
 
 import torch
@@ -11,9 +12,11 @@ from ..rendering.stepfun import distortion, interlevel, midpoints
 from ..types import Batch, Rendered, Want
 from .model import Facts, Model
 
-__all__ = ["NEARBY", "ending", "terms", "total", "wanted"]
+__all__ = ["NEARBY", "SHELL", "emptiness", "ending", "terms", "total", "wanted"]
 
 
+SHELL = 4.0
+"""Sky lies at least so many space units away: times what views commonly see, or the scene's inner radius."""
 NEARBY = 0.1
 """Share of its distance by which a ray's end may miss a point: what a reconstruction is uncertain by, and samples are apart."""
 
@@ -57,6 +60,10 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
         found = ending(sampled.t, weights, batch.distance * facts.space.scale)
         if found is not None:
             result["depth"] = found
+    if config.sky > 0 and batch.sky is not None:
+        found = emptiness(sampled.t, weights, batch.sky, shell=math.inf if facts.space.kind in ("box", "ndc") else SHELL)
+        if found is not None:
+            result["sky"] = found
     due = step % config.penalty_every == 0 and (config.variation > 0 or config.proposal_variation > 0)
     penalties = model.penalties() if due else {}
     for name, weight in (("variation", config.variation), ("proposal_variation", config.proposal_variation)):
@@ -79,6 +86,20 @@ def ending(t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], dista
     return ((1 - (w * there).sum(-1)).square() + (w * before).sum(-1).square()).mean()
 
 
+def emptiness(
+    t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], sky: Annotated[Tensor, "R"], *, shell: float
+) -> Tensor | None:
+    """How much rays into the sky meet before `shell` (space units); None where there are none.
+
+    Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell.
+    """
+    chosen = sky.nonzero()[:, 0]
+    if not len(chosen):
+        return None
+    before = midpoints(t.index_select(0, chosen)) < shell
+    return (weights.index_select(0, chosen) * before).sum(-1).square().mean()
+
+
 def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
     """Weighted sum."""
     # Both colours of a decoder with a part of the scene's own share one weight: the regularisers keep theirs.
@@ -91,6 +112,7 @@ def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
         "interlevel": config.interlevel,
         "distortion": config.distortion,
         "depth": config.depth,
+        "sky": config.sky,
         "variation": config.variation * config.penalty_every,
         "proposal_variation": config.proposal_variation * config.penalty_every,
     }

@@ -236,4 +236,5 @@ class Loop:
             return batch
         content, semantic = (x.to(self.device) if x is not None else None for x in (batch.content, batch.semantic))
         distance = batch.distance.to(self.device) if batch.distance is not None else None
-        return Batch(batch.view, batch.pixel, batch.rgb.to(self.device), content, semantic, distance)
+        sky = batch.sky.to(self.device) if batch.sky is not None else None
+        return Batch(batch.view, batch.pixel, batch.rgb.to(self.device), content, semantic, distance, sky)

@@ -13,7 +13,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..datamanagers.images import load_image
+from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..engine.loading import Trained
 from ..engine.model import background_of
@@ -54,7 +54,9 @@ def align(
         progress(done, len(views), "fitting poses")
         width, height = (int(v) for v in cameras.size[view])
         truth = torch.from_numpy(load_image(scene.paths[view], (width, height), facts.background)).float() / 255
-        moves[view] = align_view(trained, cameras, view, truth, reach, config or AlignmentConfig())
+        mask = scene.masks[view] if scene.masks and trained.config.datamanager.masks else None
+        where = None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
+        moves[view] = align_view(trained, cameras, view, truth, reach, config or AlignmentConfig(), where)
         turned = [rotated(pose[view, :, axis][None], moves[view][None, :3])[0] for axis in range(3)]
         pose[view] = torch.stack([*turned, pose[view, :, 3] + moves[view][3:]], -1)
     progress(len(views), len(views), "fitting poses")
@@ -62,20 +64,28 @@ def align(
 
 
 def align_view(
-    trained: Trained, cameras: Cameras, view: int, truth: Annotated[Tensor, "H W 3"], reach: float, config: AlignmentConfig
+    trained: Trained,
+    cameras: Cameras,
+    view: int,
+    truth: Annotated[Tensor, "H W 3"],
+    reach: float,
+    config: AlignmentConfig,
+    where: Annotated[Tensor, "H W"] | None = None,
 ) -> Annotated[Tensor, "6"]:
-    """Turn and shift (world units), float64, that bring the render of a view nearest to its image."""
+    """Turn and shift (world units), float64, that bring the render of a view nearest to its image, `where` that counts."""
     model, facts = trained.model, trained.known.facts
     device = next(model.parameters()).device
     through, background = PixelRays(cameras.select(torch.tensor([view]))), background_of(facts, device)
     tones = model.tones
     factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()
     pixels, generator = truth.reshape(-1, 3), torch.Generator().manual_seed(view)
+    used = None if where is None or not bool(where.any()) else where.reshape(-1).nonzero()[:, 0]
     move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     optimizer = torch.optim.Adam([move], lr=config.rate, betas=(0.9, 0.95))
     for step in range(config.steps):
         optimizer.param_groups[0]["lr"] = 0.5 * config.rate * (1 + math.cos(math.pi * step / config.steps))
-        at = torch.randint(len(pixels), (config.rays,), generator=generator)
+        at = torch.randint(len(pixels) if used is None else len(used), (config.rays,), generator=generator)
+        at = at if used is None else used[at]
         pixel = torch.stack([at % truth.shape[1], at // truth.shape[1]], -1) + 0.5
         origin, direction = through(torch.zeros_like(at), pixel)
         turned = rotated(direction, move[:3].expand_as(direction))

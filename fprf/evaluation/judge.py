@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from ..datamanagers.images import load_image
+from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..engine.loading import Trained
 from ..engine.views import View, render_view
@@ -29,7 +29,8 @@ def judge(
 ) -> tuple[dict[str, Any], list[View]]:
     """Metrics of the views (means and each by name), and the renders.
 
-    Seconds are those of rendering alone. Consistency warps each view into the next one of the list by the rendered depth.
+    Pixels that the capture's masks leave out do not count. Seconds are those of rendering alone. Consistency warps each view
+    into the next one of the list by the rendered depth.
     """
     facts, cameras = trained.known.facts, trained.known.cameras
     renders, rows, seconds = [], {}, 0.0
@@ -43,7 +44,9 @@ def judge(
         renders.append(render)
         width, height = (int(v) for v in cameras.size[view])
         truth = torch.from_numpy(load_image(scene.paths[view], (width, height), facts.background)).float() / 255
-        rows[trained.known.names[view]] = image_metrics(render.rgb, truth)
+        mask = scene.masks[view] if scene.masks and trained.config.datamanager.masks else None
+        where = None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
+        rows[trained.known.names[view]] = image_metrics(render.rgb, truth, where)
     progress(len(views), len(views), "rendering")
     pixels = sum(v.rgb.shape[0] * v.rgb.shape[1] for v in renders)
     chosen = cameras.select(torch.tensor(list(views), dtype=torch.int64))

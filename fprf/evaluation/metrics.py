@@ -45,8 +45,8 @@ def psnr(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
     return min(PSNR_CAP, -10 * math.log10(error)) if error > 0 else PSNR_CAP
 
 
-def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
-    """Structural similarity in [-1, 1], 1 for identical images; symmetric.
+def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"], where: Annotated[Tensor, "H W"] | None = None) -> float:
+    """Structural similarity in [-1, 1], 1 for identical images; symmetric. Of windows about `where` alone, if given.
 
     An image with a side below 11 pixels is judged with the largest odd window that fits. Raises as `psnr`.
     """
@@ -56,13 +56,27 @@ def ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
     x, y = first.permute(2, 0, 1)[None], second.permute(2, 0, 1)[None]
     # No eps: K keeps the denominator above 9e-8, and kornia's 1e-12 would cost black images 1e-5.
     windows = _ssim_map(x, y, window, eps=0.0, padding="valid")
+    if where is not None:
+        edge = window // 2
+        about = where[edge : edge + windows.shape[2], edge : edge + windows.shape[3]]
+        windows = windows[..., about] if bool(about.any()) else windows
     # Rounding can carry an identical pair past 1.
     return max(-1.0, min(1.0, _finite("ssim", float(windows.mean()))))
 
 
-def image_metrics(render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H W 3"]) -> dict[str, float]:
-    """Every metric of one view, by name."""
-    return {"psnr": psnr(render, truth), "ssim": ssim(render, truth)}
+def image_metrics(
+    render: Annotated[Tensor, "H W 3"], truth: Annotated[Tensor, "H W 3"], where: Annotated[Tensor, "H W"] | None = None
+) -> dict[str, float]:
+    """Every metric of one view, by name. Pixels that are not `where` (a capture's mask) are left out.
+
+    Windows of SSIM about the others still see them: the same in both images. Raises DataError where the mask leaves nothing.
+    """
+    if where is None:
+        return {"psnr": psnr(render, truth), "ssim": ssim(render, truth)}
+    if not bool(where.any()):
+        raise DataError("a mask leaves nothing of a view that is to be judged; leave the view out, or its mask")
+    filled = torch.where(where[..., None], render, truth)
+    return {"psnr": psnr(render[where][None], truth[where][None]), "ssim": ssim(filled, truth, where)}
 
 
 def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:

@@ -99,3 +99,17 @@ def test_mean_over_views() -> None:
         mean_metrics([])
     with pytest.raises(KeyError):
         mean_metrics([rows[0], {"psnr": 1.0}])
+
+
+def test_what_a_mask_leaves_out_does_not_count() -> None:
+    """Any change there leaves PSNR as it is, and SSIM but for windows that reach into it: those see the same in both images."""
+    draw = torch.Generator().manual_seed(0)
+    truth, where = torch.rand(40, 30, 3, generator=draw), torch.zeros(40, 30, dtype=torch.bool)
+    where[:, :20] = True
+    render = (truth + 0.1 * torch.randn(40, 30, 3, generator=draw)).clamp(0, 1)
+    spoilt = torch.where(where[..., None], render, torch.rand(40, 30, 3, generator=draw))
+    assert image_metrics(render, truth, where) == image_metrics(spoilt, truth, where)
+    assert image_metrics(render, truth, where)["psnr"] == pytest.approx(psnr(render[:, :20], truth[:, :20]))
+    assert image_metrics(render, truth, torch.ones_like(where)) == pytest.approx(image_metrics(render, truth))
+    with pytest.raises(DataError, match="leaves nothing"):
+        image_metrics(render, truth, torch.zeros_like(where))

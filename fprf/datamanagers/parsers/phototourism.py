@@ -52,6 +52,8 @@ class PhotoTourismParser(DataParser):
             test=place[held],
             depths=None if scene.depths is None else scene.depths[kept],
             seen=seen,
+            masks=tuple(scene.masks[k] for k in kept.tolist()) if scene.masks else (),
+            sky_masks=tuple(scene.sky_masks[k] for k in kept.tolist()) if scene.sky_masks else (),
         )
 
     def _table(self, data: Path) -> Path:

@@ -2,6 +2,7 @@
 
 Poses are camera-to-world in OpenGL axes and are kept as they are (an `applied_transform` is not undone). Intrinsics
 (`fl_x fl_y cx cy w h`, else `camera_angle_x`; `k1 k2 k3 k4 p1 p2`; `camera_model`; `near`, `far`) stand once or by frame.
+`mask_path` names an image's mask (black pixels are left out), `sky_mask_path` one of its sky (white).
 `points.npz` beside the file holds sparse points in the same frame; so does a COLMAP model in `sparse/0` that it was made of.
 """
 
@@ -48,6 +49,8 @@ class _Entry(NamedTuple):
     path: Path
     role: str
     """train, test, or nothing: then the file's lists or the rule decide."""
+    data: Path
+    """Folder that paths are relative to."""
 
 
 class TransformsParser(DataParser):
@@ -102,8 +105,8 @@ def _entry(data: Path, record: Record, role: str) -> _Entry:
     if not path.is_file():
         for suffix in _SUFFIXES:
             if path.with_name(path.name + suffix).is_file():
-                return _Entry(record, name + suffix, path.with_name(path.name + suffix), role)
-    return _Entry(record, name, path, role)
+                return _Entry(record, name + suffix, path.with_name(path.name + suffix), role, data)
+    return _Entry(record, name, path, role, data)
 
 
 def _view(entry: _Entry) -> View:
@@ -129,7 +132,16 @@ def _view(entry: _Entry) -> View:
         distortion=distortion,
         lens=lens,
         depths=None if near is None or far is None else (near, far),
+        mask=_named(entry, "mask_path"),
+        sky_mask=_named(entry, "sky_mask_path"),
     )
+
+
+def _named(entry: _Entry, key: str) -> Path | None:
+    text = entry.record.own.get(key)
+    if text is None:
+        return None
+    return inside(entry.data, entry.record.where, entry.record.text(key) or "")[1]
 
 
 def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from ...rendering.cameras import Cameras
 from ..image_header import read_header
 from ..scene import Scene
 from .files import name_of
+from .masks import MASKS, SKY_MASKS, masks_beside
 from .split import every_eighth
 
 __all__ = ["View", "assemble", "found", "rigid"]
@@ -41,6 +42,9 @@ class View:
     distortion: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     lens: int = 0
     depths: tuple[float, float] | None = None
+    mask: Path | None = None
+    """Where the capture names it; else it is looked for beside the image."""
+    sky_mask: Path | None = None
 
 
 def found(root: Path, paths: Sequence[Path]) -> None:
@@ -117,8 +121,18 @@ def assemble(
         points=None if points is None or not len(points) else torch.from_numpy(points),
         seen=None if seen is None or not len(seen) else torch.from_numpy(seen),
         depths=torch.tensor(depths, dtype=torch.float64) if len(depths) == len(views) else None,
+        masks=_masks(data, views, [view.mask for view in views], MASKS),
+        sky_masks=_masks(data, views, [view.sky_mask for view in views], SKY_MASKS),
         alpha=alpha,
     )
+
+
+def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str) -> tuple[Path | None, ...]:
+    """Those that the capture names, or where it names none, those that lie beside the images."""
+    if not any(named):
+        return masks_beside(data, [view.path for view in views], folder)
+    found(data, [path for path in named if path is not None])
+    return tuple(named)
 
 
 def _check_size(view: View, file: tuple[int, int], reduced: bool) -> None:
