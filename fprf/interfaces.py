@@ -158,6 +158,15 @@ class Stylizer(nn.Module, ABC):
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """The features in the new style, at full strength."""
 
+    def shared(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"] | None]:
+        """`forward`, and the points' shares of the scene's regions (`style.scene.membership`), if it has found them.
+
+        What follows, such as strengths and colours by region, then need not find them again.
+        """
+        return self(content, semantic), None
+
     @abstractmethod
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """Attention of each point to each style code; rows sum to 1."""

@@ -70,7 +70,8 @@ def whitener(side: Keys, whitening: float) -> Annotated[Tensor, "D D"]:
     if whitening == 0 or not bool(size > 0):
         return unity
     values, vectors = torch.linalg.eigh(scatter / size + _RIDGE * unity)
-    return (vectors * values.clamp_min(_RIDGE) ** (-whitening / 2)) @ vectors.T
+    root: Tensor = (vectors * values.clamp_min(_RIDGE) ** (-whitening / 2)) @ vectors.T
+    return root
 
 
 def _directions(x: Tensor, centre: Tensor, white: Tensor) -> Annotated[Tensor, "N D"]:

@@ -61,11 +61,22 @@ class ColourMaps(nn.Module):
         """Semantics only where there is more than one region."""
         return Want.CONTENT | Want.SEMANTIC if len(self.units) > 1 else Want.CONTENT
 
-    def forward(self, colour: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N 3"]:
-        """What is to be added to colours in [0, 1] so that they lie in the style and in [0, 1]."""
-        seen = colour[:, :0] if semantic is None else semantic
-        belongs = membership(seen.to(self.units), self.semantic_mean, self.units, self.softness)
-        change = mixture.affine(colour.to(self.units), belongs, self.matrix, self.bias, centre=self.origin).to(colour)
+    def forward(
+        self,
+        colour: Annotated[Tensor, "N 3"],
+        semantic: Annotated[Tensor, "N D"] | None,
+        belongs: Annotated[Tensor, "N K"] | None = None,
+    ) -> Annotated[Tensor, "N 3"]:
+        """What is to be added to colours in [0, 1] so that they lie in the style and in [0, 1].
+
+        `belongs` is the points' membership, where somebody has it.
+        """
+        if belongs is None:
+            seen = colour[:, :0] if semantic is None else semantic
+            belongs = membership(seen.to(self.units), self.semantic_mean, self.units, self.softness)
+        change = mixture.affine(colour.to(self.units), belongs.to(self.units), self.matrix, self.bias, centre=self.origin).to(
+            colour
+        )
         return (colour + change).clamp(0, 1) - colour
 
 

@@ -83,25 +83,18 @@ class Restyle:
         self, decoder: Decoder, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
     ) -> Annotated[Tensor, "N 3"]:
         """Colours of points in this look, in [0, 1]."""
-        styled, strength, luminance = self.applied(content, semantic)
+        shown = [(part, *part._alone(content, semantic)) for part in self.parts if part.share > 0]
+        styled, strength, luminance = _mix([(part.share, applied) for part, applied, _ in shown])
         colour: Tensor = decoder.restyled(content, styled, strength)
-        change = [x for part in self.parts if (x := part._recoloured(colour, semantic)) is not None]
+        found = (part._recoloured(colour, semantic, belongs) for part, _, belongs in shown)
+        change = [x for x in found if x is not None]
         if change:
             colour = (colour + torch.stack(change).sum(0)).clamp(0, 1)
         return keep_luminance(colour, decoder(content), luminance) if luminance > 0 else colour
 
     def applied(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Applied:
         """The features with all strengths applied, and what a decoder must know besides."""
-        shown = [part for part in self.parts if part.share > 0]
-        if len(shown) == 1:
-            return shown[0]._alone(content, semantic)
-        styled, luminance = torch.zeros_like(content), 0.0
-        strength: float | Tensor = 0.0
-        for part in shown:
-            features, at, kept = part._alone(content, semantic)
-            styled, luminance = styled + part.share * features, luminance + part.share * kept
-            strength = strength + part.share * at
-        return styled, strength, luminance
+        return _mix([(part.share, part._alone(content, semantic)[0]) for part in self.parts if part.share > 0])
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """How much each point takes of each style code, those of all parts one after the other; rows sum to 1 at most.
@@ -114,22 +107,40 @@ class Restyle:
             taken.append(part.share * (own if part.regions is None else own * part.regions(semantic)))
         return torch.cat(taken, 1)
 
-    def _alone(self, content: Tensor, semantic: Tensor | None) -> Applied:
+    def _alone(self, content: Tensor, semantic: Tensor | None) -> tuple[Applied, Annotated[Tensor, "N K"] | None]:
+        """What this part makes of points, and which regions they belong to, if the stylizer has found that."""
         if self.strength == 0:
-            return content, 0.0, self.luminance
-        strength = self.features * self._strength(content, semantic)
-        return blend_strength(content, self.stylizer(content, semantic), strength), strength, self.luminance
+            return (content, 0.0, self.luminance), None
+        styled, belongs = self.stylizer.shared(content, semantic)
+        strength = self.features * self._strength(content, semantic, belongs)
+        return (blend_strength(content, styled, strength), strength, self.luminance), belongs
 
-    def _strength(self, points: Annotated[Tensor, "N X"], semantic: Tensor | None) -> float | Annotated[Tensor, "N 1"]:
+    def _strength(
+        self, points: Annotated[Tensor, "N X"], semantic: Tensor | None, belongs: Tensor | None
+    ) -> float | Annotated[Tensor, "N 1"]:
         if self.regions is None:
             return self.strength
         # Without semantics there is one region, and nothing to look up.
-        weight: Tensor = self.regions(points[:, :0] if semantic is None else semantic)
+        weight: Tensor = self.regions(points[:, :0] if semantic is None else semantic, belongs)
         return self.strength * weight
 
-    def _recoloured(self, colour: Annotated[Tensor, "N 3"], semantic: Tensor | None) -> Annotated[Tensor, "N 3"] | None:
+    def _recoloured(
+        self, colour: Annotated[Tensor, "N 3"], semantic: Tensor | None, belongs: Tensor | None
+    ) -> Annotated[Tensor, "N 3"] | None:
         """What this part adds to colours; None where that is nothing."""
         if self.colours is None or self.share == 0 or self.strength == 0:
             return None
-        change: Tensor = self.colours(colour, semantic)
-        return self.share * self._strength(colour, semantic) * change
+        change: Tensor = self.colours(colour, semantic, belongs)
+        return self.share * self._strength(colour, semantic, belongs) * change
+
+
+def _mix(parts: list[tuple[float, Applied]]) -> Applied:
+    """Parts of a mix by their shares; one alone is left as it is, bit for bit."""
+    if len(parts) == 1:
+        return parts[0][1]
+    styled, luminance = torch.zeros_like(parts[0][1][0]), 0.0
+    strength: float | Tensor = 0.0
+    for share, (features, at, kept) in parts:
+        styled, luminance = styled + share * features, luminance + share * kept
+        strength = strength + share * at
+    return styled, strength, luminance

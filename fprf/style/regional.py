@@ -55,10 +55,13 @@ class RegionWeight(nn.Module):
         """More than one region: points need semantics to tell which."""
         return len(self.units) > 1
 
-    def forward(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N X"]:
-        """The values, mixed by membership: exactly 0 where all of a point's regions have 0."""
-        share = membership(semantic.to(self.units), self.centre, self.units, self.softness)
-        return share @ self.values
+    def forward(
+        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+    ) -> Annotated[Tensor, "N X"]:
+        """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's regions have 0."""
+        if belongs is None:
+            belongs = membership(semantic.to(self.units), self.centre, self.units, self.softness)
+        return belongs.to(self.values) @ self.values
 
 
 class RegionStylizer(Stylizer):

@@ -147,10 +147,16 @@ class TwoSidedStylizer(Stylizer):
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """Each point by the maps of the regions that it belongs to."""
+        return self.shared(content, semantic)[0]
+
+    def shared(
+        self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
+    ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"]]:
+        """`forward`, and the regions that points belong to."""
         with full_precision(content):
             share = self._membership(content[:, :0] if semantic is None else semantic)
             moved: Tensor = self.maps(content.to(self.centre), share, self.centre)
-            return moved.to(content)
+            return moved.to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """Memberships times the table."""
