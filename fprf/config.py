@@ -140,6 +140,9 @@ class RenderConfig:
     """Rays rendered at a time."""
     background: tuple[float, float, float] | None = None
     """Colour behind everything; none = white where images have transparency, else nothing is assumed."""
+    tone: tuple[float, float, float] | None = None
+    """Factors that rendered red, green and blue are multiplied by; none = the scene as its views have it in common. `--tone`
+    of a view says them where they were learnt."""
 
     def __post_init__(self) -> None:
         between("render.budget", self.budget, 0.0, 0.5)
@@ -147,6 +150,8 @@ class RenderConfig:
         positive("render.resolution", self.resolution)
         between("render.resolution", self.resolution, 0.0, 1.0)
         at_least("render.chunk", self.chunk, 1)
+        for part in self.tone or ():
+            positive("render.tone", part)
         for part in self.background or ():
             between("render.background", part, 0.0, 1.0)
 

@@ -89,6 +89,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "render.resolution": (0.5, "render"),
     "render.chunk": (100, "chunks"),
     "render.background": ((1.0, 0.0, 1.0), "background"),
+    "render.tone": ((0.5, 1.0, 0.8), "render"),
     "tones": (True, "facts"),
     "poses": (0.05, "facts"),
     "statistics.rays": (64, "style"),
@@ -281,6 +282,7 @@ def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     assert not torch.equal(view(world.config), view(second("render.budget")))
     assert not torch.equal(view(world.config), view(second("render.resolution")))
+    assert torch.allclose(view(second("render.tone")), view(world.config) * torch.tensor([0.5, 1.0, 0.8]))
     calls: list[int] = []
     whole = trained.model.field.density
     monkeypatch.setattr(trained.model.field, "density", lambda points: calls.append(len(points)) or whole(points))

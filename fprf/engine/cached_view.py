@@ -39,6 +39,8 @@ class Part:
     """On the CPU."""
     samples: int
     """How many there were before the light ones were dropped."""
+    tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """What colours are multiplied by at last."""
 
     @property
     def bytes(self) -> int:
@@ -53,7 +55,8 @@ class Part:
             points: Tensor = decoder(self.content)
         else:
             points = restyle.colour(decoder, self.content, self.semantic if Want.SEMANTIC in restyle.needs else None)
-        return (composite(self.kept, points, self.rays) + self.behind).cpu().clamp(0, 1)
+        rgb = (composite(self.kept, points, self.rays) + self.behind).cpu()
+        return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * torch.tensor(self.tone)).clamp(0, 1)
 
     @torch.inference_mode()
     def mean(self, values: Annotated[Tensor, "M X"]) -> Annotated[Tensor, "R X"]:
@@ -120,4 +123,5 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
         # Points and latents have done their part.
         bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
         depth = model.space.metric(origin[here], direction[here], marched.depth.cpu())
-        yield Part(bare, content, semantic, behind, len(chunk.near), depth, marched.opacity.cpu(), marched.weights.numel())
+        opacity, samples, tone = marched.opacity.cpu(), marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
+        yield Part(bare, content, semantic, behind, len(chunk.near), depth, opacity, samples, tone)

@@ -4,6 +4,7 @@ A preset sets samples along rays, error budget and resolution; whoever gives one
 parameters stay as they are. `fprf bench pareto` shows each preset beside every single knob.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
@@ -55,6 +56,10 @@ class QualityConfig:
     max_memory: float | None = None
     """MiB that blocks of a large scene may take together; the least recently used make room. none = all stay."""
 
+    tone: tuple[str, ...] = ()
+    """Training views in whose light to show the scene, by name or number; several, as VIEW=WEIGHT, for what lies between
+    them. none = the light that all views have in common. For runs with learnt `tones`."""
+
     def __post_init__(self) -> None:
         if self.samples is not None:
             positive("samples", self.samples)
@@ -80,10 +85,39 @@ def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
         render = replace(render, budget=preset.budget, resolution=preset.resolution)
     given = {name: value for name in ("budget", "resolution", "chunk") if (value := getattr(quality, name)) is not None}
     render = replace(render, **given)
+    if quality.tone:
+        render = replace(render, tone=_tone(trained, quality.tone))
     config = replace(trained.config, render=render)
     if samples == 1:
         return trained._replace(config=config)
     return _resampled(trained._replace(config=config), samples)
+
+
+def _tone(trained: "Trained", texts: tuple[str, ...]) -> tuple[float, float, float]:
+    """Factors of some training views, weighted; as they are, VIEW alone counts 1."""
+    tones, known = trained.model.tones, trained.known
+    if tones is None:
+        raise UsageError("tone: this run has learnt no tones; train it with --tones true, or leave --tone out")
+    views, weights = [], []
+    for text in texts:
+        name, _, share = text.rpartition("=") if text not in known.names else (text, "", "1")
+        name, share = (text, "1") if not name else (name, share)
+        try:
+            weight = float(share)
+            view = known.names.index(name) if name in known.names else int(name)
+        except ValueError:
+            few = ", ".join(known.names[k] for k in known.train[:3])
+            raise UsageError(f"tone: {text!r} is no view or VIEW=WEIGHT; views are {few} ..., or their numbers") from None
+        if view not in known.train or not 0 <= weight < math.inf:
+            why = "was not learnt from" if view not in known.train else "has no weight of at least 0"
+            raise UsageError(f"tone: {text!r}: the view {why}; choose one of the {len(known.train)} training views")
+        views.append(view)
+        weights.append(weight)
+    if not sum(weights):
+        raise UsageError("tone: all weights are 0; give at least one view a weight")
+    shares = tuple(weight / sum(weights) for weight in weights)
+    red, green, blue = tones.mixed(tuple(views), shares).tolist()
+    return red, green, blue
 
 
 def _resampled(trained: "Trained", samples: float) -> "Trained":

@@ -54,8 +54,10 @@ def render_view(
 ) -> View:
     """Colour and depth of one view, in chunks of `config.chunk` rays; below `config.resolution` 1 from fewer of them.
 
-    Colours are multiplied by `factor`, if one is given: how a camera took them (`tones`).
+    Colours are multiplied by `factor`, if one is given: how a camera took them (`tones`); else by the config's tone.
     """
+    if factor is None and config.tone is not None:
+        factor = torch.tensor(config.tone)
     if config.resolution < 1:
         small = cameras.select(torch.tensor([view])).scaled(1 / config.resolution)
         whole = replace(config, resolution=1.0)
