@@ -12,6 +12,7 @@ from .parsing import LIST_FLAGS, load_method, methods, parse
 
 if TYPE_CHECKING:
     from ..config import TrainConfig
+    from ..datamanagers.scene import Scene
     from ..engine.model import Model
     from ..engine.prepare import Prepared
     from ..engine.run import Run
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["EventLog", "default_output", "run", "train_scene"]
 
 PLAN = "--plan"
+CHANGED = "--changed-images"
 LINE_SECONDS = 5.0
 """Time between lines in events.jsonl, and on standard error where it is no terminal."""
 
@@ -37,21 +39,24 @@ def run(args: list[str]) -> int:
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
     rest, place = take_view(args[1:])
+    others = CHANGED in rest
+    rest = [arg for arg in rest if arg != CHANGED]
     flags = [arg for arg in rest if arg != PLAN]
     if LIST_FLAGS in flags:
-        print(f"{PLAN}\n{VIEW}")
+        print(f"{PLAN}\n{VIEW}\n{CHANGED}")
     about = (
         f"Train a scene with {method}. {PLAN} alone shows its blocks and what they will cost, and runs nothing;\n"
-        f"{VIEW} [[HOST:]PORT] shows training live in the browser, at http://127.0.0.1:8080 if nothing is said."
+        f"{VIEW} [[HOST:]PORT] shows training live in the browser, at http://127.0.0.1:8080 if nothing is said;\n"
+        f"{CHANGED} goes on with a run although its images are no longer those that it was begun with."
     )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
     if len(flags) < len(rest):
         show_plan(config, method, config.output or default_output(config, method))
     elif place is None:
-        train_scene(config, method)
+        train_scene(config, method, others=others)
     else:
         with open_view(place) as view:
-            train_scene(config, method, view=view)
+            train_scene(config, method, view=view, others=others)
     return 0
 
 
@@ -60,14 +65,17 @@ def default_output(config: "TrainConfig", method: str) -> Path:
     return Path("runs") / f"{config.data.resolve().name or 'scene'}-{method}"
 
 
-def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False, view: "Aside | None" = None) -> Path:
-    """Train to the end and return the run folder. An existing run there is resumed if its config fits.
+def train_scene(
+    config: "TrainConfig", method: str, *, quiet: bool = False, view: "Aside | None" = None, others: bool = False
+) -> Path:
+    """Train to the end and return the run folder. An existing run there is resumed if its config and its images fit;
+    with `others` the images may have changed.
 
     `view` shows how it goes; where there is a terminal, and somebody looks at the end, it stays until they leave.
 
     Raises DataError where another process is training there.
     """
-    from ..engine import prepare, style_pass, trainer
+    from ..engine import originals, prepare, style_pass, trainer
     from ..engine.lay_out import plan_scene
     from ..engine.lock import held
     from ..engine.model import build_model
@@ -84,17 +92,27 @@ def train_scene(config: "TrainConfig", method: str, *, quiet: bool = False, view
         if view is not None:
             display.say(f"live at {view.address}")
         _check_same(folder, config)
+        marks: dict[str, str] = {}
+
+        def look(scene: "Scene") -> None:
+            marks.update(originals.fingerprints(scene))
+            if folder.exists and not others:
+                originals.refuse_others(output, scene, marks)
+
         if config.blocks.cuts:
             scene, plan = plan_scene(config)
             if plan.cut:
+                look(scene)
+                originals.keep(output, marks)
                 if view is not None:
                     raise UsageError(f"{VIEW}: scenes in blocks are not shown while they are trained; leave it out")
                 train_blocks(config, method, folder, scene, plan, display, start)
                 display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
                 return output
-        prepared = prepare.prepare(config, display.features)
+        prepared = prepare.prepare(config, display.features, look)
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
+        originals.keep(output, marks)
         folder.save_known(prepared.scene, config.data, prepared.facts)
         if prepared.basis is not None:
             folder.save_tensors("basis", prepared.basis.tensors())

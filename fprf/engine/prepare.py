@@ -52,9 +52,14 @@ def device_of(name: str) -> torch.device:
         raise PluginError(f"device: {name!r} is not available here; use cpu or auto") from e
 
 
-def prepare(config: TrainConfig, progress: Callable[[int, int, str], None] | None = None) -> Prepared:
-    """Everything but the model. `progress(done, total, what)` is told of the features."""
+def prepare(
+    config: TrainConfig,
+    progress: Callable[[int, int, str], None] | None = None,
+    look: Callable[[Scene], None] = lambda scene: None,
+) -> Prepared:
+    """Everything but the model. `progress(done, total, what)` is told of the features; `look` may refuse the scene before."""
     scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
+    look(scene)
     content = config.content.encoder.build()
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     semantic = config.semantic.encoder.build() if config.semantic.encoder is not None else None

@@ -4,6 +4,7 @@
     scene.json          what was found out: space, cameras, names, splits, sizes
     basis.safetensors   semantic basis, to bring references into the scene's terms
     style.safetensors   the scene's own statistics and regions
+    images.json         hashes of the images, so that another start does not go on with others
     events.jsonl        one line every few seconds of training
     metrics.json        written by `fprf eval`
     checkpoints/        see `engine.checkpoint`

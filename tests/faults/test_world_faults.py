@@ -78,6 +78,23 @@ def test_an_image_that_is_gone_or_changed_is_named(
     assert not checkpoint.steps(tmp_path / "run" / "checkpoints")
 
 
+def test_an_image_that_is_another_at_the_second_start_is_named(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    town, run = tmp_path / "town", tmp_path / "run"
+    shutil.copytree(world.town, town)
+    shutil.copytree(world.run, run)
+    images = sorted((town / "images").iterdir())
+    images[3].write_bytes(images[4].read_bytes())  # of the same shape
+    args = ["train", str(run / "config.json"), "--data", str(town), "--steps", "16"]
+    assert cli.main(args) == 2
+    (error,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert f"{images[3]} is another" in error and "--changed-images" in error
+    assert checkpoint.steps(run / "checkpoints")[-1] == 15
+    assert cli.main([*args, "--changed-images"]) == 0
+    assert checkpoint.steps(run / "checkpoints")[-1] == 16
+
+
 def start(args: Sequence[str], **environment: str) -> subprocess.Popen[str]:
     words = [sys.executable, "-m", "fprf", *args]
     return subprocess.Popen(words, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
