@@ -13,7 +13,15 @@ import torch
 from ..datamanagers.images import load_image
 from ..datamanagers.parsers.checksum import crc32c, masked
 from ..datamanagers.parsers.colmap_model import read_model
-from ..datamanagers.parsers.config import ColmapConfig, LlffConfig, MegaNerfConfig, TransformsConfig
+from ..datamanagers.parsers.config import (
+    ColmapConfig,
+    LlffConfig,
+    MegaNerfConfig,
+    OdmConfig,
+    PolycamConfig,
+    Record3DConfig,
+    TransformsConfig,
+)
 from ..datamanagers.parsers.files import read_npz
 from ..datamanagers.parsers.phototourism import read_list
 from ..datamanagers.parsers.tfrecord import read_examples
@@ -37,7 +45,8 @@ def targets(folder: Path) -> list[Target]:
     found += [_image(folder / "images", suffix) for suffix in ("png", "jpg", "webp", "bmp", "tiff")]
     found += [_camera_path(folder / "paths"), _style(folder / "styles"), _config(folder / "configs")]
     found += _tensors(folder / "tensors")
-    return [*found, _checkpoint(folder / "checkpoints"), *_tables(folder / "tables"), _meganerf(folder / "meganerf")]
+    found += [_checkpoint(folder / "checkpoints"), *_tables(folder / "tables"), _meganerf(folder / "meganerf")]
+    return [*found, _polycam(folder / "polycam"), _record3d(folder / "record3d"), *_odm(folder / "odm")]
 
 
 def _pictures(folder: Path, count: int) -> list[str]:
@@ -218,3 +227,59 @@ def _meganerf(folder: Path) -> Target:
         torch.save({"H": SIDE, "W": SIDE, "c2w": pose, "intrinsics": torch.tensor([30.0, 30, 12, 12])}, metadata / f"{k}.pt")
     parser = MegaNerfConfig().build()
     return Target("metadata of Mega-NeRF", metadata / "0.pt", lambda: parser.parse(folder, 1))
+
+
+def _polycam(folder: Path) -> Target:
+    names = _pictures(folder / "keyframes" / "images", 2)
+    cameras = folder / "keyframes" / "cameras"
+    cameras.mkdir()
+    for k, name in enumerate(names):
+        pose = {f"t_{row}{column}": float(row == column) + 0.3 * k * (column == 3) for row in range(3) for column in range(4)}
+        lens = {"fx": 30.0, "fy": 30.0, "cx": SIDE / 2, "cy": SIDE / 2, "width": SIDE, "height": SIDE}
+        (cameras / f"{Path(name).stem}.json").write_text(json.dumps(pose | lens))
+    parser = PolycamConfig().build()
+    return Target("camera of Polycam", cameras / "0.json", lambda: parser.parse(folder, 1))
+
+
+def _record3d(folder: Path) -> Target:
+    _pictures(folder / "rgb", 3)
+    poses = [[0.0, 0.0, 0.0, 1.0, 0.3 * k, 0.0, 0.0] for k in range(3)]
+    lenses = [[30.0, 30.0, SIDE / 2, SIDE / 2]] * 3
+    document = {"w": SIDE, "h": SIDE, "K": [30, 0, 0, 0, 30, 0, 12, 12, 1], "poses": poses, "perFrameIntrinsicCoeffs": lenses}
+    file = folder / "metadata.json"
+    file.write_text(json.dumps(document))
+    parser = Record3DConfig().build()
+    return Target("metadata of Record3D", file, lambda: parser.parse(folder, 1))
+
+
+def _odm(folder: Path) -> list[Target]:
+    """A project with a reconstruction, and one with a report alone."""
+    camera = {
+        "projection_type": "brown",
+        "width": SIDE,
+        "height": SIDE,
+        "focal_x": 1.2,
+        "focal_y": 1.2,
+        "c_x": 0.01,
+        "k1": 0.01,
+    }
+    shots, features = {}, []
+    for k, name in enumerate(_pictures(folder / "full" / "images", 3)):
+        shots[name] = {"camera": "v2", "rotation": [0.0, 0.0, 0.1 * k], "translation": [0.3 * k, 0.0, 1.0]}
+        features.append({"properties": {"filename": name, **shots[name]}})
+    points = {str(k): {"coordinates": [0.1 * k, 0.0, 5.0], "color": [1, 2, 3]} for k in range(4)}
+    whole, part = folder / "full" / "opensfm" / "reconstruction.json", folder / "report" / "odm_report" / "shots.geojson"
+    _pictures(folder / "report" / "images", 3)
+    for file, document in (
+        (whole, [{"cameras": {"v2": camera}, "shots": shots, "points": points}]),
+        (part, {"type": "FeatureCollection", "features": features}),
+        (folder / "report" / "cameras.json", {"v2": camera}),
+    ):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(json.dumps(document))
+    parser = OdmConfig().build()
+    return [
+        Target("reconstruction of ODM", whole, lambda: parser.parse(folder / "full", 1)),
+        Target("shots of ODM", part, lambda: parser.parse(folder / "report", 1)),
+        Target("cameras of ODM", folder / "report" / "cameras.json", lambda: parser.parse(folder / "report", 1)),
+    ]

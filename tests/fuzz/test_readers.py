@@ -29,6 +29,9 @@ NAMES = [
     "list of photographs",
     "tf.train.Example",
     "metadata of Mega-NeRF",
+    "camera of Polycam",
+    "metadata of Record3D",
+    *(f"{kind} of ODM" for kind in ("reconstruction", "shots", "cameras")),
 ]
 
 

@@ -17,7 +17,10 @@ __all__ = [
     "DataParserConfig",
     "LlffConfig",
     "MegaNerfConfig",
+    "OdmConfig",
     "PhotoTourismConfig",
+    "PolycamConfig",
+    "Record3DConfig",
     "TownConfig",
     "TransformsConfig",
 ]
@@ -151,3 +154,45 @@ class PhotoTourismConfig(DataParserConfig):
         from .phototourism import PhotoTourismParser
 
         return PhotoTourismParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolycamConfig(DataParserConfig):
+    """Polycam's raw data: `keyframes` with images and a JSON file for each camera, corrected ones first."""
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .polycam import PolycamParser
+
+        return PolycamParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record3DConfig(DataParserConfig):
+    """Record3D's LiDAR videos: `metadata.json` with `rgb`, or an unpacked .r3d."""
+
+    frames: int = 300
+    """At most so many images, evenly through the recording."""
+
+    def __post_init__(self) -> None:
+        at_least("parser.frames", self.frames, 1)
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .record3d import Record3DParser
+
+        return Record3DParser(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdmConfig(DataParserConfig):
+    """OpenDroneMap's projects (ODM, WebODM): photographs with `opensfm/reconstruction.json` or `odm_report/shots.geojson`."""
+
+    images: str = "images"
+    """Folder of the photographs, of any size."""
+
+    def build(self) -> DataParser:
+        """The parser."""
+        from .odm import OdmParser
+
+        return OdmParser(self)

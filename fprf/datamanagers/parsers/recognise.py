@@ -12,10 +12,16 @@ from .config import (
     DataParserConfig,
     LlffConfig,
     MegaNerfConfig,
+    OdmConfig,
     PhotoTourismConfig,
+    PolycamConfig,
+    Record3DConfig,
     TownConfig,
     TransformsConfig,
 )
+from .odm import project_file
+from .polycam import keyframes
+from .record3d import recording
 
 __all__ = ["parse_scene", "recognise"]
 
@@ -47,6 +53,12 @@ def recognise(data: Path) -> DataParserConfig:
         return TransformsConfig(file=manifests[0])
     if record_files(data):
         return BlockNerfConfig()
+    if keyframes(data) is not None:
+        return PolycamConfig()
+    if recording(data) is not None:
+        return Record3DConfig()
+    if project_file(data) is not None:
+        return OdmConfig()
     raise DataError(
         f"{data}: no transforms.json, transforms_train.json, poses_bounds.npy or sparse/0/cameras.bin, "
         f"but {_content(data)}; choose the parser by name, or make poses with `fprf process`"

@@ -1,0 +1,164 @@
+"""OpenDroneMap's projects (ODM, WebODM): images with `opensfm/reconstruction.json`, or `odm_report/shots.geojson` with
+`cameras.json` where a download holds no more than those.
+
+OpenSfM's coordinates on the image plane have their origin in the middle and the larger side as their unit, so they hold for
+images of any size. A shot's `rotation` (axis times angle) and, in a reconstruction, `translation` take the world to the camera,
+whose x is right, y down and z forward. In shots.geojson `translation` is the camera's place in projected metres. Frames are
+kept. Of several reconstructions that of most shots is read. WebODM's download leaves the photographs out: put them in `images`.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import DataError
+from ...interfaces import DataParser
+from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
+from ..image_header import read_header
+from ..scene import Scene
+from .config import OdmConfig
+from .files import Json, inside, read_json
+from .record import Record, record_of
+from .views import View, assemble, found, rigid
+
+__all__ = ["OdmParser", "project_file"]
+
+_RECONSTRUCTION, _SHOTS = "opensfm/reconstruction.json", "odm_report/shots.geojson"
+_RADIAL = {"perspective": OPENCV, "simple_radial": OPENCV, "radial": OPENCV, "brown": OPENCV}
+_LENSES = _RADIAL | {"fisheye": FISHEYE, "fisheye_opencv": FISHEYE}
+_FLIP = np.array([1.0, -1.0, -1.0])
+_TURN = 1e3
+"""Largest angle of a rotation in radians that is taken for one."""
+
+
+class _Shot(NamedTuple):
+    """An image's pose before the image is looked at."""
+
+    name: str
+    camera: Record
+    turn: NDArray[np.float64]
+    """World to camera, OpenCV's axes."""
+    place: NDArray[np.float64]
+
+
+def project_file(data: Path) -> Path | None:
+    """What says where a project's images were taken, or None."""
+    return next((data / file for file in (_RECONSTRUCTION, _SHOTS) if (data / file).is_file()), None)
+
+
+class OdmParser(DataParser):
+    """A project folder."""
+
+    def __init__(self, config: OdmConfig) -> None:
+        self.config = config
+
+    def parse(self, data: Path, downscale: int) -> Scene:
+        """The scene at 1/downscale of its photographs, with the reconstruction's points where they are there."""
+        file = project_file(data)
+        if file is None:
+            raise DataError(f"{data}: neither {_RECONSTRUCTION} nor {_SHOTS}; give the folder of an ODM project")
+        shots, points = _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
+        folder = inside(data, "parser.images", self.config.images)[1]
+        named = sorted((*inside(folder, str(file), shot.name), shot) for shot in shots)
+        found(folder, [path for _, path, _ in named])
+        views = [_view(str(file), name, path, shot) for name, path, shot in named]
+        return assemble(data, views, downscale=downscale, points=points)
+
+
+def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
+    """Shots and points of the largest part."""
+    whole = read_json(file)
+    parts = [record_of(f"{file}: [{k}]", part) for k, part in enumerate(whole)] if isinstance(whole, list) else []
+    largest = max(parts, key=lambda part: len(_objects(part, "shots")), default=None)
+    if largest is None or not _objects(largest, "shots"):
+        raise DataError(f"{file}: no list of reconstructions with shots; run ODM again")
+    cameras = _objects(largest, "cameras")
+    shots = []
+    for name, record in _objects(largest, "shots").items():
+        key = record.text("camera") or ""
+        if key not in cameras:
+            raise DataError(f"{record.where}: its camera {key!r} is none of cameras; run ODM again")
+        turn, offset = _turn(record), _numbers(record, "translation", record.get("translation"))
+        shots.append(_Shot(name, cameras[key], turn, -turn.T @ offset))
+    points = [_numbers(point, "coordinates", point.get("coordinates")) for point in _objects(largest, "points").values()]
+    return shots, np.array(points).reshape(-1, 3)
+
+
+def _shots(data: Path, file: Path) -> list[_Shot]:
+    """Shots of a report, with the cameras beside it."""
+    beside = data / "cameras.json"
+    cameras = _objects(record_of(beside, {"cameras": read_json(beside)}), "cameras")
+    shots = []
+    for feature in record_of(file, read_json(file)).records("features"):
+        record = record_of(f"{feature.where}: properties", feature.own.get("properties"))
+        name, key = record.text("filename"), record.text("camera")
+        if name is None:
+            raise DataError(f"{record.where}: filename is missing; each shot names its image")
+        if key is None and len(cameras) == 1:
+            key = next(iter(cameras))
+        if key is None or key not in cameras:
+            raise DataError(f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {_RECONSTRUCTION}")
+        place = _numbers(record, "translation", record.get("translation"))
+        shots.append(_Shot(name, cameras[key], _turn(record), place))
+    if len({shot.name for shot in shots}) < len(shots):
+        raise DataError(f"{file}: an image occurs twice; remove one of its shots")
+    return shots
+
+
+def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
+    header = read_header(path)
+    camera, longest = shot.camera, max(header.width, header.height)
+    own = camera.number("width"), camera.number("height")
+    if None not in own and abs((own[0] or 0) * header.height - (own[1] or 0) * header.width) > 2 * longest:
+        raise DataError(f"{path}: {header.width}x{header.height} pixels is not the shape of its camera; restore the image")
+    kind = camera.text("projection_type") or "perspective"
+    if kind not in _LENSES:
+        raise DataError(f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_LENSES)}")
+    k1, k2, k3, k4, p1, p2 = (camera.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    fx, fy = (camera.number(key) or camera.number("focal") for key in ("focal_x", "focal_y"))
+    if fx is None:
+        raise DataError(f"{camera.where}: neither focal nor focal_x; run ODM again")
+    straight = kind in _RADIAL and not any((k1, k2, k3, k4, p1, p2))
+    turned = np.concatenate([shot.turn.T * _FLIP, shot.place[:, None]], 1)
+    return View(
+        name=name,
+        path=path,
+        pose=rigid(f"{where} ({name})", turned),
+        size=(header.width, header.height),
+        focal=(fx * longest, (fx if fy is None else fy) * longest),
+        # OpenSfM counts pixels from the middle of the first one, we from its corner: the half cancels.
+        centre=(
+            header.width / 2 + (camera.number("c_x") or 0.0) * longest,
+            header.height / 2 + (camera.number("c_y") or 0.0) * longest,
+        ),
+        distortion=(k1, k2, k3, k4, p1, p2),
+        lens=PINHOLE if straight else _LENSES[kind],
+    )
+
+
+def _turn(record: Record) -> NDArray[np.float64]:
+    vector = _numbers(record, "rotation", record.get("rotation"))
+    if np.abs(vector).max() > _TURN:
+        raise DataError(f"{record.where}: rotation is {vector.tolist()}, not an axis times an angle; run ODM again")
+    return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
+
+
+def _numbers(record: Record, key: str, value: Json) -> NDArray[np.float64]:
+    cells = value if isinstance(value, list) else []
+    numbers = [float(c) for c in cells if isinstance(c, int | float) and not isinstance(c, bool) and abs(c) < 1e300]
+    if len(numbers) != 3 or len(cells) != 3:
+        raise DataError(f"{record.where}: {key} is not three numbers; run ODM again")
+    return np.array(numbers)
+
+
+def _objects(record: Record, key: str) -> Mapping[str, Record]:
+    """An object of objects by their names; none where it is absent."""
+    value = record.own.get(key)
+    if value is None:
+        return {}
+    whole = record_of(f"{record.where}: {key}", value)
+    return {name: record_of(f"{whole.where}[{name!r}]", each) for name, each in whole.own.items()}

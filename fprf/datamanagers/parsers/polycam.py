@@ -1,0 +1,75 @@
+"""Polycam's raw data (LiDAR captures, developer mode): `keyframes/` with images and a JSON file for each camera.
+
+`corrected_images` and `corrected_cameras`, which Polycam writes after its global optimisation, are used where they are; else
+`images` and `cameras`. `t_00` ... `t_23` are camera to world, three rows of four, in OpenGL axes (ARKit's: y is up in the
+world); `fx fy cx cy width height` are in pixels. The world frame is kept, in metres. An image without a camera is left out.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DataError
+from ...interfaces import DataParser
+from ..scene import Scene
+from .config import PolycamConfig
+from .files import image_names, read_json
+from .record import Record, record_of
+from .views import View, assemble, rigid
+
+__all__ = ["PolycamParser", "keyframes"]
+
+_PAIRS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
+_MOST = 1e6
+"""Pixels of a side."""
+
+
+def keyframes(data: Path) -> tuple[Path, Path] | None:
+    """Folders of images and cameras in a scene folder, or None: either may be `keyframes` or hold it."""
+    for root in (data / "keyframes", data):
+        for images, cameras in _PAIRS:
+            if (root / images).is_dir() and (root / cameras).is_dir() and next((root / cameras).glob("*.json"), None):
+                return root / images, root / cameras
+    return None
+
+
+class PolycamParser(DataParser):
+    """`keyframes/` of a raw export."""
+
+    def __init__(self, config: PolycamConfig) -> None:
+        self.config = config
+
+    def parse(self, data: Path, downscale: int) -> Scene:
+        """The scene at 1/downscale of its images."""
+        folders = keyframes(data)
+        if folders is None:
+            raise DataError(f"{data}: no keyframes/images with keyframes/cameras/*.json; export raw data from Polycam")
+        images, cameras = folders
+        named = [(images / name, cameras / f"{Path(name).stem}.json") for name in image_names(images)]
+        views = [_view(image, file) for image, file in named if file.is_file()]
+        if not views:
+            raise DataError(f"{cameras}: no file has the name of an image in {images}; export the raw data again")
+        return assemble(data, views, downscale=downscale)
+
+
+def _view(image: Path, file: Path) -> View:
+    record = record_of(file, read_json(file))
+    rows = [[_number(record, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    width, height, fx, fy, cx, cy = (_number(record, key) for key in ("width", "height", "fx", "fy", "cx", "cy"))
+    if not (1 <= width <= _MOST and 1 <= height <= _MOST):
+        raise DataError(f"{file}: an image of {width:g}x{height:g} pixels; export the raw data again")
+    return View(
+        name=image.name,
+        path=image,
+        pose=rigid(str(file), np.array(rows)),
+        size=(round(width), round(height)),
+        focal=(fx, fy),
+        centre=(cx, cy),
+    )
+
+
+def _number(record: Record, key: str) -> float:
+    value = record.number(key)
+    if value is None:
+        raise DataError(f"{record.where}: {key} is missing; export the raw data again")
+    return value
