@@ -21,6 +21,7 @@ from . import tensorfiles
 from .blocks import SURROUNDINGS, Built, folder_of, inset, load_finished, read_done, restore, save_finished, surroundings
 from .checkpoint import reached
 from .lay_out import RAYS, asked_of, load_boxes
+from .lock import held
 from .model import Facts
 from .prepare import Prepared, cache_folder
 from .run import Run
@@ -53,8 +54,13 @@ def train_block(task: BlockTask, report: Callable[[Report], None]) -> bool:
     """Train a block to its end, from its newest checkpoint; False where it was finished already.
 
     A folder that was trained as something else (other bounds, rays, images or knobs) is started anew. Raises ConfigError
-    where the images are not those of the run.
+    where the images are not those of the run, DataError where another process trains the block at this moment.
     """
+    with held(folder_of(Path(task.root), task.block)):
+        return _train_held(task, report)
+
+
+def _train_held(task: BlockTask, report: Callable[[Report], None]) -> bool:
     root = Path(task.root)
     run = Run(root)
     config, _ = run.load_config()

@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -20,8 +21,9 @@ from fprf.engine.block_task import BlockTask, train_block
 from fprf.engine.blocks import SURROUNDINGS
 from fprf.engine.loading import load_run
 from fprf.engine.trainer import Report
-from fprf.errors import CheckpointError, ConfigError
+from fprf.errors import CheckpointError, ConfigError, DataError
 from fprf.fields.layouts import AdaptiveConfig, StreetConfig
+from fprf.types import Rendered
 
 NAMES = ("surroundings", "00", "01", "02")
 
@@ -91,6 +93,44 @@ def test_an_interrupted_block_goes_on_to_the_same_bits(
     assert train_block(task(block_world, root, block), lambda event: seen.append(event.step))
     assert seen[:4] == [1, 2, 3, 4], "it must not start over"
     assert same(root, block_world.root, name)
+
+
+def test_two_workers_on_a_block_the_second_is_told_and_changes_nothing(block_world: BlockWorld, tmp_path: Path) -> None:
+    """It is refused while the first holds the folder, and finds the block finished afterwards; other blocks are free."""
+    root = copy_of(block_world, tmp_path)
+    shutil.rmtree(root / "blocks/01/checkpoints")
+    (root / "blocks/01/done.json").unlink()
+    met: list[str] = []
+
+    def meanwhile(event: Report) -> None:
+        with pytest.raises(DataError, match=r"01: process \d+ on .+ is training here"):
+            train_block(task(block_world, root, 1), lambda event: None)
+        assert not train_block(task(block_world, root, 2), lambda event: None)
+        met.append("refused")
+
+    assert train_block(task(block_world, root, 1), meanwhile)
+    assert met and same(root, block_world.root, "01")
+    assert not train_block(task(block_world, root, 1), lambda event: None)
+    assert not (root / "blocks/01/.lock").exists()
+
+
+def test_a_block_s_sampler_goes_on_where_its_surroundings_stopped(
+    block_world: BlockWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, asked = copy_of(block_world, tmp_path), []
+    whole = trainer.render_rays
+
+    def watched(*args: Any, **named: Any) -> Rendered:
+        asked.append(named["step"])
+        return whole(*args, **named)
+
+    monkeypatch.setattr(trainer, "render_rays", watched)
+    for name in ("surroundings", "01"):
+        shutil.rmtree(root / "blocks" / name / "checkpoints")
+        (root / "blocks" / name / "done.json").unlink()
+    assert train_block(task(block_world, root, SURROUNDINGS), lambda event: None)
+    assert train_block(task(block_world, root, 1), lambda event: None)
+    assert asked == [*range(6), *range(6, 12)]
 
 
 def test_another_task_in_the_folder_starts_anew(block_world: BlockWorld, tmp_path: Path) -> None:

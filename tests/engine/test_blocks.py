@@ -1,6 +1,7 @@
 """Models of blocks for training, and finished blocks in files."""
 
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,10 @@ from fprf.engine.blocks import (
 )
 from fprf.engine.lay_out import load_boxes
 from fprf.engine.run import Run
-from fprf.errors import CheckpointError
-from fprf.types import Boxes
+from fprf.errors import CheckpointError, PluginError
+from fprf.fields.config import PlanesConfig
+from fprf.fields.content import PlanesField
+from fprf.types import Boxes, FieldSample
 
 
 @pytest.fixture
@@ -99,3 +102,27 @@ def test_the_surroundings_span_all_blocks_however_they_are_cut() -> None:
     halves = Boxes(low, high, eye.expand(2, 3, 3), 0.25)
     one, two = surroundings_of(whole), surroundings_of(halves)
     assert torch.equal(one.low, two.low) and torch.equal(one.high, two.high)
+
+
+def test_a_part_that_breaks_its_contract_is_told_before_a_block_is_trained(parts) -> None:  # type: ignore[no-untyped-def]
+    """Each block is made of the same parts as the surroundings, which come first."""
+    config, facts, boxes = parts
+    wrong = replace(config, content=replace(config.content, field=Negative()))
+    with pytest.raises(PluginError, match="test_blocks:Negative: density: expected numbers in"):
+        surroundings(wrong, facts, boxes)
+
+
+class Thin(PlanesField):
+    """A field whose densities are below 0."""
+
+    def density(self, points: torch.Tensor) -> FieldSample:
+        sample = super().density(points)
+        return sample._replace(density=-sample.density)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Negative(PlanesConfig):
+    """A stranger's field."""
+
+    def build(self, *, channels: int, seed: int) -> Thin:
+        return Thin(self, channels=channels, seed=seed)
