@@ -3,8 +3,8 @@
     python benchmarks/poisoned.py [--steps 30000] [--share 0.01] [--seeds 0 1] [--output benchmarks/results/poisoned.json]
 
 The toy is a town of ten pictures and a model of a few thousand numbers (`kills.py` trains the same). Which batches are spoilt,
-and how, are functions of (seed, step): colours, features or pixels that are NaN or infinite, in one ray or in all; colours
-whose square overflows. Every step must leave finite parameters and moments; at the end both models are compared on all views.
+and how, are functions of (seed, step): colours or features that are NaN or infinite, in one ray or in all, or whose square
+overflows. Every step must leave finite parameters and moments; at the end both models are compared on all views.
 """
 
 import argparse
@@ -65,8 +65,8 @@ POISONS: dict[str, Callable[[Batch], Batch]] = {
     "colours of 1e25": _field("rgb", lambda x: torch.full_like(x, 1e25)),
     "one content feature NaN": _field("content", lambda x: _one(x, NAN)),
     "one semantic feature infinite": _field("semantic", lambda x: _one(x, -INF)),
-    "one pixel NaN": _field("pixel", lambda x: _one(x, NAN)),
-    "all pixels infinite": _field("pixel", lambda x: torch.full_like(x, INF)),
+    "all content features 3e38": _field("content", lambda x: torch.full_like(x, 3e38)),
+    "all semantic features NaN": _field("semantic", lambda x: torch.full_like(x, NAN)),
 }
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from . import __version__
 from .errors import FprfError, UsageError
+from .memory import out_of_memory, shortage
 from .plugins.registry import nearest
 from .process import settle
 
@@ -69,7 +70,10 @@ def main(args: Sequence[str] | None = None) -> int:
     except Exception as error:
         if debug:
             traceback.print_exc()
-        else:
+        if out_of_memory(error):
+            print(f"error: {shortage('fprf', error, 'close other programs, or take a larger --downscale')}", file=sys.stderr)
+            return 2
+        if not debug:
             print(_our_fault(error), file=sys.stderr)
         return 1
     return code

@@ -8,6 +8,7 @@
       WeightsError            encoder or decoder weights: absent, of another encoder, damaged
       CheckpointError         a run folder or a checkpoint
       NumericsError           a value that is not finite where it must be
+      OutOfMemoryError        not enough memory, and nothing left that could be made smaller
 
 The command line turns each into one line on standard error and exit code 2.
 """
@@ -18,6 +19,7 @@ __all__ = [
     "DataError",
     "FprfError",
     "NumericsError",
+    "OutOfMemoryError",
     "PluginError",
     "UsageError",
     "WeightsError",
@@ -54,3 +56,7 @@ class CheckpointError(FprfError):
 
 class NumericsError(FprfError):
     """A value that is not finite where the computation needs one."""
+
+
+class OutOfMemoryError(FprfError):
+    """Not enough memory, and nothing left that could be made smaller."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
+from ..memory import out_of_memory
 from .image_header import ImageHeader, header_of, read_header
 
 if TYPE_CHECKING:  # else reading a picture would need torch
@@ -94,8 +95,11 @@ def _decode(path: Path, header: ImageHeader) -> NDArray[np.generic]:
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
+        if out_of_memory(error):
+            raise
         raise DataError(f"{path}: the {header.kind} data cannot be decoded; copy or export the image again") from error
     if pixels is None:
+        np.empty(8 * header.width * header.height, np.uint8)  # raises MemoryError where that is what the decoder lacked
         raise DataError(f"{path}: the {header.kind} data cannot be decoded; copy or export the image again")
     return np.asarray(pixels)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..interfaces import Decoder
+from ..memory import in_parts
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Restyle, composite, march
 from ..types import Rays, Want
@@ -112,8 +113,8 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
     """The same chunk by chunk, for those who may stop half-way or keep none."""
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
-    for start in range(0, len(rays.near), config.chunk):
-        here = slice(start, start + config.chunk)
+
+    def part(here: slice) -> Part:
         chunk = Rays(*(x[here] for x in rays))
         marched = march(chunk, model.parts, budget=config.budget)
         kept = marched.kept
@@ -124,4 +125,6 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
         bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
         depth = model.space.metric(origin[here], direction[here], marched.depth.cpu())
         opacity, samples, tone = marched.opacity.cpu(), marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
-        yield Part(bare, content, semantic, behind, len(chunk.near), depth, opacity, samples, tone)
+        return Part(bare, content, semantic, behind, len(chunk.near), depth, opacity, samples, tone)
+
+    yield from in_parts(len(rays.near), config.chunk, part)

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from ..config import TrainConfig
+from ..memory import in_parts
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import march
 from ..style.scene import SceneStyle, scene_style
-from ..style.statistics import empty, merge, moments
+from ..style.statistics import Moments, empty, merge, moments
 from .model import Model
 from .poses import refined
 
@@ -47,21 +48,25 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
     device = next(model.parameters()).device
     view, pixel = lattice(cameras, views, config.statistics.rays)
     whole = None
-    contents, semantics, weights = [], [], []
-    for start in range(0, len(view), config.render.chunk):
-        part = slice(start, start + config.render.chunk)
+
+    def part_of(part: slice) -> tuple[Moments, Tensor, Tensor, Tensor | None]:
         rays = model.space.rays(*rays_through(cameras, view[part], pixel[part]))
         rays = type(rays)(*(x.to(device) for x in rays))
         kept = march(rays, model.parts, budget=config.render.budget).kept
         content = model.field.content(kept.latent, kept.view)
         own = moments(content, kept.weight)
-        whole = merge(whole if whole is not None else empty(content.shape[1]), own)
         # Regions are found and measured on an even share of the points; whole moments above see every one.
         every = max(1, -(-len(content) * config.statistics.rays // (len(rays.near) * POINTS)))
-        contents.append(content[::every].cpu())
-        weights.append(kept.weight[::every].cpu())
-        if model.semantic is not None:
-            semantics.append(model.semantic(kept.point[::every]).cpu())
+        semantic = model.semantic(kept.point[::every]).cpu() if model.semantic is not None else None
+        return own, content[::every].cpu(), kept.weight[::every].cpu(), semantic
+
+    contents, weights, semantics = [], [], []
+    for own, content, weight, semantic in in_parts(len(view), config.render.chunk, part_of):
+        whole = merge(whole if whole is not None else empty(content.shape[1]), own)
+        contents.append(content)
+        weights.append(weight)
+        if semantic is not None:
+            semantics.append(semantic)
     return scene_style(
         torch.cat(contents),
         torch.cat(semantics) if semantics else None,

@@ -12,6 +12,7 @@ from torch.profiler import record_function
 
 from ..config import TrainConfig
 from ..errors import NumericsError
+from ..memory import out_of_memory, shortage
 from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays
@@ -78,7 +79,8 @@ def train(
     `model` is one at its start, where it is not simply that of the config: a block in its surroundings, which was trained for
     `lead` steps before, as far as its sampler is concerned. An interrupt saves
     first, then goes on upwards. Steps that are not finite change nothing and are logged; several in a row lead back to the
-    last checkpoint. Raises NumericsError where there is none, or where that was of no use.
+    last checkpoint. Raises NumericsError where there is none, or where that was of no use, OutOfMemoryError where a step
+    finds too little memory.
     """
     device = device_of(config.device)
     model = (build_model(config, prepared.facts) if model is None else model).to(device)
@@ -117,11 +119,22 @@ def train(
             if not stop.hurried:
                 checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
             raise
+        except Exception as error:
+            if not out_of_memory(error):
+                raise
+            raise shortage(f"training step {step}", error, _less(run)) from error
     if saved is None or step > saved.step:
         checkpoint.save(run.checkpoints, model, optimizer, step=step, seconds=clock)
     if loop.steps:
         report(loop.summary(step, 1.0, clock))
     return model
+
+
+def _less(run: Run) -> str:
+    """What to do where there is not enough memory for a step."""
+    found = checkpoint.steps(run.checkpoints)
+    kept = f"the checkpoint of step {found[-1]} is kept" if found else "there is no checkpoint yet"
+    return f"lower --datamanager.rays, or begin anew with a larger --downscale ({kept})"
 
 
 def _go_back(run: Run, loop: "Loop", step: int, again: int) -> int:

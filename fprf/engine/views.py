@@ -10,10 +10,11 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..interfaces import Stylizer
+from ..memory import in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.pixel_rays import grid_rays
 from ..rendering.renderer import Restyle, composite, march, render_rays
-from ..types import Rays, Want
+from ..types import Rays, Rendered, Want
 from .model import Facts, Model, background_of
 
 __all__ = ["View", "match_view", "paint_pixels", "render_view", "view_rays"]
@@ -65,9 +66,12 @@ def render_view(
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
     rgb, depth, opacity, kept, samples = [], [], [], 0, 0
-    for start in range(0, len(rays.near), config.chunk):
-        part = Rays(*(x[start : start + config.chunk] for x in rays))
-        out = render_rays(part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=restyle)
+
+    def render(here: slice) -> Rendered:
+        part = Rays(*(x[here] for x in rays))
+        return render_rays(part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=restyle)
+
+    for out in in_parts(len(rays.near), config.chunk, render):
         assert out.rgb is not None
         rgb.append(out.rgb.cpu())
         depth.append(out.depth.cpu())
@@ -120,13 +124,14 @@ def paint_pixels(
     `semantic` is false. Neither content nor colour is computed.
     """
     rays, _, _ = view_rays(model, cameras, view, pixel)
-    painted, opacity = [], []
-    for start in range(0, len(rays.near), config.chunk):
-        chunk = Rays(*(x[start : start + config.chunk] for x in rays))
+
+    def paint(here: slice) -> tuple[Tensor, Tensor]:
+        chunk = Rays(*(x[here] for x in rays))
         marched = march(chunk, model.parts, budget=config.budget)
         kept, field = marched.kept, model.semantic if semantic else None
         found = values(kept.point[:, :0] if field is None else field(kept.point))
         mass = composite(kept, torch.ones_like(kept.weight)[:, None], len(chunk.near))
-        painted.append((composite(kept, found, len(chunk.near)) / mass.clamp_min(1e-10)).cpu())
-        opacity.append(marched.opacity.cpu())
+        return (composite(kept, found, len(chunk.near)) / mass.clamp_min(1e-10)).cpu(), marched.opacity.cpu()
+
+    painted, opacity = zip(*in_parts(len(rays.near), config.chunk, paint), strict=True)
     return torch.cat(painted), torch.cat(opacity)

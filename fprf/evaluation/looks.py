@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..engine.model import Facts, Model, background_of
+from ..memory import in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import composite, march
 from ..style.look import Restyle
@@ -26,21 +27,23 @@ def render_looks(
     device = next(model.parameters()).device
     rays = Rays(*(x.to(device) for x in model.space.rays(origin, direction)))
     background = background_of(facts, device)
-    pictures: dict[str, list[Tensor]] = {name: [] for name in looks}
-    depth = []
     asks = any(look is not None and Want.SEMANTIC in look.needs for look in looks.values())
-    for start in range(0, len(pixel), config.chunk):
-        part = Rays(*(x[start : start + config.chunk] for x in rays))
+
+    def shown(here: slice) -> tuple[dict[str, Tensor], Tensor]:
+        part = Rays(*(x[here] for x in rays))
         marched = march(part, model.parts, budget=config.budget)
         content = model.field.content(marched.kept.latent, marched.kept.view)
         semantic = model.semantic(marched.kept.point) if asks and model.semantic is not None else None
+        pictures = {}
         for name, look in looks.items():
             colour = model.decoder(content) if look is None else look.colour(model.decoder, content, semantic)
             rgb = composite(marched.kept, colour, len(part.near))
-            pictures[name].append((rgb if background is None else rgb + marched.through[:, None] * background).cpu())
-        depth.append(marched.depth.cpu())
+            pictures[name] = (rgb if background is None else rgb + marched.through[:, None] * background).cpu()
+        return pictures, marched.depth.cpu()
+
+    found = list(in_parts(len(pixel), config.chunk, shown))
     width, height = (int(side) for side in cameras.size[view])
     return (
-        {name: torch.cat(parts).view(height, width, 3).clamp(0, 1) for name, parts in pictures.items()},
-        model.space.metric(origin, direction, torch.cat(depth)).view(height, width),
+        {name: torch.cat([part[name] for part, _ in found]).view(height, width, 3).clamp(0, 1) for name in looks},
+        model.space.metric(origin, direction, torch.cat([depth for _, depth in found])).view(height, width),
     )

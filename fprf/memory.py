@@ -1,0 +1,104 @@
+"""What to do when there is not enough memory: take less at once where that gives the same, else say what was needed.
+
+Every library says it differently: Python and NumPy raise MemoryError, torch a RuntimeError on the CPU and one of its own on a
+GPU, OpenCV its error -4. None of them is imported here.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from .errors import OutOfMemoryError
+
+__all__ = ["LEAST", "in_parts", "out_of_memory", "shortage", "wanted"]
+
+LEAST = 1024
+"""Rays below which parts are not halved: their share of the memory is small beside the model's."""
+_TEXT = re.compile(r"can't allocate memory|not enough memory|Cannot allocate memory|Tried to allocate|out of memory|bad_alloc")
+_ASKED = re.compile(r"(?:allocate|allocate array of|llocate) ([\d.]+) (bytes|KiB|MiB|GiB|TiB)", re.IGNORECASE)
+_UNITS = {"bytes": 1, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30, "tib": 1 << 40}
+_OPENCV_NO_MEMORY = -4
+_GIB = 1 << 30
+_Found = TypeVar("_Found")
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory could not be had."""
+    if isinstance(error, MemoryError):
+        return True
+    if getattr(error, "code", None) == _OPENCV_NO_MEMORY and type(error).__module__ == "cv2":
+        return True
+    if isinstance(error, SystemError) and error.__cause__ is not None:  # numba's, of an error in a parallel loop
+        return out_of_memory(error.__cause__)
+    return isinstance(error, RuntimeError) and _TEXT.search(str(error)) is not None
+
+
+def wanted(error: BaseException) -> int | None:
+    """The bytes that could not be had, where the error tells."""
+    found = _ASKED.search(str(error))
+    return None if found is None else int(float(found[1]) * _UNITS[found[2].lower()])
+
+
+def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator[_Found]:
+    """`work` of one slice after the other that together are `count` things, `size` at a time; half as many, down to LEAST,
+    from where there was not enough memory on. What is worked out of a thing must not depend on the others.
+
+    Raises OutOfMemoryError where there is not enough for LEAST either.
+    """
+    start = 0
+    while start < count:
+        try:
+            found = work(slice(start, start + size))
+        except Exception as error:
+            if not out_of_memory(error):
+                raise
+            if size <= LEAST:
+                raise shortage(f"{size} rays at a time", error, "close other programs") from error
+            size = max(LEAST, size // 2)
+        else:
+            yield found
+            start += size
+
+
+def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
+    """One line: what was going on, what it took, what there is, and what to do."""
+    more = wanted(error)
+    asked = "" if more is None else f" and wanted {_told(more)} more"
+    held = _peak()
+    took = "" if held is None else f"; the process held up to {_told(held)}{asked}"
+    return OutOfMemoryError(f"{what}: not enough memory{took}{_limits()}; {remedy}")
+
+
+def _told(count: float) -> str:
+    return f"{count / _GIB:.2f} GiB"
+
+
+def _peak() -> int | None:
+    """Most bytes that this process ever held; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return kib if sys.platform == "darwin" else kib * 1024
+
+
+def _limits() -> str:
+    """What is free, and what the process may have, as far as the system tells."""
+    parts = []
+    try:
+        available = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())
+        if available:
+            parts.append(f"{_told(int(available[1]) * 1024)} are free on this machine")
+    except OSError:
+        pass
+    if os.name == "posix":
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            parts.append(f"{_told(limit)} of addresses are allowed")
+    return f" ({', '.join(parts)})" if parts else ""

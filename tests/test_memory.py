@@ -1,0 +1,113 @@
+"""What libraries say when memory is short, parts that get smaller, and the one line at the end."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf import cli
+from fprf.errors import OutOfMemoryError
+from fprf.memory import LEAST, in_parts, out_of_memory, shortage, wanted
+
+TORCH = "[enforce fail at alloc_cpu.cpp:127] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 4096 bytes."
+CUDA = "CUDA out of memory. Tried to allocate 1.50 GiB. GPU 0 has a total capacity of 79 GiB of which 1 GiB is free."
+
+
+def opencv(code: int) -> cv2.error:
+    error = cv2.error("OpenCV(5.0.0): error: Failed to allocate 2700000000 bytes in function 'OutOfMemoryError'")
+    error.code = code
+    return error
+
+
+def caused(error: Exception, cause: Exception) -> Exception:
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "short", "bytes_"),
+    [
+        (MemoryError("Unable to allocate 8.00 GiB for an array with shape (1073741824,)"), True, 8 << 30),
+        (MemoryError(), True, None),
+        (RuntimeError(TORCH), True, 4096),
+        (torch.OutOfMemoryError(CUDA), True, 3 << 29),
+        (RuntimeError("std::bad_alloc"), True, None),
+        (opencv(-4), True, 2_700_000_000),
+        (opencv(-215), False, 2_700_000_000),
+        (caused(SystemError("returned a result with an exception set"), MemoryError()), True, None),
+        (SystemError("something else"), False, None),
+        (RuntimeError("sizes do not match"), False, None),
+        (ValueError("out of memory"), False, None),
+        (KeyboardInterrupt(), False, None),
+    ],
+)
+def test_what_each_library_says(error: BaseException, short: bool, bytes_: int | None) -> None:
+    assert out_of_memory(error) is short
+    assert wanted(error) == bytes_
+
+
+def test_the_errors_of_the_installed_libraries() -> None:
+    """More than a process can address: refused without being tried."""
+    huge = 1 << 46
+    for ask in (lambda: torch.empty(huge), lambda: np.empty(huge), lambda: bytearray(huge)):
+        with pytest.raises((RuntimeError, MemoryError)) as told:
+            ask()
+        assert out_of_memory(told.value)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 20_000), st.integers(500, 9000), st.integers(1, 9000))
+def test_everything_is_done_once_and_in_order_whatever_fits(count: int, size: int, fits: int) -> None:
+    tried: list[int] = []
+
+    def work(part: slice) -> list[int]:
+        found = list(range(count))[part]
+        tried.append(part.stop - part.start)
+        if len(found) > max(fits, LEAST):
+            raise MemoryError
+        return found
+
+    found = list(in_parts(count, size, work))
+    assert [each for part in found for each in part] == list(range(count))
+    assert tried == sorted(tried, reverse=True), "once smaller, always smaller"
+    assert all(part >= min(size, LEAST) for part in tried)
+    assert all(tried.count(part) >= 1 and part in {max(LEAST, size >> k) for k in range(20)} | {size} for part in tried)
+
+
+def test_other_errors_and_too_little_for_the_least_are_raised() -> None:
+    def broken(part: slice) -> None:
+        raise ZeroDivisionError
+
+    def short(part: slice) -> None:
+        tried.append(part.stop - part.start)
+        raise RuntimeError(TORCH)
+
+    with pytest.raises(ZeroDivisionError):
+        list(in_parts(5, 2, broken))
+    tried: list[int] = []
+    with pytest.raises(OutOfMemoryError, match=r"1024 rays at a time: not enough memory; .* wanted 0.00 GiB more"):
+        list(in_parts(10_000, 5000, short))
+    assert tried == [5000, 2500, 1250, 1024]
+    with pytest.raises(OutOfMemoryError, match="300 rays at a time"):
+        list(in_parts(300, 300, short))
+
+
+def test_the_line_says_what_was_needed() -> None:
+    line = str(shortage("training step 7", MemoryError("Unable to allocate 8.00 GiB for an array"), "do this"))
+    assert line.startswith("training step 7: not enough memory; the process held up to ")
+    assert " and wanted 8.00 GiB more" in line and line.endswith("; do this") and "\n" not in line
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError(TORCH), opencv(-4)])
+def test_the_command_line_ends_with_one_line_and_2(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(args: list[str]) -> int:
+        raise error
+
+    monkeypatch.setattr("fprf.commands.plugins.run", fail)
+    assert cli.main(["plugins"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: fprf: not enough memory")
