@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .event_log import EventLog
 from .progress import Display
 
 if TYPE_CHECKING:
@@ -63,7 +64,6 @@ def run_block(task: "BlockTask") -> None:
     from ..engine.block_task import train_block
     from ..engine.blocks import SURROUNDINGS, folder_of
     from ..engine.run import Run
-    from .train import EventLog
 
     name = "surroundings" if task.block == SURROUNDINGS else f"block {task.block:02d}"
     log = EventLog(Run(folder_of(Path(task.root), task.block)))

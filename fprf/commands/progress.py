@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["Display"]
 
 LINE_SECONDS = 5.0
-"""Time between JSON lines where standard error is no terminal."""
+"""Time between JSON lines where standard error is no terminal, and in events.jsonl."""
 
 
 class Display:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from ..errors import UsageError
 from .beside import VIEW, linger, open_view, take_view
 from .blocks import show_plan, train_blocks
+from .event_log import EventLog
 from .parsing import LIST_FLAGS, load_method, methods, parse
 
 if TYPE_CHECKING:
@@ -19,12 +20,10 @@ if TYPE_CHECKING:
     from ..engine.trainer import Report
     from ..viewer.aside import Aside
 
-__all__ = ["EventLog", "default_output", "run", "train_scene"]
+__all__ = ["default_output", "run", "train_scene"]
 
 PLAN = "--plan"
 CHANGED = "--changed-images"
-LINE_SECONDS = 5.0
-"""Time between lines in events.jsonl, and on standard error where it is no terminal."""
 
 
 def run(args: list[str]) -> int:
@@ -146,31 +145,6 @@ def train_scene(
     if view is not None:
         linger(view, display)
     return output
-
-
-class EventLog:
-    """Lines for events.jsonl, not more often than every few seconds, and the last one always."""
-
-    def __init__(self, folder: "Run") -> None:
-        self.folder, self.last = folder, -LINE_SECONDS
-
-    def __call__(self, event: "Report") -> None:
-        """A line for the event, if one is due."""
-        now = time.perf_counter()
-        if now - self.last < LINE_SECONDS and event.share < 1:
-            return
-        self.last = now
-        self.folder.log(
-            {
-                "step": event.step,
-                "seconds": round(event.seconds, 2),
-                "psnr": round(event.psnr, 3),
-                "rays_per_second": round(event.rays_per_second),
-                "kept": round(event.kept, 4),
-                "skipped_steps": event.skipped,
-                "losses": {name: float(f"{value:.4g}") for name, value in event.losses.items()},
-            }
-        )
 
 
 def _described(prepared: "Prepared") -> str:
