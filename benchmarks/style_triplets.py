@@ -20,7 +20,7 @@ from fprf.plugins.encoders.config import EncoderConfig
 from fprf.plugins.stylizers.config import IdentityConfig
 from fprf.style.dictionary import build_dictionary
 
-DIM, REGIONS, CLUSTERS = 32, 8, 10
+DIM, REGIONS, CLUSTERS = 32, 16, 20
 """Of `fprf-lite`: semantic components, regions of a scene, codes of a reference."""
 SOURCES = ("painted", "encoder")
 

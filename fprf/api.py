@@ -136,7 +136,7 @@ class TrainedScene:
         weights: Sequence[float] = (),
         strength: float = 1.0,
         luminance: float = 0.0,
-        clusters: int = 10,
+        clusters: int = 20,
         blend: float = 0.1,
         stylizer: StylizerConfig | None = None,
         pin: Sequence[str] = (),

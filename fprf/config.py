@@ -162,7 +162,7 @@ class StatisticsConfig:
 
     rays: int = 65536
     """Rays, spread evenly over the training views."""
-    regions: int = 8
+    regions: int = 16
     """Scene codes: clusters of the scene's own semantics."""
 
     def __post_init__(self) -> None:

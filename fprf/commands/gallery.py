@@ -43,7 +43,7 @@ class GalleryConfig(QualityConfig):
     """0 leaves the scene as it is, 1 is the full style; of photographs."""
     luminance: float = 0.0
     """How much of the scene's own luminance is kept, in [0, 1]; of photographs."""
-    clusters: int = 10
+    clusters: int = 20
     """Local styles per photograph, at least 1."""
     stylizer: StylizerConfig = RegionOtConfig()
     """What moves the scene's features; of photographs."""

@@ -13,7 +13,7 @@ from ..interfaces import Encoder
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import colour_maps
 from ..style.config import NO_MASK, StyleConfig
-from ..style.dictionary import BLEND, Reference, StyleDictionary, build_dictionary
+from ..style.dictionary import BLEND, CLUSTERS, Reference, StyleDictionary, build_dictionary
 from ..style.files import StyleFile, check_photographs, read_style
 from ..style.look import Restyle
 from ..style.matching import unit
@@ -149,7 +149,7 @@ def restyle(
     *,
     strength: float = 1.0,
     weights: Sequence[float] = (),
-    clusters: int = 10,
+    clusters: int = CLUSTERS,
     blend: float = BLEND,
 ) -> Styled:
     """`apply_style` without wishes about regions."""

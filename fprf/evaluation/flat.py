@@ -71,7 +71,7 @@ def flat_scene(
     semantic: Annotated[Tensor, "N D"] | None,
     size: tuple[int, int],
     *,
-    regions: int = 8,
+    regions: int = 16,
     seed: int = 0,
 ) -> Flat:
     """The photograph of these features, with its statistics; all pixels weigh alike."""

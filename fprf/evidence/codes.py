@@ -36,6 +36,8 @@ class Matched(NamedTuple):
     """Pixels that take a code of their own class."""
     match_inside: float | None
     """The same of pixels that are no nearer than two pixels to another class: encoders see cells, not pixels."""
+    match_border: float | None
+    """The same of the other pixels: how sharply what is told apart is told apart."""
     match_kind: float | None
     """Pixels that take a code of their own kind (see KINDS)."""
 
@@ -86,6 +88,7 @@ def match_rates(
     return Matched(
         _rate(taken == true, counts),
         _rate(taken == true, counts & inside),
+        _rate(taken == true, counts & ~inside),
         _rate(kind[taken] == kind[true], counts),
     )
 

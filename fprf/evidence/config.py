@@ -6,6 +6,7 @@ from typing import Literal
 
 from ..checks import at_least, between, positive
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
+from ..style.config import StyleConfig
 
 __all__ = ["EvidenceConfig", "PaperConfig", "PeerConfig", "RestyleConfig"]
 
@@ -40,9 +41,9 @@ class RestyleConfig(EvidenceConfig):
     """Longer side in pixels of views and frames."""
     stylizer: StylizerConfig = RegionToneConfig()
     """The method that is to be recommended."""
-    clusters: int = 10
+    clusters: int = StyleConfig.clusters
     """Style codes per reference, for all methods."""
-    blend: float = 0.3
+    blend: float = StyleConfig.blend
     """Share of the overall style in each local one, for all methods, in [0, 1]."""
     sheet: Path | None = None
     """Picture of all methods side by side, .png or .jpg; none = none."""
@@ -88,7 +89,9 @@ class PeerConfig(EvidenceConfig):
 class PaperConfig(EvidenceConfig):
     """A table of the paper, from short trainings of one scene: the method as it is, and with one thing changed."""
 
-    table: Literal["reconstruction", "time", "ablation", "multi-reference", "guided-filter", "clusters"] = "reconstruction"
+    table: Literal[
+        "reconstruction", "ablation", "guided-filter", "time", "multi-reference", "clusters", "statistics", "large-scale"
+    ] = "reconstruction"
     """Which."""
     run: Path | None = None
     """Run folder of a town, for the tables that train nothing but one scene; none = that one is trained first."""
@@ -108,6 +111,10 @@ class PaperConfig(EvidenceConfig):
     """Lights that a town is restyled in, with three references."""
     clusters: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
     """Style codes per reference, of the table of that name."""
+    codes: int = StyleConfig.clusters
+    """Style codes per reference, of all others."""
+    blend: float = StyleConfig.blend
+    """Share of the overall style in each local one, in [0, 1]."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
 
@@ -117,5 +124,7 @@ class PaperConfig(EvidenceConfig):
         at_least("trainings", len(self.trainings), 1)
         at_least("views", self.views, 1)
         at_least("palettes", len(self.palettes), 1)
+        at_least("codes", self.codes, 1)
+        between("blend", self.blend, 0.0, 1.0)
         for value in self.clusters:
             at_least("clusters", value, 1)

@@ -6,13 +6,12 @@ judged by its truth. Styles that need no training of their own (numbers of clust
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from ..config import TrainConfig
 from ..datamanagers.images import load_image
@@ -26,24 +25,18 @@ from ..engine.trainer import Report, train
 from ..engine.views import render_view
 from ..errors import UsageError
 from ..evaluation.metrics import image_metrics, mean_metrics
-from ..output.images import to_uint8, write_image
 from ..plugins.decoders.config import ResidualDecoderConfig
-from ..plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig, StylizerConfig
-from ..style.dictionary import StyleDictionary
-from .codes import code_classes, match_rates, winners
+from ..plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from .config import PaperConfig
-from .methods import dictionary_of, in_scene
-from .references import Reference, photograph, places
+from .paper_styles import Bench, restyled, set_up, style_rows
 from .scene_decoder import SceneDecoderConfig
-from .scores import Row, mean_rows, score
-from .stage import Stage, set_stage, town_folder, true_views
+from .scores import Row, mean_rows
+from .stage import town_folder
 
 __all__ = ["TRAINED", "Short", "paper", "short_training"]
 
 Progress = Callable[[int, int, str], None]
 Change = Callable[[TrainConfig], TrainConfig]
-SEEDS = (7, 11, 13)
-"""Towns of the references."""
 
 
 def _same(config: TrainConfig) -> TrainConfig:
@@ -116,6 +109,8 @@ def paper(config: PaperConfig, method: TrainConfig, progress: Progress) -> dict[
             "views": config.views,
             "palettes": list(config.palettes),
             "downscale": config.downscale,
+            "codes": config.codes,
+            "blend": config.blend,
         },
         "rows": mean_rows(tables),
     }
@@ -149,26 +144,20 @@ def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progr
             short = short_training(change(base), folder / str(k), progress)
             rows[name] = _held_out(short.trained, config.views) | {"train_seconds": short.seconds}
             if town_folder(short.trained) is not None:
-                rows[name] |= _restyled(config, short, folder / f"references-{k}", RegionToneConfig(), "three", 10)
+                rows[name] |= _styled(set_up(short.trained, short.encoders, config, folder / f"references-{k}"))
         return rows
     short = short_training(base, folder / "run", progress) if config.run is None else _finished(config.run, config.device)
     if town_folder(short.trained) is None:
         raise UsageError(f"--table {config.table}: judged by a town's truth; --run or --data is another scene, leave it out")
-    styles: dict[str, tuple[StylizerConfig, str, int]]
-    if config.table == "clusters":
-        styles = {f"{n} clusters": (RegionToneConfig(), "three", n) for n in config.clusters}
-    elif config.table == "multi-reference":
-        kinds = {"adain": AdainConfig(), "local-adain": LocalAdainConfig(), "region-tone": RegionToneConfig()}
-        styles = {f"{name}, {count}": (kind, count, 10) for count in ("one", "three") for name, kind in kinds.items()}
-    else:
-        kinds = {"adain": AdainConfig(), "local-adain": LocalAdainConfig(), "region-tone": RegionToneConfig()}
-        styles = {f"{name}, three references": (kind, "three", 10) for name, kind in kinds.items()}
-    rows = {}
-    for name, (stylizer, references, clusters) in styles.items():
-        rows[name] = _restyled(config, short, folder / "references", stylizer, references, clusters)
-    if config.table == "time":
-        rows = {"training": {"train_seconds": short.seconds}, **rows}
-    return rows
+    steady = config.table in ("statistics", "large-scale")
+    return style_rows(set_up(short.trained, short.encoders, config, folder / "references", path=steady))
+
+
+def _styled(bench: Bench) -> Row:
+    """The recommended stylizer on a training, and the paper's own, which has nothing but features."""
+    paper = restyled(bench, LocalAdainConfig())
+    shown = {f"paper_{key}": paper[key] for key in ("styled_psnr", "styled_delta_e", "structure") if key in paper}
+    return restyled(bench, RegionToneConfig()) | shown
 
 
 def _finished(root: Path, device: str) -> Short:
@@ -188,44 +177,3 @@ def _held_out(trained: Trained, views: int) -> Row:
         truth = torch.from_numpy(load_image(scene.paths[view], size, known.facts.background)).float() / 255
         found.append(image_metrics(render, truth))
     return dict(mean_metrics(found))
-
-
-def _restyled(config: PaperConfig, short: Short, folder: Path, stylizer: StylizerConfig, references: str, clusters: int) -> Row:
-    """Figures of a style of the town, means over the palettes: nearness to the truth, match rate, seconds."""
-    trained, encoders = short.trained, short.encoders
-    side = int(trained.known.cameras.size.amax())
-    stage = set_stage(trained, views=config.views, frames=0, longest=side)
-    width, height = (int(v) for v in trained.known.cameras.size[0])
-    rows: list[dict[str, Row]] = []
-    for light in config.palettes:
-        shown = [photograph(place, light) for place in places(SEEDS, (width, height))[references]]
-        paths = [folder / f"{references}-{reference.name}.png" for reference in shown]
-        for path, reference in zip(paths, shown, strict=True):
-            write_image(path, to_uint8(reference.image))
-        dictionary, spent = dictionary_of(trained, paths, encoders, clusters=clusters, blend=0.3)
-        found = in_scene(trained, stage.shown, stylizer, dictionary, encoders, paths)
-        labels = [each.labels for each in stage.truth]
-        near, _ = score(found.pictures, true_views(stage, light), labels)
-        row: Row = {f"styled_{name}": value for name, value in near.items()}
-        row["match_inside"] = _match(short, found.taken, dictionary, paths, shown, stage)
-        row |= {"style_seconds": spent + found.style_seconds, "view_seconds": found.view_seconds}
-        rows.append({"": row})
-    return mean_rows(rows)[""]
-
-
-def _match(
-    short: Short,
-    taken: Sequence[Tensor] | None,
-    dictionary: StyleDictionary,
-    paths: Sequence[Path],
-    shown: Sequence[Reference],
-    stage: Stage,
-) -> float | None:
-    """Match rate inside of things; None where nothing is matched."""
-    if taken is None:
-        return None
-    known = {path.name: reference for path, reference in zip(paths, shown, strict=True)}
-    classes = code_classes(dictionary, known, short.encoders, short.trained.config.datamanager.guided)
-    truth = [each.labels for each in stage.truth]
-    found = [winners(share, classes).view(like.shape) for share, like in zip(taken, truth, strict=True)]
-    return match_rates(found, truth, shown).match_inside

@@ -12,7 +12,7 @@ from ..engine.restyle import Encoders, open_encoders
 from ..errors import UsageError
 from ..evaluation.steadiness import steadiness
 from ..output.images import Picture, to_uint8, write_image
-from .codes import code_classes, match_rates, winners
+from .codes import Matched, code_classes, match_rates, winners
 from .config import RestyleConfig
 from .contact import contact_sheet
 from .methods import FLAT, GLOBAL, PLAIN, Shown, dictionary_of, in_scene, lineup, nothing, one_by_one, transfers
@@ -75,6 +75,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
             "view_size": [int(side) for side in stage.views.size[0]],
             "clusters": config.clusters,
             "blend": config.blend,
+            "regions": trained.config.statistics.regions,
             "semantic_encoder": trained.known.facts.semantic_encoder,
         },
         "recommended": best,
@@ -181,9 +182,7 @@ def _rest(
     spent: float,
 ) -> Row:
     """Match rates, consistency and seconds; None where a method has none."""
-    row: Row = dict.fromkeys(
-        ("match", "match_inside", "match_kind", "consistency", "warp_short", "warp_long", "style_seconds", "view_seconds")
-    )
+    row: Row = dict.fromkeys((*Matched._fields, "consistency", "warp_short", "warp_long", "style_seconds", "view_seconds"))
     if method is None:
         return row
     count = len(stage.shown)

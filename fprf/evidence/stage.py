@@ -60,8 +60,8 @@ class Stage(NamedTuple):
     path_truth: Sequence[Truth]
 
 
-def set_stage(trained: Trained, *, views: int, frames: int, longest: int) -> Stage:
-    """Held-out views, evenly spread, and a path that begins at one of them (no frames, no path).
+def set_stage(trained: Trained, *, views: int, frames: int, longest: int, stride: float = 1.0) -> Stage:
+    """Held-out views, evenly spread, and a path that begins at one of them (no frames, no path; longer steps with `stride`).
 
     Raises UsageError where the run shows no town.
     """
@@ -73,7 +73,7 @@ def set_stage(trained: Trained, *, views: int, frames: int, longest: int) -> Sta
     chosen = torch.tensor([held_out[i * len(held_out) // count] for i in range(count)])
     cameras = known.cameras.scaled(max(1.0, float(known.cameras.size.amax()) / longest))
     judged = cameras.select(chosen)
-    path = short_path(judged.select(torch.tensor([count // 2])), frames)
+    path = short_path(judged.select(torch.tensor([count // 2])), frames, stride)
     render = trained.config.render
 
     def cached(of: Cameras) -> list[CachedView]:
@@ -122,18 +122,19 @@ def true_views(stage: Stage, light: str) -> list[Annotated[Tensor, "H W 3"]]:
     return [torch.from_numpy(picture).float() / 255 for picture in pictures]
 
 
-def short_path(start: Cameras, frames: int) -> Cameras:
+def short_path(start: Cameras, frames: int, stride: float = 1.0) -> Cameras:
     """A few steps onward from a camera, slowly turning to the left: neighbouring frames see nearly the same."""
     path = start.select(torch.zeros(frames, dtype=torch.int64))
     pose = path.pose.clone()
     ahead = -start.pose[0, :2, 2]
     ahead = ahead / ahead.norm().clamp_min(1e-9)
-    for k in range(frames):
+    for step in range(frames):
+        k = stride * step
         turn = pose.new_tensor(
             [[math.cos(k * _TURN), -math.sin(k * _TURN), 0], [math.sin(k * _TURN), math.cos(k * _TURN), 0], [0, 0, 1]]
         )
-        pose[k, :, :3] = turn @ pose[k, :, :3]
-        pose[k, :2, 3] += k * _STEP * ahead
+        pose[step, :, :3] = turn @ pose[step, :, :3]
+        pose[step, :2, 3] += k * _STEP * ahead
     return Cameras(pose, path.focal, path.centre, path.size, path.distortion, path.lens)
 
 

@@ -26,7 +26,7 @@ class StyleConfig:
     """A picture for each reference, in their order: only what is white there makes style codes; `none` = all of it."""
     stylizer: StylizerConfig = RegionToneConfig()
     """What moves the scene's features."""
-    clusters: int = 10
+    clusters: int = 20
     """Local styles (codes) per reference, at least 1."""
     blend: float = 0.1
     """Share of the overall style in each local one, in [0, 1], on both sides: 0 = local, 1 = global."""

@@ -19,6 +19,7 @@ from .statistics import covariance, double, group_moments, mix, moments
 
 __all__ = [
     "BLEND",
+    "CLUSTERS",
     "Reference",
     "StyleDictionary",
     "blend_codes",
@@ -33,6 +34,9 @@ __all__ = [
 BLEND = 0.1
 """Share of the whole image's (or scene's) statistics in each local code. The paper has none, its released code 0.3, which
 ends further from the truth where that is known (docs/evidence)."""
+
+CLUSTERS = 20
+"""Local codes a reference: with ten, as the paper suggests, trees and houses share some (docs/evidence)."""
 
 _FORMAT = "fprf-style-1"
 _TENSORS = ("keys", "mean", "covariance", "share", "reference", "weight")
@@ -80,7 +84,7 @@ class StyleDictionary(NamedTuple):
 def build_dictionary(
     references: Sequence[Reference],
     *,
-    clusters: int = 10,
+    clusters: int = CLUSTERS,
     blend: float = BLEND,
     seed: int = 0,
     min_members: int = 32,

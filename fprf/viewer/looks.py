@@ -50,7 +50,7 @@ class Look:
     strength: float = 1.0
     temperature: float = 0.2
     """Of the matching of regions and codes, relative; low = each region takes from what is most like it."""
-    clusters: int = 10
+    clusters: int = 20
     blend: float = 0.1
     luminance: float = 0.0
     orders: frozenset[Order] = frozenset()

@@ -24,14 +24,14 @@ def test_rates_count_what_they_say() -> None:
     truth = torch.full((12, 12), SKY)
     truth[6:] = FACADE
     shown = reference(torch.tensor([[SKY, FACADE, WINDOW]]))
-    assert tuple(match_rates([truth], [truth], [shown])) == (1, 1, 1)
+    assert tuple(match_rates([truth], [truth], [shown])) == (1, 1, 1, 1)
     found = truth.clone()
     found[6:] = WINDOW  # the right kind, another class
-    assert tuple(match_rates([found], [truth], [shown])) == (0.5, 0.5, 1)
+    assert tuple(match_rates([found], [truth], [shown])) == (0.5, 0.5, 0.5, 1)
     edge = truth.clone()
     edge[5:7] = CAR  # wrong at the border alone
-    match, inside, kind = match_rates([edge], [truth], [shown])
-    assert match == pytest.approx(10 / 12) and inside == 1 and kind == pytest.approx(10 / 12)
+    match, inside, border, kind = match_rates([edge], [truth], [shown])
+    assert match == pytest.approx(10 / 12) and inside == 1 and border == 0.5 and kind == pytest.approx(10 / 12)
 
 
 def test_classes_that_no_reference_shows_do_not_count() -> None:
@@ -39,7 +39,7 @@ def test_classes_that_no_reference_shows_do_not_count() -> None:
     assert match_rates([torch.full_like(truth, SKY)], [truth], [reference(torch.tensor([[SKY]]))]).match == 1
     assert match_rates([truth], [truth], [reference(torch.tensor([[WINDOW]]))]).match is None
     without = torch.full_like(truth, -1)  # codes of no class are wrong, of no kind too
-    assert tuple(match_rates([without], [truth], [reference(truth)])) == (0, None, 0)
+    assert tuple(match_rates([without], [truth], [reference(truth)])) == (0, None, 0, 0)
 
 
 def test_interiors_keep_their_distance() -> None:

@@ -29,7 +29,13 @@ def test_rows_are_trainings_with_one_thing_changed(world: World, tmp_path: Path,
     rows = table(world, "ablation", tmp_path / "a.json", "--page", str(page))["rows"]
     assert list(rows) == list(TRAINED["ablation"])
     for row in rows.values():
-        assert row["psnr"] > 5 and row["train_seconds"] > 0 and row["styled_psnr"] > 3 and 0 <= row["match_inside"] <= 1
+        assert (
+            row["psnr"] > 5
+            and row["train_seconds"] > 0
+            and row["styled_psnr"] > 3
+            and row["paper_styled_psnr"] > 3
+            and 0 <= row["match_border"] <= 1
+        )
     assert rows["as it is"]["psnr"] != rows["without pre-trained decoder"]["psnr"]
     text = page.read_text()
     assert text.startswith("# Ablation") and "without either" in text and text in capsys.readouterr().out
@@ -46,9 +52,28 @@ def test_the_same_seeds_give_the_same_rows(world: World, tmp_path: Path) -> None
 
 def test_clusters_share_one_training(world: World, tmp_path: Path) -> None:
     rows = table(world, "clusters", tmp_path / "a.json", "--clusters", "1", "3")["rows"]
-    assert list(rows) == ["1 clusters", "3 clusters"]
+    assert list(rows)[:2] == ["1 clusters", "3 clusters"] and len(rows) == 6
     assert all("psnr" not in row and row["style_seconds"] > 0 for row in rows.values())
     assert rows["1 clusters"]["styled_psnr"] != rows["3 clusters"]["styled_psnr"]
+    cells, clusters = (rows[f"local-adain, {codes}"] for codes in ("every cell a code", "clusters"))
+    assert cells["styled_psnr"] != clusters["styled_psnr"] and 0 < cells["match_inside"] <= 1
+
+
+def test_statistics_of_views_differ_from_the_scenes(world: World, tmp_path: Path) -> None:
+    rows = table(world, "statistics", tmp_path / "a.json", "--run", str(world.run))["rows"]
+    for name in ("adain", "local-adain", "region-tone"):
+        shared, alone = rows[f"{name}, of the scene"], rows[f"{name}, of each view"]
+        assert shared["styled_psnr"] != alone["styled_psnr"]
+        assert shared["consistency"] is not None and alone["consistency"] is not None
+
+
+def test_far_views_are_compared_on_one_path(world: World, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    rows = table(world, "large-scale", tmp_path / "a.json", "--run", str(world.run), "--page", str(page))["rows"]
+    assert list(rows) == ["no change", "2d, every picture alone", "adain", "local-adain", "region-tone", "region-ot"]
+    assert rows["no change"]["consistency"] == 0 and rows["no change"]["structure"] == pytest.approx(1)
+    assert all(row["consistency"] >= 0 and row["structure"] <= 1 for row in rows.values())
+    assert page.read_text().startswith("# Large-scale") and "seven frames on" in page.read_text()
 
 
 def test_tables_of_styles_need_a_town(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -83,4 +108,4 @@ def test_a_finished_run_is_not_trained_again(world: World, tmp_path: Path) -> No
     assert document["settings"]["steps"] == 15
     rows = document["rows"]
     assert list(rows)[:2] == ["adain, one", "local-adain, one"] and len(rows) == 6
-    assert rows["adain, one"]["match_inside"] is None and rows["region-tone, three"]["match_inside"] is not None
+    assert "match_inside" not in rows["adain, one"] and rows["region-tone, three"]["match_inside"] is not None

@@ -43,6 +43,8 @@ def test_the_path_moves_on_slowly(world: World) -> None:
     assert torch.allclose(steps, steps[:1].expand(8)) and 0 < float(steps[0]) < 0.5
     assert torch.allclose(path.pose[:, 2, 3], path.pose[:1, 2, 3].expand(9)), "no higher, no lower"
     turned = path.pose[:, :, :3]
+    longer = short_path(start, 3, 4.0)
+    torch.testing.assert_close(longer.pose, path.pose[::4])
     assert torch.allclose(turned.transpose(1, 2) @ turned, torch.eye(3, dtype=torch.float64).expand(9, 3, 3))
 
 

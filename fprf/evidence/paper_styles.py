@@ -1,0 +1,212 @@
+"""Styles of one training side by side: references, clusters, whose statistics, and the same places seen from far apart.
+
+All are judged by a town's truth, with references of other towns, as restyling is (see `restyle`).
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..engine.cached_view import CachedView
+from ..engine.loading import Trained
+from ..engine.restyle import Encoders
+from ..evaluation.steadiness import steadiness
+from ..evaluation.structure import structure
+from ..output.images import to_uint8, write_image
+from ..plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from ..style.dictionary import StyleDictionary
+from ..style.scene import scene_style
+from .cells import cell_dictionary
+from .codes import code_classes, match_rates, winners
+from .config import PaperConfig
+from .methods import Shown, dictionary_of, in_scene, nothing, one_by_one
+from .references import Reference, photograph, places
+from .scores import Row, mean_rows, score
+from .stage import Stage, set_stage, true_views
+
+__all__ = ["ONE_TRAINING", "Bench", "restyled", "set_up", "style_rows"]
+
+SEEDS = (7, 11, 13)
+"""Towns of the references."""
+_FRAMES = 8
+"""Of the path, where consistency is asked for: enough for a pair seven apart."""
+_STRIDE = 4.0
+"""Longer steps of the path in which places are seen from far apart."""
+_SIDE = 11
+"""Smaller pictures have no structure that could be judged."""
+
+Settings = Mapping[str, StylizerConfig]
+_KINDS: Settings = {"adain": AdainConfig(), "local-adain": LocalAdainConfig(), "region-tone": RegionToneConfig()}
+
+
+class Bench(NamedTuple):
+    """One training, what it is judged by, and the settings of styles."""
+
+    trained: Trained
+    encoders: Encoders
+    stage: Stage
+    config: PaperConfig
+    folder: Path
+    """Takes the references' files."""
+
+
+class Case(NamedTuple):
+    """References in one palette."""
+
+    light: str
+    shown: list[Reference]
+    paths: list[Path]
+    dictionary: StyleDictionary
+    seconds: float
+
+
+Restyled = Callable[[Case], Shown]
+
+
+def set_up(trained: Trained, encoders: Encoders, config: PaperConfig, folder: Path, *, path: bool = False) -> Bench:
+    """Views at the size of the training, and a path where it is asked for (with long steps, for the table about those)."""
+    side = int(trained.known.cameras.size.amax())
+    stride = _STRIDE if config.table == "large-scale" else 1.0
+    stage = set_stage(trained, views=config.views, frames=_FRAMES if path else 0, longest=side, stride=stride)
+    return Bench(trained, encoders, stage, config, folder)
+
+
+def style_rows(bench: Bench) -> dict[str, Row]:
+    """The rows of a table of ONE_TRAINING."""
+    return ONE_TRAINING[bench.config.table](bench)
+
+
+def restyled(bench: Bench, stylizer: StylizerConfig, references: str = "three", clusters: int | None = None) -> Row:
+    """Figures of a style, means over the palettes; `clusters` None = the usual number."""
+    return _row(bench, _cases(bench, references, clusters), _inside(bench, stylizer))
+
+
+def _clusters(bench: Bench) -> dict[str, Row]:
+    rows = {f"{n} clusters": restyled(bench, RegionToneConfig(), clusters=n) for n in bench.config.clusters}
+    usual, cells = _cases(bench, "three", None), _cases(bench, "three", 0)
+    for name, kind in (("local-adain", LocalAdainConfig()), ("region-tone", RegionToneConfig())):
+        rows[f"{name}, clusters"] = _row(bench, usual, _inside(bench, kind))
+        rows[f"{name}, every cell a code"] = _row(bench, cells, _inside(bench, kind))
+    return rows
+
+
+def _references(bench: Bench) -> dict[str, Row]:
+    return {f"{name}, {count}": restyled(bench, kind, count) for count in ("one", "three") for name, kind in _KINDS.items()}
+
+
+def _time(bench: Bench) -> dict[str, Row]:
+    rows: dict[str, Row] = {"training": {"train_seconds": bench.trained.seconds}}
+    return rows | {f"{name}, three references": restyled(bench, kind) for name, kind in _KINDS.items()}
+
+
+def _statistics(bench: Bench) -> dict[str, Row]:
+    cases = _cases(bench, "three", None)
+    rows = {}
+    for name, kind in _KINDS.items():
+        rows[f"{name}, of the scene"] = _row(bench, cases, _inside(bench, kind))
+        rows[f"{name}, of each view"] = _row(bench, cases, _by_view(bench, kind))
+    return rows
+
+
+def _large_scale(bench: Bench) -> dict[str, Row]:
+    cases, plain = _cases(bench, "three", None), nothing(_views(bench))
+    rows = {"no change": _row(bench, cases, lambda _: plain)}
+    flat = RegionToneConfig()
+    rows["2d, every picture alone"] = _row(
+        bench, cases, lambda case: one_by_one(bench.trained, plain.pictures, flat, case.dictionary, bench.encoders)
+    )
+    for name, kind in {**_KINDS, "region-ot": RegionOtConfig()}.items():
+        rows[name] = _row(bench, cases, _inside(bench, kind))
+    return rows
+
+
+ONE_TRAINING: Mapping[str, Callable[[Bench], dict[str, Row]]] = {
+    "time": _time,
+    "multi-reference": _references,
+    "clusters": _clusters,
+    "statistics": _statistics,
+    "large-scale": _large_scale,
+}
+"""Tables that train nothing but one scene, by name."""
+
+
+def _cases(bench: Bench, references: str, clusters: int | None) -> list[Case]:
+    """In every palette; 0 clusters stands for none: every cell of the references is a code of its own."""
+    trained, encoders = bench.trained, bench.encoders
+    width, height = (int(v) for v in trained.known.cameras.size[0])
+    found = []
+    for light in bench.config.palettes:
+        shown = [photograph(place, light) for place in places(SEEDS, (width, height))[references]]
+        paths = [bench.folder / f"{references}-{reference.name}.png" for reference in shown]
+        for path, reference in zip(paths, shown, strict=True):
+            write_image(path, to_uint8(reference.image))
+        start = time.perf_counter()
+        if clusters == 0:
+            made = cell_dictionary({path.name: r.image for path, r in zip(paths, shown, strict=True)}, trained, encoders)
+        else:
+            number = bench.config.codes if clusters is None else clusters
+            made = dictionary_of(trained, paths, encoders, clusters=number, blend=bench.config.blend)[0]
+        found.append(Case(light, shown, paths, made, time.perf_counter() - start))
+    return found
+
+
+def _row(bench: Bench, cases: Sequence[Case], restyle: Restyled) -> Row:
+    return mean_rows([{"": _judged(bench, case, restyle(case))} for case in cases])[""]
+
+
+def _judged(bench: Bench, case: Case, found: Shown) -> Row:
+    """Nearness to the truth, match rates, structure, steadiness where there is a path, seconds."""
+    stage, count = bench.stage, len(bench.stage.shown)
+    labels = [each.labels for each in stage.truth]
+    near, _ = score(found.pictures[:count], true_views(stage, case.light), labels)
+    row: Row = {f"styled_{name}": value for name, value in near.items()}
+    plain = [view.restyled().rgb for view in _views(bench)]
+    if min(plain[0].shape[:2]) >= _SIDE:
+        kept = [structure(a, b) for a, b in zip(plain[:count], found.pictures[:count], strict=True)]
+        row["structure"] = math.fsum(kept) / len(kept)
+    if found.taken is not None:
+        known = dict(zip((path.name for path in case.paths), case.shown, strict=True))
+        classes = code_classes(case.dictionary, known, bench.encoders, bench.trained.config.datamanager.guided)
+        taken = [winners(share, classes).view(like.shape) for share, like in zip(found.taken[:count], labels, strict=True)]
+        row |= match_rates(taken, labels, case.shown)._asdict()
+    if len(stage.path):
+        depths = [each.depth for each in stage.path_truth]
+        steady = steadiness(plain[count:], found.pictures[count:], depths, stage.path)
+        row |= {"consistency": steady.score, "warp_short": steady.short, "warp_long": steady.long}
+    return row | {"style_seconds": case.seconds + found.style_seconds, "view_seconds": found.view_seconds}
+
+
+def _views(bench: Bench) -> list[CachedView]:
+    return [*bench.stage.shown, *bench.stage.passed]
+
+
+def _inside(bench: Bench, stylizer: StylizerConfig) -> Restyled:
+    """By the scene's statistics."""
+    return lambda case: in_scene(bench.trained, _views(bench), stylizer, case.dictionary, bench.encoders, case.paths)
+
+
+def _by_view(bench: Bench, stylizer: StylizerConfig) -> Restyled:
+    """Every view by statistics and regions of its own, of the same samples."""
+    settings = bench.trained.config
+    scenes = []
+    for view in _views(bench):
+        content, weight = (torch.cat(parts) for parts in zip(*((p.content, p.kept.weight) for p in view.parts), strict=True))
+        seen = [part.semantic for part in view.parts if part.semantic is not None]
+        semantic = torch.cat(seen) if seen else None
+        scenes.append(scene_style(content, semantic, weight, None, settings.statistics.regions, settings.seed))
+
+    def restyle(case: Case) -> Shown:
+        found = [
+            in_scene(bench.trained, [view], stylizer, case.dictionary, bench.encoders._replace(scene=own), case.paths)
+            for view, own in zip(_views(bench), scenes, strict=True)
+        ]
+        taken: list[Tensor] = [share for each in found for share in each.taken or []]
+        style, each_view = (math.fsum(x) / len(found) for x in zip(*(one[2:] for one in found), strict=True))
+        return Shown([each.pictures[0] for each in found], taken or None, style, each_view)
+
+    return restyle
