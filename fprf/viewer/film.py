@@ -6,7 +6,7 @@ their photographs. The film is rendered from these very files, so the same comma
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Full, Queue
 from typing import NamedTuple
@@ -28,10 +28,19 @@ from .eyes import CHUNK
 from .looks import Look, settled, style_of
 from .stage import Eye, Stage
 
-__all__ = ["FilmPlan", "Key", "frames_of_film", "lay_film", "new_folder", "path_of", "taken"]
+__all__ = ["FilmPlan", "Key", "Thumbnail", "frames_of_film", "lay_film", "new_folder", "path_of", "taken"]
 
 LONGEST = 600.0
 """Seconds of a film."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A picture that is compared by what it is, not by its pixels."""
+
+    number: int
+    """What the page calls it by."""
+    picture: Picture
 
 
 class Key(NamedTuple):
@@ -39,6 +48,8 @@ class Key(NamedTuple):
 
     eye: Eye
     look: Look
+    thumbnail: Thumbnail | None = None
+    """What was seen there."""
 
 
 class FilmPlan(NamedTuple):

@@ -21,14 +21,19 @@ _EDGES = ((0, 1), (0, 2), (0, 4), (1, 3), (1, 5), (2, 3), (2, 6), (3, 7), (4, 5)
 """Of a box whose corner c has its bit k set where it lies at the high end of axis k."""
 
 
-def camera_lines(stage: Stage, cameras: Cameras, size: float) -> Segments:
-    """A pyramid for each camera, `size` page units deep, with a roof on the side that is up."""
+def camera_lines(stage: Stage, cameras: Cameras, size: float, *, behind: bool = False) -> Segments:
+    """A pyramid for each camera, `size` page units deep, with a roof on the side that is up.
+
+    One that lies `behind` its camera is not seen by who stands there.
+    """
     width, height = cameras.size.double().unbind(-1)
     right, up = width / 2 / cameras.focal[:, 0], height / 2 / cameras.focal[:, 1]
     ahead = torch.full_like(right, -1.0)
     corners = torch.stack([torch.stack([x * right, y * up, ahead], -1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))], 1)
     roof = torch.stack([torch.zeros_like(up), 1.5 * up, ahead], -1)[:, None]
     local = torch.cat([torch.zeros_like(roof), corners, roof], 1) * size
+    if behind:
+        local = local + torch.tensor([0.0, 0.0, size], dtype=local.dtype)
     page = (cameras.pose[:, None, :, :3] @ local[..., None])[..., 0] + stage.to_page(cameras.pose[:, None, :, 3])
     pairs = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (4, 5), (5, 3))
     return _joined(page, pairs)

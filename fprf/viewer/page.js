@@ -154,6 +154,32 @@
     training.children[2].style.width = `${100 * now.share}%`;
   };
 
+  // The flight: what a client's own camera does goes by viser's buttons, the rest by requests
+  const flight = make("div", { id: "fprf-flight", className: "fprf" });
+  const press = (text) => [...document.querySelectorAll("button")].find((each) => each.textContent.trim() === text)?.click();
+  const edit = (key, action, after) => ask("/fprf/keys", { key, action }).then(() => after && press(after)).catch((error) => say(error.message, true));
+  let flown = "";
+  const fillFlight = ({ keys, chosen, film, playing }) => {
+    const now = JSON.stringify([keys, chosen, film, playing]);
+    if (now === flown) return;
+    flown = now;
+    flight.classList.toggle("on", keys.length > 0);
+    const busy = film.total > 0 && !film.ready;
+    const shots = keys.map((number, at) => {
+      const small = (text, title, action) => make("button", { textContent: text, title, onclick: (event) => { event.stopPropagation(); action(); } });
+      return make("div", { className: at === chosen ? "key on" : "key", title: "go there", onclick: () => edit(at, "choose", "Go to the chosen key") },
+        number ? make("img", { src: `/fprf/key?key=${number}`, alt: `key ${at + 1}`, draggable: false }) : make("img", { alt: "" }),
+        make("b", { textContent: at + 1 }),
+        make("span", {}, small("‹", "earlier", () => edit(at, "earlier")), small("⟳", "replace by this view, in this look", () => edit(at, "choose", "Replace the chosen key")),
+          small("×", "remove", () => edit(at, "remove")), small("›", "later", () => edit(at, "later"))));
+    });
+    flight.replaceChildren(...shots,
+      make("div", { className: "acts" },
+        make("button", { textContent: "+ key", title: "this view, in this look", onclick: () => press("Add a key here") }),
+        make("button", { textContent: playing ? "■ stop" : "▶ play", title: "coarsely, here alone", disabled: keys.length < 2, onclick: () => press("Play the flight") }),
+        make("button", { textContent: busy ? `${film.done} / ${film.total}` : "● film", title: "make an mp4", disabled: busy, onclick: () => press("Make the film") })));
+  };
+
   // What has changed
   let version = -1;
   let film = false;
@@ -168,6 +194,7 @@
         fillShelf(state.shelf);
         fillRegion(state.picked, state.shelf);
         fillTraining(state.training);
+        fillFlight(state);
         wipe.classList.toggle("on", state.wipe !== null);
         if (state.wipe !== null && !held) place(state.wipe);
         if (state.film.ready && !film && version > 0) {
@@ -182,7 +209,7 @@
   };
   const begin = () => {
     shelf.append(add);
-    document.body.append(veil, shelf, wipe, region, training, told, picker);
+    document.body.append(veil, shelf, wipe, region, flight, training, told, picker);
     follow();
   };
   if (document.body) begin(); else window.addEventListener("DOMContentLoaded", begin);

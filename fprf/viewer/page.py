@@ -18,6 +18,7 @@ from ..errors import UsageError
 from ..output.images import encode
 from ..output.maps import palette
 from .gate import Answer, Request
+from .keys import chosen, shifted, without
 from .looks import Card, Verb, only, ordered, weighed
 from .session import Session
 from .state import State, removed
@@ -27,6 +28,12 @@ __all__ = ["Page", "built_page"]
 _WAIT = 20.0
 _SAID = 20
 _JSON, _PLAIN = "application/json", "text/plain; charset=utf-8"
+_EDITS: Mapping[str, Callable[[State], State]] = {
+    "choose": lambda state: state,
+    "earlier": lambda state: shifted(state, -1),
+    "later": lambda state: shifted(state, 1),
+    "remove": without,
+}
 _VERBS: Mapping[str, Verb | None] = {"pin": "pin", "forbid": "forbid", "keep": "keep", "free": None}
 
 
@@ -50,6 +57,8 @@ class Page:
             ("GET", "/fprf/state"): self._state,
             ("GET", "/fprf/card"): self._card,
             ("GET", "/fprf/film"): self._film,
+            ("GET", "/fprf/key"): self._key,
+            ("POST", "/fprf/keys"): self._keys,
             ("POST", "/fprf/photograph"): self._photograph,
             ("POST", "/fprf/shelf"): self._shelf,
             ("POST", "/fprf/region"): self._region,
@@ -109,6 +118,21 @@ class Page:
         name = f"{path.parent.parent.parent.name}-{path.parent.name}.mp4"
         plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in name)
         return Answer(200, "video/mp4", path.read_bytes(), {"content-disposition": f'attachment; filename="{plain}"'})
+
+    async def _key(self, request: Request) -> Answer:
+        number = _number(request.query.get("key", ""))
+        shots = (key.thumbnail for key in self._session.state.keys)
+        thumbnail = next((each for each in shots if each is not None and each.number == number), None)
+        if thumbnail is None:
+            return Answer(404, _PLAIN, b"no picture of this key\n")
+        return Answer(200, "image/jpeg", encode(thumbnail.picture, "jpg"), {"cache-control": "private, max-age=3600"})
+
+    async def _keys(self, request: Request) -> Answer:
+        asked = _asked(request)
+        at, edit = _number(str(asked.get("key"))), _EDITS.get(str(asked.get("action")))
+        if edit is None:
+            raise UsageError(f"keys: the action is none of {', '.join(_EDITS)}")
+        return self._done(self._session, lambda state: edit(chosen(state, at)))
 
     async def _photograph(self, request: Request) -> Answer:
         session, name = self._session, request.query.get("name", "photograph")
@@ -199,6 +223,9 @@ def described(state: State) -> dict[str, Any]:
         },
         "map": state.map,
         "training": None if state.training is None else asdict(state.training),
+        "keys": [0 if key.thumbnail is None else key.thumbnail.number for key in state.keys],
+        "chosen": state.chosen,
+        "playing": state.playing,
         "film": {"done": state.film.done, "total": state.film.total, "ready": state.film.path is not None},
     }
 

@@ -10,6 +10,7 @@ from typing import Any, cast
 import viser
 
 from .film import FilmPlan, Key, path_of
+from .keys import added, at_key, replaced
 from .painter import MAPS, Map
 from .session import Session
 from .stage import Eye, fitted
@@ -18,6 +19,7 @@ from .state import LEAST, MOST, Film, Landing, State, kept
 __all__ = ["Panel"]
 
 _NONE = "nothing"
+_PLAY = "Play the flight"
 _LANDINGS: tuple[Landing, ...] = ("alone", "in the mix")
 _SIZES = {"small (480)": 480, "medium (960)": 960, "full HD (1920)": 1920}
 
@@ -56,6 +58,7 @@ class Panel:
         self._set(self._towards, toward[0] if toward else _NONE)
         if before.keys != now.keys:
             self._about_keys.content = _about(now)
+        if (before.keys, before.playing) != (now.keys, now.playing):
             self._draw(self)
         if before.film != now.film:
             self._progress.value = 100.0 * now.film.done / max(1, now.film.total)
@@ -87,11 +90,11 @@ class Panel:
             self._looks: dict[str, Any] = {
                 "strength": add("strength", 0.0, 1.0, 0.01, look.strength, hint="0 = the scene as it was captured"),
                 "temperature": add("temperature", 0.05, 2.0, 0.05, look.temperature, hint=_HINTS["temperature"]),
-                "clusters": add("clusters", 1, 20, 1, look.clusters, hint=_HINTS["clusters"]),
+                "clusters": add("clusters", 1, 40, 1, look.clusters, hint=_HINTS["clusters"]),
                 "blend": add("local ↔ global", 0.0, 1.0, 0.01, look.blend, hint=_HINTS["blend"]),
                 "luminance": add("keep light", 0.0, 1.0, 0.01, look.luminance, hint=_HINTS["luminance"]),
             }
-            self._landing = self._gui.add_dropdown("a dropped photo is", _LANDINGS, initial_value=state.landing)
+            self._landing = self._gui.add_dropdown("new photo", _LANDINGS, initial_value=state.landing, hint=_HINTS["landing"])
         for name, control in self._looks.items():
             self._on_look(name, control)
         self._on(self._landing, lambda value: lambda state: replace(state, landing=_one(value, _LANDINGS)))
@@ -101,10 +104,10 @@ class Panel:
         with self._gui.add_folder("Show"):
             self._map = self._gui.add_dropdown("map", MAPS, initial_value=state.map, hint=_HINTS["map"])
             self._cover = self._gui.add_slider("map covers", 0.0, 1.0, 0.05, state.cover)
-            self._wipe = self._gui.add_checkbox("before / after", state.wipe is not None, hint="drag the line on the picture")
-            self._picking = self._gui.add_checkbox("click picks a region", state.picking, hint=_HINTS["picking"])
-            self._cameras = self._gui.add_checkbox("captured cameras", False)
-            self._blocks = self._gui.add_checkbox("block boxes", False)
+            self._wipe = self._gui.add_checkbox("before/after", state.wipe is not None, hint="drag the line on the picture")
+            self._picking = self._gui.add_checkbox("pick a region", state.picking, hint=_HINTS["picking"])
+            self._cameras = self._gui.add_checkbox("cameras", False, hint="where the images were taken")
+            self._blocks = self._gui.add_checkbox("blocks", False, hint="the boxes that a large scene is cut into")
             self._pixels = self._gui.add_slider("sharpness", LEAST, MOST, 32, state.pixels, hint="longest side in pixels")
             view = self._gui.add_slider("fly to view", 0, max(1, len(names) - 1), 1, 0)
         self._on(self._map, lambda value: lambda state: replace(state, map=cast(Map, value)))
@@ -144,7 +147,9 @@ class Panel:
         with self._gui.add_folder("Film", expand_by_default=False):
             self._about_keys = self._gui.add_markdown(_about(State()))
             add = self._gui.add_button("Add a key here", hint="this view, in this look")
-            undo = self._gui.add_button("Remove the last key")
+            swap = self._gui.add_button("Replace the chosen key", hint="by this view, in this look")
+            back = self._gui.add_button("Go to the chosen key", hint="to its view, in its look")
+            self._play = self._gui.add_button(_PLAY, hint="coarsely, here alone; once more to end it")
             self._seconds = self._gui.add_number("seconds between keys", 2.0, min=0.1, max=60.0, step=0.1)
             self._fps = self._gui.add_number("frames a second", 24, min=1, max=60, step=1)
             self._size = self._gui.add_dropdown("size", tuple(_SIZES), initial_value="medium (960)")
@@ -152,22 +157,42 @@ class Panel:
             self._make = self._gui.add_button("Make the film")
             self._progress = self._gui.add_progress_bar(0.0)
 
-        def key(client: "viser.ClientHandle") -> None:
-            eye = self._seen(client)
-            self._session.change(lambda state: replace(state, keys=(*state.keys, Key(eye, state.look))), client.client_id)
+        session = self._session
 
-        self._pressed(add, key)
-        self._pressed(undo, lambda client: self._session.change(lambda state: replace(state, keys=state.keys[:-1])))
+        def put(to: Callable[[State, Key], State]) -> Callable[["viser.ClientHandle"], None]:
+            def pressed(client: "viser.ClientHandle") -> None:
+                eye, picture = self._seen(client), session.thumbnail(client.client_id)
+                session.change(lambda state: to(state, Key(eye, state.look, picture)), client.client_id)
+
+            return pressed
+
+        def go(client: "viser.ClientHandle") -> None:
+            session.land(client.client_id)
+            state = session.state
+            if session.change(at_key, client.client_id) and state.chosen is not None:
+                self._fly(client, state.keys[state.chosen].eye)
+
+        self._pressed(add, put(added))
+        self._pressed(swap, put(replaced))
+        self._pressed(back, go)
+
+        def fly(client: "viser.ClientHandle") -> None:
+            if session.state.playing:
+                session.land(client.client_id)
+            else:
+                session.play(client.client_id, self.plan, lambda eye: self._fly(client, eye))
+
+        self._pressed(self._play, fly)
         self._pressed(self._make, lambda client: self._session.film(self.plan, client.client_id))
 
-        def fly(event: Any) -> None:
+        def go_along(event: Any) -> None:
             if event.client is None or not self._session.state.keys:
                 return
             path = path_of(self._session.stage, self.plan)
             at = min(1.0, max(0.0, float(along.value)))
             self._fly(event.client, self._session.stage.eye(path, round(at * (len(path) - 1))))
 
-        along.on_update(fly)
+        along.on_update(go_along)
 
     def _on(self, control: Any, to: Callable[[Any], Callable[[State], State]]) -> None:
         """A control that replaces the state."""
@@ -195,8 +220,9 @@ _HINTS = {
     "clusters": "local styles of each photograph",
     "blend": "0 = each region takes a local style, 1 = all take that of the whole photograph",
     "luminance": "how much of the scene's own light and dark stays",
+    "landing": "what a photograph that is dropped becomes: the style alone, or one more in the mix",
     "map": "matches: which photograph each place takes its style from; regions: what can be picked",
-    "picking": "then choose what the region takes from, or that it stays as it is",
+    "picking": "a click on the scene picks what is there; then choose what the region takes from, or that it stays as it is",
 }
 
 

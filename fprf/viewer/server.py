@@ -160,10 +160,10 @@ class Server(Face):
         elif panel.blocks:
             self.say("this scene is not cut into blocks")
         self._lines("blocks", boxes, (255, 196, 80))
-        keys = session.state.keys
+        keys = () if session.state.playing else session.state.keys  # in a flight they would be in the way
         path = path_lines(stage, path_of(stage, panel.plan)) if len(keys) > 1 else None
         self._lines("film", path, (255, 110, 150))
-        places = camera_lines(stage, stage.cameras([key.eye for key in keys], (160, 90)), 0.08) if keys else None
+        places = camera_lines(stage, stage.cameras([key.eye for key in keys], (160, 90)), 0.08, behind=True) if keys else None
         self._lines("keys", places, (255, 110, 150))
         for client in self._viser.get_clients().values():  # depth is sent where there is something to hide, or no more
             with contextlib.suppress(FprfError):

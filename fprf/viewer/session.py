@@ -9,25 +9,27 @@ from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
-from queue import Queue
-
-import numpy as np
 
 from ..engine.loading import Trained
 from ..errors import FprfError, UsageError
-from ..output.images import Picture, encode
-from ..output.video import write_video
+from ..output.images import Picture, shrink
+from .crew import Crew
 from .desk import Desk
 from .eyes import Frame, Glance, Sight
-from .film import FilmPlan, frames_of_film, lay_film, new_folder, taken
+from .film import FilmPlan, Thumbnail
 from .intake import Intake, shown_name
-from .looks import Card, only
+from .looks import Card, Look
 from .moment import likest
+from .painter import Shown
+from .rehearsal import rehearsal
 from .stage import Eye, Stage, stage_of
-from .state import Film, State, dropped, renumbered
+from .state import State, dropped, renumbered
 from .studio import Opener, Studio
 
 __all__ = ["Face", "Session"]
+
+_THUMBNAIL = 192
+"""Longest side of a key's picture."""
 
 
 class Face(ABC):
@@ -61,6 +63,9 @@ class Session:
         self._lock = threading.RLock()
         self._sight = Sight(trained, self.studio, self.stage, self._show)
         self._desk: Desk[Glance] = Desk(self._sight.look, self._fault)
+        self._crew = Crew(self, self._desk)
+        self._pictures: dict[Hashable, Picture] = {}
+        self._shots = 0
 
     def __enter__(self) -> "Session":
         self._desk.start()
@@ -81,28 +86,18 @@ class Session:
     def warm(self) -> None:
         """Make ready what the first photograph needs, while nobody waits: encoders, kernels, the process that decodes."""
         threading.Thread(target=self.intake.warm, name="fprf-warm", daemon=True).start()
-        self._desk.spare(self._rehearse())
 
-    def _rehearse(self) -> Iterator[None]:
-        """What a photograph goes through, with a picture of nothing."""
-        self.studio.encoders  # noqa: B018  they are opened by asking for them
-        yield
-        path = self.intake.folder / "rehearsal.png"
-        ramp = np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8)
-        path.write_bytes(encode(ramp, "png"))
-        card = self.studio.card(path, "rehearsal")
-        yield
-        look = only(State().look, card)
-        self.studio.restyle(look)
-        yield
-        eye = self.stage.eye(self.trained.known.cameras, 0)
-        yield from self._sight.look(None, Glance(eye, replace(self.state, look=look).shown, 32))
-        self._sight.forget(None)
-        self.studio.keep(self.state.all_cards)
+        def work() -> Iterator[None]:
+            yield from rehearsal(self.studio, self._sight, self.stage, self.intake.folder)
+            self.studio.keep(self.state.all_cards)
+
+        self._desk.spare(work())
 
     def see(self, client: Hashable, eye: Eye) -> None:
         """A client's camera is here now."""
         with self._lock:
+            if self._crew.playing(client):
+                return
             self._eyes[client] = eye
             self._desk.ask(client, Glance(eye, self.state.shown, self.state.pixels))
 
@@ -110,6 +105,8 @@ class Session:
         """A client has gone."""
         with self._lock:
             self._eyes.pop(client, None)
+            self._pictures.pop(client, None)
+        self._crew.stop(client)
         self._desk.leave(client)
         self._desk.do(("forget", client), lambda: self._sight.forget(client))
 
@@ -139,9 +136,9 @@ class Session:
 
         self._desk.do("renew", self._told(now, None))
 
-    def say(self, text: str) -> None:
-        """A line for all to read."""
-        self._say(text)
+    def say(self, text: str, client: Hashable | None = None) -> None:
+        """A line to read, for one client or for all."""
+        self._say(text, client)
 
     def change(self, to: Callable[[State], State], client: Hashable | None = None) -> bool:
         """Replace the state; all clients see it. What cannot be is said to the client, and nothing changes."""
@@ -210,32 +207,40 @@ class Session:
 
     def film(self, plan: FilmPlan, client: Hashable | None = None) -> None:
         """Make a film in the run's folder, while nobody waits for a picture; one at a time."""
+        self._crew.film(plan, client)
+
+    def play(self, client: Hashable, plan: FilmPlan, fly: Callable[[Eye], None]) -> None:
+        """Show a client the flight; `fly` moves its camera. Its own moves count again when it is over."""
+        self._crew.play(client, plan, fly)
+
+    def preview(self, client: Hashable, eye: Eye, look: Look) -> None:
+        """For one client, another look than that of all."""
         with self._lock:
-            if self.state.film.busy:
-                self._say("film: one is being made; wait for it", client)
-                return
-            self.change(lambda state: replace(state, film=Film(0, 1)))
-        threading.Thread(target=self._make, args=(plan, client), name="fprf-film", daemon=True).start()
+            if client in self._eyes:
+                self._eyes[client] = eye = eye._replace(aspect=self._eyes[client].aspect)
+                self._desk.ask(client, Glance(eye, Shown(look), self.state.pixels))
 
-    def _make(self, plan: FilmPlan, client: Hashable | None) -> None:
-        try:
-            folder = new_folder(self.trained.run.root)
-            lay_film(folder, self.stage, plan, self.trained.known.facts.semantic_encoder)
-            frames: Queue[Picture | None] = Queue(2)
-            failed: list[Exception] = []
-            self._desk.spare(_watched(frames_of_film(folder, self.trained, frames, self._progress), failed))
-            write_video(folder / "film.mp4", taken(frames), plan.fps)
-            if failed:
-                raise failed[0]
-        except Exception as error:  # whatever it is, the next film can be made
-            self.change(lambda state: replace(state, film=Film()))
-            self._say(f"film: {error}", client)
-            return
-        self.change(lambda state: replace(state, film=replace(state.film, path=folder / "film.mp4")))
-        self._say(f"film: {folder / 'film.mp4'}")
+    def look_again(self, client: Hashable) -> None:
+        """What a client sees is to be what all see."""
+        with self._lock:
+            if client in self._eyes:
+                self._desk.ask(client, Glance(self._eyes[client], self.state.shown, self.state.pixels))
 
-    def _progress(self, done: int, total: int) -> None:
-        self.change(lambda state: replace(state, film=Film(done, total)))
+    def land(self, client: Hashable) -> None:
+        """End a client's flight where it is."""
+        self._crew.stop(client)
+
+    def picture(self, client: Hashable) -> Picture | None:
+        """What a client was shown last."""
+        return self._pictures.get(client)
+
+    def thumbnail(self, client: Hashable) -> Thumbnail | None:
+        """What a client sees now, small."""
+        picture = self._pictures.get(client)
+        if picture is None:
+            return None
+        self._shots += 1
+        return Thumbnail(self._shots, shrink(picture, _THUMBNAIL))
 
     def _choose(self, region: int | None) -> None:
         count = self.studio.regions
@@ -263,6 +268,7 @@ class Session:
 
     def _show(self, client: Hashable, frame: Frame) -> None:
         if self._face is not None and client is not None:  # a rehearsal has no one to show itself to
+            self._pictures[client] = frame.picture
             self._face.show(client, frame)
 
     def _say(self, text: str, client: Hashable | None = None) -> None:
@@ -272,15 +278,6 @@ class Session:
     def _fault(self, client: Hashable | None, error: Exception) -> None:
         known = isinstance(error, FprfError)
         self._say(str(error) if known else f"this should not have happened: {type(error).__name__}: {error}", client)
-
-
-def _watched(frames: Iterator[None], failed: list[Exception]) -> Iterator[None]:
-    """The work, remembering what went wrong for who waits for its end."""
-    try:
-        yield from frames
-    except Exception as error:
-        failed.append(error)
-        raise
 
 
 def _free(name: str, state: State) -> str:

@@ -56,6 +56,10 @@ class State:
     saved: tuple[tuple[str, Look], ...] = ()
     """Looks that were kept, by name."""
     keys: tuple[Key, ...] = ()
+    chosen: int | None = None
+    """Place of the key that is edited."""
+    playing: bool = False
+    """A flight is shown to somebody."""
     film: Film = Film()
     pixels: int = 640
     """Longest side of the sharpest picture."""

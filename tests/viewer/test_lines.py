@@ -52,3 +52,12 @@ def test_a_path_goes_from_frame_to_frame(world: World) -> None:
     lines = path_lines(stage, cameras)
     assert lines.shape == (len(cameras) - 1, 2, 3) and np.array_equal(lines[:-1, 1], lines[1:, 0])
     assert path_lines(stage, cameras.select(torch.tensor([0]))).shape == (0, 2, 3)
+
+
+def test_pyramids_behind_their_cameras_are_not_seen_from_there(world: World) -> None:
+    cameras = world.load().known.cameras
+    stage = stage_of(cameras)
+    ahead, behind = camera_lines(stage, cameras, 0.1), camera_lines(stage, cameras, 0.1, behind=True)
+    assert ahead.shape == behind.shape
+    axis = cameras.pose[:, :, 2].repeat_interleave(10, 0).numpy()
+    assert np.allclose(behind - ahead, 0.1 * axis[:, None], atol=1e-6)

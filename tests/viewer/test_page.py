@@ -10,12 +10,15 @@ import pytest
 from tiny_world import World
 
 from fprf.errors import DataError, UsageError
+from fprf.viewer.film import Key, Thumbnail
 from fprf.viewer.gate import Answer, Request
-from fprf.viewer.looks import Card
+from fprf.viewer.looks import Card, Look
 from fprf.viewer.page import Page, built_page, described
 from fprf.viewer.session import Session
+from fprf.viewer.stage import Eye
 from fprf.viewer.state import State
 from fprf.viewer.studio import Picked
+from fprf.viewer.training import Training
 
 
 @pytest.fixture
@@ -152,3 +155,33 @@ def test_the_map_tells_the_colours_of_photographs(page: Page, world: World) -> N
 
 def test_no_film_is_no_page(page: Page) -> None:
     assert ask(page, "GET", "/fprf/film").status == 404
+
+
+def test_keys_are_edited_by_their_places(page: Page) -> None:
+    shot = Thumbnail(7, np.full((12, 16, 3), 200, np.uint8))
+    keys = tuple(Key(Eye((1, 0, 0, 0), (float(k), 0, 0), 1.0, 1.0), Look(), shot if k == 1 else None) for k in range(3))
+    page._session.change(lambda state: replace(state, keys=keys))
+    told = described(page._session.state)
+    assert told["keys"] == [0, 7, 0] and told["chosen"] is None and not told["playing"]
+    post(page, "/fprf/keys", key=1, action="earlier")
+    assert [key.eye.position[0] for key in page._session.state.keys] == [1, 0, 2] and page._session.state.chosen == 0
+    post(page, "/fprf/keys", key=0, action="later")
+    post(page, "/fprf/keys", key=2, action="remove")
+    assert page._session.state.keys == keys[:2] and page._session.state.chosen == 1
+    answer = ask(page, "GET", "/fprf/key", {"key": "7"})
+    picture = cv2.imdecode(np.frombuffer(answer.body, np.uint8), 1)
+    assert answer.kind == "image/jpeg" and picture.shape == (12, 16, 3) and abs(int(picture.mean()) - 200) < 3
+    assert ask(page, "GET", "/fprf/key", {"key": "0"}).status == 404
+
+
+@pytest.mark.parametrize("body", [b'{"key": 9, "action": "remove"}', b'{"key": 0, "action": "x"}', b'{"key": "x"}', b"{}"])
+def test_keys_that_are_none_are_refused(page: Page, body: bytes) -> None:
+    with pytest.raises(UsageError):
+        ask(page, "POST", "/fprf/keys", body=body)
+
+
+def test_how_training_goes_is_told(page: Page) -> None:
+    assert described(page._session.state)["training"] is None
+    page._session.change(lambda state: replace(state, training=Training(30, 0.25, 19.5, 30.0)))
+    told = described(page._session.state)["training"]
+    assert told == {"step": 30, "share": 0.25, "psnr": 19.5, "seconds_left": 30.0}
