@@ -25,6 +25,9 @@ class EvalConfig(QualityConfig):
     """Views to judge."""
     data: Path | None = None
     """Scene folder, where it has moved since training."""
+    fit_poses: bool = False
+    """Fit each view's own pose to its image first, the scene as it is: for captures whose poses are rough, or were refined.
+    metrics.json then says how far they were moved."""
     images: bool = True
     """Write the renders to RUN/renders/SPLIT."""
     device: str = "auto"
@@ -38,6 +41,7 @@ def run(args: list[str]) -> int:
     from ..datamanagers.parsers.recognise import parse_scene
     from ..engine.loading import load_run
     from ..engine.run import view_names
+    from ..evaluation.alignment import align, described
     from ..evaluation.judge import judge
     from ..output.atomic import write_json
     from ..output.images import to_uint8
@@ -51,7 +55,11 @@ def run(args: list[str]) -> int:
     views = trained.known.split(config.split)
     if not views:
         raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
+    fitted: dict[str, object] = {}
     with Display() as display:
+        if config.fit_poses:
+            trained, moves = align(trained, scene, views, display.count)
+            fitted = {"fitted_poses": {trained.known.names[view]: described(move) for view, move in moves.items()}}
         metrics, renders = judge(trained, scene, views, display.count)
     metrics = {
         "method": trained.method,
@@ -59,6 +67,7 @@ def run(args: list[str]) -> int:
         "split": config.split,
         "quality": config.quality,
         **metrics,
+        **fitted,
     }
     write_json(config.run / "metrics.json", metrics)
     if config.images:

@@ -24,7 +24,7 @@ from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Rays, Want
 
-__all__ = ["AlignmentConfig", "align", "align_view"]
+__all__ = ["AlignmentConfig", "align", "align_view", "described"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +61,11 @@ def align(
         pose[view] = torch.stack([*turned, pose[view, :, 3] + moves[view][3:]], -1)
     progress(len(views), len(views), "fitting poses")
     return trained._replace(known=replace(trained.known, cameras=replace(cameras, pose=pose))), moves
+
+
+def described(move: Annotated[Tensor, "6"]) -> dict[str, float]:
+    """For JSON: how far a view was moved."""
+    return {"turn_degrees": math.degrees(float(move[:3].norm())), "shift": float(move[3:].norm())}
 
 
 def align_view(

@@ -33,6 +33,18 @@ def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str
     assert "psnr" in table and f"{metrics['psnr']:.3f}" in table and "rays/s" in table
 
 
+def test_poses_are_fitted_where_that_is_asked_and_told(run: Path) -> None:
+    assert cli.main(["eval", str(run), "--no-images"]) == 0
+    plain = json.loads((run / "metrics.json").read_text())
+    assert "fitted_poses" not in plain
+    assert cli.main(["eval", str(run), "--no-images", "--fit-poses"]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["fitted_poses"].keys() == {"0000", "0008"}
+    for move in metrics["fitted_poses"].values():
+        assert move.keys() == {"turn_degrees", "shift"} and move["turn_degrees"] > 0
+    assert metrics["psnr"] > plain["psnr"] - 0.05
+
+
 def test_other_splits_without_pictures(run: Path) -> None:
     assert cli.main(["eval", str(run), "--split", "train", "--no-images"]) == 0
     metrics = json.loads((run / "metrics.json").read_text())
