@@ -31,8 +31,8 @@ from mutations import Mutation, mutated, mutations
 ROOT = Path(__file__).resolve().parents[1]
 MODULES: dict[str, tuple[str, ...]] = {
     "fprf/ops/march.py": ("ops/test_march.py", "ops/test_march_gradients.py"),
-    "fprf/ops/triplane.py": ("ops/test_triplane.py", "ops/test_point_slopes.py"),
-    "fprf/ops/triplane_numba.py": ("ops/test_triplane.py", "ops/test_point_slopes.py"),
+    "fprf/ops/triplane.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
+    "fprf/ops/triplane_numba.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
     "fprf/ops/dense.py": ("ops/test_dense.py",),
     "fprf/ops/exponential.py": ("ops/test_exponential.py", "ops/test_march.py"),
     "fprf/ops/guided.py": ("ops/test_guided.py",),
@@ -43,7 +43,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/ops/dense_gradients.py": ("ops/test_dense.py",),
     "fprf/ops/guided_kernels.py": ("ops/test_guided.py",),
     "fprf/ops/mixture_kernels.py": ("ops/test_mixture.py",),
-    "fprf/ops/triplane_kernels.py": ("ops/test_triplane.py", "ops/test_point_slopes.py"),
+    "fprf/ops/triplane_kernels.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
     "fprf/ops/tile.py": ("ops/test_dense.py",),
     "fprf/ops/vector.py": ("ops/test_triplane.py", "ops/test_point_slopes.py", "ops/test_march.py"),
     "fprf/ops/rows.py": ("ops/test_dense.py", "ops/test_march.py"),

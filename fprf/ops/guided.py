@@ -109,7 +109,8 @@ def apply(
     share = (weight[0][:, :, None] * weight[1][:, None, :]).flatten(1)
     corners = coefs.reshape(rows * columns, channels, 4)[flat].float()
     colour = torch.cat([rgb.float(), torch.ones_like(rgb[:, :1], dtype=torch.float32)], 1)
-    return torch.einsum("rkcl,rk,rl->rc", corners, share, colour)
+    with torch.autocast(coefs.device.type, enabled=False):
+        return torch.einsum("rkcl,rk,rl->rc", corners, share, colour)
 
 
 def upsample(

@@ -81,7 +81,8 @@ def distances(s: Annotated[Tensor, "R E"], near: Annotated[Tensor, "R"], far: An
     from . import march_kernels as kernels
 
     t = torch.empty(s.shape)
-    kernels.distances(_flat(s), _flat(near), _flat(far), _flat(warp), t.view(-1).numpy())
+    if t.numel() > 0:
+        kernels.distances(_flat(s), _flat(near), _flat(far), _flat(warp), t.view(-1).numpy())
     return t
 
 
@@ -118,7 +119,8 @@ def place(rays: Rays, t: Annotated[Tensor, "R E"], warp: Warp) -> Annotated[Tens
     from . import march_kernels as kernels
 
     point = torch.empty(len(t), t.shape[1] - 1, 3)
-    kernels.place(_flat(rays.origin), _flat(rays.direction), _flat(t), _flat(warp), point.view(-1).numpy())
+    if point.numel() > 0:
+        kernels.place(_flat(rays.origin), _flat(rays.direction), _flat(t), _flat(warp), point.view(-1).numpy())
     return point
 
 
@@ -177,6 +179,8 @@ class _Weigh(torch.autograd.Function):
             return None, None, None, None
         density, t, fair, weights, through = ctx.saved_tensors
         out = torch.empty(density.shape)
+        if out.numel() == 0:
+            return out, None, None, None
         given = (_flat(x) for x in (density, t, fair, weights, through, grads[0], grads[3]))
         kernels.weigh_back(*given, out.view(-1).numpy())
         return out, None, None, None
@@ -228,12 +232,13 @@ def _weighed(density: Tensor, t: Tensor, budget: float) -> Weighed:
 
     rays = len(density)
     weights = torch.empty(density.shape)
-    depth, opacity, through = (torch.empty(rays) for _ in range(3))
+    depth, opacity, through = torch.zeros(rays), torch.zeros(rays), torch.ones(rays)  # of no samples: nothing is seen
     keep, kept = torch.empty(density.shape, dtype=torch.bool), torch.zeros(rays + 1, dtype=torch.int64)
-    kernels.weigh(
-        _flat(density), _flat(t), np.float32(max(budget, 0.0)), weights.view(-1).numpy(), depth.numpy(), opacity.numpy(),
-        through.numpy(), keep.view(-1).numpy(), kept[1:].numpy(),
-    )  # fmt: skip
+    if density.numel() > 0:
+        kernels.weigh(
+            _flat(density), _flat(t), np.float32(max(budget, 0.0)), weights.view(-1).numpy(), depth.numpy(),
+            opacity.numpy(), through.numpy(), keep.view(-1).numpy(), kept[1:].numpy(),
+        )  # fmt: skip
     return Weighed(weights, depth, opacity, through, keep, kept.cumsum(0))
 
 
@@ -251,10 +256,11 @@ def _gathered(
         torch.empty(total, 3),
         None if fair is None else torch.empty(total),
     )
-    kernels.gather(
-        keep.view(-1).numpy(), start[:-1].numpy(), _flat(weights), _flat(point), _flat(latent), _flat(view), _flat(fair),
-        out.ray.numpy(), *(_flat(x) for x in out[1:]),
-    )  # fmt: skip
+    if total > 0:
+        kernels.gather(
+            keep.view(-1).numpy(), start[:-1].numpy(), _flat(weights), _flat(point), _flat(latent), _flat(view), _flat(fair),
+            out.ray.numpy(), *(_flat(x) for x in out[1:]),
+        )  # fmt: skip
     return out
 
 

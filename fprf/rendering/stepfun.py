@@ -131,7 +131,7 @@ def interlevel(
     high = torch.searchsorted(edges, s[:, 1:].contiguous()).clamp(0, last)
     bound = total.gather(1, high) - total.gather(1, low)
     # 1e-7 is float32's resolution of a weight: below it the ratio means nothing.
-    return ((w - bound).clamp_min(0).square() / (w + 1e-7)).mean()
+    return _mean((w - bound).clamp_min(0).square() / (w + 1e-7))
 
 
 def distortion(s: Annotated[Tensor, "R E"], w: Annotated[Tensor, "R S"]) -> Tensor:
@@ -140,7 +140,12 @@ def distortion(s: Annotated[Tensor, "R E"], w: Annotated[Tensor, "R S"]) -> Tens
     before_w = w.cumsum(-1) - w
     before_m = (w * middle).cumsum(-1) - w * middle
     between = 2 * (w * (middle * before_w - before_m)).sum(-1)
-    return (between + (width * w.square()).sum(-1) / 3).mean()
+    return _mean(between + (width * w.square()).sum(-1) / 3)
+
+
+def _mean(x: Tensor) -> Tensor:
+    """The mean; of nothing 0, so that a batch without rays has a loss and gradients of 0."""
+    return x.sum() / max(1, x.numel())
 
 
 def keep_heaviest(w: Annotated[Tensor, "R S"], budget: float) -> Annotated[Tensor, "R S"]:

@@ -1,0 +1,131 @@
+"""Every mathematical function of ops, style and rendering: no rows, one, an odd number, as many as in production; float32
+against float64 in values and gradients; nothing written to its inputs.
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+import torch
+from operator_cases import CASES, Case
+from operators_elsewhere import ELSEWHERE
+from torch import Tensor
+
+import fprf
+from fprf.ops import march
+
+PACKAGES = ("ops", "style", "rendering")
+
+
+def public(package: str) -> list[str]:
+    """module.function of what the modules of a package name in __all__."""
+    found = []
+    for path in sorted((Path(fprf.__file__).parent / package).glob("*.py")):
+        tree = ast.parse(path.read_text())
+        lists = [n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"]
+        names = {element for value in lists for element in ast.literal_eval(value)}
+        found += [f"{path.stem}.{n.name}" for n in tree.body if isinstance(n, ast.FunctionDef) and n.name in names]
+    return found
+
+
+def test_every_function_is_in_the_table_or_has_a_reason() -> None:
+    named = {case.name for case in CASES}
+    every = [name for package in PACKAGES for name in public(package)]
+    missing = [name for name in every if name not in named and name not in ELSEWHERE and name.split(".")[0] not in ELSEWHERE]
+    assert not missing
+    modules = {path.stem for package in PACKAGES for path in (Path(fprf.__file__).parent / package).glob("*.py")}
+    gone = [name for name in (*named, *ELSEWHERE) if name not in every and name not in modules]
+    assert not gone
+
+
+def cast(made: list[Tensor], dtype: torch.dtype) -> list[Tensor]:
+    return [x.to(dtype) if x.is_floating_point() else x for x in made]
+
+
+def outputs(found: object) -> list[Tensor]:
+    if isinstance(found, Tensor):
+        return [found]
+    assert isinstance(found, tuple)
+    return [x for each in found for x in outputs(each)]
+
+
+def check_close(case: Case, found: Tensor, exact: Tensor) -> None:
+    assert found.shape == exact.shape
+    if not exact.numel():
+        return
+    assert bool(torch.isfinite(found).all()) or not bool(torch.isfinite(exact).all())
+    if not exact.is_floating_point():
+        assert float((found != exact).double().mean()) <= case.slack
+        return
+    apart = (found.double() - exact).abs()
+    off = ~(apart <= case.tolerance * exact.abs().amax().clamp_min(1e-30))
+    assert float(off.double().mean()) <= case.slack, f"{float(apart.max()):.3g}"
+
+
+ROWS = [pytest.param(case, n, id=f"{case.name}-{n}") for case in CASES for n in case.sizes]
+
+
+@pytest.mark.parametrize(("case", "n"), ROWS)
+def test_values_are_those_of_float64_and_inputs_stay(case: Case, n: int) -> None:
+    given = cast(list(case.make(n)), torch.float32)
+    before = [x.clone() for x in given]
+    found = outputs(case.call(*given))
+    exact = outputs(case.call(*cast(before, torch.float64)))
+    assert all(torch.equal(a, b) for a, b in zip(given, before, strict=True))
+    for one, other in zip(found, exact, strict=True):
+        check_close(case, one, other)
+
+
+@pytest.mark.parametrize(("case", "n"), [row for row in ROWS if row.values[0].slopes])
+def test_gradients_are_those_of_float64(case: Case, n: int) -> None:
+    """Elementwise, relative L2, cosine and signed bias."""
+    made = cast(list(case.make(n)), torch.float32)
+    slopes = []
+    for dtype in (torch.float32, torch.float64):
+        given = cast(made, dtype)
+        for k in case.slopes:
+            given[k] = given[k].detach().requires_grad_(True)
+        out = [x for x in outputs(case.call(*given)) if x.requires_grad]
+        draws = [torch.rand(x.shape, generator=torch.Generator().manual_seed(k)) - 0.3 for k, x in enumerate(out)]
+        torch.autograd.backward([(x * w.to(dtype)).sum() for x, w in zip(out, draws, strict=True)])
+        slopes.append([given[k].grad for k in case.slopes])
+    for a, b in zip(*slopes, strict=True):
+        assert a is not None and b is not None and a.shape == b.shape
+        assert bool(torch.isfinite(a).all())
+        if not b.numel() or float(b.norm()) == 0:
+            assert float(a.norm()) == 0
+            continue
+        apart, size = a.double() - b, b.norm()
+        assert float(apart.abs().max()) <= 1e-3 * float(b.abs().max())
+        assert float(apart.norm()) <= 1e-4 * float(size)
+        assert float((a.double() * b).sum() / (a.double().norm() * size)) >= 1 - 1e-7
+        assert abs(float(apart.mean())) <= 1e-4 * float(b.abs().mean())
+
+
+@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("name", ["matching.scores", "matching.attention", "guided.apply", "stepfun.transmittance_weights"])
+def test_autocast_does_not_lower_the_precision(name: str, half: torch.dtype) -> None:
+    (case,) = (case for case in CASES if case.name == name)
+    given = cast(list(case.make(37)), torch.float32)
+    with torch.autocast("cpu", dtype=half):
+        (found,) = outputs(case.call(*given))
+    assert found.dtype == torch.float32
+    check_close(case, found, outputs(case.call(*cast(given, torch.float64)))[0])
+
+
+@pytest.mark.parametrize(("rays", "samples"), [(0, 5), (5, 0), (0, 0), (1, 1), (37, 21)])
+def test_the_march_of_no_rays_and_of_no_samples(rays: int, samples: int) -> None:
+    """Asked for directly, without `fit`, which would have sent these to the plain form."""
+    density, t = torch.rand(rays, samples), torch.rand(rays, samples + 1).sort(-1).values
+    found = march.weigh(density, t, 0.01)
+    assert found.weights.shape == (rays, samples) and found.start.tolist()[0] == 0
+    assert found.depth.shape == found.opacity.shape == found.through.shape == (rays,)
+    if not samples:
+        assert found.opacity.tolist() == [0.0] * rays and found.through.tolist() == [1.0] * rays
+    kept = march.gather(found, torch.rand(rays, samples, 3), torch.rand(rays * samples, 4), torch.rand(rays, 3))
+    assert len(kept.ray) == len(kept.weight) == int(found.start[-1]) == int(found.keep.sum())
+    out = march.composite(kept.weight, torch.rand(len(kept.ray), 3), found.start)
+    assert out.shape == (rays, 3) and bool(torch.isfinite(out).all())
+    learnt = density.clone().requires_grad_(True)
+    march.weigh(learnt, t, 0.01).weights.sum().backward()
+    assert learnt.grad is not None and learnt.grad.shape == density.shape
