@@ -12,6 +12,7 @@ import torch
 
 from ..blocks.plan import Plan
 from ..config import TrainConfig
+from ..datamanagers.pixel_file import HELD
 from ..datamanagers.scene import Scene
 from ..interfaces import DataManager
 from ..types import Batch
@@ -99,7 +100,8 @@ def estimates(config: TrainConfig, scene: Scene, plan: Plan) -> list[Estimate]:
     }
 
     def row(name: str, views: torch.Tensor, rays: int, extent: tuple[float, float, float], members: int, built: Built) -> None:
-        images = 3 * int(area[views].sum()) + 4 * rays
+        pixels = 3 * int(area[views].sum())
+        images = pixels if pixels <= HELD else 0  # else they lie in a mapped file
         held = members * parameters * 4
         working = _WORKING * batch * 64
         seconds = config.steps * speed[id(built)]
@@ -110,7 +112,7 @@ def estimates(config: TrainConfig, scene: Scene, plan: Plan) -> list[Estimate]:
                 rays,
                 extent,
                 (held * _STATE + images + working) / _MIB,
-                (parameters * 4 + 2 * 3 * held) / _MIB,
+                (parameters * 4 + 2 * 3 * held + pixels - images) / _MIB,
                 seconds,
             )
         )

@@ -6,6 +6,7 @@ import pytest
 import torch
 from block_world import BlockWorld, small
 
+from fprf.engine import estimate
 from fprf.engine.estimate import Estimate, estimates
 from fprf.engine.lay_out import plan_scene
 from fprf.fields.config import PlanesConfig
@@ -55,6 +56,16 @@ def test_time_follows_the_steps_until_the_limit(block_world: BlockWorld) -> None
     config = replace(block_world.config, steps=1_000_000, minutes=2.0)
     limited = estimates(config, *plan_scene(config))
     assert limited[-1].seconds == pytest.approx(120)
+
+
+def test_many_pixels_take_disk_and_no_memory(
+    block_world: BlockWorld, rows: list[Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimate, "HELD", 0)
+    mapped = estimates(block_world.config, *plan_scene(block_world.config))
+    pixels = 3 * 10 * 32 * 24 / 2**20
+    assert rows[0].memory_mib - mapped[0].memory_mib == pytest.approx(pixels)
+    assert mapped[0].disk_mib - rows[0].disk_mib == pytest.approx(pixels)
 
 
 def test_one_block_has_no_surroundings(block_world: BlockWorld) -> None:
