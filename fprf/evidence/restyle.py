@@ -34,6 +34,8 @@ GOALS: Mapping[str, float] = {
 """PSNR of the recommended stylizer with three references against no change, the best of GLOBAL, and itself on single pictures,
 at least; its match rate inside of things, at least; its score of consistency, at most."""
 JUDGED = "three"
+LPIPS_MISSING = "its weights do not ship with the package, and no dependency brings them"
+"""Why that figure is null."""
 
 Progress = Callable[[int, int, str], None]
 
@@ -78,6 +80,8 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
             "regions": trained.config.statistics.regions,
             "semantic_encoder": trained.known.facts.semantic_encoder,
         },
+        "lpips": None,
+        "lpips_missing": LPIPS_MISSING,
         "recommended": best,
         "reconstruction": _own_look(stage),
         "means": means,

@@ -44,7 +44,7 @@ def test_every_method_is_in_the_table_and_numbers_repeat(
         assert (row["match"] is not None) == (name in METHODS - {"no change", "reinhard", "histogram", "adain", MATCHED, BOUND})
         assert (row["consistency"] is None) == (name in (MATCHED, BOUND))
     assert found["rows"]["no change"]["consistency"] == 0
-    assert document["recommended"] == "region-tone"
+    assert document["recommended"] == "region-tone" and document["lpips"] is None and document["lpips_missing"]
     assert document["verdict"]["goals"] == dict(GOALS) and set(document["verdict"]["met"]) == set(GOALS)
     # A map that knows the truth is nearer to it than doing nothing, whatever the scene.
     assert found["rows"][BOUND]["psnr"] > found["rows"]["no change"]["psnr"]
