@@ -50,7 +50,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/style/clusters.py": ("style/test_clusters.py",),
     "fprf/style/colours.py": ("style/test_colours.py",),
     "fprf/style/controls.py": ("style/test_controls.py",),
-    "fprf/style/matching.py": ("style/test_matching.py",),
+    "fprf/style/matching.py": ("style/test_matching.py", "ops/test_mixture.py"),
     "fprf/style/regional.py": ("style/test_regional.py",),
     "fprf/style/statistics.py": ("style/test_statistics.py",),
     "fprf/style/transport.py": ("style/test_transport.py",),

@@ -6,7 +6,7 @@ annotations, decorators, imports, messages of errors and asserts are left alone:
 
 import ast
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 __all__ = ["Mutation", "mutated", "mutations"]
 
@@ -67,6 +67,10 @@ SWAPS = {
     "zeros": "ones",
     "logical_and": "logical_or",
 }
+AXES = ("sum", "mean", "cumsum", "cat", "stack", "amax", "amin", "softmax", "diff", "sort", "unbind", "gather", "squeeze",
+        "norm", "unsqueeze", "median", "all", "any", "cross", "prod", "argmax", "argmin", "new_zeros", "view", "reshape",
+        "flatten", "logsumexp", "repeat_interleave", "movedim", "log_softmax", "normalize")  # fmt: skip
+"""Calls whose arguments name axes: of a matrix, axis 1 is axis -1, and no test could tell."""
 SKIPPED = (ast.Raise, ast.Assert, ast.Import, ast.ImportFrom, ast.JoinedStr)
 
 
@@ -127,11 +131,18 @@ def _nodes(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
         children = [] if node.value is None else [node.value]
     elif isinstance(node, ast.Assign):
         children = [*node.targets, node.value]
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in AXES:
+        children = [child.operand if _is_axis(child) else child for child in (node.func, *node.args)]
+        children += [k.value.operand if _is_axis(k.value) else k.value for k in node.keywords]
     else:
         children = list(ast.iter_child_nodes(node))
     for child in children:
         if not (isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant)):  # a docstring
             yield from _nodes(child)
+
+
+def _is_axis(node: ast.AST) -> TypeGuard[ast.UnaryOp]:
+    return isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and isinstance(node.operand, ast.Constant)
 
 
 def _is_all(node: ast.AST) -> bool:

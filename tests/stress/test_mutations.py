@@ -93,6 +93,11 @@ def test_kinds_of_changes(changes: ModuleType, before: str, what: str, after: st
     assert ast.unparse(changes.mutated(before, mutation)) == after
 
 
+def test_an_axis_keeps_its_sign(changes: ModuleType) -> None:
+    found = [each.what for each in changes.mutations(ast.parse("x.cumsum(-1) + x.sum(dim=-2) + f(-3)"))]
+    assert "1 to 2" in found and "2 to 3" in found and found.count("USub left out") == 1
+
+
 def test_samples_are_functions_of_module_and_seed_and_every_module_has_tests(changes: ModuleType) -> None:
     runner = load("mutants")
     source = (BENCHMARKS.parent / "fprf/rendering/stepfun.py").read_text()

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import ConfigError
-from fprf.style.matching import Similarity, attention, compared, score_spread, share_mean, unit
+from fprf.style.matching import Similarity, attention, compared, point_shares, score_spread, share_mean, unit
 
 
 def plain_attention(q: torch.Tensor, k: torch.Tensor, temperature: float) -> torch.Tensor:
@@ -92,7 +92,7 @@ def test_share_mean_weighs() -> None:
     torch.testing.assert_close(share_mean(torch.tensor([[0.0], [4.0]]), torch.tensor([3.0, 1.0])), torch.tensor([1.0]))
 
 
-@pytest.mark.parametrize("temperature", [1e-30, 1e-3, 1.0, 100.0, 1e6])
+@pytest.mark.parametrize("temperature", [1e-38, 1e-30, 1e-3, 1.0, 100.0, 1e6])
 def test_duplicate_keys_share_evenly_at_any_temperature(temperature: float) -> None:
     k = torch.randn(3, 8) * 50
     a = attention(torch.randn(20, 8) * 50, torch.cat([k, k]), temperature)
@@ -117,3 +117,75 @@ def test_scores_of_compared_sides_are_cosines_or_differences_of_dot_products(sim
     else:
         plain = q @ k.T
         torch.testing.assert_close(r - r[:, :1], plain - plain[:, :1], rtol=1e-4, atol=1e-4)
+
+
+def plain_shares(
+    x: torch.Tensor, keys: torch.Tensor, temperature: float, centre: torch.Tensor | None, prior: torch.Tensor, faint: float
+) -> torch.Tensor:
+    """Row by row in float64."""
+    out = []
+    for row in x.double():
+        away = row if centre is None else row - centre.double()
+        size = 1.0 if centre is None else float(away.norm())
+        away = away / size if size > 1e-6 * float(0.0 if centre is None else centre.double().norm()) else 0 * away
+        odds = (keys.double() @ away / temperature - float((keys.double() @ away / temperature).max())).exp() * prior.double()
+        odds = odds / odds.sum()
+        odds = torch.where(odds < faint * odds.max(), 0.0, odds)
+        out.append(odds / odds.sum())
+    return torch.stack(out) if out else x.double().new_zeros(0, len(keys))
+
+
+@pytest.mark.parametrize("wide", [torch.float32, torch.float64])
+@pytest.mark.parametrize("centred", [False, True])
+@pytest.mark.parametrize("faint", [0.0, 0.2])
+@pytest.mark.parametrize("count", [0, 1, 50])
+def test_shares_of_points_are_those_of_a_loop(wide: torch.dtype, centred: bool, faint: float, count: int) -> None:
+    draw = torch.Generator().manual_seed(count)
+    x, keys = torch.randn(count, 8, generator=draw) * 3 + 5, torch.randn(6, 8, generator=draw)
+    centre = torch.full((8,), 5.0) if centred else None
+    if centre is not None and count > 1:
+        x[0] = centre
+        x[1] = centre * (1 + 2e-7)  # rounding alone: no direction
+    prior = torch.rand(6, generator=draw) + 0.2
+    at = None if centre is None else centre.to(wide)
+    found = point_shares(x.to(wide), keys.to(wide), 0.7, centre=at, prior=prior.to(wide), faint=faint)
+    exact = plain_shares(x, keys, 0.7, centre, prior, faint)
+    assert found.dtype == wide and found.shape == (count, 6)
+    # A share at the edge of being faint may fall either way.
+    off = ((found.double() - exact).abs() > (4 * 12 * 6e-8 * 60 if wide == torch.float32 else 1e-12)).any(1)
+    assert float(off.double().sum()) <= (1 if faint else 0)
+    if faint and count == 50:
+        assert bool((found == 0).any()), "else nothing was faint"
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0])
+def test_shares_of_points_refuse_temperatures_that_are_not_above_zero(temperature: float) -> None:
+    with pytest.raises(ConfigError, match="temperature"):
+        point_shares(torch.ones(3, 8), torch.ones(2, 8), temperature)
+
+
+def test_points_in_float32_may_meet_keys_in_float64() -> None:
+    with pytest.raises(RuntimeError, match="dtype"):
+        point_shares(torch.ones(3, 8), torch.ones(2, 8, dtype=torch.float64), 1.0)
+
+
+def test_a_common_offset_of_keys_costs_no_digits() -> None:
+    draw = torch.Generator().manual_seed(0)
+    q, k = torch.randn(6, 8, generator=draw), torch.randn(5, 8, generator=draw) + 1e4
+    a, b = compared(q, k, "dot", queries_centre=q.mean(0), keys_centre=k.mean(0))
+    r, exact = a @ b.T, q.double() @ (k.double() - k.double().mean(0)).T
+    assert float(((r - r[:, :1]).double() - (exact - exact[:, :1])).abs().max()) < 1e-4
+
+
+def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
+    assert score_spread(torch.tensor([[1e6], [0.0]]), torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)) == 1.0
+
+
+def test_directions_begin_just_above_rounding_and_have_gradients_at_the_centre() -> None:
+    centre = torch.full((4,), 100.0, dtype=torch.float64)
+    near, apart = centre * (1 + 0.7e-6), centre * (1 + 1.5e-6)
+    found = unit(torch.stack([near, apart]), centre)
+    assert found[0].tolist() == [0.0] * 4 and float(found[1].norm()) == pytest.approx(1)
+    x = torch.cat([centre[None], centre[None] + 1]).requires_grad_(True)
+    unit(x, centre).sum().backward()
+    assert x.grad is not None and bool(x.grad.isfinite().all())

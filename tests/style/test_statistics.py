@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -147,3 +149,21 @@ def test_dead_channels_are_those_that_are_floored() -> None:
     assert dead_channels(torch.zeros(6), sigma.square()).tolist() == [False, False, False, True, True, False, False]
     assert dead_channels(torch.full((3,), 1e6), torch.full((3,), 0.25)).all(), "rounding of the mean"
     assert not dead_channels(torch.zeros(4), torch.ones(4)).any()
+
+
+def test_groups_of_nothing_have_no_share() -> None:
+    mean, spread, share = group_moments(torch.randn(5, 3), torch.zeros(5, 2))
+    assert share.tolist() == [0.0, 0.0] and not bool(mean.any()) and not bool(spread.any())
+
+
+@pytest.mark.parametrize("function", [deviation, dead_channels])
+def test_each_of_many_is_as_if_it_were_alone(function: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> None:
+    draw = torch.Generator().manual_seed(0)
+    mean, variance = torch.randn(4, 4, generator=draw), torch.rand(4, 4, generator=draw) ** 6
+    together = function(mean, variance)
+    assert all(torch.equal(together[k], function(mean[k], variance[k])) for k in range(4))
+
+
+def test_the_largest_mean_says_what_rounding_is() -> None:
+    found = deviation(torch.tensor([1e4, 0.0, 1.0]), torch.zeros(3))
+    assert found.tolist() == pytest.approx([1e-2] * 3)
