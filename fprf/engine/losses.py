@@ -61,7 +61,7 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
         if found is not None:
             result["depth"] = found
     if config.sky > 0 and batch.sky is not None:
-        found = emptiness(sampled.t, weights, batch.sky, shell=math.inf if facts.space.kind in ("box", "ndc") else SHELL)
+        found = emptiness(sampled.t, weights, batch.sky, within=math.inf if facts.space.kind in ("box", "ndc") else SHELL)
         if found is not None:
             result["sky"] = found
     due = step % config.penalty_every == 0 and (config.variation > 0 or config.proposal_variation > 0)
@@ -87,16 +87,16 @@ def ending(t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], dista
 
 
 def emptiness(
-    t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], sky: Annotated[Tensor, "R"], *, shell: float
+    t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], sky: Annotated[Tensor, "R"], *, within: float
 ) -> Tensor | None:
-    """How much rays into the sky meet before `shell` (space units); None where there are none.
+    """How much rays into the sky meet before `within` (space units); None where there are none.
 
     Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell.
     """
     chosen = sky.nonzero()[:, 0]
     if not len(chosen):
         return None
-    before = midpoints(t.index_select(0, chosen)) < shell
+    before = midpoints(t.index_select(0, chosen)) < within
     return (weights.index_select(0, chosen) * before).sum(-1).square().mean()
 
 

@@ -16,14 +16,14 @@ from fprf.types import Batch
 def test_what_sky_rays_meet_before_the_shell(shell: float, wanted: float) -> None:
     t = torch.tensor([[1.0, 3.0, 6.0]]).repeat(3, 1)
     weights = torch.tensor([[0.3, 0.6], [0.5, 0.5], [1.0, 0.0]], requires_grad=True)
-    found = emptiness(t, weights, torch.tensor([True, False, True]), shell=shell)
+    found = emptiness(t, weights, torch.tensor([True, False, True]), within=shell)
     assert found is not None and found.item() == pytest.approx(wanted)
     found.backward()
     assert weights.grad is not None and not weights.grad[1].any()
 
 
 def test_without_sky_there_is_no_term() -> None:
-    assert emptiness(torch.rand(2, 4), torch.rand(2, 3), torch.tensor([False, False]), shell=SHELL) is None
+    assert emptiness(torch.rand(2, 4), torch.rand(2, 3), torch.tensor([False, False]), within=SHELL) is None
 
 
 def test_the_sky_is_cleared(world: World, tmp_path: Path) -> None:
