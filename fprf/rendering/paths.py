@@ -194,7 +194,11 @@ def _spacing(apart: Annotated[Tensor, "V V"]) -> float:
 
 
 def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:
-    """The point closest to all optical axes, in front of the cameras; None where the axes are too parallel to say."""
+    """The point closest to all optical axes, in front of the cameras; None where they do not meet, or hardly.
+
+    Of axes that all but agree in direction the closest point lies among the cameras themselves: most axes must pass it at
+    less than half of its distance.
+    """
     forward = -pose[:, :, 2]
     across = torch.eye(3, dtype=pose.dtype, device=pose.device) - forward[:, :, None] * forward[:, None, :]
     system = across.mean(dim=0)
@@ -203,8 +207,10 @@ def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:
     if float(values[0]) < 1e-3:
         return None
     target = torch.linalg.solve(system, (across @ pose[:, :, 3:]).mean(dim=0)[:, 0])
-    ahead = ((target - pose[:, :, 3]) * forward).sum(dim=-1)
-    return target if float((ahead > 0).double().mean()) > 0.75 else None
+    way = target - pose[:, :, 3]
+    ahead = (way * forward).sum(dim=-1)
+    past = (way - ahead[:, None] * forward).norm(dim=-1)
+    return target if float((past < 0.5 * ahead).double().mean()) > 0.75 else None
 
 
 def _focus_depth(cameras: Cameras, view: int, points: Tensor | None, depths: Tensor | None) -> float:

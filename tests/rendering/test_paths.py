@@ -148,6 +148,13 @@ def test_an_orbit_is_rigid_closed_and_smooth(capture: Callable[[int], Cameras], 
     assert float(turns(path).max()) < 0.25
 
 
+@pytest.mark.parametrize("seed", [63, 149, 160, 316, 593, 835])
+def test_cameras_that_look_one_way_do_not_circle_among_themselves(seed: int) -> None:
+    """Their axes come closest to each other where the cameras are."""
+    path = orbit(forward_facing(seed), 120)
+    assert float(turns(path).max()) < 0.25 and float(steps(path).max()) <= 6 * float(steps(path).mean())
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000))
 def test_an_orbit_of_a_surrounded_place_is_a_full_circle_at_its_distance(seed: int) -> None:
