@@ -6,6 +6,9 @@ Needs the extra `cluster`. Both sides run `fprf train` in processes of their own
 features extracted before. `speedup` is that of the whole command, the surroundings (which come first, alone) and Ray's start
 included; `blocks_speedup` that of the blocks alone, from the surroundings' end to the last block's. Times are wall times: the
 machine must be free.
+
+The file: `blocks`, `steps_each`, `workers`, `processors` (integers); `serial_seconds`, `ray_seconds` and their quotient
+`speedup`; `serial_blocks_seconds`, `ray_blocks_seconds` and their quotient `blocks_speedup`; `same_bits` (true or false).
 """
 
 import argparse
