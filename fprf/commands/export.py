@@ -1,16 +1,14 @@
 """`fprf export RUN [ply splat cameras ...]`: a scene, plain or restyled, as files that other programs open."""
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..checks import at_least, between, positive
-from ..errors import UsageError
+from ..errors import DataError, UsageError
+from ..export.config import ExportConfig
 from ..export.looks import Look, Named, make_looks, named_styles, style_name
 from ..export.plan import KINDS, Plan, look_file, plan
-from ..style.config import StyleConfig
 from .progress import Display
 from .style_flags import read_flags
 
@@ -18,68 +16,17 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..engine.loading import Trained
+    from ..export.colours import Coloured
     from ..export.fusion import Cloud
     from ..export.sights import Sights
+    from ..export.witness import Witnesses
 
-__all__ = ["ExportConfig", "run"]
+__all__ = ["run"]
 
 _DESCRIPTION = f"""A scene as files that other programs open, in the capture's own frame.
 
 Kinds may follow the run, none = all of them: {", ".join(f"{name} = {what}" for name, what in KINDS.items())}. A look
 of the scene is a file: points.ply as it is, points.NAME.ply in a style, with the same points in the same order."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportConfig(StyleConfig):
-    """What to export, how finely, and in which styles."""
-
-    run: Path = Path()
-    """Run folder."""
-    kinds: tuple[str, ...] = ()
-    """What to export; the same as words behind the run. None = everything."""
-    output: Path | None = None
-    """A folder, or a single file (.ply .splat .glb .json .cube); by default RUN/exports."""
-    style: Path | None = None
-    """A style file, such as the style.json of `fprf stylize`; flags come over it."""
-    styles: tuple[str, ...] = ()
-    """Further styles of the same geometry: NAME=PHOTO,PHOTO or NAME=STYLE.json each."""
-    views: int = 120
-    """Training views that the geometry is taken from, at most; spread evenly."""
-    side: int = 400
-    """Longest side of their depth maps, in pixels."""
-    points: int = 500_000
-    """Points, at most."""
-    edge: float | None = None
-    """Edge of the finest voxel in world units, above 0: one point each; none = the median pixel on the surface."""
-    tolerance: float = 0.02
-    """Views agree on a point where their depths differ by no more than this share, in (0, 0.5]."""
-    agree: int = 2
-    """Other views that must see a point, where so many look there."""
-    reach: float | None = None
-    """What is farther from its view, in world units, is sky; none = 20 times the scene's inner radius."""
-    sky: bool = True
-    """Put a dome round splats where views see nothing within reach."""
-    mesh_edge: float | None = None
-    """Edge of the mesh's lattice in world units, above 0; none = twice the finest voxel's."""
-    lut_size: int = 33
-    """Nodes a side of lookup tables, in [2, 129]; editors take 17, 33 or 65."""
-    images: bool = False
-    """With cameras: also render every view, in the style if there is one, so that other methods can train on them."""
-    device: str = "auto"
-    """cpu, cuda, mps, or auto."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        at_least("views", self.views, 2)
-        at_least("side", self.side, 8)
-        at_least("points", self.points, 1)
-        between("tolerance", self.tolerance, 1e-6, 0.5)
-        at_least("agree", self.agree, 1)
-        between("lut_size", self.lut_size, 2, 129)
-        for name in ("edge", "reach", "mesh_edge"):
-            value = getattr(self, name)
-            if value is not None:
-                positive(name, value)
 
 
 def run(args: list[str]) -> int:
@@ -133,21 +80,21 @@ class _Place(NamedTuple):
             return [self.what.folder / look_file(base, look.name, ending)]
         return [self.what.single] if self.what.single.suffix.lower() == ending else []
 
-    def colours(self, point: "Tensor", view: "Tensor") -> "Iterator[tuple[Look, Tensor]]":
-        """Each look with the colours of points that views of the sights see."""
+    def colours(self, point: "Tensor", seen: "Witnesses", tolerance: float | None) -> "Coloured":
+        """Every look's colours of points that views of the sights see."""
         from ..export.colours import seen_colours
 
-        found = seen_colours(
+        return seen_colours(
             self.trained.model,
             self.trained.known.facts,
             self.sights.cameras,
             point,
-            view,
+            seen,
             self.trained.config.render,
             [look.restyle for look in self.looks],
-            lambda done, total: self.display.count(done, total, "colouring"),
+            tolerance=tolerance,
+            report=lambda done, total: self.display.count(done, total, "colouring"),
         )
-        return zip(self.looks, found, strict=True)
 
 
 def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequence[Look], display: Display) -> dict[str, Any]:
@@ -169,9 +116,9 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
     place = _Place(trained, what, looks, sights, origin_of(cloud), display)
     made = {"origin": place.origin.tolist(), "views": len(sights.depth), "finest_edge": float(cloud.edge.amin())}
     if {"ply", "splat"} & set(what.kinds):
-        made |= _points(place, cloud, sky=config.sky)
+        made |= _points(place, cloud, config)
     if "glb" in what.kinds:
-        made |= _mesh(place, cloud, config.mesh_edge)
+        made |= _mesh(place, cloud, config)
     return made
 
 
@@ -190,37 +137,55 @@ def _sights(trained: "Trained", config: ExportConfig, display: Display) -> "Sigh
     )
 
 
-def _points(place: _Place, cloud: "Cloud", *, sky: bool) -> dict[str, Any]:
+def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
     """Points and splats: one geometry, a colour set for each look."""
-    from ..export.fusion import joined
+    import torch
+
+    from ..export.fusion import Cloud, joined
     from ..export.points import write_points
     from ..export.sky import dome
     from ..export.splats import discs, write_gaussians, write_splat
+    from ..export.witness import alone, witnesses
 
     kinds = place.what.kinds
-    above = dome(place.sights, cloud) if sky and "splat" in kinds else None
+    found = place.colours(
+        cloud.point, witnesses(place.sights, cloud.point, cloud.normal, cloud.edge, config.witnesses), config.tolerance
+    )
+    solid = found.presence >= config.presence
+    if not bool(solid.any()):
+        raise DataError(f"export: no point is as present as {config.presence:g} in the field; lower --presence")
+    cloud, colours = Cloud(*(column[solid] for column in cloud)), [colour[solid] for colour in found.colours]
+    above = dome(place.sights, cloud) if config.sky and "splat" in kinds else None
     whole = cloud if above is None else joined(cloud, above)
-    count, splats = len(cloud.point), discs(whole)
-    for look, colour in place.colours(whole.point, whole.view):
+    beyond = None if above is None else place.colours(above.point, alone(above.view), None).colours
+    splats = discs(whole)
+    for number, look in enumerate(place.looks):
+        colour = colours[number]
+        every = colour if beyond is None else torch.cat([colour, beyond[number]])
         if "ply" in kinds:
             for path in place.paths("points", look, ".ply"):
-                write_points(path, cloud, colour[:count], place.origin)
+                write_points(path, cloud, colour, place.origin)
         if "splat" in kinds:
             for path in place.paths("splats", look, ".ply"):
-                write_gaussians(path, splats, colour, place.origin)
+                write_gaussians(path, splats, every, place.origin)
             for path in place.paths("splats", look, ".splat"):
-                write_splat(path, splats, colour, place.origin)
-    return {"points": count, "splats": len(whole.point)}
+                write_splat(path, splats, every, place.origin)
+    return {"points": len(cloud.point), "floating": int((~solid).sum()), "splats": len(whole.point)}
 
 
-def _mesh(place: _Place, cloud: "Cloud", edge: float | None) -> dict[str, Any]:
+def _mesh(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
     """The mesh in both formats, a file for each look."""
     from ..export.mesh import build_mesh, write_mesh_glb, write_mesh_ply
+    from ..export.witness import witnesses
 
     mesh = build_mesh(
-        place.sights, cloud, edge=edge, report=lambda done, total: place.display.count(done, total, "building the mesh")
+        place.sights,
+        cloud,
+        edge=config.mesh_edge,
+        report=lambda done, total: place.display.count(done, total, "building the mesh"),
     )
-    for look, colour in place.colours(mesh.point, mesh.view):
+    seen = witnesses(place.sights, mesh.point, mesh.normal, mesh.edge, config.witnesses)
+    for look, colour in zip(place.looks, place.colours(mesh.point, seen, config.tolerance).colours, strict=True):
         for path in place.paths("mesh", look, ".ply"):
             write_mesh_ply(path, mesh, colour, place.origin)
         for path in place.paths("mesh", look, ".glb"):

@@ -14,17 +14,21 @@ from ..errors import ConfigError, FprfError, PluginError, UsageError
 from ..plugins import registry
 from ..plugins.codec import Missing, load_config
 from ..plugins.slots import Slot, hints_of, resolve, slots
+from .describe import describe
 from .flags import Flag, explain, flags_of, spell
 
 if TYPE_CHECKING:
     from ..config import TrainConfig
 
-__all__ = ["LIST_FLAGS", "load_method", "methods", "parse"]
+__all__ = ["DESCRIBE", "LIST_FLAGS", "load_method", "methods", "parse"]
 
 C = TypeVar("C")
 
 LIST_FLAGS = "--list-flags"
 """Asks any verb for its flags, one a line: for shells that complete them."""
+
+DESCRIBE = "--describe"
+"""Asks any verb for all of its flags with their meanings, as JSON."""
 
 _COLUMNS = 100
 
@@ -38,6 +42,9 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     """
     if LIST_FLAGS in args:
         print("\n".join(sorted({*flags_of(default), *(f"--{slot.path.replace('_', '-')}" for slot in slots(default))})))
+        raise SystemExit(0)
+    if DESCRIBE in args:
+        print(describe(default, prog=prog, description=description, positional=positional))
         raise SystemExit(0)
     config, rest = resolve(default, args)
     for slot in slots(config):

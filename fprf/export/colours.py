@@ -1,7 +1,11 @@
-"""Colours of points, plain or restyled: what the view that sees a point best sees on the ray through it."""
+"""Colours of points, plain or restyled: what the views that see a point best see there.
+
+A ray is followed only close to the point, so that nothing before or behind it, as at the edge of a nearer thing, mixes in.
+Views are averaged: one alone would give neighbours the moods of different pictures.
+"""
 
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,8 +15,22 @@ from ..engine.model import Facts, Model, background_of
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Parts, Restyle, composite, march
 from ..types import Rays, Want
+from .witness import Witnesses, alone
 
-__all__ = ["paint", "seen_colours"]
+__all__ = ["Coloured", "paint", "seen_colours"]
+
+_LOST = 1e-3
+"""Where less light than this comes from a point, the colour of the whole ray is taken."""
+
+
+class Coloured(NamedTuple):
+    """N points in one or more looks."""
+
+    colours: list[Annotated[Tensor, "N 3"]]
+    """sRGB in [0, 1], one set a look."""
+    presence: Annotated[Tensor, "N"]
+    """How much of the light of the rays to a point comes from there, in [0, 1]: low where a point floats before or behind
+    the field's own surface."""
 
 
 def paint(kept: Kept, parts: Parts, styles: Sequence[Restyle | None]) -> list[Annotated[Tensor, "M 3"]]:
@@ -31,26 +49,64 @@ def seen_colours(
     facts: Facts,
     cameras: Cameras,
     points: Annotated[Tensor, "N 3"],
-    view: Annotated[Tensor, "N"],
+    seen: Witnesses,
     config: RenderConfig,
     styles: Sequence[Restyle | None],
+    *,
+    tolerance: float | None,
     report: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Annotated[Tensor, "N 3"]]:
-    """sRGB in [0, 1] of world points, one set a style (None = plain), on the rays from their views' centres.
+) -> Coloured:
+    """Colours of world points, one set a style (None = plain), from the rays of the views that see each.
 
-    The geometry is the same for all, and only as many rays as points are marched, however many views there are.
+    What lies farther from the point than `tolerance` of its distance is left out; None = the whole ray, with the background.
+    The geometry is the same for all styles.
     """
+    sums = torch.zeros(len(points), 3 * len(styles))
+    light, share = torch.zeros(len(points)), torch.zeros(len(points))
+    total = int((seen.weight > 0).sum())
+    done = 0
+    for rank in range(seen.view.shape[1]):
+        for part in torch.split((seen.weight[:, rank] > 0).nonzero()[:, 0], config.chunk):
+            report(done, total)
+            done += len(part)
+            found, opacity = _looked(model, facts, cameras, points[part], seen.view[part, rank], config, styles, tolerance)
+            weight = seen.weight[part, rank].float()
+            sums[part] += found * weight[:, None]
+            light[part] += opacity * weight
+            share[part] += weight
+    report(total, total)
+    presence = light / share.clamp_min(1e-10)
+    colour = (sums / (share if tolerance is None else light).clamp_min(1e-10)[:, None]).clamp(0, 1)
+    lost = (presence < _LOST).nonzero()[:, 0]
+    if tolerance is not None and len(lost):
+        first = alone(seen.view[lost, 0])
+        whole = seen_colours(model, facts, cameras, points[lost], first, config, styles, tolerance=None)
+        colour[lost] = torch.cat(whole.colours, 1)
+    return Coloured(list(torch.split(colour, 3, 1)), presence)
+
+
+def _looked(
+    model: Model,
+    facts: Facts,
+    cameras: Cameras,
+    points: Annotated[Tensor, "R 3"],
+    view: Annotated[Tensor, "R"],
+    config: RenderConfig,
+    styles: Sequence[Restyle | None],
+    tolerance: float | None,
+) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
+    """Composited colours of all styles side by side, and opacities, of rays from views to points."""
     device = next(model.parameters()).device
     origin = cameras.pose[view, :, 3]
-    rays = model.space.rays(origin, torch.nn.functional.normalize(points - origin, dim=-1))
-    background = background_of(facts, device)
-    found: list[list[Tensor]] = [[torch.zeros(0, 3)] for _ in styles]
-    for start in range(0, len(points), config.chunk):
-        report(start, len(points))
-        part = Rays(*(x[start : start + config.chunk].to(device) for x in rays))
-        marched = march(part, model.parts, budget=config.budget)
-        behind = 0.0 if background is None else marched.through[:, None] * background
-        for colours, colour in zip(found, paint(marched.kept, model.parts, styles), strict=True):
-            colours.append((composite(marched.kept, colour, len(part.near)) + behind).clamp(0, 1).cpu())
-    report(len(points), len(points))
-    return [torch.cat(colours) for colours in found]
+    distance = torch.linalg.vector_norm(points - origin, dim=-1)
+    direction = (points - origin) / distance[:, None]
+    rays = model.space.rays(origin, direction)
+    if tolerance is not None:
+        ends = (model.space.parameter(origin, direction, distance * (1 + side)).float() for side in (-tolerance, tolerance))
+        near, far = (torch.maximum(torch.minimum(end, rays.far), rays.near) for end in ends)
+        rays = rays._replace(near=near, far=far)
+    marched = march(Rays(*(x.to(device) for x in rays)), model.parts, budget=config.budget)
+    background = background_of(facts, device) if tolerance is None else None
+    behind = 0.0 if background is None else marched.through[:, None] * background
+    colours = [composite(marched.kept, colour, len(points)) + behind for colour in paint(marched.kept, model.parts, styles)]
+    return torch.cat(colours, 1).cpu(), marched.opacity.cpu()

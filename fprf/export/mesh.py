@@ -13,11 +13,11 @@ from .fusion import Cloud
 from .glb import write_glb
 from .ply import write_ply
 from .points import columns, told
-from .sights import Sights, gaps
+from .sights import Sights
 from .surface_nets import surface_nets
 from .tsdf import around, integrate
 
-__all__ = ["Mesh", "build_mesh", "components", "vertex_normals", "witnesses", "write_mesh_glb", "write_mesh_ply"]
+__all__ = ["Mesh", "build_mesh", "components", "vertex_normals", "write_mesh_glb", "write_mesh_ply"]
 
 _NEAR = 4.0
 """Points of voxels more than so many times the finest stay out: far surfaces are known too coarsely for a mesh."""
@@ -38,8 +38,6 @@ class Mesh(NamedTuple):
     """int64."""
     normal: Annotated[Tensor, "N 3"]
     """float32, unit."""
-    view: Annotated[Tensor, "N"]
-    """int64 index, among the sights, of the view that sees a vertex best."""
     edge: float
     """Of the lattice, world units."""
 
@@ -60,8 +58,7 @@ def build_mesh(
         raise DataError("export: no surface for a mesh; raise --mesh-edge, or export ply or splat instead")
     used, corner = torch.unique(face, return_inverse=True)
     point, face = origin + width * at[used], corner.view(-1, 3)
-    normal = vertex_normals(point - origin, face)
-    return Mesh(point, face, normal, witnesses(sights, point, normal, width), width)
+    return Mesh(point, face, vertex_normals(point - origin, face), width)
 
 
 def components(count: int, face: Annotated[Tensor, "F 3"]) -> Annotated[Tensor, "count"]:
@@ -89,27 +86,6 @@ def vertex_normals(point: Annotated[Tensor, "N 3"], face: Annotated[Tensor, "F 3
     for k in range(3):
         total.index_add_(0, face[:, k], normal)
     return torch.nn.functional.normalize(total, dim=-1).float()
-
-
-def witnesses(
-    sights: Sights, point: Annotated[Tensor, "N 3"], normal: Annotated[Tensor, "N 3"], near: float
-) -> Annotated[Tensor, "N"]:
-    """Which view sees each point best: the finest and straightest of those that see it, else the one that misses it least.
-
-    A view sees what lies within 2 `near` of its surface.
-    """
-    best = torch.full((len(point),), -torch.inf, dtype=torch.float64)
-    found = torch.zeros(len(point), dtype=torch.int64)
-    for view in range(len(sights.depth)):
-        gap, distance = gaps(sights, view, point)
-        way = (sights.cameras.pose[view, :, 3] - point) / distance[:, None]
-        facing = (way * normal.double()).sum(-1).clamp_min(1e-3)
-        # Both kinds of score in one: positive where it is seen, negative where not.
-        missed = torch.nan_to_num(gap.abs(), nan=1e18, posinf=1e17)
-        score = torch.where(missed <= 2 * near, facing / distance.square(), -missed)
-        better = score > best
-        best, found = torch.where(better, score, best), torch.where(better, view, found)
-    return found
 
 
 def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:

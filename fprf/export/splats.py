@@ -22,7 +22,7 @@ __all__ = ["Splats", "discs", "facing", "write_gaussians", "write_splat"]
 
 _HARMONIC = 0.28209479177387814
 """The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
-_WIDTH = 0.6
+_WIDTH = 0.55
 """Standard deviation along the surface, in spacings."""
 _THICKNESS = 0.1
 """Standard deviation across the surface, as a share of that along it."""

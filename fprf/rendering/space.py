@@ -126,6 +126,19 @@ class Space:
         z = start / (1 - t.to(o.dtype)).clamp_min(1e-9)
         return (to_near + (z - start) / d[:, 2]).to(t.dtype)
 
+    def parameter(
+        self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"], distance: Annotated[Tensor, "R"]
+    ) -> Annotated[Tensor, "R"]:
+        """The ray parameter t at a world distance along unit world rays: the inverse of `metric`."""
+        if self.kind != "ndc":
+            return distance * self.scale
+        low, high = torch.zeros_like(distance), torch.ones_like(distance)
+        for _ in range(40):  # `metric` rises with t
+            middle = (low + high) / 2
+            short = self.metric(origin, direction, middle) < distance
+            low, high = torch.where(short, middle, low), torch.where(short, high, middle)
+        return low
+
     def _device_coordinates(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Rays from the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one."""
         dz = d[:, 2].clamp(max=-1e-6)

@@ -8,11 +8,11 @@ import trimesh
 from tiny_world import World
 
 from fprf import cli
-from fprf.commands.export import ExportConfig
 from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.export.config import ExportConfig
 from fprf.export.depths import render_sights
 
-LOOSE = ["--tolerance", "0.3", "--agree", "1"]
+LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0"]
 """The tiny model has barely begun to agree with itself."""
 
 
@@ -34,7 +34,8 @@ def test_everything_in_two_styles(world: World, tmp_path: Path, capsys: pytest.C
     assert export(world, *LOOSE, *references, "--output", str(tmp_path)) == 0
     assert names(tmp_path) >= {
         "export.json", "transforms.json", "points.ply", "points.dusk.ply", "points.snow.ply",
-        "splats.ply", "splats.dusk.ply", "splats.snow.ply", "splats.splat", "splats.dusk.splat", "splats.snow.splat",
+        "mesh.ply", "mesh.dusk.glb", "splats.ply", "splats.dusk.ply", "splats.snow.ply",
+        "splats.splat", "splats.dusk.splat", "splats.snow.splat",
         "luts/dusk/all.cube", "luts/dusk/region0.cube", "luts/snow/all.cube", "luts/snow/region3.cube",
     }  # fmt: skip
     made = json.loads((tmp_path / "export.json").read_text())
@@ -114,6 +115,8 @@ def test_one_table_of_another_size(world: World, tmp_path: Path) -> None:
     ("args", "told"),
     [
         (["plx"], "'plx' is nothing to export"),
+        (["--witnesses", "0"], "--witnesses: 0 must be at least 1"),
+        (["--presence", "1.5"], "--presence: 1.5 must lie in [0.0, 1.0]"),
         (["--points", "0"], "--points: 0 must be at least 1"),
         (["--views", "1"], "--views: 1 must be at least 2"),
         (["--edge", "0"], "--edge: 0.0 must be above 0"),

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.engine.views import render_view
-from fprf.export.colours import seen_colours
+from fprf.export.colours import Coloured, seen_colours
 from fprf.export.depths import chosen, half_way, reach_of, render_sights
+from fprf.export.witness import alone
 from fprf.rendering.cameras import pixel_grid, rays_through
 from fprf.rendering.renderer import Restyle
 from fprf.rendering.space import Space
@@ -83,9 +84,10 @@ def test_points_on_rays_of_pixels_have_the_colours_of_the_picture(world: World) 
     points = origin + direction * (1 + torch.rand(len(pixel), 1))
     styled = trained_restyle(world)
     told: list[tuple[int, int]] = []
-    plain, full, none = seen_colours(
-        trained.model, known.facts, known.cameras, points, torch.full((len(pixel),), 1), render,
-        [None, styled, Restyle(styled.stylizer, 0.0)], lambda done, total: told.append((done, total)),
+    seen = alone(torch.full((len(pixel),), 1))
+    [plain, full, none], presence = seen_colours(
+        trained.model, known.facts, known.cameras, points, seen, render, [None, styled, Restyle(styled.stylizer, 0.0)],
+        tolerance=None, report=lambda done, total: told.append((done, total)),
     )  # fmt: skip
     picture = render_view(trained.model, known.facts, known.cameras, 1, render).rgb.view(-1, 3)
     styled_picture = render_view(trained.model, known.facts, known.cameras, 1, render, styled).rgb.view(-1, 3)
@@ -94,6 +96,36 @@ def test_points_on_rays_of_pixels_have_the_colours_of_the_picture(world: World) 
     assert float((full - styled_picture).abs().amax()) < 5e-3
     assert torch.equal(plain, none) and float((plain - full).abs().mean()) > 0.01
     assert told[-1] == (len(points), len(points))
+    opacity = render_view(trained.model, known.facts, known.cameras, 1, render).opacity.view(-1)
+    assert float((presence - opacity).abs().amax()) < 5e-3
+
+
+def test_near_a_point_nothing_else_of_its_rays_is_seen(world: World) -> None:
+    """Presence is what an interval of the ray holds: it grows with the tolerance, and is small in the empty air."""
+    trained = world.load()
+    known, render = trained.known, trained.config.render
+    sights = render_sights(trained.model, known.cameras, known.train[:1], render, side=400, reach=math.inf)
+    pixel = pixel_grid(sights.cameras, 0)
+    origin, direction = rays_through(sights.cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
+    depth = sights.depth[0].view(-1, 1).double()
+    there = depth[:, 0].isfinite()
+
+    def look(away: float, tolerance: float | None, styles: int = 1) -> Coloured:
+        points = (origin + direction * depth * away)[there]
+        seen = alone(torch.zeros(len(points), dtype=torch.int64))
+        return seen_colours(
+            trained.model, known.facts, sights.cameras, points, seen, render, [None] * styles, tolerance=tolerance
+        )
+
+    narrow, wide, air = look(1, 0.1).presence, look(1, 0.5).presence, look(0.2, 0.1).presence
+    assert bool((wide > narrow - 0.02).all()) and float(wide.mean()) > float(narrow.mean()) > 3 * float(air.mean())
+    one, two = look(1, 0.5, 2).colours
+    assert torch.equal(one, two) and bool((one >= 0).all()) and bool((one <= 1).all())
+    whole = look(1, None).colours[0]
+    assert float((one - whole).abs().mean()) < 0.15, "a wide interval holds most of what the ray shows"
+    lost = look(1e-3, 1e-6)
+    assert bool((lost.presence < 1e-3).all())
+    assert float((lost.colours[0] - whole).abs().amax()) < 0.02, "where nothing is the whole ray's colour stands in"
 
 
 def trained_restyle(world: World) -> Restyle:

@@ -155,6 +155,7 @@ def test_ndc_is_nerfs_projection(offset: float, seed: int) -> None:
         assert (found - wanted).abs().max() <= slack * 5
         back = space.metric(origin, direction, torch.full((50,), t, dtype=torch.float64))
         assert ((back - along) / along.abs()).abs().max() <= 1e-9 + offset * 1e-14
+        assert (space.parameter(origin, direction, along) - t).abs().max() <= 1e-9 + offset * 1e-14
 
 
 def test_ndc_bends_rays_that_look_backwards() -> None:
@@ -189,6 +190,7 @@ def test_world_rays_are_recentred_turned_and_scaled_in_float64(kind: Kind, offse
     t = torch.tensor([0.3, 2.0])
     world = space.metric(origin[:2], direction[:2], t)
     assert torch.allclose(world, t / scale)
+    assert torch.allclose(space.parameter(origin[:2], direction[:2], world), t)
 
 
 def slab_oracle(o: list[float], d: list[float], least: float) -> tuple[float, float] | None:

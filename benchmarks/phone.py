@@ -1,0 +1,140 @@
+"""A folder as a phone gives it (the town's views as JPEG, no poses) to a restyled scene, by the README's own lines.
+
+    python benchmarks/phone.py WORK [--output benchmarks/results/phone.json] [--picture FILE.jpg] [--minutes 8]
+
+WORK holds everything that is made; lines that have run are not repeated. Needs the extra `sfm`.
+"""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from sheets import sheet
+from town_references import town_reference
+
+from fprf.commands.parsing import parse
+from fprf.datamanagers.images import load_image
+from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.errors import UsageError
+from fprf.output.atomic import write_json
+from fprf.output.images import to_uint8, write_image
+from fprf.town.write import write_town
+
+HERE = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(HERE / "tests" / "sfm"))  # the tests' own measure of poses
+
+from alignment import misses  # noqa: E402
+
+VERBS = ("process", "train", "eval", "stylize")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhoneConfig:
+    """How large the capture is."""
+
+    work: Path = Path()
+    """A folder for everything that is made."""
+    views: int = 40
+    """Photographs."""
+    quality: int = 92
+    """Of the JPEG files."""
+    minutes: float | None = None
+    """Training, instead of the README's."""
+    output: Path | None = None
+    """JSON file for the figures."""
+    picture: Path | None = None
+    """A sheet: captured, rendered, in two styles."""
+
+
+def lines_of(readme: str) -> dict[str, list[str]]:
+    """The words of the README's tour, without comments, for each verb that is needed here."""
+    tour = re.search(r"## Five-minute tour\s+```sh\n(.*?)```", readme, re.S)
+    assert tour is not None, "the README has a tour"
+    words = [shlex.split(line, comments=True) for line in tour[1].splitlines()]
+    return {each[1]: each[1:] for each in words if each[:1] == ["fprf"] and each[1] in VERBS}
+
+
+def photographs(config: PhoneConfig) -> None:
+    """The town and its pictures as a phone would name them; two references from another town."""
+    work = config.work
+    write_town(work / "town", seed=0, palette="day", views=config.views, width=640, height=480)
+    (work / "my_photos").mkdir(exist_ok=True)
+    for number, path in enumerate(sorted((work / "town" / "images").glob("*.png"))):
+        file = work / "my_photos" / f"IMG_{number:04d}.jpg"
+        cv2.imwrite(str(file), cv2.imread(str(path)), [cv2.IMWRITE_JPEG_QUALITY, config.quality])
+    for name in ("autumn", "night"):
+        write_image(work / f"{name}.jpg", to_uint8(town_reference(name).image))
+
+
+def poses(work: Path) -> dict[str, float]:
+    """How far what was found is from the truth."""
+    found, truth = parse_scene(work / "my_scene", 1, None), parse_scene(work / "town", 1, None)
+    numbers = [int(path.stem.removeprefix("IMG_")) for path in found.paths]
+    miss = misses(found.cameras.pose.numpy(), truth.cameras.pose[numbers].numpy())
+    focal = float(found.cameras.focal[0, 0] / truth.cameras.focal[0, 0])
+    return {
+        "posed": len(numbers),
+        "photographs": len(truth.paths),
+        "position_largest": miss.position,
+        "position_rms": miss.rms,
+        "degrees_largest": miss.degrees,
+        "focal_ratio": focal,
+    }
+
+
+def main(args: list[str]) -> None:
+    config = parse(PhoneConfig(), args, prog="phone.py", description=__doc__ or "", positional=("work",))
+    work = config.work
+    work.mkdir(parents=True, exist_ok=True)
+    log = work / "lines.json"
+    done: dict[str, Any] = json.loads(log.read_text()) if log.is_file() else {}
+    if not (work / "night.jpg").is_file():
+        photographs(config)
+    for verb, words in lines_of((HERE / "README.md").read_text()).items():
+        if verb in done:
+            continue
+        if verb == "train" and config.minutes is not None:
+            words += ["--minutes", str(config.minutes)]
+        start = time.monotonic()
+        print("fprf", *words, flush=True)
+        if subprocess.run([sys.executable, "-m", "fprf", *words], cwd=work, check=False).returncode:
+            raise UsageError(f"`fprf {' '.join(words)}` failed in {work}; see above")
+        done[verb] = {"line": shlex.join(["fprf", *words]), "seconds": round(time.monotonic() - start, 1)}
+        write_json(log, done)
+    run = next((work / "runs").iterdir())
+    metrics = json.loads((run / "metrics.json").read_text())
+    figures = {"poses": poses(work), "lines": done, "psnr": metrics["psnr"], "ssim": metrics["ssim"]}
+    figures["train_seconds"] = metrics["train_seconds"]
+    print(json.dumps(figures, indent=1))
+    if config.output is not None:
+        write_json(config.output, figures)
+    if config.picture is not None:
+        write_image(config.picture, sheet([row(work, run, name) for name in held_out(run)]))
+
+
+def held_out(run: Path) -> list[str]:
+    """Three views that nothing was trained on."""
+    names = sorted(path.stem for path in (run / "renders" / "test").glob("IMG_*.png") if "." not in path.stem)
+    return [names[round(k * (len(names) - 1) / 2)] for k in range(3)]
+
+
+def row(work: Path, run: Path, name: str) -> dict[str, Any]:
+    """One view: captured, rendered, restyled."""
+    import torch
+
+    files = {"photograph": work / "my_photos" / f"{name}.jpg", "rendered": run / "renders" / "test" / f"{name}.png"}
+    files |= {file.parent.name: file for file in sorted((run / "styles").glob(f"*/{name}.png"))}
+    shown = {key: np.asarray(load_image(path)) for key, path in files.items()}
+    return {key: torch.from_numpy(picture).float() / 255 for key, picture in shown.items()}
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,50 @@
+import torch
+from analytic import RADIUS, globe
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.export.sights import gaps
+from fprf.export.witness import alone, witnesses
+
+
+def sphere(count: int, seed: int) -> torch.Tensor:
+    drawn = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return RADIUS * torch.nn.functional.normalize(drawn, dim=1)
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 2**31), count=st.integers(1, 5))
+def test_witnesses_are_the_best_of_those_that_see_a_point(seed: int, count: int) -> None:
+    """Against looking at each point and view alone."""
+    sights, point = globe(6), sphere(12, seed)
+    seen = witnesses(sights, point, point.float(), 0.05, count)
+    assert seen.view.shape == seen.weight.shape == (12, count)
+    for n in range(12):
+        scores = {}
+        for view in range(6):
+            [gap], [distance] = gaps(sights, view, point[n : n + 1])
+            if abs(float(gap)) <= 0.1:
+                way = (sights.cameras.pose[view, :, 3] - point[n]) / distance
+                scores[view] = max(1e-3, float(way @ point[n])) / float(distance) ** 2
+        best = sorted(scores, key=lambda view: -scores[view])[:count]
+        used = seen.weight[n] > 0
+        if best:
+            assert seen.view[n][used].tolist() == best
+            wanted = torch.tensor([scores[view] / scores[best[0]] for view in best], dtype=torch.float64)
+            assert torch.allclose(seen.weight[n][used], wanted, rtol=1e-6)
+        else:
+            assert used.tolist() == [True] + [False] * (count - 1), "somebody must speak for it"
+
+
+def test_the_first_witness_does_not_depend_on_how_many_are_asked() -> None:
+    sights, point = globe(6), sphere(50, 1)
+    one, many = (witnesses(sights, point, point.float(), 0.05, count) for count in (1, 99))
+    assert one.view.shape == (50, 1) and many.view.shape == (50, 6), "never more than there are views"
+    several = many.weight[:, 1] > 0  # where nobody sees a point, any view may speak for it
+    assert int(several.sum()) > 20 and torch.equal(one.view[several, 0], many.view[several, 0])
+    assert bool((many.weight.diff(dim=1) <= 0).all()) and bool((many.weight <= 1).all())
+
+
+def test_alone() -> None:
+    seen = alone(torch.tensor([3, 1]))
+    assert seen.view.tolist() == [[3], [1]] and seen.weight.tolist() == [[1.0], [1.0]]
