@@ -55,7 +55,8 @@ def keep_luminance(
     tint = moved - level
     room = torch.where(tint > 0, 1 - level, level)
     fits = (room / tint.abs().clamp_min(torch.finfo(tint.dtype).tiny)).amin(-1, keepdim=True)
-    return torch.where(fits < 1, level + fits * tint, moved).clamp(0, 1)
+    leaves = ((moved < 0) | (moved > 1)).any(-1, keepdim=True)
+    return torch.where(leaves, level + fits.clamp(max=1) * tint, moved).clamp(0, 1)
 
 
 def allowed_references(

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import UsageError
@@ -45,6 +45,7 @@ def test_strength_has_a_range(strength: float) -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(COLOUR, COLOUR, st.sampled_from([0.0, 0.3, 1.0]))
+@example((0.0, 0.0, 1.1754943508222875e-38), (0.0, 0.0, 0.0), 0.0)
 def test_kept_luminance_is_the_scenes_and_colours_stay_colours(
     styled: tuple[float, float, float], own: tuple[float, float, float], share: float
 ) -> None:
