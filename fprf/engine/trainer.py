@@ -79,7 +79,7 @@ def train(
     `model` is one at its start, where it is not simply that of the config: a block in its surroundings, whose sampler was
     trained for `lead` steps before. An interrupt saves first, then goes on upwards. Steps that are not finite change nothing
     and are logged; several in a row lead back to the last checkpoint. Raises NumericsError where there is none, or where that
-    was of no use.
+    was of no use, OutOfMemoryError where a step finds too little memory.
     """
     device = device_of(config.device)
     model = (build_model(config, prepared.facts) if model is None else model).to(device)
