@@ -214,6 +214,13 @@ def take(tour: Tour, references: list[Path]) -> None:
         tour.fly_to(view, 3)
         tour.key(number + 1)
     tour.save("flight")
+    page.get_by_text("Film", exact=True).click()
+    page.wait_for_timeout(600)
+    slow = page.locator("input.mantine-NumberInput-input:visible").nth(8)
+    slow.fill("6")  # seconds from key to key: so that the film has some of it
+    slow.press("Enter")
+    page.get_by_text("Film", exact=True).click()
+    page.wait_for_timeout(600)
     tour.say("Play it; ● film makes an mp4 of it")
     tour.click(page.locator("#fprf-flight .acts button").nth(1))
     found.until(lambda state: state["playing"])

@@ -21,9 +21,8 @@ with open(sys.argv[1], "w") as log:
     for line in sys.stdin:
         said = json.loads(line)
         if "snapshot" in said:
-            from safetensors import safe_open
-            with safe_open(said["snapshot"], "pt") as file:
-                said["names"] = sorted(file.keys())
+            with open(said["snapshot"], "rb") as file:  # safetensors: the length of a JSON header, and that
+                said["names"] = sorted(json.loads(file.read(int.from_bytes(file.read(8), "little"))))
             tell({"want": True})
         print(json.dumps(said), file=log, flush=True)
         if "done" in said:

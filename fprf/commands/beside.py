@@ -46,8 +46,10 @@ def open_view(place: "Place") -> "Aside":
     return Aside(place)
 
 
-def linger(view: "Aside", display: "Display") -> None:
+def linger(view: "Aside | None", display: "Display") -> None:
     """Training is over: on a terminal the view stays as long as somebody looks. Ctrl-C is then no failure."""
+    if view is None:
+        return
     if view.fault is not None:
         display.say(f"{VIEW}: the viewer has ended ({view.fault}); training did not need it")
     if display.live and view.looked_at:

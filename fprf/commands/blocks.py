@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from ..config import TrainConfig
     from ..datamanagers.scene import Scene
     from ..engine.block_task import BlockTask
+    from ..engine.model import Model
     from ..engine.run import Run
     from ..engine.trainer import Report
+    from ..viewer.aside import Aside
 
 __all__ = ["SHARE", "block_minutes", "run_block", "show_plan", "train_blocks"]
 
@@ -22,9 +24,19 @@ SHARE = 0.2
 
 
 def train_blocks(
-    config: "TrainConfig", method: str, folder: "Run", scene: "Scene", plan: "Plan", display: Display, start: float
+    config: "TrainConfig",
+    method: str,
+    folder: "Run",
+    scene: "Scene",
+    plan: "Plan",
+    display: Display,
+    start: float,
+    view: "Aside | None" = None,
 ) -> None:
-    """Features of all views, the surroundings, the blocks, largest first, and the style of the whole. Finished ones stay."""
+    """Features of all views, the surroundings, the blocks, largest first, and the style of the whole. Finished ones stay.
+
+    With a `view` all is trained here, where it can be looked at, whatever the executor.
+    """
     from ..engine.block_task import BlockTask
     from ..engine.blocks import SURROUNDINGS
     from ..engine.lay_out import lay_out, write_down
@@ -44,8 +56,13 @@ def train_blocks(
         return BlockTask(root=root, data=data, block=block, minutes=minutes, quiet=display.quiet)
 
     rays = plan.rays
-    executor.map(run_block, [task(SURROUNDINGS, around)])
-    executor.map(run_block, [task(block, each) for block in rays.argsort(descending=True).tolist()])
+    tasks = [task(block, each) for block in rays.argsort(descending=True).tolist()]
+    if view is None:
+        executor.map(run_block, [task(SURROUNDINGS, around)])
+        executor.map(run_block, tasks)
+    else:
+        for one in (task(SURROUNDINGS, around), *tasks):
+            run_block(one, view)
     display.say("measuring the scene's own style")
     trained = load_run(folder.root, config.device)
     folder.save_tensors("style", to_tensors(measure_style(config, trained.model, scene.cameras, scene.train)))
@@ -59,7 +76,7 @@ def block_minutes(config: "TrainConfig", blocks: int, spent: float) -> tuple[flo
     return SHARE * left, (1 - SHARE) * left / blocks
 
 
-def run_block(task: "BlockTask") -> None:
+def run_block(task: "BlockTask", view: "Aside | None" = None) -> None:
     """Train one block, here or on a worker, and show how it goes."""
     from ..engine.block_task import train_block
     from ..engine.blocks import SURROUNDINGS, folder_of
@@ -67,13 +84,20 @@ def run_block(task: "BlockTask") -> None:
 
     name = "surroundings" if task.block == SURROUNDINGS else f"block {task.block:02d}"
     log = EventLog(Run(folder_of(Path(task.root), task.block)))
+    device = Run(Path(task.root)).load_config()[0].device
     with Display(quiet=task.quiet) as display:
 
         def report(event: "Report") -> None:
             display.training(event, name)
             log(event)
+            if view is not None:
+                view(event)
 
-        if not train_block(task, report):
+        def begun(model: "Model") -> None:
+            if view is not None:
+                view.begin(Path(task.root), model, device, block=task.block, what=name)
+
+        if not train_block(task, report, begun):
             display.say(f"{name} is finished already")
 
 

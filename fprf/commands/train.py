@@ -103,10 +103,9 @@ def train_scene(
             if plan.cut:
                 look(scene)
                 originals.keep(output, marks)
-                if view is not None:
-                    raise UsageError(f"{VIEW}: scenes in blocks are not shown while they are trained; leave it out")
-                train_blocks(config, method, folder, scene, plan, display, start)
+                train_blocks(config, method, folder, scene, plan, display, start, view)
                 display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
+                linger(view, display)
                 return output
         prepared = prepare.prepare(config, display.features, look)
         folder.root.mkdir(parents=True, exist_ok=True)
@@ -142,8 +141,7 @@ def train_scene(
         folder.save_tensors("style", to_tensors(style))
         folder.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
         display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
-    if view is not None:
-        linger(view, display)
+    linger(view, display)
     return output
 
 

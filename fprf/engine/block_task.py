@@ -22,12 +22,12 @@ from .blocks import SURROUNDINGS, Built, folder_of, inset, load_finished, read_d
 from .checkpoint import reached
 from .lay_out import RAYS, asked_of, load_boxes
 from .lock import held
-from .model import Facts
+from .model import Facts, Model
 from .prepare import Prepared, cache_folder
 from .run import Run
 from .trainer import Report, train
 
-__all__ = ["BlockTask", "train_block"]
+__all__ = ["BlockTask", "built_block", "train_block"]
 
 
 WARM_UP = 20
@@ -50,17 +50,17 @@ class BlockTask:
     """Show nothing."""
 
 
-def train_block(task: BlockTask, report: Callable[[Report], None]) -> bool:
-    """Train a block to its end, from its newest checkpoint; False where it was finished already.
+def train_block(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None] = lambda model: None) -> bool:
+    """Train a block to its end, from its newest checkpoint; False where it was finished already. `begun` is given its model.
 
     A folder that was trained as something else (other bounds, rays, images or knobs) is started anew. Raises ConfigError
     where the images are not those of the run, DataError where another process trains the block at this moment.
     """
     with held(folder_of(Path(task.root), task.block)):
-        return _train_held(task, report)
+        return _train_held(task, report, begun)
 
 
-def _train_held(task: BlockTask, report: Callable[[Report], None]) -> bool:
+def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None]) -> bool:
     root = Path(task.root)
     run = Run(root)
     config, _ = run.load_config()
@@ -75,12 +75,13 @@ def _train_held(task: BlockTask, report: Callable[[Report], None]) -> bool:
     config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
     _begin(folder, asked["task"])
     manager = _manager(run, config, facts, own, folder)
-    built = _built(root, config, facts, boxes, task.block, own.train)
+    built = built_block(root, config, facts, boxes, task.block, own.train)
     block_run = Run(folder)
     prepared, lead = Prepared(own, manager, facts, None), 0
     if task.block != SURROUNDINGS:
         lead = load_finished(folder_of(root, SURROUNDINGS), verify=False).step
         config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
+    begun(built.model)
     train(config, prepared, block_run, report, model=built.model, lead=lead)
     step, seconds = reached(block_run.checkpoints)
     save_finished(folder, built, asked=asked, step=step, seconds=seconds)
@@ -132,7 +133,7 @@ def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: 
     )
 
 
-def _built(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: int, views: Tensor) -> Built:
+def built_block(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: int, views: Tensor) -> Built:
     """The model of a block, inside of its finished surroundings."""
     around = surroundings(config, facts, boxes)
     if block == SURROUNDINGS:

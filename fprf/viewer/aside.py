@@ -90,10 +90,13 @@ class Aside:
         lines = (Path(self._folder.name) / _LOG).read_text(errors="replace").split("\n")
         return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "it said nothing")
 
-    def begin(self, root: Path, model: "Model", device: str) -> None:
-        """This run is being trained, its config.json and scene.json are written, and this is its model."""
+    def begin(self, root: Path, model: "Model", device: str, *, block: int | None = None, what: str = "") -> None:
+        """This run is being trained, or a `block` of it; its config.json and scene.json are written, and this is the model.
+
+        `what` is how the page calls it.
+        """
         self._model = model
-        self._put({"run": str(root.resolve()), "device": device})
+        self._put({"run": str(root.resolve()), "device": device, "block": block, "what": what})
 
     def __call__(self, report: "Report") -> None:
         """Between two steps: say how it goes, and copy the parameters where the viewer waits for them."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Queue
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 from ..errors import FprfError
 from .access import make_access
@@ -32,12 +32,22 @@ _LEAVING = 3.0
 """Seconds after which somebody who has gone is taken to have gone."""
 
 
+class _Run(NamedTuple):
+    """What is being trained."""
+
+    root: Path
+    device: str
+    block: int | None
+    what: str
+
+
 class Follower:
     """Keeps a session up to date with a training run. `tell` sends a line to training."""
 
     def __init__(self, host: Host, tell: Callable[[dict[str, Any]], None]) -> None:
         self._host, self._tell = host, tell
-        self._run: tuple[Path, str] | None = None
+        self._run: _Run | None = None
+        self._shown: _Run | None = None
         self._session: Session | None = None
         self._looking = self._wanted = self._over = False
         self._last_seen = self._last_new = 0.0
@@ -50,13 +60,15 @@ class Follower:
     def hear(self, said: dict[str, Any]) -> None:
         """A line from training."""
         if "run" in said:
-            self._run = (Path(said["run"]), str(said["device"]))
+            self._run = _Run(Path(said["run"]), str(said["device"]), said.get("block"), str(said.get("what", "")))
+            self._wanted = False  # what was asked for was of another model
         elif "snapshot" in said and self._run is not None:
             self._take(Path(said["snapshot"]))
         elif "report" in said and self._session is not None:
             step, share, psnr, seconds = said["report"]
             left = seconds * (1 - share) / max(share, 1e-3)
-            self._say_how(Training(int(step), float(share), float(psnr), float(left)))
+            what = "" if self._run is None else self._run.what
+            self._say_how(Training(int(step), float(share), float(psnr), float(left), what))
         elif "done" in said:
             self._over = True
             self._finish()
@@ -88,14 +100,17 @@ class Follower:
 
         tensors = load_file(path)
         self._wanted, self._last_new = False, time.monotonic()
-        session = self._session
-        if session is not None:
+        run, session = self._run, self._session
+        assert run is not None
+        if session is None:
+            trained = filled(begun(run.root, run.device, run.block), tensors)
+            self._session = self._host.open(lambda: trained, (), 640, encoders_now)
+            self._say_how(Training(what=run.what))
+        elif run == self._shown:
             session.renew(lambda: filled(session.trained, tensors))
-            return
-        assert self._run is not None
-        trained = begun(*self._run)
-        self._session = self._host.open(lambda: filled(trained, tensors), (), 640, encoders_now)
-        self._say_how(Training())
+        else:
+            session.renew(lambda: filled(begun(run.root, run.device, run.block), tensors))
+        self._shown = run
 
     def _finish(self) -> None:
         """The last parameters and the scene's own style are in the run folder now."""
@@ -104,7 +119,7 @@ class Follower:
         from ..engine.loading import load_run
         from ..engine.restyle import open_encoders
 
-        last = load_run(*self._run)
+        last = load_run(self._run.root, self._run.device)
         self._session.renew(lambda: last, lambda trained, before: open_encoders(trained))
         self._say_how(Training(last.step, 1.0))
 

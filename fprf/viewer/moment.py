@@ -9,6 +9,10 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.basis import Basis
+from ..engine import tensorfiles
+from ..engine.block_task import built_block
+from ..engine.blocks import folder_of
+from ..engine.lay_out import RAYS, load_boxes
 from ..engine.loading import Trained
 from ..engine.model import build_model
 from ..engine.prepare import device_of
@@ -25,12 +29,20 @@ _RAYS = 2**14
 """Rays that the style of a moment is measured with: 0.2 s instead of seconds, and it changes soon."""
 
 
-def begun(root: Path, device: str) -> Trained:
-    """A run whose config.json and scene.json are written, with its model at its seeded start. Raises CheckpointError."""
+def begun(root: Path, device: str, block: int | None = None) -> Trained:
+    """A run whose config.json and scene.json are written, with its model, or that of a block in its surroundings, at its start.
+
+    Raises CheckpointError.
+    """
     run = Run(root)
     config, method = run.load_config()
     known = run.load_known()
-    model = build_model(config, known.facts).requires_grad_(False)
+    if block is None:
+        model = build_model(config, known.facts)
+    else:
+        views = tensorfiles.read(folder_of(root, block) / RAYS)["views"]
+        model = built_block(root, config, known.facts, load_boxes(root), block, views).model
+    model.requires_grad_(False)
     return Trained(run, config, method, known, model.to(device_of(device)).eval(), 0, 0.0)
 
 

@@ -149,7 +149,7 @@
     const left = now.seconds_left === null ? "" : ` · ${Math.floor(now.seconds_left / 60)}:${String(Math.round(now.seconds_left) % 60).padStart(2, "0")} left`;
     const quality = now.psnr === null ? "" : ` · ${now.psnr.toFixed(1)} dB`;
     training.classList.toggle("over", over);
-    training.children[0].textContent = over ? "trained" : "training";
+    training.children[0].textContent = over ? "trained" : now.what ? `training ${now.what}` : "training";
     training.children[1].textContent = over ? `${now.step} steps` : `step ${now.step}${quality}${left}`;
     training.children[2].style.width = `${100 * now.share}%`;
   };

@@ -15,3 +15,5 @@ class Training:
     psnr: float | None = None
     """Of the training rays; None = not known yet."""
     seconds_left: float | None = None
+    what: str = ""
+    """Which part of a scene in blocks."""

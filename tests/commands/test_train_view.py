@@ -1,4 +1,5 @@
 import importlib.util
+import json
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,9 @@ from fprf.commands.beside import open_view, take_view
 from fprf.engine import trainer
 from fprf.engine.run import Run
 from fprf.errors import UsageError
+from fprf.viewer import aside
 from fprf.viewer.aside import Aside, Place
+from fprf.viewer.moment import begun
 
 
 @pytest.mark.parametrize(
@@ -66,11 +69,23 @@ def test_help_and_completion_know_it(capsys: pytest.CaptureFixture[str]) -> None
     assert {"--view", "--plan", "--steps"} <= set(capsys.readouterr().out.splitlines())
 
 
-def test_scenes_in_blocks_say_so_before_any_work(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_blocks_are_shown_one_after_the_other_and_trained_the_same(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(DEAF)))
-    blocks = ["--blocks", "street", "--blocks.segments", "2"]
-    assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), *blocks, "--view"]) == 2
-    assert "--view: scenes in blocks" in capsys.readouterr().err
-    assert not (tmp_path / "run" / "checkpoints").exists()
+    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(GREEDY, str(tmp_path / "log"))))
+    monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(aside, "_SHARE", 1e6)  # so short a training gives no time for more than one copy
+    blocks = ["--blocks", "street", "--blocks.segments", "2", "--steps", "6"]
+    for name, view in (("plain", []), ("shown", ["--view"])):
+        assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / name), *blocks, *view]) == 0
+    for file in ("blocks/surroundings/block.safetensors", "blocks/00/block.safetensors", "style.safetensors"):
+        assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "shown" / file).read_bytes()
+    heard = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    told = [(line["block"], line["what"]) for line in heard if "run" in line]
+    assert told[0][1] == "surroundings" and {what for _, what in told} == {"surroundings", "block 00", "block 01"}
+    shown = None
+    for line in heard:
+        shown = line["block"] if "run" in line else shown
+        if "names" in line:  # what was handed over fits the model that the viewer builds
+            assert line["names"] == sorted(begun(tmp_path / "shown", "cpu", shown).model.state_dict())
+    assert any("names" in line for line in heard)

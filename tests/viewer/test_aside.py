@@ -56,7 +56,7 @@ def test_who_looks_gets_the_parameters_of_now_and_how_it_goes(world: World, tmp_
         assert not view.looked_at
         assert not view.finish(stay=True)
     heard = [json.loads(line) for line in log.read_text().splitlines()]
-    assert heard[0] == {"run": str(world.run.resolve()), "device": "cpu"}
+    assert heard[0] == {"run": str(world.run.resolve()), "device": "cpu", "block": None, "what": ""}
     assert {"report": [7, 0.07, 20.0, 1.0]} in heard and heard[-1] == {"done": True}
     assert all(each["names"] == sorted(model.state_dict()) for each in heard if "snapshot" in each)
     assert not list(Path(view._folder.name).parent.glob(Path(view._folder.name).name))

@@ -1,14 +1,18 @@
 """The whole viewer: a process, a browser, real drops and clicks. Skipped where viser, playwright or Chromium are not there."""
 
 import shutil
+import signal
 import socket
+import subprocess
+import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import pytest
 from browser import Front, front, served
-from tiny_world import World
+from tiny_world import World, flags
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -59,6 +63,7 @@ def test_a_drop_a_click_a_wipe_and_a_pin(opened: tuple[Front, int], world: World
     boxes.nth(0).click(force=True)
     boxes.nth(1).click(force=True)
     found.until(lambda state: state["picking"] and state["wipe"] is None)
+    found.page.wait_for_timeout(2000)  # the page is told by two ways; clicks by the slower one
     found.page.mouse.click(200, 200)
     picked = found.until(lambda state: state["picked"] is not None)["picked"]
     assert sum(row["share"] for row in picked["taken"]) == pytest.approx(1, abs=1e-3)
@@ -115,3 +120,71 @@ def test_with_a_token_the_address_opens_and_without_it_nothing(run: Path) -> Non
         with socket.create_connection(("127.0.0.1", urlsplit(found.page.url).port or 0), timeout=60) as wire:
             wire.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{urlsplit(address).port}\r\n\r\n".encode())
             assert wire.recv(100).startswith(b"HTTP/1.1 403")
+
+
+def test_keys_are_set_seen_put_in_another_order_and_played(opened: tuple[Front, int], world: World) -> None:
+    found, _ = opened
+    press = "(text) => [...document.querySelectorAll('button')].find((each) => each.textContent.trim() === text).click()"
+    found.page.evaluate(press, "Add a key here")
+    found.until(lambda state: len(state["keys"]) == 1)
+    found.drop(world.references[0])
+    found.rest()
+    turn(found, 2)
+    found.rest()
+    strip = found.page.locator("#fprf-flight")
+    strip.get_by_text("+ key").click()
+    keys = found.until(lambda state: len(state["keys"]) == 2)["keys"]
+    loaded = "() => [...document.querySelectorAll('#fprf-flight img')].every((each) => each.naturalWidth > 0)"
+    found.page.wait_for_function(loaded)
+    strip.locator(".key").nth(1).hover()
+    strip.locator(".key").nth(1).get_by_title("earlier").click()
+    found.until(lambda state: state["keys"] == keys[::-1] and state["chosen"] == 0)
+    strip.locator(".key").nth(1).locator("b").click()  # back to where it began, in the look of then
+    found.until(lambda state: state["chosen"] == 1 and state["shelf"][0]["weight"] == 0)
+    found.rest()
+    count = len(found.pictures)
+    strip.get_by_text("play").click()
+    found.until(lambda state: state["playing"])
+    found.until(lambda state: not state["playing"])
+    assert len(found.pictures) > count + 3
+    strip.locator(".key").nth(0).hover()
+    strip.locator(".key").nth(0).get_by_title("remove").click()
+    found.until(lambda state: state["keys"] == keys[:1])
+
+
+def test_a_film_is_made_from_the_page_and_can_be_downloaded(opened: tuple[Front, int]) -> None:
+    found, _ = opened
+    press = "(text) => [...document.querySelectorAll('button')].find((each) => each.textContent.trim() === text).click()"
+    found.page.evaluate(press, "Add a key here")
+    found.until(lambda state: len(state["keys"]) == 1)
+    found.page.locator("#fprf-flight").get_by_text("film").click()
+    found.until(lambda state: state["film"]["ready"], 240)
+    link = found.page.get_by_text("download the film")
+    link.wait_for()
+    answer = found.page.request.get(urljoin(found.page.url, link.get_attribute("href")))
+    assert answer.status == 200 and b"ftyp" in answer.body()[:32]
+
+
+def test_training_is_shown_live_and_goes_on_without_its_viewer(world: World, tmp_path: Path) -> None:
+    few = flags(world, tmp_path / "run")
+    few[few.index("--steps") + 1] = "100000"
+    command = [sys.executable, "-m", "fprf", "train", "fprf-lite", *few, "--view", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        try:
+            address = next(line.split("live at ")[1].rstrip('"}\n') for line in process.stderr if "live at" in line)
+            threading.Thread(target=process.stderr.read, daemon=True).start()
+            with front(address) as found:
+                found.page.locator("#fprf-training.on").wait_for(timeout=120_000)
+                found.rest(0.5)
+                first = found.until(lambda state: state["training"]["step"] > 0)["training"]["step"]
+                found.drop(world.references[0])
+                found.until(lambda state: len(state["shelf"]) == 1)
+                turn(found, 5)
+                found.until(lambda state: state["training"]["step"] > first)
+                assert found.errors == []
+            assert process.poll() is None  # the page is gone, training is not
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(120) == 130
+    assert list((tmp_path / "run" / "checkpoints").glob("step-*/manifest.json"))

@@ -141,6 +141,17 @@ def test_at_the_end_the_run_is_what_was_saved(told: Told, world: World) -> None:
     assert told.tick(60) == [{"looking": False}] and told.follower.over
 
 
+def test_another_block_is_another_model(told: Told) -> None:
+    session = told.begin()
+    before = session.trained
+    told.follower.hear({"run": str(told.run), "device": "cpu", "block": None, "what": "block 01"})
+    told.follower.hear({"snapshot": str(told.newest)})
+    settle(session)
+    assert session.trained is not before and session.studio.trained is session.trained is session._sight._trained
+    told.follower.hear({"report": [3, 0.5, 19.5, 10.0]})
+    assert session.state.training == Training(3, 0.5, 19.5, 10.0, "block 01")
+
+
 def test_an_end_that_nobody_sees_is_the_end(told: Told) -> None:
     told.follower.hear({"done": True})
     assert told.follower.over

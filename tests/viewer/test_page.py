@@ -184,4 +184,4 @@ def test_how_training_goes_is_told(page: Page) -> None:
     assert described(page._session.state)["training"] is None
     page._session.change(lambda state: replace(state, training=Training(30, 0.25, 19.5, 30.0)))
     told = described(page._session.state)["training"]
-    assert told == {"step": 30, "share": 0.25, "psnr": 19.5, "seconds_left": 30.0}
+    assert told == {"step": 30, "share": 0.25, "psnr": 19.5, "seconds_left": 30.0, "what": ""}
