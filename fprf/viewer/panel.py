@@ -5,9 +5,7 @@ Values come from a browser: whatever does not fit a look or the state is refused
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
-
-import viser
+from typing import TYPE_CHECKING, Any, cast
 
 from .film import FilmPlan, Key, path_of
 from .keys import added, at_key, replaced
@@ -15,6 +13,9 @@ from .painter import MAPS, Map
 from .session import Session
 from .stage import Eye, fitted
 from .state import LEAST, MOST, Film, Landing, State, kept
+
+if TYPE_CHECKING:
+    import viser
 
 __all__ = ["Panel"]
 

@@ -1,0 +1,210 @@
+"""Every control of the panel on a real session, moved as a browser would move it."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from fake_gui import Client, Gui
+from test_session import Listener
+from tiny_world import World
+
+from fprf.engine.loading import load_run
+from fprf.viewer import crew
+from fprf.viewer.panel import Panel
+from fprf.viewer.session import Session
+from fprf.viewer.stage import Eye
+from fprf.viewer.state import Film, State
+
+
+class Desk(Listener):
+    """A face with the panel on it."""
+
+    panel: Panel
+
+    def changed(self, before: State, now: State) -> None:
+        self.panel.follow(before, now)
+        super().changed(before, now)
+
+
+class Room:
+    def __init__(self, session: Session) -> None:
+        self.session, self.gui, self.face, self.client = session, Gui(), Desk(), Client(1)
+        self.drawn = 0
+        here = session.stage.eye(session.trained.known.cameras, 2)
+        self.client.eyes.append(here)
+        self.face.panel = self.panel = Panel(
+            self.gui,  # type: ignore[arg-type]
+            session,
+            lambda client, eye: client.eyes.append(eye),  # type: ignore[attr-defined]
+            lambda client: client.eyes[-1],  # type: ignore[attr-defined, no-any-return]
+            self.draw,
+        )
+        session.meet(self.face)
+        session.see(1, here)
+
+    @property
+    def state(self) -> State:
+        return self.session.state
+
+    @property
+    def eye(self) -> Eye:
+        found: Eye = self.client.eyes[-1]
+        return found
+
+    def draw(self, panel: Panel) -> None:
+        self.drawn += 1
+
+    def move(self, label: str, value: object) -> None:
+        self.gui[label].moved(value, self.client)
+
+    def press(self, label: str) -> None:
+        self.gui[label].pressed(self.client)
+
+    def until(self, true: Callable[[], bool]) -> None:
+        end = time.monotonic() + 120
+        while not true():
+            assert time.monotonic() < end
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def room(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Room]:
+    monkeypatch.setattr(crew, "STEPS", 50.0)
+    shutil.copytree(world.run, tmp_path / "run")
+    with Session(load_run(tmp_path / "run", "cpu"), State(pixels=64)) as session:
+        yield Room(session)
+
+
+def test_at_first_the_controls_say_what_the_state_is(room: Room) -> None:
+    look = room.state.look
+    assert [room.gui[name].value for name in ("strength", "temperature", "clusters", "local ↔ global", "keep light")] == [
+        look.strength,
+        look.temperature,
+        look.clusters,
+        look.blend,
+        look.luminance,
+    ]
+    assert room.gui["map"].value == "none" and not room.gui["before/after"].value and room.gui["sharpness"].value == 64
+
+
+@pytest.mark.parametrize(
+    ("label", "value", "name", "wanted"),
+    [
+        ("strength", 0.4, "strength", 0.4),
+        ("temperature", 0.7000000001, "temperature", 0.7),
+        ("clusters", 5.0, "clusters", 5),
+        ("local ↔ global", 0.3, "blend", 0.3),
+        ("keep light", 1.0, "luminance", 1.0),
+    ],
+)
+def test_sliders_of_the_look(room: Room, label: str, value: float, name: str, wanted: float) -> None:
+    room.move(label, value)
+    found = getattr(room.state.look, name)
+    assert found == wanted and type(found) is type(wanted)
+
+
+@pytest.mark.parametrize("value", [7.0, -1.0])
+def test_what_no_browser_of_ours_sends_is_told_and_changes_nothing(room: Room, value: float) -> None:
+    before = room.state
+    room.move("strength", value)
+    assert room.state == before and any("strength" in text for text in room.face.said)
+
+
+def test_what_is_shown(room: Room) -> None:
+    for label, value, name, wanted in (
+        ("map", "depth", "map", "depth"),
+        ("map covers", 0.5, "cover", 0.5),
+        ("before/after", True, "wipe", 0.5),
+        ("before/after", False, "wipe", None),
+        ("pick a region", True, "picking", True),
+        ("sharpness", 128.0, "pixels", 128),
+        ("new photo", "in the mix", "landing", "in the mix"),
+        ("new photo", "nonsense", "landing", "alone"),
+    ):
+        room.move(label, value)
+        assert getattr(room.state, name) == wanted, label
+    room.move("map", "nonsense")
+    assert room.state.map == "depth"
+    drawn = room.drawn
+    room.move("cameras", True)
+    room.move("blocks", True)
+    assert room.drawn == drawn + 2 and room.panel.cameras and room.panel.blocks
+
+
+def test_the_camera_flies_to_captured_views(room: Room) -> None:
+    room.move("fly to view", 4)
+    assert room.eye == room.session.stage.eye(room.session.trained.known.cameras, 4)
+    room.move("fly to view", 999)
+    room.gui["fly to view"].moved(3, None)  # nobody's
+    assert len(room.client.eyes) == 2
+
+
+def test_what_others_change_comes_back_to_the_controls(room: Room, world: World) -> None:
+    from dataclasses import replace
+
+    room.session.change(lambda state: replace(state, look=replace(state.look, strength=0.25), map="regions", wipe=0.7))
+    assert room.gui["strength"].value == 0.25 and room.gui["map"].value == "regions" and room.gui["before/after"].value
+    room.session.change(lambda state: replace(state, film=Film(3, 12)))
+    assert room.gui["progress"].value == 25.0 and room.gui["Make the film"].disabled
+    assert "frame 3 of 12" in room.gui["about"].content
+
+
+def test_looks_are_kept_gone_back_to_and_lie_at_the_end_of_a_slider(room: Room, world: World) -> None:
+    room.session.drop(world.references[0].read_bytes(), "dusk.png")
+    first = room.state.look
+    room.move("name", "dusk")
+    room.press("Keep this look")
+    assert room.gui["towards"].options == room.gui["back to"].options == ("nothing", "dusk")
+    room.session.drop(world.references[1].read_bytes(), "snow.png")
+    room.move("towards", "dusk")
+    room.move("on the way", 0.5)
+    assert room.state.look.towards == first and room.state.look.at == 0.5 and room.gui["towards"].value == "dusk"
+    room.move("back to", "dusk")
+    assert room.state.look == first and room.gui["towards"].value == "nothing"
+    room.move("back to", "nothing")
+    assert room.state.look == first
+
+
+def test_keys_are_set_replaced_and_gone_to(room: Room, world: World) -> None:
+    room.press("Go to the chosen key")
+    assert any("no key is chosen" in text for text in room.face.said)
+    start = room.eye
+    room.until(lambda: room.session.thumbnail(1) is not None)
+    room.press("Add a key here")
+    room.session.drop(world.references[0].read_bytes(), "dusk.png")
+    room.move("fly to view", 4)
+    room.press("Add a key here")
+    assert [key.eye for key in room.state.keys] == [start, room.eye] and room.state.chosen == 1
+    assert all(key.thumbnail is not None for key in room.state.keys) and "2 keys" in room.gui["about"].content
+    room.move("fly to view", 5)
+    room.press("Replace the chosen key")
+    assert room.state.keys[1].eye == room.eye and room.drawn >= 3
+    room.move("strength", 0.3)
+    room.press("Go to the chosen key")
+    assert room.state.look == room.state.keys[1].look and room.state.look.strength == 1.0
+
+
+def test_a_flight_is_played_and_ended_by_the_same_button(room: Room) -> None:
+    room.press("Add a key here")
+    room.move("fly to view", 4)
+    room.press("Add a key here")
+    room.move("fly along", 0.0)
+    assert room.eye.position == pytest.approx(room.state.keys[0].eye.position, abs=1e-6)
+    room.gui["seconds between keys"].value = 60.0
+    room.press("Play the flight")
+    room.until(lambda: room.state.playing)
+    room.press("Play the flight")
+    room.until(lambda: not room.state.playing)
+
+
+def test_the_film_is_what_the_controls_say(room: Room) -> None:
+    room.press("Add a key here")
+    room.gui["size"].value = "small (480)"
+    room.gui["frames a second"].value = 12
+    plan = room.panel.plan
+    assert plan.size == (480, 360) and plan.fps == 12.0 and plan.seconds == 2.0 and len(plan.keys) == 1
+    room.press("Make the film")
+    room.until(lambda: room.state.film.path is not None)
+    assert "film.mp4" in room.gui["about"].content and not room.gui["Make the film"].disabled
