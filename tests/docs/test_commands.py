@@ -1,0 +1,194 @@
+"""Every command of the README and the documents, on a tiny scene: run, or for the heavy ones parsed to the end.
+
+A command that is neither stands in `ELSEWHERE` with the reason; nothing else is left out.
+"""
+
+import importlib
+import re
+import shlex
+import shutil
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from tiny_world import World, flags
+
+from fprf import cli
+from fprf.cli import VERBS
+from fprf.output.atomic import write_json
+from fprf.output.video import write_video
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+RUN = ("eval", "stylize", "render", "gallery", "report", "export", "cluster", "plugins", "doctor", "completion")
+"""Verbs whose commands are run here."""
+PARSED = {
+    "demo": "minutes; tests/commands/test_demo_verb.py runs it small",
+    "process": "needs pycolmap; tests/sfm/test_town_sfm.py runs it",
+    "train": "minutes; run below with `-m slow`",
+    "bench": "minutes; tests/commands/test_bench_verb.py and tests/evidence run them small",
+    "view": "stays up; tests/viewer run it",
+    "pretrain": "hours; tests/pretraining run it small",
+}
+"""Verbs whose commands are parsed whole, with the files that they name."""
+ELSEWHERE = {
+    "gabor": "the encoder of examples/plugin: tests/test_example_plugin.py installs and runs it",
+    "--tone": "needs a run whose photographs differ in exposure: tests/engine/test_tones.py",
+}
+"""Commands with these words, and where they are tested instead."""
+TOOLS = ("python3", ".", "pip", "export", "pytest", "ruff", "mypy", "mkdocs")
+"""Programs that are not fprf: that their options exist in pyproject.toml is checked, they are not run."""
+SMALL = {
+    "0015:67,33": "0005:20,12", "0015": "0005", "--keep 7": "--keep 2", "--across 4096": "--across 32",
+    "--max-memory 500": "--max-memory 5",
+}  # fmt: skip
+"""What is named by its place in a larger scene."""
+FEWER = {"render": ["--frames", "2"]}
+SCENES = ("my_scene", "SCENE", "DIR", "FOLDER", "scenes/yard", "fox")
+RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite")
+PHOTOGRAPHS = ("autumn.jpg", "night.jpg", "dusk.jpg", "snow.jpg", "a.jpg", "A.jpg", "photos/one.jpg", "my_photos/one.jpg")
+WEIGHTS = ("vgg19.safetensors", "F")
+
+
+class Command(NamedTuple):
+    page: str
+    words: list[str]
+
+
+class Parsed(Exception):
+    """Arguments were understood."""
+
+
+def commands(page: Path) -> Iterator[Command]:
+    """The commands of a page's `sh` blocks; words that are flags alone belong to `fprf train`."""
+    for block in re.findall(r"^```sh\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE):
+        for line in block.replace("\\\n", " ").splitlines():
+            for part in re.split(r"\s&&\s", line):
+                words = shlex.split(part, comments=True)
+                if words and words[0].startswith("--"):
+                    words = ["fprf", "train", "fprf-lite", "--data", "DIR", *words]
+                if words:
+                    yield Command(str(page.relative_to(ROOT)), words)
+
+
+EVERY = [command for page in PAGES for command in commands(page)]
+OURS = [command for command in EVERY if command.words[0] == "fprf" and not set(command.words) & ELSEWHERE.keys()]
+
+
+def smaller(words: Sequence[str]) -> list[str]:
+    text = shlex.join(words)
+    for large, small in SMALL.items():
+        text = text.replace(large, small)
+    return shlex.split(text)
+
+
+@pytest.fixture
+def place(world: World, tmp_path: Path) -> Path:
+    """A folder with something under every name that documents use."""
+    folder = tmp_path / "documents"
+    for name in RUNS:
+        shutil.copytree(world.run, folder / name, dirs_exist_ok=True)
+    for name in SCENES:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).symlink_to(world.town)
+    for number, name in enumerate(PHOTOGRAPHS):
+        (folder / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / name), cv2.imread(str(world.references[number % 2])))
+    for name in WEIGHTS:
+        (folder / name).write_bytes(b"")
+    pose = [float(x) for x in np.eye(4).ravel()]
+    frames = [{"camera_to_world": pose, "fov": 50, "aspect": 1.3}] * 2
+    write_json(folder / "camera_path.json", {"camera_path": frames, "render_width": 32, "render_height": 24, "fps": 2})
+    (folder / "night").mkdir()
+    write_json(folder / "night" / "style.json", {"format": 1, "style": {"references": [str(folder / "night.jpg")]}})
+    write_video(folder / "clip.mp4", [np.full((24, 32, 3), 90, np.uint8)] * 2, 2)
+    (folder / "clip.mp4").rename(folder / "IMG_0001.MOV")
+    return folder
+
+
+def test_documents_have_commands_and_each_is_looked_at() -> None:
+    assert len(OURS) > 30 and {command.words[1] for command in OURS} <= VERBS.keys()
+    assert set(RUN) | PARSED.keys() == VERBS.keys() and not set(RUN) & PARSED.keys()
+    strangers = {command.words[0] for command in EVERY if command.words[0] != "fprf"}
+    assert strangers <= set(TOOLS)
+    unused = [word for word in ELSEWHERE if not any(word in command.words for command in EVERY)]
+    assert not unused, "an exception that nothing needs"
+
+
+def pages(*, run: bool) -> list[Any]:
+    """The commands of each page in their order: one may need what another wrote."""
+    found: dict[str, list[list[str]]] = {}
+    for command in OURS:
+        if (command.words[1] in RUN) == run:
+            found.setdefault(command.page, []).append(command.words)
+    return [pytest.param(lines, id=page) for page, lines in found.items()]
+
+
+@pytest.mark.parametrize("lines", pages(run=True))
+def test_it_runs(place: Path, lines: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    for words in lines:
+        assert cli.main([*smaller(words)[1:], *FEWER.get(words[1], [])]) == 0, shlex.join(words)
+
+
+@pytest.mark.parametrize("lines", pages(run=False))
+def test_it_is_understood(place: Path, lines: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the real parser; every file that is read exists under its name."""
+    monkeypatch.chdir(place)
+    for words in lines:
+        config = parsed(smaller(words), monkeypatch)
+        for name in ("data", "run", "source"):
+            value = getattr(config, name, None)
+            if isinstance(value, Path) and value != Path() and str(value) != "town":
+                assert value.exists(), shlex.join(words)
+
+
+def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The config that a verb would start with."""
+    module = importlib.import_module(f"fprf.commands.{words[1]}")
+    real, heard = module.parse, []
+
+    def stop(*args: Any, **named: Any) -> None:
+        heard.append(real(*args, **named))
+        raise Parsed
+
+    with monkeypatch.context() as patched, pytest.raises(Parsed):
+        patched.setattr(module, "parse", stop)
+        module.run(words[2:])
+    return heard[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(command.words, id=shlex.join(command.words))
+        for command in OURS
+        if command.words[1] == "train" and not set(command.words) & {*WEIGHTS, "--view"}
+    ],
+)
+def test_it_trains(world: World, place: Path, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    size = flags(world, tmp_path / "run")[2:]
+    assert cli.main([*words[1:], *size]) == 0
+    assert "--plan" in words or (tmp_path / "run" / "config.json").is_file()
+
+
+@pytest.mark.parametrize("command", [command for command in EVERY if command.words[0] in ("pip", "pytest")], ids=str)
+def test_what_is_installed_and_marked_exists(command: Command) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    extras = {extra for word in command.words for extra in re.findall(r"\[([\w,]+)\]", word)}
+    assert {name for extra in extras for name in extra.split(",")} <= project["project"]["optional-dependencies"].keys()
+    if command.words[:2] == ["pytest", "-m"]:
+        markers = [line.partition(":")[0] for line in project["tool"]["pytest"]["ini_options"]["markers"]]
+        assert command.words[2] in markers
+
+
+def test_the_python_of_the_plug_in_page_runs() -> None:
+    [block] = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL | re.MULTILINE)
+    exec(compile(block, "docs/plugins.md", "exec"), {})
