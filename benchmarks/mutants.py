@@ -10,6 +10,7 @@ ten times their time. With an output file that is there already, only what no te
 import argparse
 import ast
 import contextlib
+import gc
 import hashlib
 import importlib.abc
 import importlib.machinery
@@ -65,7 +66,20 @@ MODULES: dict[str, tuple[str, ...]] = {
 }
 """Each numerics module and its tests."""
 COMPILED = ("_kernels.py", "dense_gradients.py", "tile.py", "vector.py", "rows.py", "exponential.py", "triplane_numba.py")
-THIRD_PARTY = ("torch", "numpy", "cv2", "numba", "llvmlite", "safetensors", "pytest", "hypothesis", "kornia.color")
+THIRD_PARTY = (
+    "torch",
+    "torch.distributed.tensor",
+    "hypothesis.extra.pytestplugin",
+    "hypothesis.internal.conjecture.engine",
+    "numpy",
+    "cv2",
+    "numba",
+    "llvmlite",
+    "safetensors",
+    "pytest",
+    "hypothesis",
+    "kornia.color",
+)
 """What is imported before processes are forked; nothing of ours may be."""
 ROOM = 16 << 30
 """Bytes of address space: a wrong size of an array must not take the machine down."""
@@ -135,14 +149,16 @@ def _in_child(module: str, code: CodeType | None, seconds: float, root: Path) ->
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))
     os.chdir(root)
-    sys.path.insert(0, str(root))
+    sys.path[:0] = [str(root), str(root / "tests")]
     if code is not None:
         name = module.removesuffix(".py").replace("/", ".")
         sys.meta_path.insert(0, Changed(name, root / module, code))
     tests = [str(path) for name in MODULES[module] if (path := root / "tests" / name).exists()]
     if not tests:
         return 98
-    return int(pytest.main(["-x", "-q", "--assert=plain", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests]))
+    return int(
+        pytest.main(["-x", "-q", "--assert=plain", "--noconftest", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests])
+    )
 
 
 def chosen(source: str, module: str, count: int, seed: int) -> tuple[list[Mutation], int]:
@@ -186,6 +202,7 @@ def main() -> None:
     asked = parser.parse_args()
     for name in THIRD_PARTY:
         importlib.import_module(name)
+    gc.freeze()  # else every child walks over all of torch, several times
     document: dict[str, Any] = {"modules": {}}
     if asked.output is not None and asked.output.exists():
         document = json.loads(asked.output.read_text())

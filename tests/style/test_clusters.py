@@ -95,6 +95,20 @@ def test_of_many_rows_a_sample_is_clustered_and_all_are_labelled() -> None:
     torch.testing.assert_close(kmeans(x, 3, seed=0, weights=only).centres.sum(0), x[5] + x[59_999])
 
 
+@pytest.mark.parametrize(("rows", "sampled"), [(20_480, False), (20_481, True)])
+def test_up_to_so_many_rows_centres_are_the_means_of_all_their_members(rows: int, sampled: bool) -> None:
+    x = torch.randn(rows, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = kmeans(x, 2, seed=0)
+    means = torch.stack([x[found.label == k].mean(0) for k in range(2)])
+    assert bool(((found.centres - means).abs() < 1e-9).all()) is not sampled
+
+
+@pytest.mark.parametrize(("rows", "k"), [(0, 3), (4, 0), (0, 0)])
+def test_no_rows_or_no_clusters(rows: int, k: int) -> None:
+    found = kmeans(torch.ones(rows, 2), k, seed=0)
+    assert found.centres.shape == (0, 2) and found.label.tolist() == [0] * rows
+
+
 def test_cost_per_cpu_second_is_bounded() -> None:
     # 16 384 x 48, k = 10: 0.1 to 0.3 s on one idle core; the bound leaves room for a busy machine.
     x = torch.randn(16384, 48)

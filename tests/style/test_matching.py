@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import ConfigError
+from fprf.style import matching
 from fprf.style.matching import Similarity, attention, compared, point_shares, score_spread, share_mean, unit
 
 
@@ -139,6 +140,7 @@ def plain_shares(
 @pytest.mark.parametrize("centred", [False, True])
 @pytest.mark.parametrize("faint", [0.0, 0.2])
 @pytest.mark.parametrize("count", [0, 1, 50])
+@torch.no_grad()
 def test_shares_of_points_are_those_of_a_loop(wide: torch.dtype, centred: bool, faint: float, count: int) -> None:
     draw = torch.Generator().manual_seed(count)
     x, keys = torch.randn(count, 8, generator=draw) * 3 + 5, torch.randn(6, 8, generator=draw)
@@ -158,7 +160,27 @@ def test_shares_of_points_are_those_of_a_loop(wide: torch.dtype, centred: bool, 
         assert bool((found == 0).any()), "else nothing was faint"
 
 
+@pytest.mark.parametrize(("learn", "count", "asked"), [(False, 1, 1), (False, 9, 1), (True, 9, 0), (False, 0, 0)])
+def test_the_compiled_form_is_asked_where_nobody_learns(
+    learn: bool, count: int, asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    real = matching.mixture.attention
+
+    def watched(x: torch.Tensor, keys: torch.Tensor, *rest: object, **named: object) -> torch.Tensor:
+        calls.append(len(x))
+        return real(x, keys, *rest, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(matching.mixture, "attention", watched)
+    x, keys = torch.randn(count, 8), torch.randn(3, 8)
+    with torch.set_grad_enabled(learn):
+        found = point_shares(x, keys, 0.5)
+    assert len(calls) == asked
+    torch.testing.assert_close(found, attention(x, keys, 0.5), rtol=0.0, atol=1e-5)  # nothing is faint by itself
+
+
 @pytest.mark.parametrize("temperature", [0.0, -1.0])
+@torch.no_grad()
 def test_shares_of_points_refuse_temperatures_that_are_not_above_zero(temperature: float) -> None:
     with pytest.raises(ConfigError, match="temperature"):
         point_shares(torch.ones(3, 8), torch.ones(2, 8), temperature)
@@ -178,7 +200,8 @@ def test_a_common_offset_of_keys_costs_no_digits() -> None:
 
 
 def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
-    assert score_spread(torch.tensor([[1e6], [0.0]]), torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)) == 1.0
+    keys = torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)
+    assert score_spread(torch.tensor([[1e6], [0.0]]), keys) == score_spread(torch.tensor([[-1e6]]), keys) == 1.0
 
 
 def test_directions_begin_just_above_rounding_and_have_gradients_at_the_centre() -> None:

@@ -167,3 +167,16 @@ def test_each_of_many_is_as_if_it_were_alone(function: Callable[[torch.Tensor, t
 def test_the_largest_mean_says_what_rounding_is() -> None:
     found = deviation(torch.tensor([1e4, 0.0, 1.0]), torch.zeros(3))
     assert found.tolist() == pytest.approx([1e-2] * 3)
+
+
+@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
+def test_one_bad_number_among_good_ones_is_refused(bad: float) -> None:
+    x, w = rows(20, 3)
+    w[7] = bad
+    with pytest.raises(NumericsError, match="a weight"):
+        moments(x, w)
+    x, w = rows(20, 3)
+    x[7, 1] = bad
+    if bad != -1.0:
+        with pytest.raises(NumericsError, match="a content feature"):
+            moments(x, w)
