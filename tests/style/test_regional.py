@@ -17,6 +17,7 @@ from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, code_odds, whole_style
 from fprf.style.regional import RegionStylizer, RegionWeight, regional
 from fprf.style.scene import SceneStyle, membership, region_units, scene_style
+from fprf.testing import cases
 from fprf.types import Want
 
 ALL = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
@@ -164,3 +165,8 @@ def test_odds_of_a_choice_are_those_of_the_references_that_are_left() -> None:
     _, _, _, d = setting()
     part, codes = choose(d, torch.tensor([False, True, True]))
     torch.testing.assert_close(code_odds(part), code_odds(d)[codes] / code_odds(d)[codes].sum())
+
+
+@pytest.mark.parametrize(("regions", "divided"), [(1, False), (2, True), (5, True)])
+def test_two_regions_are_already_divided(regions: int, divided: bool) -> None:
+    assert RegionWeight(cases.scene(regions, 3, 4), torch.ones(regions, 1)).divided is divided

@@ -76,3 +76,11 @@ def test_batches_equal_single_maps() -> None:
     both = monge(a, b, gain=8.0)
     for k in range(3):
         torch.testing.assert_close(both[k], monge(a[k], b[k], gain=8.0), rtol=1e-9, atol=1e-11)
+
+
+def test_the_cap_is_for_what_is_above_it() -> None:
+    t = torch.diag(torch.tensor([10.0, 3.0, 0.5, 0.0], dtype=torch.float64))
+    found = limit_gain(t, 3.0)
+    torch.testing.assert_close(found, torch.diag(torch.tensor([3.0, 3.0, 0.5, 0.0], dtype=torch.float64)))
+    below = torch.diag(torch.tensor([3.0, 1.0, -1e-9], dtype=torch.float64))
+    assert torch.equal(limit_gain(below, 3.0), below), "bit for bit where nothing is above"
