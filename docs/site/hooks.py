@@ -130,15 +130,18 @@ def tables(found: dict[str, Any]) -> list[str]:
     lines: list[str] = []
     for owner in dict.fromkeys(row["of"] for row in found["flags"]):
         lines += ["", f"### {owner}"] if owner else []
-        lines += ["", "| flag | takes | default | meaning |", "|---|---|---|---|"]
+        lines += ["", "| flag | meaning |", "|---|---|"]
         for row in (row for row in found["flags"] if row["of"] == owner):
             name = row["flag"].upper() if row["positional"] else row["flag"]
-            default = "required" if row["positional"] else f"`{row['default']}`" if row["default"] else "nothing"
-            lines.append(f"| `{name}` | {cell(row['takes'])} | {cell(default)} | {cell(row['meaning'])} |")
+            default = f"; `{row['default']}`" if row["default"] else ""
+            takes = "required" if row["positional"] else f"{row['takes']}{default}"
+            # The meaning first: on a phone little more is seen.
+            lines.append(f"| `{name}` | {cell(row['meaning'])}<br>*{cell(takes)}* |")
     if found["slots"]:
-        lines += ["", "### Plug-ins", "", "| slot | default | one of | |", "|---|---|---|---|"]
+        lines += ["", "### Plug-ins", "", "| slot | what fills it |", "|---|---|"]
         for slot in found["slots"]:
-            lines.append(f"| `{slot['flag']}` | `{slot['default']}` | {', '.join(slot['one of'])} | {cell(slot['meaning'])} |")
+            names = ", ".join(slot["one of"])
+            lines.append(f"| `{slot['flag']}` | {cell(slot['meaning'])}<br>*one of {names}*; `{slot['default']}` |")
     return lines
 
 
