@@ -55,7 +55,7 @@ def command(name: str, config: EvidencePages) -> list[str]:
     if name in SCENES:
         scene, smaller = SCENES[name]
         return [*table, "--data", str(config.scenes / scene), "--downscale", smaller, "--steps", "2000", *files, *device]
-    return [*table, *(TOWN if name in TRAININGS else ("--run", run, *LIGHTS)), *files, *device]
+    return [*table, *(TOWN if name in TRAININGS else ("--run", run)), *files, *device]
 
 
 def main() -> int:
