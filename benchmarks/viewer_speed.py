@@ -1,6 +1,7 @@
 """How fast the viewer is, whether it keeps memory, and what `fprf train --view` costs.
 
-    python benchmarks/viewer_speed.py RUN --references a.png b.png [--parts start drop memory training] [--output FILE]
+    python benchmarks/viewer_speed.py RUN --references a.png b.png [--parts start drop memory training] [--steps 300]
+        [--output FILE]
 
 start     `fprf view RUN` until its page and state are served, five times
 drop      a photograph dropped on the page in a headless Chromium, until its first restyled picture has arrived; twenty times
@@ -38,14 +39,13 @@ from fprf.output.atomic import write_json
 
 FORMAT = 1
 TARGETS = {"start_seconds": 3.0, "drop_seconds": 0.5, "memory_ratio": 1.05}
-STEPS = 300
 
 
 def spread(values: list[float]) -> dict[str, float]:
     return {"median": round(statistics.median(values), 3), "worst": round(max(values), 3), "count": len(values)}
 
 
-def start(run: Path, references: list[Path]) -> dict[str, object]:
+def start(run: Path, references: list[Path], steps: int) -> dict[str, object]:
     """Seconds until the page is there: the first run of all is left out, it fills the system's cache of files."""
     page, ready = [], []
     for _ in range(6):
@@ -61,7 +61,7 @@ def start(run: Path, references: list[Path]) -> dict[str, object]:
     return {"address_seconds": spread(page[1:]), "start_seconds": spread(ready[1:])}
 
 
-def drop(run: Path, references: list[Path]) -> dict[str, object]:
+def drop(run: Path, references: list[Path], steps: int) -> dict[str, object]:
     """Seconds from the drop to the next picture, with the camera at rest: it is the coarse one in the new style."""
     with served(run) as (address, _), front(address, 1280, 720) as found:
         found.rest(2.0)
@@ -74,7 +74,7 @@ def drop(run: Path, references: list[Path]) -> dict[str, object]:
         return {"drop_seconds": spread(seconds), "faults": found.errors}
 
 
-def memory(run: Path, references: list[Path]) -> dict[str, object]:
+def memory(run: Path, references: list[Path], steps: int) -> dict[str, object]:
     """As the test of the same does, with a scene of real size. The shelf is full before it begins."""
     with served(run, "--pixels", "256") as (address, pid), front(address) as found:
         found.rest(2.0)
@@ -101,15 +101,15 @@ def memory(run: Path, references: list[Path]) -> dict[str, object]:
         }
 
 
-def training(run: Path, references: list[Path]) -> dict[str, object]:
+def training(run: Path, references: list[Path], steps: int) -> dict[str, object]:
     """Three trainings of the same town, one after the other."""
-    found: dict[str, object] = {"steps": STEPS}
+    found: dict[str, object] = {"steps": steps}
     parameters = {}
     with tempfile.TemporaryDirectory() as folder:
         for name in ("plain", "nobody", "looked_at"):
             root = Path(folder) / name
             view = [] if name == "plain" else ["--view", "0"]
-            found[name] = trained(root, view, look=name == "looked_at")
+            found[name] = trained(root, view, steps, look=name == "looked_at")
             last = max(root.glob("checkpoints/step-*"), key=lambda path: path.name)
             parameters[name] = load_file(last / "model.safetensors") | load_file(last / "optimizer.safetensors")
     plain = parameters["plain"]
@@ -119,9 +119,9 @@ def training(run: Path, references: list[Path]) -> dict[str, object]:
     return found
 
 
-def trained(root: Path, view: list[str], *, look: bool) -> dict[str, float]:
+def trained(root: Path, view: list[str], steps: int, *, look: bool) -> dict[str, float]:
     """Seconds of the training part alone (events.jsonl), and processor seconds of all that the command did."""
-    command = [sys.executable, "-m", "fprf", "train", "fprf-lite", "--data", "town", "--steps", str(STEPS)]
+    command = [sys.executable, "-m", "fprf", "train", "fprf-lite", "--data", "town", "--steps", str(steps)]
     with subprocess.Popen(
         [*command, "--device", "cpu", "--output", str(root), *view], stderr=subprocess.PIPE, text=True
     ) as process:
@@ -169,7 +169,7 @@ def turn(found: Front, times: int) -> None:
         mouse.up()
 
 
-PARTS: dict[str, Callable[[Path, list[Path]], dict[str, object]]] = {
+PARTS: dict[str, Callable[[Path, list[Path], int], dict[str, object]]] = {
     "start": start,
     "drop": drop,
     "memory": memory,
@@ -182,13 +182,17 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--references", type=Path, nargs="+", required=True)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--steps", type=int, default=300, help="of the trainings")
     parser.add_argument("--output", type=Path, default=Path("benchmarks/results/viewer.json"))
     args = parser.parse_args()
     found: dict[str, object] = json.loads(args.output.read_text()) if args.output.is_file() else {}
     found |= {"format": FORMAT, "targets": TARGETS}
     for name in args.parts:
         load = round(os.getloadavg()[0], 2)
-        found[name] = PARTS[name](args.run, args.references) | {"load_average_before": load, "processors": os.cpu_count()}
+        found[name] = PARTS[name](args.run, args.references, args.steps) | {
+            "load_average_before": load,
+            "processors": os.cpu_count(),
+        }
         write_json(args.output, found)
         print(name, json.dumps(found[name]), flush=True)
 

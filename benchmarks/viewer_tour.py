@@ -236,7 +236,7 @@ def main() -> None:
     parser.add_argument("--references", type=Path, nargs=3, required=True)
     parser.add_argument("--output", type=Path, default=Path("docs/images"))
     args = parser.parse_args()
-    with served(args.run) as (address, _), front(address, WIDTH, HEIGHT) as found:
+    with served(args.run, "--pixels", "480") as (address, _), front(address, WIDTH, HEIGHT) as found:
         found.rest(2.0)
         tour = Tour(found, args.output)
         take(tour, args.references)
