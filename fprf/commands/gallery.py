@@ -9,7 +9,7 @@ from ..checks import at_least, between
 from ..engine.quality import QualityConfig, at_quality
 from ..errors import UsageError
 from ..plugins.registry import nearest
-from ..plugins.stylizers.config import RegionOtConfig, StylizerConfig
+from ..plugins.stylizers.config import StylizerConfig
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
 from .parsing import parse
@@ -43,9 +43,9 @@ class GalleryConfig(QualityConfig):
     """0 leaves the scene as it is, 1 is the full style; of photographs."""
     luminance: float = 0.0
     """How much of the scene's own luminance is kept, in [0, 1]; of photographs."""
-    clusters: int = 20
+    clusters: int = StyleConfig().clusters
     """Local styles per photograph, at least 1."""
-    stylizer: StylizerConfig = RegionOtConfig()
+    stylizer: StylizerConfig = StyleConfig().stylizer
     """What moves the scene's features; of photographs."""
     split: Literal["test", "train", "all"] = "test"
     """Views to choose from."""

@@ -30,6 +30,8 @@ class ReportConfig:
     """Run folder; one in training will do."""
     output: Path | None = None
     """The page; by default RUN/report.html."""
+    tensorboard: Path | None = None
+    """A folder for event files of TensorBoard as well (extra tensorboard): `tensorboard --logdir` shows them."""
 
 
 def run(args: list[str]) -> int:
@@ -56,6 +58,11 @@ def run(args: list[str]) -> int:
     )
     _print(histories, parts, notes)
     print(f"charts in {output}")
+    if config.tensorboard is not None:
+        from ..output.tensorboard import write_scalars
+
+        count = write_scalars(config.tensorboard, histories)
+        print(f"{count} values in {config.tensorboard}: tensorboard --logdir {config.tensorboard}")
     return 0
 
 
