@@ -41,14 +41,15 @@ ELSEWHERE = {
     "--tone": "needs a run whose photographs differ in exposure: tests/engine/test_tones.py",
 }
 """Commands with these words, and where they are tested instead."""
-TOOLS = ("python3", ".", "pip", "export", "pytest", "ruff", "mypy", "mkdocs")
+TOOLS = ("python3", "python", ".", "pip", "export", "pytest", "ruff", "mypy", "mkdocs")
 """Programs that are not fprf: that their options exist in pyproject.toml is checked, they are not run."""
 SMALL = {
     "0015:67,33": "0005:20,12", "0015": "0005", "--keep 7": "--keep 2", "--across 4096": "--across 32",
     "--max-memory 500": "--max-memory 5",
 }  # fmt: skip
 """What is named by its place in a larger scene."""
-FEWER = {"render": ["--frames", "2"]}
+FEWER = {"render": ["--frames", "2"], "export": ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--lut-size", "5"]}
+"""The tiny model renders few frames, and has barely begun to agree with itself."""
 SCENES = ("my_scene", "SCENE", "DIR", "FOLDER", "scenes/yard", "fox")
 RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite")
 PHOTOGRAPHS = ("autumn.jpg", "night.jpg", "dusk.jpg", "snow.jpg", "a.jpg", "A.jpg", "photos/one.jpg", "my_photos/one.jpg")
@@ -187,6 +188,11 @@ def test_what_is_installed_and_marked_exists(command: Command) -> None:
     if command.words[:2] == ["pytest", "-m"]:
         markers = [line.partition(":")[0] for line in project["tool"]["pytest"]["ini_options"]["markers"]]
         assert command.words[2] in markers
+
+
+@pytest.mark.parametrize("command", [command for command in EVERY if command.words[0] == "python"], ids=str)
+def test_scripts_are_there(command: Command) -> None:
+    assert (ROOT / command.words[1]).is_file()
 
 
 def test_the_python_of_the_plug_in_page_runs() -> None:
