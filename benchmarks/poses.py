@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path, nargs="?", default=Path("town"))
     parser.add_argument("--as-given", action="store_true", help="the scene's poses are refined as they are")
     parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--rate", type=float, default=0.03, help="`--poses` of the refined side")
+    parser.add_argument("--rate", type=float, default=0.015, help="`--poses` of the refined side")
     parser.add_argument("--degrees", type=float, default=0.5)
     parser.add_argument("--share", type=float, default=0.005, help="of the cameras' extent")
     parser.add_argument("--seed", type=int, default=1)

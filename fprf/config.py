@@ -211,7 +211,7 @@ class TrainConfig:
     have in common."""
     poses: float = 0.0
     """Refine the cameras' poses with the scene, at this share of the learning rate (in radians, and in distances that views
-    commonly see); 0 = they are as the capture says, 0.03 suits poses that are off by some pixels."""
+    commonly see); 0 = they are as the capture says, 0.02 suits poses that are off by some pixels."""
     render: RenderConfig = RenderConfig()
     """Rendering and skipping."""
     statistics: StatisticsConfig = StatisticsConfig()
