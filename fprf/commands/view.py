@@ -1,6 +1,7 @@
 """`fprf view RUN`: the scene in the browser; drop a photograph on it and it is restyled."""
 
 import importlib.util
+import os
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from ..engine.loading import Trained
 
 __all__ = ["ViewConfig", "run"]
+
+_PATIENCE = 15.0
+"""Seconds after an interrupt within which all must have ended."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +61,14 @@ def run(args: list[str]) -> int:
     with Host(access, config.port) as host:
         print(host.address, flush=True)
         host.open(lambda: _load(config), config.references, config.pixels)
-        threading.Event().wait()
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            # Whatever a thread is in the middle of, the terminal comes back.
+            last = threading.Timer(_PATIENCE, os._exit, (130,))
+            last.daemon = True
+            last.start()
+            raise
     return 0
 
 

@@ -69,6 +69,11 @@ class Desk(Generic[Request]):
         with self._change:
             return not (self._fresh or self._active or self._errands)
 
+    @property
+    def closed(self) -> bool:
+        """Nothing more will be done."""
+        return self._closed
+
     def close(self, timeout: float = 5.0) -> None:
         """Stop after the step at hand; work that is left is dropped."""
         with self._change:

@@ -28,6 +28,8 @@ from .studio import Opener, Studio
 
 __all__ = ["Face", "Session"]
 
+_PATIENCE = 0.5
+"""Seconds between looks whether the desk is closed."""
 _THUMBNAIL = 192
 """Longest side of a key's picture."""
 
@@ -175,7 +177,12 @@ class Session:
                 done.set_exception(error)
 
         self._desk.do(("add", path), encode)
-        return done.result()
+        while True:  # who waits for ever keeps the process from ending
+            try:
+                return done.result(_PATIENCE)
+            except TimeoutError:
+                if self._desk.closed and not done.done():
+                    raise UsageError("the viewer is ending") from None
 
     def _tidy(self, card: Card) -> None:
         """Photographs that left the shelf, and that no look needs, go with what was made of them: some 6 MB each."""

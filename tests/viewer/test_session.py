@@ -8,7 +8,7 @@ import pytest
 from tiny_world import World
 
 from fprf.engine.loading import load_run
-from fprf.errors import DataError
+from fprf.errors import DataError, UsageError
 from fprf.viewer.eyes import Frame
 from fprf.viewer.film import FilmPlan, Key
 from fprf.viewer.looks import Look
@@ -125,6 +125,14 @@ def test_a_film_that_cannot_be_is_told_and_the_next_can(opened: tuple[Session, L
     session.film(FilmPlan((), 1.0, 24.0, (32, 24)))
     listener.until(lambda: any("no keys" in text for text in listener.said))
     listener.until(lambda: not session.state.film.busy)
+
+
+def test_who_drops_while_the_viewer_ends_is_not_left_waiting(opened: tuple[Session, Listener], world: World) -> None:
+    session, _ = opened
+    path = session.intake.take(world.references[0].read_bytes())
+    session._desk.close()
+    with pytest.raises(UsageError, match="the viewer is ending"):
+        session.add(path, "dusk.png")
 
 
 def test_faults_of_ours_are_told_and_nothing_stops(opened: tuple[Session, Listener]) -> None:
