@@ -75,13 +75,13 @@ def tiny(data: Path, output: Path) -> TrainConfig:
 
 def flags(world: World, output: Path) -> list[str]:
     """The same config on the command line, from the method `fprf-lite`."""
-    words = f"""--data {world.town} --output {output} --steps 15 --device cpu --datamanager.rays 256
+    words = """--steps 15 --device cpu --datamanager.rays 256
         --datamanager.semantic-share 0.5 --sampler.samples 16 --sampler.final 8 --sampler.resolutions 8
         --sampler.anneal-steps 10 --content.field.resolutions 8 16 --content.field.channels 8 --content.field.hidden 32
         --content.field.layers 1 --semantic.field.resolutions 8 --semantic.field.channels 8 --semantic.field.hidden 16
         --semantic.field.layers 1 --semantic.dim 8 --loss.penalty-every 2 --optimizer.warm-up 5 --statistics.rays 2048
         --statistics.regions 4"""
-    return words.split()
+    return ["--data", str(world.town), "--output", str(output), *words.split()]
 
 
 def make_world(folder: Path) -> World:

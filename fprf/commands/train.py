@@ -79,6 +79,7 @@ def train_scene(
     from ..engine.lock import held
     from ..engine.model import build_model
     from ..engine.run import Run
+    from ..output.atomic import remove_unfinished
     from ..style.scene import to_tensors
     from .progress import Display
 
@@ -91,6 +92,8 @@ def train_scene(
         if view is not None:
             display.say(f"live at {view.address}")
         _check_same(folder, config)
+        for place in (output, *output.glob("blocks/*")):
+            remove_unfinished(place)
         marks: dict[str, str] = {}
 
         def look(scene: "Scene") -> None:

@@ -84,8 +84,11 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text with the line ends it has, whole or not at all."""
-    write_bytes(path, text.encode())
+    """Write UTF-8 text with the line ends it has, whole or not at all.
+
+    In a locale without UTF-8, names of files reach Python as escaped bytes: they are written as the bytes that they are.
+    """
+    write_bytes(path, text.encode(errors="surrogateescape"))
 
 
 def write_json(path: Path, value: object) -> None:

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 from ..errors import PluginError
+from ..process import entry_points_of
 
 __all__ = ["Entry", "entry", "forget", "groups", "installed", "load", "load_object", "name_of", "nearest", "peek", "unreadable"]
 
@@ -139,7 +140,7 @@ def _scan() -> _Scan:
     seen: set[str] = set()
     for distribution in distributions():
         try:
-            package, points = f"{distribution.name} {distribution.version}", list(distribution.entry_points)
+            package, points = f"{distribution.name} {distribution.version}", list(entry_points_of(distribution))
         except Exception as error:  # whatever a damaged file makes the reader raise
             bad.extend(_complaint(distribution, error))
             continue

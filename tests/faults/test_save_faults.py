@@ -6,6 +6,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from forked import DEAD, Deadly, forked
 from tiny_world import World
 
 from fprf import cli
+from fprf.commands.train import train_scene
 from fprf.engine import checkpoint
 from fprf.engine.lock import held
 from fprf.engine.model import Model, build_model
@@ -252,9 +254,9 @@ print("latest", checkpoint.load_latest(folder / "run" / "checkpoints")[0] is not
 
 
 @pytest.mark.fault
-@pytest.mark.parametrize(("size", "reason"), [("112k", "No space left on device"), ("8m", "Read-only file system")])
+@pytest.mark.parametrize(("size", "reason"), [("300k", "No space left on device"), ("8m", "Read-only file system")])
 def test_a_disk_that_is_full_or_read_only(world: World, tmp_path: Path, size: str, reason: str) -> None:
-    """A real one, in a name space of its own: 112 KiB hold a checkpoint or two and no more; 8 MiB are mounted read-only."""
+    """A real one, in a name space of its own: 300 KiB hold a checkpoint and no more; 8 MiB are mounted read-only."""
     if subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
         pytest.skip("may not mount here")
     (tmp_path / "disk").mkdir()
@@ -269,3 +271,14 @@ def test_a_disk_that_is_full_or_read_only(world: World, tmp_path: Path, size: st
         assert "2 []" in done.stdout and "checkpoint" not in errors[0], "before any work"
     else:
         assert "KiB are free" in errors[0] and "latest True" in done.stdout
+
+
+def test_what_a_killed_process_left_in_a_run_is_removed_at_the_next_start(world: World, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(world.run, run)
+    (run / "blocks" / "00").mkdir(parents=True)
+    left = (run / ".basis.f1a2fda9.safetensors", run / ".tmpAbCdEf", run / "blocks" / "00" / ".cut.0123abcd.json")
+    for path in (*left, run / ".mine"):
+        path.write_bytes(b"half")
+    train_scene(replace(world.config, output=run), "fprf-lite", quiet=True)
+    assert not any(path.exists() for path in left) and (run / ".mine").exists()

@@ -108,7 +108,8 @@ def test_a_signal_from_outside_saves_and_ends_with_130(world: World, tmp_path: P
     process = start(["train", "fprf-lite", *args])
     try:
         end = time.monotonic() + 200
-        while not (tmp_path / "run" / "events.jsonl").exists() and time.monotonic() < end:
+        events = tmp_path / "run" / "events.jsonl"
+        while not (events.exists() and '"psnr"' in events.read_text()) and time.monotonic() < end:
             time.sleep(0.2)
         time.sleep(2)
         process.send_signal(number)

@@ -119,3 +119,9 @@ def test_json_refuses_what_json_lacks(tmp_path: Path, value: float) -> None:
     with pytest.raises(NumericsError, match="must be finite"):
         write_json(tmp_path / "m.json", {"psnr": [value]})
     assert not list(tmp_path.iterdir())
+
+
+def test_names_from_a_locale_without_utf8_are_written_as_the_bytes_that_they_are(tmp_path: Path) -> None:
+    escaped = "ünïcode 場面".encode().decode("ascii", errors="surrogateescape")
+    write_json(tmp_path / "x.json", {"data": escaped})
+    assert json.loads((tmp_path / "x.json").read_text(encoding="utf-8")) == {"data": "ünïcode 場面"}

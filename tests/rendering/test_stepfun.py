@@ -274,22 +274,3 @@ def test_budget_zero_keeps_everything_above_zero() -> None:
     assert keep_heaviest(torch.zeros(0, 4), 0.1).shape == (0, 4)
     equal = keep_heaviest(torch.full((1, 8), 0.125), 0.25)
     assert int(equal.sum()) == 6
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_ray_of_bad_weights_harms_no_other_and_stays_in_its_edges(bad: float) -> None:
-    s = torch.linspace(0, 1, 9).repeat(3, 1)
-    w = torch.rand(3, 8, generator=torch.Generator().manual_seed(0))
-    good = resample(s, w, 16, padding=1e-3, generator=None)
-    for at in (0, 7):
-        spoilt = w.clone()
-        spoilt[1, at] = bad
-        found = resample(s, spoilt, 16, padding=1e-3, generator=None)
-        assert torch.equal(found[[0, 2]], good[[0, 2]]) and found.shape == good.shape
-
-
-@pytest.mark.parametrize("weight", [0.0, 1e-9, 5e-8, 1e-7, 2e-7, 1e-3])
-def test_faint_weights_cost_a_finite_share(weight: float) -> None:
-    s, w = torch.tensor([[0.0, 1.0]]), torch.tensor([[weight]])
-    found = float(interlevel(s, w, s, torch.zeros(1, 1)))
-    assert found == pytest.approx(weight**2 / (weight + 1e-7), rel=1e-5)
