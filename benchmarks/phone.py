@@ -46,6 +46,8 @@ class PhoneConfig:
     """Photographs."""
     quality: int = 92
     """Of the JPEG files."""
+    verbs: tuple[str, ...] = VERBS
+    """Lines of the README that are run now."""
     minutes: float | None = None
     """Training, instead of the README's."""
     output: Path | None = None
@@ -99,7 +101,7 @@ def main(args: list[str]) -> None:
     if not (work / "night.jpg").is_file():
         photographs(config)
     for verb, words in lines_of((HERE / "README.md").read_text()).items():
-        if verb in done:
+        if verb in done or verb not in config.verbs:
             continue
         if verb == "train" and config.minutes is not None:
             words += ["--minutes", str(config.minutes)]
@@ -109,14 +111,15 @@ def main(args: list[str]) -> None:
             raise UsageError(f"`fprf {' '.join(words)}` failed in {work}; see above")
         done[verb] = {"line": shlex.join(["fprf", *words]), "seconds": round(time.monotonic() - start, 1)}
         write_json(log, done)
-    run = next((work / "runs").iterdir())
-    metrics = json.loads((run / "metrics.json").read_text())
-    figures = {"poses": poses(work), "lines": done, "psnr": metrics["psnr"], "ssim": metrics["ssim"]}
-    figures["train_seconds"] = metrics["train_seconds"]
+    figures: dict[str, Any] = {"poses": poses(work), "lines": done}
+    run = next((work / "runs").glob("*/metrics.json"), work / "none").parent
+    if "eval" in done:
+        metrics = json.loads((run / "metrics.json").read_text())
+        figures |= {key: metrics[key] for key in ("psnr", "ssim", "train_seconds", "train_steps")}
     print(json.dumps(figures, indent=1))
     if config.output is not None:
         write_json(config.output, figures)
-    if config.picture is not None:
+    if config.picture is not None and "stylize" in done:
         write_image(config.picture, sheet([row(work, run, name) for name in held_out(run)]))
 
 
