@@ -73,7 +73,9 @@ def fuse(
     while len(cloud.point) > most:
         base *= 2 ** max(0.25, 0.5 * float(torch.log2(torch.tensor(len(cloud.point) / most))))
         cloud = _thin(every, view, base)
-    return cloud
+    # Last, since it costs more than all before: points that stand alone have no spacing, and go.
+    apart = spacing(cloud.point, cloud.edge)
+    return Cloud(*(column[apart.isfinite()] for column in cloud._replace(space=apart)))
 
 
 def joined(first: Cloud, second: Cloud) -> Cloud:
@@ -112,7 +114,7 @@ def _some(seen: Surface, which: Tensor) -> Surface:
 
 
 def _thin(seen: Surface, view: Tensor, base: float) -> Cloud:
-    """One point a voxel: means weighted by how finely each pixel samples the surface."""
+    """One point a voxel: means weighted by how finely each pixel samples the surface. Spacings are left at 0."""
     middle = seen.point.mean(0)
     local = seen.point - middle
     level = torch.log2(seen.footprint.double() / base).round().long().clamp(0, LEVELS - 1)
@@ -129,10 +131,8 @@ def _thin(seen: Surface, view: Tensor, base: float) -> Cloud:
     # Surfaces seen from both sides share a voxel where they are thin: their mean has no direction.
     keep = (torch.linalg.vector_norm(normal, dim=-1) > 0.5) & finest_alone(point, level, base)
     point, normal, edge, view = point[keep], normal[keep], edge[keep], view[best][keep]
-    apart = spacing(point, edge)
-    crowd = apart.isfinite()
-    direction = torch.nn.functional.normalize(normal[crowd], dim=-1).float()
-    return Cloud(point[crowd] + middle, direction, edge[crowd], apart[crowd], view[crowd])
+    direction = torch.nn.functional.normalize(normal, dim=-1).float()
+    return Cloud(point + middle, direction, edge, torch.zeros_like(edge), view)
 
 
 def _best(group: Annotated[Tensor, "N"], score: Annotated[Tensor, "N"], groups: int) -> Annotated[Tensor, "groups"]:
