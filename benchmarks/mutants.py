@@ -56,7 +56,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/style/statistics.py": ("style/test_statistics.py",),
     "fprf/style/transport.py": ("style/test_transport.py",),
     "fprf/rendering/stepfun.py": ("rendering/test_stepfun.py", "rendering/test_stepfun_edges.py"),
-    "fprf/rendering/space.py": ("rendering/test_space.py", "ops/test_march.py"),
+    "fprf/rendering/space.py": ("rendering/test_space.py", "rendering/test_space_plain.py", "ops/test_march.py"),
     "fprf/rendering/renderer.py": ("rendering/test_renderer.py", "rendering/test_renderer_edges.py"),
     "fprf/rendering/cameras.py": ("rendering/test_cameras.py",),
     "fprf/rendering/lens.py": ("rendering/test_cameras.py",),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from fprf.rendering.stepfun import interlevel, resample
+from fprf.rendering.stepfun import interlevel, resample, scale_gradient
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
@@ -39,3 +39,10 @@ def test_edges_that_lie_nowhere_are_looked_up_within_the_array(bad: float) -> No
         spoilt = s.clone()
         spoilt[1, at] = bad
         assert interlevel(spoilt, w, s, w).shape == () and interlevel(s, w, spoilt, w).shape == ()
+
+
+def test_gradients_are_scaled_and_values_are_not() -> None:
+    x, by = torch.tensor([1.0, -2.0, 3.0], requires_grad=True), torch.tensor([0.5, 0.0, 4.0])
+    found = scale_gradient(x, by)
+    (found * torch.tensor([1.0, 1.0, -1.0])).sum().backward()
+    assert found.tolist() == x.tolist() and x.grad is not None and x.grad.tolist() == [0.5, 0.0, -4.0]
