@@ -24,7 +24,8 @@ def test_distances_of_a_contraction_are_even_in_its_shares(near: float, far: flo
         pytest.skip("nothing between")
     space = Space("contraction", (0.0, 0.0, 0.0), EYE, 1.0, 0.05, 1e3)
     s = torch.linspace(0, 1, 11, dtype=torch.float64)
-    found = space.distance(s[None], torch.tensor([near]).double(), torch.tensor([far]).double())[0]
+    ends = torch.tensor([[near], [far]], dtype=torch.float64)
+    found = space.distance(s[None], ends[0], ends[1])[0]
     low, high = share(near), share(far)
     exact = [distance(low + (high - low) * at) for at in s.tolist()]
     assert found.tolist() == pytest.approx(exact, rel=1e-9)
