@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import NumericsError
-from fprf.style.clusters import kmeans
+from fprf.style.clusters import _draw, _means, kmeans
 
 
 def blobs(n: int, d: int, k: int, *, spread: float, norm: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -107,6 +107,29 @@ def test_up_to_so_many_rows_centres_are_the_means_of_all_their_members(rows: int
 def test_no_rows_or_no_clusters(rows: int, k: int) -> None:
     found = kmeans(torch.ones(rows, 2), k, seed=0)
     assert found.centres.shape == (0, 2) and found.label.tolist() == [0] * rows
+
+
+@pytest.mark.parametrize(
+    ("odds", "draw", "index"),
+    [
+        ([0.0, 1.0, 0.0, 3.0], 0.0, 1),
+        ([0.0, 1.0, 0.0, 3.0], 0.25, 3),
+        ([0.0, 1.0, 0.0, 3.0], 0.2499, 1),
+        ([1.0, 3.0, 0.0], 1.0, 1),  # what rounding of the sum may make of a draw just below 1
+        ([2.0, 5.0, 0.5, 0.0], 1.0, 1),
+        ([0.5, 0.25], 0.9, 1),
+    ],
+)
+def test_a_draw_never_lands_on_odds_of_nothing(odds: list[float], draw: float, index: int) -> None:
+    found = _draw(torch.tensor(odds, dtype=torch.float64), torch.tensor(draw, dtype=torch.float64))
+    assert int(found) == index
+
+
+def test_labels_skip_clusters_without_weight() -> None:
+    points = torch.tensor([[0.0], [1.0], [5.0], [9.0]], dtype=torch.float64)
+    mass = torch.tensor([1.0, 0.0, 1.0, 1.0], dtype=torch.float64)
+    centres, label = _means(points, mass, torch.tensor([0, 1, 2, 3]), 4)
+    assert centres.tolist() == [[0.0], [5.0], [9.0]] and label.tolist() == [0, 0, 1, 2]
 
 
 def test_cost_per_cpu_second_is_bounded() -> None:
