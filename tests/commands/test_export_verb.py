@@ -94,6 +94,10 @@ def test_bounds_and_options_reach_the_files(world: World, tmp_path: Path) -> Non
     assert count("--side", "16")["points"] < every["points"]
     assert count("--agree", "6")["points"] < every["points"]
     assert count("--tolerance", "0.1")["points"] < every["points"]
+    several = columns(tmp_path / "x" / "splats.ply", "f_dc_0")
+    assert every["floating"] == 0
+    count("--tolerance", "0.1", "--witnesses", "1")
+    assert not np.array_equal(several, columns(tmp_path / "x" / "splats.ply", "f_dc_0")), "other colours, the same points"
     trained = world.load()
     known = trained.known
     [depth] = render_sights(trained.model, known.cameras, known.train[:1], trained.config.render, side=32, reach=1e9).depth
@@ -127,6 +131,7 @@ def test_one_table_of_another_size(world: World, tmp_path: Path) -> None:
         (["cameras", "--output", "OUT/one.splat"], "holds splat, not cameras"),
         (["lut"], "a lut is the way into a style; name one with --references"),
         (["--lut-size", "1"], "--lut-size: 1 must lie in [2, 129]"),
+        (["ply", *LOOSE, "--presence", "1"], "no point is as present as 1 in the field; lower --presence"),
         (["ply", "--tolerance", "1e-6"], "no surface that two views agree on"),
     ],
 )
