@@ -3,14 +3,17 @@
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ..engine.events import History
 from ..errors import UsageError
+
+if TYPE_CHECKING:
+    from ..engine.events import History
 
 __all__ = ["write_scalars"]
 
 
-def write_scalars(folder: Path, histories: Sequence[History]) -> int:
+def write_scalars(folder: Path, histories: Sequence["History"]) -> int:
     """One run of TensorBoard for the training and each block, replaced if it is there; how many values were written.
 
     Times are those of training, so that a resumed run has no gap. Raises UsageError without the package `tensorboard`.
