@@ -238,3 +238,18 @@ def test_hidden_files_of_a_mac_are_no_images(tmp_path: Path) -> None:
     write_image(tmp_path / "a.png", (4, 4))
     (tmp_path / "._a.png").write_bytes(b"resource fork")
     assert image_names(tmp_path) == ["a.png"]
+
+
+@pytest.mark.parametrize(("shape", "sides"), [("(03, 2)", (3, 2)), ("(6,)", (6,)), ("(2, 3, )", (2, 3)), ("(3,2)", (3, 2))])
+def test_shapes_of_arrays_are_read_as_numbers_never_as_code(shape: str, sides: tuple[int, ...]) -> None:
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + np.arange(6.0).tobytes()
+    assert read_npy("x", data).shape == sides
+
+
+@pytest.mark.parametrize("shape", ["(3)", "((3, 2))", "(3 2)", "(-3, 2)", "(3,, 2)", "3, 2", "(1e1,)"])
+def test_shapes_that_are_none_are_refused(shape: str) -> None:
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + np.arange(6.0).tobytes()
+    with pytest.raises(DataError):
+        read_npy("x", data)
