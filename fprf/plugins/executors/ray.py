@@ -1,6 +1,6 @@
 """Tasks on many processes or machines, by Ray Core. A task whose worker dies is started again and finds its own checkpoint.
 
-A cluster that runs already is joined; without one a private one is started on this machine: on the loopback, with a token of
+A cluster whose address is given is joined; without one a private one is started on this machine: on the loopback, with a token of
 its own, without dashboard and without telling anybody that it is used.
 """
 
@@ -64,7 +64,8 @@ class RayExecutor(Executor):
                 ray.init(address=self.config.address, **common)
                 return
             count = self.config.workers * self.config.processors
-            ray.init(num_cpus=count, include_dashboard=False, _node_ip_address=_LOOPBACK, **common)
+            # Without "local" Ray would look for any cluster that runs, or ran, on this machine.
+            ray.init(address="local", num_cpus=count, include_dashboard=False, _node_ip_address=_LOOPBACK, **common)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             where = self.config.address or "this machine"
             raise PluginError(f"executor: no Ray cluster at {where} ({error}); `fprf cluster` says how to start one") from error

@@ -27,6 +27,34 @@ def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         RayConfig().build().map(abs, [1])
 
 
+class Refusing:
+    """Ray as far as joining goes; it keeps what it was asked for."""
+
+    class exceptions:
+        RayError = RayTaskError = KeyError
+
+    def __init__(self) -> None:
+        self.asked: dict[str, object] = {}
+
+    def is_initialized(self) -> bool:
+        return False
+
+    def init(self, **asked: object) -> None:
+        self.asked = asked
+        raise ConnectionError("nobody there")
+
+
+@pytest.mark.parametrize(("address", "joined"), [("", "local"), ("mars:7777", "mars:7777")])
+def test_only_a_cluster_that_is_named_is_joined(monkeypatch: pytest.MonkeyPatch, address: str, joined: str) -> None:
+    ray = Refusing()
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_USAGE_STATS_ENABLED"):
+        monkeypatch.setenv(name, "set before")
+    with pytest.raises(PluginError, match="nobody there"):
+        RayConfig(address=address).build().map(abs, [1])
+    assert ray.asked["address"] == joined
+
+
 def test_the_steps_name_the_machine_and_its_port(capsys: pytest.CaptureFixture[str]) -> None:
     assert cluster(["--head", "mars", "--port", "7777"]) == 0
     said = capsys.readouterr().out
