@@ -1,7 +1,7 @@
 """Tasks on many processes or machines, by Ray Core. A task whose worker dies is started again and finds its own checkpoint.
 
-A cluster whose address is given is joined; without one a private one is started on this machine: on the loopback, with a token of
-its own, without dashboard and without telling anybody that it is used.
+A cluster whose address is given is joined; without one a private one is started on this machine: on the loopback, with a token
+of its own, without dashboard and without telling anybody that it is used.
 """
 
 import importlib
