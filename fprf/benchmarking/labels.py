@@ -13,6 +13,7 @@ from torch import nn
 from torch.profiler import record_function
 
 from ..engine.model import Model
+from ..interfaces import Stylizer
 from .naive import replaced
 
 __all__ = ["PREFIX", "REST", "Event", "Range", "attribute", "exclusive", "labelled"]
@@ -44,7 +45,7 @@ class Range(NamedTuple):
 
 
 @contextmanager
-def labelled(model: Model, stylizer: nn.Module | None = None) -> Iterator[None]:
+def labelled(model: Model, stylizer: Stylizer | None = None) -> Iterator[None]:
     """Every part of the model carries its name while this lasts."""
     named: list[tuple[nn.Module | None, str, str]] = [
         (model.sampler, "forward", "sampler"),
@@ -54,7 +55,7 @@ def labelled(model: Model, stylizer: nn.Module | None = None) -> Iterator[None]:
         (model.decoder, "forward", "decoder"),
         (model.decoder, "restyled", "decoder"),
         (model, "penalties", "penalties"),
-        (stylizer, "forward", "stylizer"),
+        (stylizer, "shared", "stylizer"),
     ]
     with ExitStack() as stack:
         for module, method, name in named:
