@@ -22,7 +22,8 @@ def run(world: World, tmp_path: Path) -> Run:
 
 def test_the_files_of_a_run(world: World) -> None:
     found = {p.name for p in world.run.iterdir()}
-    assert found == {"config.json", "scene.json", "basis.safetensors", "style.safetensors", "events.jsonl", "checkpoints"}
+    kept = {"config.json", "scene.json", "images.json", "basis.safetensors", "style.safetensors", "events.jsonl", "checkpoints"}
+    assert found == kept
 
 
 def test_no_file_names_the_place_that_it_lies_in(world: World) -> None:

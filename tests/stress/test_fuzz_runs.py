@@ -66,7 +66,8 @@ def test_other_errors_and_too_much_memory_are_told(script: ModuleType, tmp_path:
     script.watch(reader(tmp_path, lambda data: bytearray(1 << 40)), total, 100, 0)
     assert total["faults"] and all("MemoryError" in line for line in total["faults"])
     total = script.fresh()
-    script.watch(reader(tmp_path, lambda data: len(bytearray(b"x") * (96 << 20))), total, 100, 0)
+    script.watch(reader(tmp_path, lambda data: len(bytearray(b"x") * (384 << 20))), total, 100, 0)
+    # A process that starts large may give some back meanwhile.
     assert total["faults"] == [] and total["grown_mib"] > 90
 
 
