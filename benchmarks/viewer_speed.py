@@ -33,7 +33,7 @@ from safetensors.torch import load_file
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "viewer"))
 
-from browser import Front, front, served
+from browser import front, served
 
 from fprf.output.atomic import write_json
 
@@ -80,10 +80,10 @@ def memory(run: Path, references: list[Path], steps: int) -> dict[str, object]:
         found.rest(2.0)
         for i in range(14):
             found.drop(references[i % len(references)])
-        turn(found, 20)
+        found.turn(20)
         found.rest(2.0)
         before = resident(pid)
-        turn(found, 200)
+        found.turn(200)
         found.rest(2.0)
         moved = resident(pid)
         for i in range(50):
@@ -156,17 +156,6 @@ def trained(root: Path, view: list[str], steps: int, *, look: bool) -> dict[str,
 def resident(pid: int) -> float:
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
-
-
-def turn(found: Front, times: int) -> None:
-    """Drags on the picture."""
-    mouse = found.page.mouse
-    for i in range(times):
-        x, y = 150 + 7 * (i % 11), 200 + 5 * (i % 7)
-        mouse.move(x, y)
-        mouse.down()
-        mouse.move(x + 30 - 60 * (i % 2), y + 6, steps=2)
-        mouse.up()
 
 
 PARTS: dict[str, Callable[[Path, list[Path], int], dict[str, object]]] = {

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from .errors import OutOfMemoryError
 
-__all__ = ["LEAST", "in_parts", "out_of_memory", "shortage", "wanted"]
+__all__ = ["LEAST", "in_parts", "out_of_memory", "peak", "shortage", "wanted"]
 
 LEAST = 1024
 """Rays below which parts are not halved: their share of the memory is small beside the model's."""
@@ -67,7 +67,7 @@ def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
     """One line: what was going on, what it took, what there is, and what to do."""
     more = wanted(error)
     asked = "" if more is None else f" and wanted {_told(more)} more"
-    held = _peak()
+    held = peak()
     took = "" if held is None else f"; the process held up to {_told(held)}{asked}"
     return OutOfMemoryError(f"{what}: not enough memory{took}{_limits()}; {remedy}")
 
@@ -76,7 +76,7 @@ def _told(count: float) -> str:
     return f"{count / _GIB:.2f} GiB"
 
 
-def _peak() -> int | None:
+def peak() -> int | None:
     """Most bytes that this process ever held; None where the system does not tell."""
     try:
         import resource

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ..rendering.cameras import Cameras
 from ..types import Rays
 
-__all__ = ["Poses", "moving", "refined", "rotated"]
+__all__ = ["Poses", "moved", "moving", "refined", "rotated"]
 
 _TINY = 1e-24
 """Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
@@ -64,8 +64,7 @@ class Poses(nn.Module):
         """The cameras where they are now."""
         with torch.no_grad():
             move = self.moves().to(cameras.pose)
-            turned = [rotated(cameras.pose[:, :, axis], move[:, :3]) for axis in range(3)]
-            return replace(cameras, pose=torch.stack([*turned, cameras.pose[:, :, 3] + self.reach * move[:, 3:]], -1))
+            return replace(cameras, pose=moved(cameras.pose, move[:, :3], self.reach * move[:, 3:]))
 
     def going_on(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...]) -> "Poses":
         """Poses that start as these are now, and learn from other views."""
@@ -75,6 +74,13 @@ class Poses(nn.Module):
         return found
 
 
+def moved(
+    pose: Annotated[Tensor, "V 3 4"], turn: Annotated[Tensor, "V 3"], shift: Annotated[Tensor, "V 3"]
+) -> Annotated[Tensor, "V 3 4"]:
+    """Poses, camera to world, turned about their own centres and shifted, both in world axes."""
+    return torch.stack([*(rotated(pose[:, :, axis], turn) for axis in range(3)), pose[:, :, 3] + shift], -1)
+
+
 def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
     """Vectors turned by rotation vectors (Rodrigues), differentiable at 0 too."""
     square = turn.square().sum(-1, keepdim=True)
@@ -82,8 +88,8 @@ def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Anno
     across = torch.linalg.cross(turn, x)
     # (1 - cos a) / a^2 by the half angle: 1 - cos would cancel.
     half = torch.sin(angle / 2) / (angle / 2)
-    moved: Tensor = x + torch.sin(angle) / angle * across + 0.5 * half.square() * torch.linalg.cross(turn, across)
-    return moved
+    found: Tensor = x + torch.sin(angle) / angle * across + 0.5 * half.square() * torch.linalg.cross(turn, across)
+    return found
 
 
 def moving(rays: Rays) -> Rays:

@@ -17,7 +17,7 @@ from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..engine.loading import Trained
 from ..engine.model import background_of
-from ..engine.poses import moving, rotated
+from ..engine.poses import moved, moving, rotated
 from ..engine.prepare import reach_of
 from ..rendering.cameras import Cameras
 from ..rendering.pixel_rays import PixelRays
@@ -57,8 +57,7 @@ def align(
         mask = scene.masks[view] if scene.masks and trained.config.datamanager.masks else None
         where = None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
         moves[view] = align_view(trained, cameras, view, truth, reach, config or AlignmentConfig(), where)
-        turned = [rotated(pose[view, :, axis][None], moves[view][None, :3])[0] for axis in range(3)]
-        pose[view] = torch.stack([*turned, pose[view, :, 3] + moves[view][3:]], -1)
+        pose[view] = moved(pose[view][None], moves[view][None, :3], moves[view][None, 3:])[0]
     progress(len(views), len(views), "fitting poses")
     return trained._replace(known=replace(trained.known, cameras=replace(cameras, pose=pose))), moves
 

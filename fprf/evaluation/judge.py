@@ -1,7 +1,5 @@
 """Renders of a run against its photographs: quality, speed, memory, consistency."""
 
-import resource
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,6 +10,7 @@ from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..engine.loading import Trained
 from ..engine.views import View, render_view
+from ..memory import peak
 from .consistency import consistency
 from .metrics import image_metrics, mean_metrics
 
@@ -19,9 +18,8 @@ __all__ = ["judge", "peak_memory"]
 
 
 def peak_memory() -> float:
-    """Most resident memory that this process ever held, in MiB."""
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return used / 2**20 if sys.platform == "darwin" else used / 2**10  # bytes there, KiB on Linux
+    """Most resident memory that this process ever held, in MiB; 0 where the system does not tell."""
+    return (peak() or 0) / 2**20
 
 
 def judge(

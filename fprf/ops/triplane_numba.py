@@ -8,6 +8,7 @@ the sum over points has one order: bitwise the same for any number of threads.
 # mypy: disable-error-code="call-arg"
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -85,21 +86,11 @@ def backward(
     """Gradient of the table [rows F] for a gradient [N scales*F] of the lookup, and raw [N] weight [scales*F] in addition."""
     from . import triplane_kernels as kernels
 
-    sizes, starts = layout(resolutions)
-    flat, channels = table.detach().contiguous().view(-1).numpy(), table.shape[1]
     # A table of few scales gives few tasks; a small one can be summed up in parts. By sizes alone: the order of sums is fixed.
-    slices = _SLICES if len(flat) <= _SMALL and len(points) * len(sizes) * channels > len(flat) else 1
+    size = table.numel()
+    slices = _SLICES if size <= _SMALL and len(points) * len(resolutions) * table.shape[1] > size else 1
     out = torch.zeros(slices, *table.shape)
-    kernels.backward(
-        points.view(-1).numpy(),
-        flat,
-        channels,
-        sizes,
-        starts,
-        *(_EMPTY if x is None else x.detach().contiguous().view(-1).numpy() for x in (grad, raw, weight)),
-        slices,
-        out.view(-1).numpy(),
-    )
+    kernels.backward(*_given(points, table, resolutions, grad, raw, weight), slices, out.view(-1).numpy())
     return out.sum(0) if slices > 1 else out[0]
 
 
@@ -114,19 +105,19 @@ def point_slopes(
     """Gradient of the points [N 3], for what `backward` is given."""
     from . import triplane_kernels as kernels
 
-    sizes, starts = layout(resolutions)
-    flat, channels = table.detach().contiguous().view(-1).numpy(), table.shape[1]
     out = torch.empty(len(points), 3)
-    kernels.point_slopes(
-        points.detach().view(-1).numpy(),
-        flat,
-        channels,
-        sizes,
-        starts,
-        *(_EMPTY if x is None else x.detach().contiguous().view(-1).numpy() for x in (grad, raw, weight)),
-        out.view(-1).numpy(),
-    )
+    kernels.point_slopes(*_given(points, table, resolutions, grad, raw, weight), out.view(-1).numpy())
     return out
+
+
+def _given(
+    points: Tensor, table: Tensor, resolutions: Sequence[int], grad: Tensor | None, raw: Tensor | None, weight: Tensor | None
+) -> tuple[Any, ...]:
+    """What both kernels of gradients read, flat; what is absent is empty."""
+    sizes, starts = layout(resolutions)
+    given = (_EMPTY if x is None else x.detach().contiguous().view(-1).numpy() for x in (grad, raw, weight))
+    flat = table.detach().contiguous().view(-1).numpy()
+    return points.detach().view(-1).numpy(), flat, table.shape[1], sizes, starts, *given
 
 
 def summed(raw: Tensor, latent: Tensor) -> Tensor:

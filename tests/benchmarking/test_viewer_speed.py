@@ -1,4 +1,4 @@
-"""The committed figures of the viewer have the form that documents speak of; its promises hold where cores were free."""
+"""The committed figures of the viewer have the form that documents speak of, and what does not depend on the machine holds."""
 
 import json
 from pathlib import Path
@@ -17,10 +17,6 @@ def found() -> dict[str, Any]:
     return whole
 
 
-def free(part: dict[str, Any]) -> bool:
-    return bool(part["load_average_before"] < 0.75 * part["processors"])
-
-
 def test_every_part_says_how_busy_the_machine_was(found: dict[str, Any]) -> None:
     assert found["format"] == 1 and found["targets"] == {"start_seconds": 3.0, "drop_seconds": 0.5, "memory_ratio": 1.05}
     for name in {"start", "drop", "memory", "training"} & found.keys():
@@ -33,7 +29,6 @@ def test_times_stand_beside_their_targets(found: dict[str, Any], part: str, key:
         pytest.skip("not measured")
     row = found[part][key]
     assert 0 < row["median"] <= row["worst"] and row["count"] >= 5
-    assert found["targets"][key] > 0 and found[part]["load_average_before"] >= 0
 
 
 def test_memory_stays(found: dict[str, Any]) -> None:

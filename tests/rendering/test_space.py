@@ -119,6 +119,14 @@ def test_spacing_is_even_in_bounded_spaces(kind: Kind) -> None:
     assert torch.allclose(t, torch.tensor([[1.0, 1.5, 2.0, 2.5, 3.0], [0.0, 0.25, 0.5, 0.75, 1.0]]))
 
 
+@pytest.mark.parametrize("near", [0.25, 1.0, 1.5, 3.0, 1e4])
+def test_the_reference_begins_where_the_ray_does(near: float) -> None:
+    """Float64 takes no kernel: s = 0 is the near end, on either side of the contraction's sphere, and s = 1 the far one."""
+    n, f = (torch.tensor([t], dtype=torch.float64) for t in (near, 4 * near))
+    t = space_of("contraction").distance(torch.tensor([[0.0, 1.0]], dtype=torch.float64), n, f)
+    torch.testing.assert_close(t, torch.stack([n, f], 1), rtol=1e-12, atol=0)
+
+
 def forward_rays(count: int, seed: int, origin: float = 0.3, spread: float = 0.4) -> tuple[Tensor, Tensor]:
     draw = torch.Generator().manual_seed(seed)
     o = torch.randn(count, 3, dtype=torch.float64, generator=draw) * origin

@@ -81,6 +81,16 @@ class Front:
                 return
         raise AssertionError("no picture ever came, or they never ended")
 
+    def turn(self, times: int) -> None:
+        """Drags on the picture."""
+        mouse = self.page.mouse
+        for i in range(times):
+            x, y = 150 + 7 * (i % 11), 200 + 5 * (i % 7)
+            mouse.move(x, y)
+            mouse.down()
+            mouse.move(x + 30 - 60 * (i % 2), y + 6, steps=2)
+            mouse.up()
+
     def drop(self, path: Path) -> float:
         """Drop a photograph; seconds until the next picture."""
         count, start = len(self.pictures), time.monotonic()

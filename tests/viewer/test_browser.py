@@ -35,16 +35,6 @@ def memory(pid: int) -> int:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1])
 
 
-def turn(found: Front, times: int) -> None:
-    mouse = found.page.mouse
-    for i in range(times):
-        x, y = 150 + 7 * (i % 11), 200 + 5 * (i % 7)
-        mouse.move(x, y)
-        mouse.down()
-        mouse.move(x + 30 - 60 * (i % 2), y + 6, steps=2)
-        mouse.up()
-
-
 def test_a_drop_a_click_a_wipe_and_a_pin(opened: tuple[Front, int], world: World) -> None:
     found, _ = opened
     found.drop(world.references[0])
@@ -84,10 +74,10 @@ def test_many_moves_and_drops_leave_no_memory_behind(opened: tuple[Front, int], 
     found, pid = opened
     for i in range(14):  # the shelf is full then
         found.drop(world.references[i % 2])
-    turn(found, 20)
+    found.turn(20)
     found.rest()
     before = memory(pid)
-    turn(found, 200)
+    found.turn(200)
     found.rest()
     for i in range(50):
         found.drop(world.references[i % 2])
@@ -129,7 +119,7 @@ def test_keys_are_set_seen_put_in_another_order_and_played(opened: tuple[Front, 
     found.until(lambda state: len(state["keys"]) == 1)
     found.drop(world.references[0])
     found.rest()
-    turn(found, 2)
+    found.turn(2)
     found.rest()
     strip = found.page.locator("#fprf-flight")
     strip.get_by_text("+ key").click()
@@ -180,7 +170,7 @@ def test_training_is_shown_live_and_goes_on_without_its_viewer(world: World, tmp
                 first = found.until(lambda state: state["training"]["step"] > 0)["training"]["step"]
                 found.drop(world.references[0])
                 found.until(lambda state: len(state["shelf"]) == 1)
-                turn(found, 5)
+                found.turn(5)
                 found.until(lambda state: state["training"]["step"] > first)
                 assert found.errors == []
             assert process.poll() is None  # the page is gone, training is not
