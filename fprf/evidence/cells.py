@@ -10,7 +10,7 @@ from ..engine.loading import Trained
 from ..engine.restyle import Encoders
 from ..errors import DataError
 from ..evaluation.flat import encoded
-from ..style.dictionary import StyleDictionary, blend_codes
+from ..style.dictionary import BLEND, StyleDictionary, blend_codes
 from ..style.statistics import covariance, group_moments, moments
 
 __all__ = ["CELL", "cell_dictionary", "cells"]
@@ -29,7 +29,7 @@ def cells(height: int, width: int) -> Annotated[Tensor, "N"]:
 
 @torch.no_grad()
 def cell_dictionary(
-    images: Mapping[str, Annotated[Tensor, "H W 3"]], trained: Trained, encoders: Encoders, blend: float = 0.1
+    images: Mapping[str, Annotated[Tensor, "H W 3"]], trained: Trained, encoders: Encoders, blend: float = BLEND
 ) -> StyleDictionary:
     """Of photographs by name: a code for every cell, with the statistics of its pixels. Raises DataError without semantics."""
     if encoders.semantic is None or encoders.basis is None:
