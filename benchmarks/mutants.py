@@ -156,9 +156,7 @@ def _in_child(module: str, code: CodeType | None, seconds: float, root: Path) ->
     tests = [str(path) for name in MODULES[module] if (path := root / "tests" / name).exists()]
     if not tests:
         return 98
-    return int(
-        pytest.main(["-x", "-q", "--assert=plain", "--noconftest", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests])
-    )
+    return int(pytest.main(["-x", "-q", "--assert=plain", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests]))
 
 
 def chosen(source: str, module: str, count: int, seed: int) -> tuple[list[Mutation], int]:

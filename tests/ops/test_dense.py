@@ -250,6 +250,20 @@ def test_a_network_of_planes_is_the_network_of_the_features(resolutions: tuple[i
     assert torch.equal(found, network(features, weights, biases, shared=shared, row=row, last="relu"))
 
 
+@torch.no_grad()
+def test_features_of_planes_are_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the fused form fits, the plain one is not asked: else it would be no faster."""
+
+    def refuse(*given: object) -> Tensor:
+        raise AssertionError("features were written")
+
+    table, (weights, biases) = draw(triplane.rows((4,)), 8), layers_of((8, 16, 2))
+    monkeypatch.setattr(triplane, "lookup", refuse)
+    assert plane_network(draw(9, 3).clamp(-1, 1), table, (4,), weights, biases).shape == (9, 2)
+    with pytest.raises(AssertionError, match="written"):
+        plane_network(draw(0, 3), table, (4,), weights, biases)
+
+
 @QUICK
 @given(st.lists(st.sampled_from([0.0, 1.0, -0.0, float("nan")]), max_size=30))
 def test_runs_of_equal_rows(values: list[float]) -> None:

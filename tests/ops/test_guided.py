@@ -179,6 +179,13 @@ def test_groups_of_channels_change_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     torch.testing.assert_close(guided.upsample(features, guide, radius=4, eps=1e-3), whole)
 
 
+def test_windows_are_placed_as_far_apart_as_their_size_allows() -> None:
+    """Else the cheap form would be the exact one, at its price: a window at every pixel."""
+    cheap = guided._axis(pixels=504, cells=63, radius=30, stride=8, fineness=8.0)
+    assert cheap.window.shape[0] <= 2 * 504 / (61 / 8) and cheap.hat.shape[0] <= 3 * 504 / (61 / 8)
+    assert guided._axis(pixels=504, cells=63, radius=30, stride=8, fineness=math.inf).window.shape[0] == 504
+
+
 def error(features: Tensor, guide: Tensor, radius: int, stride: int) -> float:
     """RMS difference from the exact filter, half precision included, in standard deviations of its output."""
     truth = exact(features, guide, radius, 1e-3)

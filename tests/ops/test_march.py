@@ -163,6 +163,16 @@ def test_nothing_is_kept_where_nothing_is() -> None:
     assert len(march.gather(weighed, torch.zeros(3, 4, 3), torch.zeros(12, 3), torch.zeros(3, 3)).ray) == 0
 
 
+@torch.no_grad()
+def test_of_no_samples_nothing_is_seen() -> None:
+    weighed = march.weigh(torch.zeros(3, 0), torch.ones(3, 1), 0.0)
+    assert weighed.weights.shape == weighed.keep.shape == (3, 0) and torch.equal(
+        weighed.start, torch.zeros(4, dtype=torch.int64)
+    )
+    assert torch.equal(weighed.opacity, torch.zeros(3)) and torch.equal(weighed.depth, torch.zeros(3))
+    assert torch.equal(weighed.through, torch.ones(3))
+
+
 def proposal(seed: int = 0, thickness: float = 4.0, resolution: int = 9, channels: int = 8) -> ProposalField:
     field = ProposalField(resolution, channels, seed=seed)
     with torch.no_grad():
@@ -249,7 +259,7 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
 
 def test_what_is_compiled() -> None:
     x = torch.zeros(4, 3)
-    assert march.fit(x) and not march.fit(x, x.double()) and not march.fit(x[:0])
+    assert march.fit(x) and march.fit(x[:1, :1]) and not march.fit(x, x.double()) and not march.fit(x[:0])
     wanted = x.clone().requires_grad_(True)
     assert march.still(x) and not march.still(x, wanted)
     with torch.no_grad():

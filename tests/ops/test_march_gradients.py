@@ -41,6 +41,8 @@ def test_only_one_of_both_may_be_asked_for() -> None:
     found = march.weigh(density, t, 0.0)
     (alone,) = torch.autograd.grad(found.through.sum(), density)
     assert torch.allclose(alone, -found.through[:, None].expand(3, 4))
+    (alone,) = torch.autograd.grad(march.weigh(density, t, 0.0).weights.sum(), density)
+    assert torch.allclose(alone, found.through[:, None].expand(3, 4)), "what does not pass is what is seen"
 
 
 @pytest.mark.parametrize("latents", [3, 64])
@@ -53,6 +55,8 @@ def test_gradients_go_back_to_the_kept_samples(latents: int) -> None:
     found = march.gather(weighed, point, latent, point[:, 0], fair)
     index = weighed.keep.view(-1).nonzero()[:, 0]
     assert found.fair is not None and torch.equal(found.fair, fair.view(-1)[index])
+    assert found.weight.requires_grad and found.latent.requires_grad
+    assert not any(x.requires_grad for x in (found.ray, found.point, found.view, found.fair))
     g, h = torch.randn(len(index), generator=draw), torch.randn(len(index), latents, generator=draw)
     loss = (found.weight * g).sum() + (found.latent * h).sum()
     got = torch.autograd.grad(loss, (weighed.weights, latent), retain_graph=True)

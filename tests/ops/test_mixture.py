@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from fprf.ops import mixture
 from fprf.ops.lanes import BLOCK
 from fprf.ops.mixture import affine, affine_reference, attention, scaled, scaled_reference
 
@@ -35,7 +36,7 @@ def affine_oracle(x: Tensor, share: Tensor, matrix: Tensor, bias: Tensor, centre
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 3), (5, 4), (16, 1), (33, 20)])
+@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 3), (5, 4), (16, 1), (16, 2), (33, 20)])
 @pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
 def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: int) -> None:
     x, centre = draw(count, channels) + 3, draw(channels, seed=1) + 3
@@ -64,6 +65,30 @@ def test_nothing_of_a_region_without_a_share_is_seen() -> None:
     clean = affine(x, share, matrix, bias, centre=x[0])
     matrix[1], bias[1] = float("nan"), float("inf")
     assert torch.equal(affine(x, share, matrix, bias, centre=x[0]), clean)
+
+
+@torch.no_grad()
+def test_what_fits_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*given: Tensor, centre: Tensor) -> Tensor:
+        raise AssertionError("the plain form was taken")
+
+    for name in ("affine_reference", "scaled_reference"):
+        monkeypatch.setattr(mixture, name, refuse)
+    x, share, centre, bias = draw(1, 16), shares(1, 3), draw(16), draw(3, 16)
+    assert affine(x, share, draw(3, 16, 16), bias, centre=centre).shape == (1, 16)
+    assert scaled(x, share, bias, bias, centre=centre).shape == (1, 16)
+
+
+@torch.no_grad()
+def test_other_types_and_no_points_take_the_plain_form() -> None:
+    x, share, centre = draw(7, 16).double(), shares(7, 3).double(), draw(16).double()
+    matrix, bias = draw(3, 16, 16).double(), draw(3, 16).double()
+    plain = affine_reference(x, share, matrix, bias, centre=centre), scaled_reference(x, share, bias, bias, centre=centre)
+    fast = affine(x, share, matrix, bias, centre=centre), scaled(x, share, bias, bias, centre=centre)
+    assert all(torch.equal(a, b) and a.dtype == torch.float64 for a, b in zip(plain, fast, strict=True))
+    x, share, centre, matrix, bias = (each.float() for each in (x[:0], share[:0], centre, matrix, bias))
+    assert affine(x, share, matrix, bias, centre=centre).shape == (0, 16)
+    assert scaled(x, share, bias, bias, centre=centre).shape == (0, 16)
 
 
 @torch.no_grad()
@@ -122,6 +147,8 @@ def test_a_point_at_the_centre_matches_everything_alike() -> None:
     found = attention(x, keys, 0.1, centre=centre, flat=1e-6 * float(centre.norm()))
     assert torch.allclose(found[:2], torch.full((2, 4), 0.25))
     assert found[2].max() > 0.3
+    close, far = (attention(torch.ones(1, 16) * step, keys, 0.1, centre=torch.zeros(16)) for step in (1e-3, 1.0))
+    assert torch.allclose(close, far, atol=1e-5), "nothing is flat unless it is said"
     at_zero = attention(torch.zeros(1, 16), keys, 0.1, centre=torch.zeros(16))
     assert torch.allclose(at_zero, torch.full((1, 4), 0.25))
 
