@@ -27,7 +27,8 @@ def overview(view_names: Sequence[str], originals: Sequence[Picture], styles: Se
     return f"""<section id="overview">
 <h2>Overview</h2>
 <p class="lead">Every view in every style. Choose one to compare it above.</p>
-<div class="scroller" tabindex="0" role="region" aria-label="Every view in every style"><table class="matrix">
+<div class="scroller" tabindex="0" role="region" aria-label="Every view in every style">
+<table class="matrix" style="--pictures:{len(styles) + 1}">
 <thead><tr><th scope="col">View</th>{heads}</tr></thead>
 <tbody>
 {body}
