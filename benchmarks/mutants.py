@@ -59,7 +59,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/rendering/space.py": ("rendering/test_space.py", "rendering/test_space_plain.py", "ops/test_march.py"),
     "fprf/rendering/renderer.py": ("rendering/test_renderer.py", "rendering/test_renderer_edges.py"),
     "fprf/rendering/cameras.py": ("rendering/test_cameras.py",),
-    "fprf/rendering/lens.py": ("rendering/test_cameras.py",),
+    "fprf/rendering/lens.py": ("rendering/test_lens.py", "rendering/test_cameras.py"),
     "fprf/rendering/pixel_rays.py": ("rendering/test_pixel_rays.py",),
     "fprf/rendering/normals.py": ("rendering/test_normals.py",),
     "fprf/rendering/splines.py": ("rendering/test_splines.py",),

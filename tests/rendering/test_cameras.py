@@ -151,6 +151,10 @@ def test_barrel_distortion_leaves_corners_that_see_nothing() -> None:
     view = torch.zeros(2, dtype=torch.int64)
     pixel = scene.centre + torch.tensor([[rim * 0.999, 0.0], [rim * 1.01, 0.0]]) * scene.focal
     assert sees(scene, view, pixel).tolist() == [True, False]
+    # A millionth of a pixel decides, in pixels of this view.
+    beyond = torch.tensor([[0.0], [0.9e-6], [1.5e-6], [1e-4]], dtype=torch.float64)
+    at_rim = scene.centre + torch.tensor([[rim, 0.0]], dtype=torch.float64) * scene.focal + beyond * torch.tensor([1.0, 0.0])
+    assert sees(scene, torch.zeros(4, dtype=torch.int64), at_rim).tolist() == [True, True, False, False]
     _, direction = rays_through(scene, view, pixel)
     forward = -(direction @ scene.pose[0, :, 2])
     assert forward[1].item() == pytest.approx(1 / math.hypot(1, reach), rel=1e-9)
@@ -189,6 +193,11 @@ def test_scaling_commutes_with_rays(factor: int, seed: int) -> None:
     ratio = small.size[view] / scene.size[view].double()
     for one, other in zip(rays_through(scene, view, pixel), rays_through(small, view, pixel * ratio), strict=True):
         assert torch.allclose(one, other, atol=1e-12)
+
+
+def test_something_is_left_of_the_smallest_image() -> None:
+    scene = cameras([PINHOLE, OPENCV])
+    assert torch.equal(scene.scaled(1e4).size, torch.ones(2, 2, dtype=torch.int64))
 
 
 def test_scaling_by_one_and_back_is_the_identity() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 from toy_parts import Never, Ones, Shift, Squash, Uniform, parts_of, rays_of, space_of
@@ -16,7 +16,9 @@ from fprf.rendering.renderer import Parts, Restyle, render_rays
 from fprf.rendering.space import Kind
 from fprf.types import Rays, Rendered, Want
 
-QUICK = settings(max_examples=15, deadline=None)
+pytestmark = pytest.mark.usefixtures("form")
+QUICK = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+"""The form that is rendered by stays the same throughout a test."""
 ALL = Want.DENSITY | Want.COLOUR | Want.CONTENT | Want.SEMANTIC
 
 
@@ -115,6 +117,11 @@ def test_semantics_never_move_density() -> None:
     assert all(g is None for g in gradients(found.semantic.square().sum(), parts.sampler))
     assert all(g is not None and g.any() for g in gradients(found.semantic.square().sum(), parts.semantic))
     assert all(g is None for g in gradients(found.rgb.sum(), parts.semantic))
+
+
+def test_content_moves_density_unless_it_is_told_not_to() -> None:
+    found = render_rays(rays_of("contraction", 3), parts := parts_of(), want=Want.CONTENT, budget=0.0)
+    assert found.content is not None and all(g is not None for g in gradients(found.content.sum(), parts.field))
 
 
 @pytest.mark.parametrize("moves", [False, True])

@@ -2,15 +2,17 @@
 
 import pytest
 import torch
+import toy_parts as toys
 from torch import Tensor, nn
 
 from fprf.interfaces import ContentField, Decoder
 from fprf.plugins.samplers.config import UniformConfig
-from fprf.rendering.renderer import VEIL, Parts, march, render_rays
+from fprf.rendering.renderer import Parts, march, render_rays
 from fprf.rendering.space import Kind, Space
 from fprf.rendering.stepfun import midpoints, scale_gradient
 from fprf.types import FieldSample, Rays, Want
 
+pytestmark = pytest.mark.usefixtures("form")
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 NEAR = 0.1
 
@@ -86,6 +88,41 @@ def test_near_densities_learn_by_the_square_of_their_distance(kind: Kind) -> Non
 
     plain, training = gradient(None), gradient(0)
     middle = midpoints(march(rays, parts, budget=0.0).sampled.t)
-    share = (middle / (VEIL * rays.near[:, None])).square().clamp(max=1) if kind == "contraction" else torch.ones(4, 64)
+    share = (middle / (4 * rays.near[:, None])).square().clamp(max=1) if kind == "contraction" else torch.ones(4, 64)
     assert bool((share < 0.5).any()) == (kind == "contraction")
     torch.testing.assert_close(training, plain * share, rtol=1e-5, atol=1e-9)
+
+
+def test_near_features_learn_by_the_square_of_their_distance() -> None:
+    """Each kept feature's gradient is its weight times its own share, sample by sample."""
+    parts, rays = parts_of("contraction", 16), rays_of(parts_of("contraction", 16), 4)
+    kept = march(rays, parts, budget=0.02, step=0).kept
+    assert kept.fair is not None
+    t = march(rays, parts, budget=0.02).sampled.t
+    share = (midpoints(t) / (4 * rays.near[:, None])).square().clamp(max=1)
+    whole = march(rays, parts, budget=0.0).weights
+    index = [int((whole[r] - w).abs().argmin()) for r, w in zip(kept.ray.tolist(), kept.weight, strict=True)]
+    assert len(kept.fair) < share.numel() and torch.allclose(kept.fair, share[kept.ray, torch.tensor(index)])
+
+
+def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
+    """Rays that want gradients are rendered as the same rays without, and where samples lie moves nothing."""
+    parts = toys.parts_of(proposal=True)
+    still = toys.rays_of("contraction", 6)
+    moved = still._replace(origin=still.origin.clone().requires_grad_(True))
+    want = Want.CONTENT | Want.COLOUR | Want.SEMANTIC
+    one, other = (render_rays(rays, parts, want=want, budget=0.0) for rays in (still, moved))
+    for name in ("rgb", "content", "semantic", "depth"):
+        assert torch.allclose(getattr(one, name), getattr(other, name), atol=2e-6), name
+    assert other.content is not None and other.semantic is not None and other.sampled is not None
+    (gradient,) = torch.autograd.grad(other.content.square().sum(), moved.origin, retain_graph=True)
+    assert gradient.isfinite().all() and (gradient.norm(dim=1) > 0).all()
+    assert torch.autograd.grad(other.semantic.sum(), moved.origin, allow_unused=True, retain_graph=True) == (None,)
+    assert not other.sampled.t.requires_grad
+
+
+@torch.no_grad()
+def test_where_nothing_is_semantics_are_nothing() -> None:
+    parts = toys.parts_of()._replace(field=toys.Uniform(0.0))
+    found = render_rays(toys.rays_of("contraction", 4), parts, want=Want.SEMANTIC | Want.DENSITY, budget=0.0)
+    assert found.semantic is not None and not found.semantic.any() and found.depth.isfinite().all()
