@@ -22,17 +22,14 @@ def normals(cameras: Cameras, view: int, depth: Annotated[Tensor, "H W"]) -> Ann
     solid = torch.isfinite(depth) & (depth > 0)
     far = torch.where(solid, depth, torch.zeros_like(depth)).double()
     points = origin.view(height, width, 3) + direction.view(height, width, 3) * far[..., None]
-    across, found_across = _step(points, solid, 1)
-    down, found_down = _step(points, solid, 0)
-    normal = torch.linalg.cross(down, across)
-    toward = (normal * direction.view(height, width, 3)).sum(-1, keepdim=True)
-    normal = torch.nn.functional.normalize(torch.where(toward > 0, -normal, normal), dim=-1, eps=1e-300)
-    known = solid & found_across & found_down
-    return torch.where(known[..., None], normal, torch.zeros_like(normal)).float()
+    # Steps follow the pixels' order, so that of what a camera sees they turn as its pixels do: the normal faces it. Where
+    # there is no step the product is 0, and stays so.
+    normal = torch.linalg.cross(_step(points, solid, 0), _step(points, solid, 1))
+    return torch.nn.functional.normalize(normal, dim=-1, eps=1e-300).float()
 
 
-def _step(points: Tensor, solid: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """From each point to the next one along an axis, or from the one before, whichever is shorter; and where there is one."""
+def _step(points: Tensor, solid: Tensor, axis: int) -> Tensor:
+    """From each point to the next one along an axis, or from the one before, whichever is shorter; 0 where there is none."""
     count = points.shape[axis]
     both = (solid.narrow(axis, 1, count - 1) & solid.narrow(axis, 0, count - 1))[..., None]
     gaps = points.narrow(axis, 1, count - 1) - points.narrow(axis, 0, count - 1)
@@ -41,5 +38,4 @@ def _step(points: Tensor, solid: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     ahead, behind = torch.cat([gaps, edge], axis), torch.cat([edge, gaps], axis)
     shorter = ahead.norm(dim=-1, keepdim=True) <= behind.norm(dim=-1, keepdim=True)
     step = torch.where(shorter, ahead, behind)
-    found = torch.isfinite(step).all(-1)
-    return torch.where(found[..., None], step, torch.zeros_like(step)), found
+    return torch.where(torch.isfinite(step), step, torch.zeros_like(step))

@@ -33,6 +33,29 @@ def test_a_plane_has_its_normal_everywhere(normal: tuple[float, float, float]) -
         assert not found[~torch.isfinite(depth)].any()
 
 
+@pytest.mark.parametrize("around", [False, True])
+def test_whatever_the_depths_normals_face_the_camera(around: bool) -> None:
+    cameras = panoramas(camera(), 48, torch.tensor([0.0, 0, 1]).double()) if around else camera()
+    width, height = cameras.size[0].tolist()
+    found = normals(cameras, 0, torch.rand(height, width, generator=torch.Generator().manual_seed(0)) * 3 + 0.1)
+    pixel = pixel_grid(cameras, 0)
+    _, direction = rays_through(cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
+    assert ((found.view(-1, 3).double() * direction).sum(-1) < 1e-6).all() and (found.norm(dim=-1) > 0.99).all()
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_units_do_not_matter(size: float) -> None:
+    cameras, wall = camera(), torch.tensor([-0.8, 0.6, 0.0], dtype=torch.float64)
+    offset = float(wall @ cameras.pose[0, :, 3]) - 2 * size
+    found = normals(cameras, 0, plane_depth(cameras, wall, offset))
+    assert torch.allclose(found, wall.float().expand_as(found), atol=1e-3 if size < 1 else 1e-5)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 9), (9, 1), (1, 1)])
+def test_a_line_of_pixels_has_no_normals(width: int, height: int) -> None:
+    assert torch.equal(normals(camera(width, height), 0, torch.ones(height, width)), torch.zeros(height, width, 3))
+
+
 def test_an_edge_belongs_to_one_of_its_sides() -> None:
     cameras = camera()
     wall = torch.tensor([-1.0, 0, 0], dtype=torch.float64)
