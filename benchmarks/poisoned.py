@@ -1,10 +1,12 @@
-"""A long training in which one batch in a hundred is spoilt, beside the same training without.
+"""A long training in which one batch in a hundred is spoilt, beside the same training without, and with other batches there.
 
-    python benchmarks/poisoned.py [--steps 30000] [--share 0.01] [--seeds 0 1] [--output benchmarks/results/poisoned.json]
+    python benchmarks/poisoned.py [--steps 30000] [--share 0.01] [--seeds 0 1 2 3] [--output benchmarks/results/poisoned.json]
 
 The toy is a town of ten pictures and a model of a few thousand numbers (`kills.py` trains the same). Which batches are spoilt,
 and how, are functions of (seed, step): colours or features that are NaN or infinite, in one ray or in all, or whose square
-overflows. Every step must leave finite parameters and moments; at the end both models are compared on all views.
+overflows. Every step must leave finite parameters and moments; at the end the models are compared on all views. What a model
+becomes depends on the order of its batches: the third training, with other healthy batches in the place of the spoilt ones,
+tells how much.
 """
 
 import argparse
@@ -12,6 +14,7 @@ import json
 import math
 import os
 import random
+import statistics
 import tempfile
 import time
 from collections import Counter
@@ -38,6 +41,8 @@ from fprf.town.write import write_town
 from fprf.types import Batch
 
 NAN, INF = float("nan"), float("inf")
+NEVER = 10**6
+"""Beyond the last step."""
 
 
 def _one(values: torch.Tensor, value: float) -> torch.Tensor:
@@ -76,20 +81,20 @@ def poison(seed: int, step: int, share: float) -> str | None:
     return draw.choice(list(POISONS)) if draw.random() < share else None
 
 
-class Poisoned(DataManager):
-    """Batches of another, some of them spoilt."""
+class Changed(DataManager):
+    """Batches of another, some of them spoilt, or in their place those of steps that nobody takes."""
 
-    def __init__(self, inner: DataManager, seed: int, share: float) -> None:
-        self.inner, self.seed, self.share = inner, seed, share
+    def __init__(self, inner: DataManager, seed: int, share: float, *, spoil: bool) -> None:
+        self.inner, self.seed, self.share, self.spoil = inner, seed, share, spoil
         self.content_store, self.semantic_store = inner.content_store, inner.semantic_store
         self.given: Counter[str] = Counter()
 
     def batch(self, step: int) -> Batch:
-        batch, name = self.inner.batch(step), poison(self.seed, step, self.share)
+        name = poison(self.seed, step, self.share)
         if name is None:
-            return batch
+            return self.inner.batch(step)
         self.given[name] += 1
-        return POISONS[name](batch)
+        return POISONS[name](self.inner.batch(step)) if self.spoil else self.inner.batch(step + NEVER)
 
     def image(self, view: int) -> torch.Tensor:
         return self.inner.image(view)
@@ -145,19 +150,33 @@ def measure(folder: Path, steps: int, share: float, seeds: list[int]) -> list[di
         config = replace(config, datamanager=replace(config.datamanager, rays=128))
         prepared = prepare(config)
         clean = trained(config, prepared, folder / f"clean-{seed}")
-        manager = Poisoned(prepared.manager, seed, share)
-        spoilt = trained(config, prepared._replace(manager=manager), folder / f"poisoned-{seed}")
-        loss = {name: clean["psnr"][name] - spoilt["psnr"][name] for name in clean["psnr"]}
-        rows.append({"seed": seed, "lost_db": loss, "spoilt": dict(manager.given), "clean": clean, "poisoned": spoilt})
+        managers = {name: Changed(prepared.manager, seed, share, spoil=name == "poisoned") for name in ("poisoned", "other")}
+        found = {n: trained(config, prepared._replace(manager=m), folder / f"{n}-{seed}") for n, m in managers.items()}
+        lost = {n: {part: clean["psnr"][part] - row["psnr"][part] for part in clean["psnr"]} for n, row in found.items()}
+        rows.append({"seed": seed, "lost_db": lost, "spoilt": dict(managers["poisoned"].given), "clean": clean, **found})
         print(json.dumps(rows[-1], indent=1), flush=True)
     return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | None]]:
+    """Mean dB lost over the seeds, and the standard error of that mean."""
+
+    def of(values: list[float]) -> dict[str, float | None]:
+        error = statistics.stdev(values) / len(values) ** 0.5 if len(values) > 1 else None
+        return {"mean": statistics.fmean(values), "error": error}
+
+    return {
+        f"{name}, {part}": of([row["lost_db"][name][part] for row in rows])
+        for name in ("poisoned", "other")
+        for part in ("held_out", "all")
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=30_000)
     parser.add_argument("--share", type=float, default=0.01)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3])
     parser.add_argument("--output", type=Path)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="fprf-poisoned-") as folder:
@@ -165,7 +184,7 @@ def main() -> None:
     seeds = " ".join(map(str, asked.seeds))
     command = f"python benchmarks/poisoned.py --steps {asked.steps} --share {asked.share:g} --seeds {seeds}"
     if asked.output is not None:
-        write_json(asked.output, {"command": command, "runs": rows})
+        write_json(asked.output, {"command": command, "lost_db": summary(rows), "runs": rows})
 
 
 if __name__ == "__main__":

@@ -35,14 +35,15 @@ def test_gradients_of_weights_and_of_what_passes(samples: int, fair: bool, thick
         assert ((got - want).abs() <= bound).all()
 
 
-def test_only_one_of_both_may_be_asked_for() -> None:
-    density = torch.rand(3, 4).requires_grad_(True)
-    t = torch.arange(5.0).repeat(3, 1)
+@pytest.mark.parametrize("rays", [1, 3])
+def test_only_one_of_both_may_be_asked_for(rays: int) -> None:
+    density = torch.rand(rays, 4).requires_grad_(True)
+    t = torch.arange(5.0).repeat(rays, 1)
     found = march.weigh(density, t, 0.0)
     (alone,) = torch.autograd.grad(found.through.sum(), density)
-    assert torch.allclose(alone, -found.through[:, None].expand(3, 4))
+    assert torch.allclose(alone, -found.through[:, None].expand(rays, 4))
     (alone,) = torch.autograd.grad(march.weigh(density, t, 0.0).weights.sum(), density)
-    assert torch.allclose(alone, found.through[:, None].expand(3, 4)), "what does not pass is what is seen"
+    assert torch.allclose(alone, found.through[:, None].expand(rays, 4)), "what does not pass is what is seen"
 
 
 @pytest.mark.parametrize("latents", [3, 64])
