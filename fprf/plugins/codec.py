@@ -4,6 +4,7 @@ Strict: duplicate keys, NaN, unknown keys and foreign formats are refused. Writt
 """
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -62,7 +63,10 @@ def packages_of(config: object) -> dict[str, str]:
 
 
 def read_json(path: Path, name: str = "a config.json") -> Any:
-    """Strict JSON: no duplicate keys, no NaN. Raises ConfigError, which asks for `name` where there is no such file."""
+    """Strict JSON: no duplicate keys, no NaN, no numbers beyond float64.
+
+    Raises ConfigError, which asks for `name` where there is no such file.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as fault:
@@ -70,7 +74,7 @@ def read_json(path: Path, name: str = "a config.json") -> Any:
     except UnicodeDecodeError as fault:
         raise ConfigError(f"{path}: is not UTF-8 text ({fault.reason} at byte {fault.start})") from fault
     try:
-        return json.loads(text, object_pairs_hook=_unique, parse_constant=_not_json)
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_not_json, parse_float=_number)
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
     except json.JSONDecodeError as fault:
@@ -107,6 +111,14 @@ def _unique(pairs: list[tuple[str, Any]]) -> Mapping[str, Any]:
             raise ConfigError(f"the key {key!r} stands twice in one object")
         found[key] = value
     return found
+
+
+def _number(text: str) -> float:
+    # Of a plug-in that is not installed nothing is known: its numbers are kept as they are, and must be written again.
+    value = float(text)
+    if not math.isfinite(value):
+        raise ConfigError(f"{text} is beyond the largest number of float64, 1.8e308")
+    return value
 
 
 def _not_json(constant: str) -> NoReturn:

@@ -1,5 +1,7 @@
 """Gradients along rays, compiled, against autograd in fp64: of weights, of what is kept, of composites."""
 
+import math
+
 import pytest
 import torch
 
@@ -65,6 +67,14 @@ def test_gradients_go_back_to_the_kept_samples(latents: int) -> None:
     assert torch.equal(got[1], torch.zeros(29 * 8, latents).index_copy(0, index, h))
     (alone,) = torch.autograd.grad((found.weight * g).sum(), weighed.weights, retain_graph=True)
     assert torch.equal(alone, got[0])
+
+
+def test_a_single_sample_gets_its_gradient() -> None:
+    density = torch.ones(1, 1, requires_grad=True)
+    weighed = march.weigh(density, torch.tensor([[0.0, 1.0]]), 0.0)
+    found = march.gather(weighed, torch.zeros(1, 1, 3), torch.zeros(1, 3), torch.zeros(1, 3))
+    (got,) = torch.autograd.grad(5 * found.weight.sum(), density)
+    assert got.item() == pytest.approx(5 * math.exp(-1), rel=1e-6)
 
 
 @pytest.mark.parametrize("width", [1, 3, 48])

@@ -172,6 +172,7 @@ def test_a_file_that_was_edited_wrongly_is_refused(
         (b"", "is not JSON: line 1, column 1"),
         (b'{"format": 1', "is not JSON"),
         (b'{"format": NaN}', "NaN is not a number that JSON knows"),
+        (b'{"format": 1, "config": {"x": -1e999}}', "-1e999 is beyond the largest number of float64"),
         (b'{"format": -Infinity}', "-Infinity is not a number"),
         (b'{"format": 1, "format": 1}', "the key 'format' stands twice"),
         (b"\xff\xfe", "is not UTF-8 text"),
