@@ -42,7 +42,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/ops/march_gradient_kernels.py": ("ops/test_march.py", "ops/test_march_gradients.py"),
     "fprf/ops/dense_kernels.py": ("ops/test_dense.py",),
     "fprf/ops/dense_gradients.py": ("ops/test_dense.py",),
-    "fprf/ops/guided_kernels.py": ("ops/test_guided.py",),
+    "fprf/ops/guided_kernels.py": ("datamanagers/test_features.py",),
     "fprf/ops/mixture_kernels.py": ("ops/test_mixture.py",),
     "fprf/ops/triplane_kernels.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
     "fprf/ops/tile.py": ("ops/test_dense.py",),

@@ -159,7 +159,7 @@ def close(found: Gradients, exact: Gradients) -> None:
         assert error.sum().abs() <= 1e-6 * b.abs().sum() + 1e-30
 
 
-@pytest.mark.parametrize("sizes", [(64, 64, 48), (7, 5), (12, 33, 20, 3), (48, 128, 3)])
+@pytest.mark.parametrize("sizes", [(64, 64, 48), (7, 5), (12, 33, 20, 3), (48, 128, 3), (200, 17)])
 @pytest.mark.parametrize("last", KINDS)
 @pytest.mark.parametrize("across", [0, 16, 3])
 @pytest.mark.parametrize("count", [1, BLOCK, 1000])

@@ -36,7 +36,7 @@ def affine_oracle(x: Tensor, share: Tensor, matrix: Tensor, bias: Tensor, centre
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 3), (5, 4), (16, 1), (16, 2), (33, 20)])
+@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 3), (5, 4), (16, 1), (16, 2), (33, 20), (72, 3), (100, 2)])
 @pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
 def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: int) -> None:
     x, centre = draw(count, channels) + 3, draw(channels, seed=1) + 3
@@ -48,7 +48,7 @@ def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: i
 
 
 @QUICK
-@given(st.integers(1, 60), st.integers(1, 5), st.integers(1, 40), st.integers(0, 99))
+@given(st.integers(1, 140), st.integers(1, 5), st.integers(1, 40), st.integers(0, 99))
 def test_any_affine_maps(channels: int, regions: int, count: int, seed: int) -> None:
     x, centre, bias = draw(count, channels, seed=seed), draw(channels, seed=seed + 1), draw(regions, channels, seed=seed + 2)
     matrix, share = draw(regions, channels, channels, seed=seed + 3), shares(count, regions, seed)
@@ -92,7 +92,7 @@ def test_other_types_and_no_points_take_the_plain_form() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 10), (5, 4), (16, 1)])
+@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 10), (5, 4), (16, 1), (72, 3)])
 @pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
 def test_gains_and_biases_stay_within_the_bound(channels: int, regions: int, count: int) -> None:
     x, centre, share = draw(count, channels) + 3, draw(channels, seed=1) + 3, shares(count, regions)
