@@ -45,7 +45,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/ops/guided_kernels.py": ("datamanagers/test_features.py",),
     "fprf/ops/mixture_kernels.py": ("ops/test_mixture.py",),
     "fprf/ops/triplane_kernels.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
-    "fprf/ops/tile.py": ("ops/test_dense.py",),
+    "fprf/ops/tile.py": ("ops/test_dense.py", "ops/test_mixture.py"),
     "fprf/ops/vector.py": ("ops/test_triplane.py", "ops/test_point_slopes.py", "ops/test_march.py"),
     "fprf/ops/rows.py": ("ops/test_dense.py", "ops/test_march.py"),
     "fprf/style/clusters.py": ("style/test_clusters.py",),

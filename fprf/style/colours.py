@@ -45,7 +45,7 @@ class ColourMaps(nn.Module):
     origin: Annotated[Tensor, "3"]
 
     def __init__(
-        self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float = 1.0
+        self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float
     ) -> None:
         super().__init__()
         units, self.softness = region_units(scene.keys, scene.semantic_mean)

@@ -51,12 +51,12 @@ def keep_luminance(
     """
     before = luma(styled)
     shift = share * (luma(own) - before)
-    moved, level = styled + shift, (before + shift).clamp(0, 1)
+    moved, level = styled + shift, before + shift
     tint = moved - level
     room = torch.where(tint > 0, 1 - level, level)
     fits = (room / tint.abs().clamp_min(torch.finfo(tint.dtype).tiny)).amin(-1, keepdim=True)
     leaves = ((moved < 0) | (moved > 1)).any(-1, keepdim=True)
-    return torch.where(leaves, level + fits.clamp(max=1) * tint, moved).clamp(0, 1)
+    return torch.where(leaves, level + fits * tint, moved).clamp(0, 1)  # rounding alone leaves the range now
 
 
 def allowed_references(

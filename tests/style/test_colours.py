@@ -1,5 +1,6 @@
 """Colours behind the decoder: targets met, nothing moved where nothing is asked, colours stay colours."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -116,7 +117,7 @@ def test_half_the_share_is_half_the_way() -> None:
     content, semantic, _, scene, d = setting()
     stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
     whole, half = (colour_maps(stylizer, d, scene, Straight(), share=s) for s in (1.0, 0.5))
-    assert whole is not None and half is not None
+    assert whole is not None and half is not None and whole.needs == Want.CONTENT | Want.SEMANTIC
     assert torch.allclose(half(content[:, :3], semantic), whole(content[:, :3], semantic) / 2, atol=1e-6)
 
 
@@ -131,13 +132,32 @@ def test_one_region_needs_no_semantics() -> None:
     assert torch.allclose(found.mean(0), points(7)[0][:, :3].mean(0), atol=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("own", "theirs", "gain", "error"),
+    [
+        (1e-4, 0.2, 3.0, 1e-5),  # would be a thousandfold: a flat region's noise must stay unseen
+        (1e-3, 3e-3, math.sqrt((9e-6 + 2e-4) / (1e-6 + 2e-4)), 2e-3),  # below four 8-bit steps nothing has a shape
+        (0.03, 0.06, math.sqrt((3.6e-3 + 2e-4) / (9e-4 + 2e-4)), 0.07),  # 512 draws know a deviation to 3 %
+    ],
+)
+def test_how_much_colours_are_spread_out(own: float, theirs: float, gain: float, error: float) -> None:
+    """One region whose colours deviate by `own` alike in all directions, a reference by `theirs`: the map is a multiple."""
+    noise = torch.randn(COUNT, 6, generator=torch.Generator().manual_seed(0))
+    noise = torch.linalg.qr(noise - noise.mean(0)).Q * COUNT**0.5
+    scene = scene_style(0.5 + own * noise, None, torch.ones(COUNT), None, 1, 0)
+    d = build_dictionary([Reference("r", noise, torch.zeros(COUNT, 0), colour=0.5 + theirs * noise[:, 3:])])
+    maps = colour_maps(IdentityConfig().build(dictionary=d, scene=scene), d, scene, Straight())
+    assert maps is not None
+    assert torch.linalg.svdvals(maps.matrix[0] + torch.eye(3)).tolist() == pytest.approx([gain] * 3, rel=error)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.0, 1.0))
 def test_colours_stay_colours_and_kept_regions_stay(seed: int, strength: float) -> None:
     draw = torch.Generator().manual_seed(seed)
     content, semantic, _, scene, d = setting()
     stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
-    wild = ColourMaps(scene, 3 * torch.randn(KINDS, 3, 3, generator=draw), torch.randn(KINDS, 3, generator=draw))
+    wild = ColourMaps(scene, 3 * torch.randn(KINDS, 3, 3, generator=draw), torch.randn(KINDS, 3, generator=draw), 1.0)
     weight = RegionWeight(scene, torch.tensor([[0.0], [1.0], [0.5]]))
     look = Restyle(stylizer, strength, weight, colours=wild)
     rgb = look.colour(Straight(), content, semantic)

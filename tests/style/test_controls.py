@@ -73,6 +73,18 @@ def test_hues_survive_where_there_is_room_and_fade_where_not() -> None:
     assert float(light.amax()) == pytest.approx(1.0)
 
 
+def test_a_channel_at_the_luma_of_black_is_a_colour() -> None:
+    """Its tint is 0 and so is its room: 0 / 0 must not reach the pixel."""
+    draw = torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0))
+    r, b = draw[:, 0], draw[:, 2]
+    weights = luma(torch.eye(3))[:, 0]
+    styled = torch.stack([r, (weights[0] * r + weights[2] * b) / (1 - weights[1]), b], 1)
+    exact = luma(styled)[:, 0] == styled[:, 1]
+    assert int(exact.sum()) > 100
+    found = keep_luminance(styled[exact], torch.zeros(int(exact.sum()), 3), 1.0)
+    assert torch.allclose(found, torch.zeros_like(found), atol=1e-6)
+
+
 def test_luminance_of_points_one_by_one_is_that_of_all_at_once() -> None:
     a, b, share = torch.rand(6, 3), torch.rand(6, 3), torch.rand(6, 1)
     whole = keep_luminance(a, b, share)
