@@ -234,6 +234,7 @@ def test_the_fused_form_is_for_float32_with_whole_vectors() -> None:
     assert not triplane_numba.usable(points.double(), table)
     assert not triplane_numba.usable(points, table.double())
     assert not triplane_numba.usable(points, table[:, :5])
+    assert not triplane_numba.usable(points, table.to("meta")) and not triplane_numba.usable(points.to("meta"), table)
     assert triplane.rows((3, 4)) == 75
 
 
