@@ -24,7 +24,7 @@ __all__ = ["Json", "image_names", "inside", "name_of", "read_bytes", "read_json"
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 
 _NPY_HEADER = re.compile(
-    r"\s*\{\s*'descr':\s*'([<>|=][fiu][1248])',\s*'fortran_order':\s*(True|False),"
+    r"\s*\{\s*'descr':\s*'([<>|=](?:f[248]|[iu][1248]))',\s*'fortran_order':\s*(True|False),"
     r"\s*'shape':\s*(\([0-9, ]*\)),?\s*\}\s*"
 )
 _MAX_ARRAY = 1 << 32
