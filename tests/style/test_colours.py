@@ -151,6 +151,15 @@ def test_how_much_colours_are_spread_out(own: float, theirs: float, gain: float,
     assert torch.linalg.svdvals(maps.matrix[0] + torch.eye(3)).tolist() == pytest.approx([gain] * 3, rel=error)
 
 
+def test_two_regions_need_semantics() -> None:
+    content, semantic, _ = points(0)
+    scene = scene_style(content, semantic, torch.ones(COUNT), None, 2, 0)
+    maps = ColourMaps(scene, torch.eye(3).expand(2, 3, 3), torch.tensor([[0.1, 0, 0], [0, 0, 0.1]]), 1.0)
+    assert maps.needs == Want.CONTENT | Want.SEMANTIC
+    change = maps(content[:, :3], semantic)
+    assert torch.allclose(change.sum(1), torch.full((COUNT,), 0.1), atol=1e-5) and float(change.std(0)[0]) > 0.01
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.0, 1.0))
 def test_colours_stay_colours_and_kept_regions_stay(seed: int, strength: float) -> None:
