@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..checks import at_least, positive
+from ..style.config import StyleConfig
 
 __all__ = ["BenchConfig", "MemoryConfig", "ParetoConfig", "ProfileConfig", "ScalingConfig", "SpeedConfig", "StressConfig"]
 
@@ -50,7 +51,7 @@ class SpeedConfig(BenchConfig):
 
     points: int = 65536
     """Points of the tri-plane lookup."""
-    clusters: int = 10
+    clusters: int = StyleConfig.clusters
     """Local styles per reference."""
 
     def __post_init__(self) -> None:
