@@ -41,7 +41,7 @@ ELSEWHERE = {
     "dictionary.load_dictionary": "a file",
     "files": "files",
     "look": "puts others together, in test_look",
-    "matching.full_precision": "a switch",
+    "precision.full_precision": "a switch",
     "references": "photographs, in test_references",
     "regional": "makes a stylizer, in test_regional",
     "scene.scene_style": "puts others together, in test_scene_style",

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from ..checks import at_least
 from ..errors import DataError
+from .precision import full_precision
 
 __all__ = ["apply", "coefficients", "upsample"]
 
@@ -88,9 +89,10 @@ def coefficients(
     channels = features.shape[0]
     result = torch.empty(len(y.keep), len(x.keep), channels, 4, device=features.device)
     group = max(1, GROUP // (4 * moments[0].numel()))
-    for first in range(0, channels, group):
-        part = features[first : first + group].float()
-        result[:, :, first : first + group] = _solve(part, mean, inverse, moments, colour, operators).permute(2, 3, 1, 0)
+    with full_precision(features):
+        for first in range(0, channels, group):
+            part = features[first : first + group].float()
+            result[:, :, first : first + group] = _solve(part, mean, inverse, moments, colour, operators).permute(2, 3, 1, 0)
     return result
 
 
@@ -109,7 +111,7 @@ def apply(
     share = (weight[0][:, :, None] * weight[1][:, None, :]).flatten(1)
     corners = coefs.reshape(rows * columns, channels, 4)[flat].float()
     colour = torch.cat([rgb.float(), torch.ones_like(rgb[:, :1], dtype=torch.float32)], 1)
-    with torch.autocast(coefs.device.type, enabled=False):
+    with full_precision(coefs):
         return torch.einsum("rkcl,rk,rl->rc", corners, share, colour)
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from .dense import usable
+from .precision import full_precision
 
 __all__ = ["affine", "affine_reference", "attention", "scaled", "scaled_reference"]
 
@@ -26,14 +27,15 @@ def affine_reference(
     centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
     """sum_k share_k ((x - centre) matrix_k + bias_k); maps that a point has no share in are not computed."""
-    x = x - centre
-    if len(matrix) == 1:
-        return x @ matrix[0] + bias[0]
-    out = share @ bias
-    for k in range(len(matrix)):
-        inside = share[:, k].nonzero().squeeze(1)
-        out.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
-    return out
+    with full_precision(x):
+        x = x - centre
+        if len(matrix) == 1:
+            return x @ matrix[0] + bias[0]
+        out = share @ bias
+        for k in range(len(matrix)):
+            inside = share[:, k].nonzero().squeeze(1)
+            out.index_add_(0, inside, (x[inside] * share[inside, k, None]) @ matrix[k])
+        return out
 
 
 def affine(
@@ -67,7 +69,8 @@ def scaled_reference(
     centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
     """(x - centre) (share gain) + share bias, channel by channel: the mixture's gains and biases."""
-    return (x - centre) * (share @ gain) + share @ bias
+    with full_precision(x):
+        return (x - centre) * (share @ gain) + share @ bias
 
 
 def scaled(

@@ -11,6 +11,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from ..ops.precision import full_precision
 from .statistics import double
 
 __all__ = ["limit_gain", "monge", "symmetric_root"]
@@ -21,9 +22,10 @@ _RIDGE = 1e-4
 
 def symmetric_root(c: Annotated[Tensor, "... C C"]) -> Annotated[Tensor, "... C C"]:
     """The symmetric positive root of symmetric matrices; negative eigenvalues (rounding) count as 0."""
-    value, vector = torch.linalg.eigh(c)
-    root: Tensor = (vector * value.clamp_min(0.0).sqrt()[..., None, :]) @ vector.mT
-    return root
+    with full_precision(c):
+        value, vector = torch.linalg.eigh(c)
+        root: Tensor = (vector * value.clamp_min(0.0).sqrt()[..., None, :]) @ vector.mT
+        return root
 
 
 def monge(
@@ -43,8 +45,9 @@ def monge(
 
 def limit_gain(t: Annotated[Tensor, "... C C"], gain: float) -> Annotated[Tensor, "... C C"]:
     """The symmetric positive map with no direction amplified more than `gain`; untouched, bit for bit, if none is."""
-    value, vector = torch.linalg.eigh(t)
-    capped = (vector * value.clamp(0.0, gain)[..., None, :]) @ vector.mT
+    with full_precision(t):
+        value, vector = torch.linalg.eigh(t)
+        capped = (vector * value.clamp(0.0, gain)[..., None, :]) @ vector.mT
     capped = (capped + capped.mT) / 2
     return torch.where((value[..., -1] > gain)[..., None, None], capped, t)
 

@@ -5,8 +5,8 @@ from typing import Annotated
 from torch import Tensor
 
 from ...interfaces import Stylizer
+from ...ops.precision import full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
-from ...style.matching import full_precision
 from ...style.scene import SceneStyle
 from ...style.statistics import deviation, double
 from ...types import Want

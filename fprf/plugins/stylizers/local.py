@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ...interfaces import Stylizer
 from ...ops import mixture
+from ...ops.precision import full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
-from ...style.matching import Similarity, compared, full_precision, point_shares, score_spread, share_mean
+from ...style.matching import Similarity, compared, point_shares, score_spread, share_mean
 from ...style.scene import SceneStyle, check_fit
 from ...style.statistics import deviation, double
 from ...types import Want

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from ...interfaces import Stylizer
 from ...ops import mixture
+from ...ops.precision import full_precision
 from ...style.alignment import Keys, Matching, match_keys
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
-from ...style.matching import full_precision
 from ...style.scene import SceneStyle, check_fit, membership, own_style, region_units
 from ...style.statistics import deviation, double
 from ...style.transport import monge
