@@ -1,6 +1,7 @@
 """Tri-plane lookup: the fused and the plain form against fp64 loops, at the documented bound, at production sizes."""
 
 import itertools
+import math
 from collections.abc import Sequence
 
 import numba
@@ -278,3 +279,13 @@ def test_gradients_of_densities_are_the_same_bits_with_any_threads(resolutions: 
         found, latent = density(points, table, resolutions, weight, 15.0)
         results.append(torch.autograd.grad(found.sum() + latent.square().sum(), (table, weight)))
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+@pytest.mark.parametrize("score", [-40.0, -2.0, 40.0])
+def test_gradients_neither_die_nor_explode_where_densities_are_cut_off(score: float) -> None:
+    """exp is differentiated as if its argument lay within +-15: planes of one, so that the features are one, too."""
+    table, weight = torch.ones(triplane.rows((4,)), 8), torch.full((8,), (score + 1) / 8)
+    weight.requires_grad_(True)
+    found, _ = triplane.density(torch.zeros(3, 3), table.requires_grad_(True), (4,), weight, 15.0)
+    (gradient,) = torch.autograd.grad(found.sum(), weight)
+    assert torch.allclose(gradient, torch.full((8,), 3 * math.exp(min(max(score, -15.0), 15.0))), rtol=1e-4)

@@ -76,6 +76,19 @@ def test_colours_get_mean_and_covariance_of_their_match() -> None:
         assert torch.allclose(torch.cov(own.T), d.colour_covariance[taken].double(), atol=0.2 * float(own.var(0).max()))
 
 
+@pytest.mark.parametrize("kinds", [2, 3])
+def test_each_region_goes_its_own_way(kinds: int) -> None:
+    content, semantic, _ = points(0)
+    scene = scene_style(content, semantic, torch.ones(COUNT), None, kinds, 0)
+    d = build_dictionary([reference(1)], clusters=KINDS, blend=0.0)
+    sharp = RegionToneConfig(temperature=1e-3, features=0.0).build(dictionary=d, scene=scene)
+    maps = colour_maps(sharp, d, scene, Straight(), features=0.0)
+    assert maps is not None and d.colour_mean is not None
+    moved = scene.region_mean[:, :3] + torch.einsum("kc,kcd->kd", scene.region_mean[:, :3], maps.matrix) + maps.bias
+    assert torch.allclose(moved, d.colour_mean[sharp.match(scene.keys).argmax(1)].float(), atol=2e-3)
+    assert len(sharp.match(scene.keys).argmax(1).unique()) > 1, "or nothing was told apart"
+
+
 def test_what_has_the_colours_already_is_left_alone() -> None:
     content, semantic, _, scene, _ = setting()
     stylizer = RegionToneConfig(temperature=1e-3).build(dictionary=own_style(scene, 0.0), scene=scene)

@@ -84,3 +84,8 @@ def test_the_cap_is_for_what_is_above_it() -> None:
     torch.testing.assert_close(found, torch.diag(torch.tensor([3.0, 3.0, 0.5, 0.0], dtype=torch.float64)))
     below = torch.diag(torch.tensor([3.0, 1.0, -1e-9], dtype=torch.float64))
     assert torch.equal(limit_gain(below, 3.0), below), "bit for bit where nothing is above"
+
+
+def test_an_eigenvalue_that_rounding_made_negative_is_none() -> None:
+    root = symmetric_root(torch.diag(torch.tensor([4.0, 1.0, -1e-12], dtype=torch.float64)))
+    torch.testing.assert_close(root, torch.diag(torch.tensor([2.0, 1.0, 0.0], dtype=torch.float64)))
