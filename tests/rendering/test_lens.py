@@ -7,7 +7,18 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.rendering.lens import OPENCV, PANORAMA, _brown, _brown_step, _powers, _radial_inverse, bend, lens_reach, unbend
+from fprf.rendering.lens import (
+    OPENCV,
+    PANORAMA,
+    PINHOLE,
+    _brown,
+    _brown_step,
+    _powers,
+    _radial_inverse,
+    bend,
+    lens_reach,
+    unbend,
+)
 
 QUICK = settings(max_examples=50, deadline=None)
 DOUBLE = torch.float64
@@ -78,3 +89,13 @@ def test_a_panorama_s_coordinates_are_angles() -> None:
     assert torch.allclose(directions[:3], torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=DOUBLE), atol=1e-15)
     found = bend(none, lens, reach, 7 * directions)[[0, 1, 3]]
     assert torch.allclose(found, angles[[0, 1, 3]], atol=1e-14)
+
+
+def test_panoramas_and_pinholes_side_by_side() -> None:
+    lens = torch.tensor([PANORAMA, PINHOLE, PANORAMA])
+    plane = torch.tensor([[0.3, 0.2], [0.3, 0.2], [-1.0, 0.5]], dtype=DOUBLE)
+    none = torch.zeros(3, 6, dtype=DOUBLE)
+    reach = lens_reach(none, lens)
+    together = unbend(none, lens, reach, plane)
+    alone = torch.cat([unbend(none[:1], lens[k : k + 1], reach[k : k + 1], plane[k : k + 1]) for k in range(3)])
+    assert torch.equal(together, alone) and not torch.allclose(together[0], together[1], atol=1e-3)

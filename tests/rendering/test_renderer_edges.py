@@ -126,3 +126,44 @@ def test_where_nothing_is_semantics_are_nothing() -> None:
     parts = toys.parts_of()._replace(field=toys.Uniform(0.0))
     found = render_rays(toys.rays_of("contraction", 4), parts, want=Want.SEMANTIC | Want.DENSITY, budget=0.0)
     assert found.semantic is not None and not found.semantic.any() and found.depth.isfinite().all()
+
+
+@torch.no_grad()
+def test_without_a_background_what_is_empty_is_black() -> None:
+    parts = toys.parts_of()._replace(field=toys.Uniform(0.0))
+    found = render_rays(toys.rays_of("contraction", 4), parts, want=Want.COLOUR, budget=0.0)
+    assert found.rgb is not None and torch.equal(found.rgb, torch.zeros(4, 3))
+
+
+class Silent(toys.Uniform):
+    """A field that must not be asked for its content."""
+
+    def content(self, latent: Tensor, view: Tensor) -> Tensor:
+        raise AssertionError("nobody wants it")
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("want", [Want.DENSITY, Want.SEMANTIC])
+def test_content_is_not_asked_for_where_nobody_wants_it(want: Want) -> None:
+    found = render_rays(toys.rays_of("contraction", 4), toys.parts_of()._replace(field=Silent(1.0)), want=want, budget=0.0)
+    assert found.rgb is None and found.content is None
+
+
+class Aided(toys.Squash):
+    """A decoder with a part that helps it: alone it answers half."""
+
+    def unaided(self, content: Tensor) -> Tensor:  # type: ignore[override]
+        return self(content) / 2
+
+
+def test_training_also_renders_what_the_decoder_says_alone() -> None:
+    parts, rays, behind = (
+        toys.parts_of()._replace(decoder=Aided()),
+        toys.rays_of("contraction", 4),
+        torch.tensor([0.2, 0.4, 0.6]),
+    )
+    found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, background=behind)
+    through = 1 - found.opacity[:, None]
+    assert found.rgb is not None and found.unaided is not None
+    assert torch.allclose(found.unaided - through * behind, (found.rgb - through * behind) / 2, atol=1e-5)
+    assert render_rays(rays, parts, want=Want.COLOUR, budget=0.0).unaided is None
