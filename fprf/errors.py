@@ -27,7 +27,13 @@ __all__ = [
 
 
 class FprfError(Exception):
-    """The root: its text is complete and meant for the user."""
+    """The root: its text is complete and meant for the user.
+
+    Names that come from files stand in it; what a terminal would not print of them (line breaks, escapes) is spelled out.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text))
 
 
 class UsageError(FprfError):
