@@ -4,6 +4,7 @@ import io
 import json
 import os
 import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -191,6 +192,28 @@ def test_an_archive_that_claims_too_much_is_not_unpacked(tmp_path: Path) -> None
     path.write_bytes(data[: head + 24] + struct.pack("<I", 0xFFFFFFF0) + data[head + 28 :])
     with pytest.raises(DataError):
         read_npz(path, "xyz")
+
+
+@pytest.mark.parametrize("field", [20, 24])
+def test_an_archive_that_claims_more_than_the_file_holds_takes_no_memory(tmp_path: Path, field: int) -> None:
+    """Packed and unpacked size stand in the directory at its end; a gigabyte is allowed for an array."""
+    path = tmp_path / "a.npz"
+    np.savez(path, xyz=np.arange(9.0))
+    data = path.read_bytes()
+    head = data.rfind(b"PK\x01\x02")
+    path.write_bytes(data[: head + field] + struct.pack("<I", 1 << 30) + data[head + field + 4 :])
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"claims .* bytes, but the file has 3"):
+            read_npz(path, "xyz")
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_what_deflates_well_is_read(tmp_path: Path) -> None:
+    np.savez_compressed(tmp_path / "a.npz", xyz=np.zeros((300_000, 3)))
+    assert read_npz(tmp_path / "a.npz", "xyz").shape == (300_000, 3)
 
 
 def test_records_fall_back_and_name_the_place() -> None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.datamanagers.images import MAX_PIXELS
 from fprf.datamanagers.parsers.config import ColmapConfig
 from fprf.errors import DataError
 from fprf.stress.fuzz import Target, fuzz, mutated
@@ -60,7 +61,9 @@ def test_mutations_are_read_or_refused_in_one_line(made: dict[str, Target], name
 def test_many_mutations(made: dict[str, Target], name: str) -> None:
     rounds = int(os.environ.get("FPRF_FUZZ", "2000"))
     found = fuzz(made[name], rounds, seed=random.SystemRandom().randrange(2**31), watch_memory=True)
-    assert not found.faults and found.memory < 64 << 20
+    # Images may have as many pixels as they say: four channels as they lie in the file, and once more as they are shown.
+    most = 8 * MAX_PIXELS if name.startswith("image, ") else 64 << 20
+    assert not found.faults and found.memory < most
 
 
 @settings(max_examples=100, deadline=None)

@@ -29,6 +29,8 @@ _NPY_HEADER = re.compile(
 )
 _MAX_ARRAY = 1 << 32
 """Bytes that an array inside an archive may unpack to."""
+_RATIO = 1032
+"""Times its size that deflated data may unpack to at most."""
 
 
 def read_bytes(path: Path) -> bytes:
@@ -135,6 +137,10 @@ def read_npz(path: Path, key: str) -> NDArray[np.float64]:
             entry = archive.getinfo(f"{key}.npy")
             if entry.file_size > _MAX_ARRAY:
                 raise DataError(f"{path}: {key} claims {entry.file_size} bytes; at most {_MAX_ARRAY} are read: thin it out")
+            # What is claimed is allocated before it is read.
+            held = path.stat().st_size
+            if entry.compress_size > held or entry.file_size > _RATIO * held:
+                raise DataError(f"{path}: {key} claims {entry.file_size} bytes, but the file has {held}; copy it again")
             data = archive.read(entry)
     except KeyError as error:
         raise DataError(f"{path}: no array {key!r} in it; write it with numpy.savez(..., {key}=...)") from error
