@@ -7,7 +7,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..output.figures import number
 from ..output.images import Picture
 from ..output.maps import palette
 from .front import Point
@@ -106,7 +105,7 @@ def _frame(image: Picture, panel: Panel, across: _Axis, up: _Axis) -> None:
     for value in ticks(across.low, across.high, log=True):
         x = across.at(value)
         cv2.line(image, (x, TOP), (x, HEIGHT - BOTTOM), FAINT, 1)
-        _text(image, number(value), (x, HEIGHT - BOTTOM + 20), centred=True)
+        _text(image, f"{value:g}", (x, HEIGHT - BOTTOM + 20), centred=True)
     for value in ticks(up.low, up.high, log=panel.log):
         y = up.at(value)
         cv2.line(image, (LEFT, y), (WIDTH - RIGHT, y), FAINT, 1)
