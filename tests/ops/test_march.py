@@ -166,9 +166,8 @@ def test_nothing_is_kept_where_nothing_is() -> None:
 @torch.no_grad()
 def test_of_no_samples_nothing_is_seen() -> None:
     weighed = march.weigh(torch.zeros(3, 0), torch.ones(3, 1), 0.0)
-    assert weighed.weights.shape == weighed.keep.shape == (3, 0) and torch.equal(
-        weighed.start, torch.zeros(4, dtype=torch.int64)
-    )
+    assert weighed.weights.shape == weighed.keep.shape == (3, 0)
+    assert torch.equal(weighed.start, torch.zeros(4, dtype=torch.int64))
     assert torch.equal(weighed.opacity, torch.zeros(3)) and torch.equal(weighed.depth, torch.zeros(3))
     assert torch.equal(weighed.through, torch.ones(3))
 

@@ -157,11 +157,8 @@ class Aided(toys.Squash):
 
 
 def test_training_also_renders_what_the_decoder_says_alone() -> None:
-    parts, rays, behind = (
-        toys.parts_of()._replace(decoder=Aided()),
-        toys.rays_of("contraction", 4),
-        torch.tensor([0.2, 0.4, 0.6]),
-    )
+    parts, rays = toys.parts_of()._replace(decoder=Aided()), toys.rays_of("contraction", 4)
+    behind = torch.tensor([0.2, 0.4, 0.6])
     found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, background=behind)
     through = 1 - found.opacity[:, None]
     assert found.rgb is not None and found.unaided is not None

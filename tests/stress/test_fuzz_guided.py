@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def script() -> ModuleType:
     spec = importlib.util.spec_from_file_location("fuzz_guided", Path(__file__).parents[2] / "benchmarks" / "fuzz_guided.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
