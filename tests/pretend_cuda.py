@@ -4,8 +4,8 @@
         train(..., device="cuda:0")
     print(seen.syncs)      # what would have made the host wait, by operator
 
-Mixing devices raises, `.numpy()` raises, `.item()`/`nonzero`/copies to the host work and are counted. Real values flow, so whole
-training runs, renders and restyles can be driven through it, and compared with the CPU bit for bit. Works with a CPU-only torch.
+Mixing devices raises, `.numpy()` raises, `.item()`, `nonzero` and copies to the host work and are counted. Real values flow,
+so whole training runs, renders and restyles can be driven through it and compared with the CPU. Works with a CPU-only torch.
 
 Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda" alone.
 What it cannot show: memory, streams, kernels' own faults (Triton: run the same path under TRITON_INTERPRET=1 on `.inner`).
