@@ -1,14 +1,12 @@
 """Methods: functions that return a complete config. Each says only how it differs from the one it starts from."""
 
-from dataclasses import replace
-
 from .config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, TrainConfig
 from .datamanagers.config import RayBatchesConfig
 from .fields.config import PlanesConfig, SemanticPlanesConfig
 from .plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from .plugins.samplers.config import ProposalConfig
 
-__all__ = ["fprf", "fprf_fast", "fprf_lite"]
+__all__ = ["fprf", "fprf_lite"]
 
 
 def fprf() -> TrainConfig:
@@ -16,38 +14,21 @@ def fprf() -> TrainConfig:
     return TrainConfig(render=RenderConfig(train_budget=0.0))
 
 
-def fprf_fast() -> TrainConfig:
-    """The paper's encoders on leaner fields: fewer samples and channels, semantics on coarse planes and a few rays."""
-    return replace(
-        fprf(),
-        steps=15_000,
-        sampler=_LEAN_SAMPLER,
-        content=ContentConfig(field=PlanesConfig(channels=16, hidden=128)),
-        semantic=replace(SemanticConfig(), field=_LEAN_SEMANTICS, samples=2),
-        datamanager=RayBatchesConfig(semantic_share=0.25),
-        optimizer=_QUICK,
-        render=RenderConfig(),
-    )
-
-
 def fprf_lite() -> TrainConfig:
     """Bundled encoders, no download, made for a CPU: `fprf demo` trains it."""
-    return replace(
-        fprf_fast(),
+    return TrainConfig(
         steps=12_000,
         datamanager=RayBatchesConfig(rays=2048, semantic_share=0.25),
         sampler=ProposalConfig(samples=(48,), final=14, resolutions=(128,), anneal_steps=500),
         content=ContentConfig(encoder=BundledContentConfig(), field=_LITE_PLANES, moves_density=False),
         semantic=SemanticConfig(encoder=BundledSemanticConfig(), field=_LEAN_SEMANTICS, dim=32, samples=2),
         # At twice this rate fox diverged after 450 steps (24.8 -> 17.7 dB); it must fall with the steps, not the minutes.
-        optimizer=replace(_QUICK, hold=500),
+        optimizer=OptimizerConfig(rate=1e-2, final=0.05, warm_up=100, hold=500),
         # Strong smoothing: few rays and steps must not leave floaters before cameras (fox, one minute: 21.5 -> 27.1 dB). With
         # more of it, or planes that end at 256, pictures stay blurred however long one trains (fox: 27 -> 29.7 dB).
         loss=LossConfig(content=3e-3, variation=5e-4, proposal_variation=1e-3, distortion=1e-2, penalty_every=8),
     )
 
 
-_LEAN_SAMPLER = ProposalConfig(samples=(48,), final=16, resolutions=(128,), anneal_steps=500)
 _LEAN_SEMANTICS = SemanticPlanesConfig(resolutions=(32, 128), channels=16, hidden=64, layers=1)
-_QUICK = OptimizerConfig(rate=1e-2, final=0.05, warm_up=100)
 _LITE_PLANES = PlanesConfig(channels=16, hidden=64, layers=1)

@@ -6,7 +6,7 @@ from fprf.commands.parsing import load_method
 from fprf.config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig
-from fprf.methods import fprf, fprf_fast, fprf_lite
+from fprf.methods import fprf, fprf_lite
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, DinoConfig, Vgg19Config
 from fprf.plugins.samplers.config import ProposalConfig
 
@@ -26,14 +26,14 @@ def test_lite_downloads_nothing() -> None:
 
 
 def test_methods_are_functions_of_nothing_and_differ() -> None:
-    made = [fprf(), fprf_fast(), fprf_lite()]
-    assert made == [fprf(), fprf_fast(), fprf_lite()]
+    made = [fprf(), fprf_lite()]
+    assert made == [fprf(), fprf_lite()]
     assert all(a != b for i, a in enumerate(made) for b in made[:i])
-    assert [load_method(name)[0] for name in ("fprf", "fprf-fast", "fprf-lite")] == made
+    assert [load_method(name)[0] for name in ("fprf", "fprf-lite")] == made
 
 
 def test_each_method_says_what_it_is_for() -> None:
-    for method in (fprf, fprf_fast, fprf_lite):
+    for method in (fprf, fprf_lite):
         assert (method.__doc__ or "").strip().endswith(("samples.", "rays.", "it."))
 
 

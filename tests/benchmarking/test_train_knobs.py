@@ -10,11 +10,11 @@ from fprf.benchmarking.subject import find, small_view
 from fprf.benchmarking.timing import Watch
 from fprf.benchmarking.train_knobs import VARIANTS, trained_points, variants
 from fprf.datamanagers.config import DataManagerConfig
-from fprf.methods import fprf, fprf_fast, fprf_lite
+from fprf.methods import fprf, fprf_lite
 from fprf.plugins.samplers.config import UniformConfig
 
 
-@pytest.mark.parametrize("method", [fprf, fprf_fast, fprf_lite])
+@pytest.mark.parametrize("method", [fprf, fprf_lite])
 def test_each_variant_of_a_method_changes_one_knob(method: object) -> None:
     assert callable(method)
     config = method()

@@ -20,7 +20,7 @@ def known() -> dict[str, Offer]:
 
 def test_every_verb_has_its_flags(known: dict[str, Offer]) -> None:
     assert known.keys() == cli.VERBS.keys()
-    assert {"fprf", "fprf-fast", "fprf-lite"} <= set(known["train"].words)
+    assert {"fprf", "fprf-lite"} <= set(known["train"].words)
     assert {"--data", "--steps", "--sampler", "--content.field.resolutions", "--help"} <= set(known["train"].flags)
     assert {"--references", "--strength", "--keep-below", "--stylizer", "--quality"} <= set(known["stylize"].flags)
     for verb in ("render", "export", "gallery", "process", "report", "eval", "demo", "doctor", "bench", "pretrain"):

@@ -156,7 +156,7 @@ def test_methods_by_name_and_by_file(tmp_path: Path) -> None:
     with pytest.raises(PluginError, match="did you mean 'fprf-lite'"):
         load_method("fprf-litee")
     listed = dict(methods())
-    assert listed["fprf"].startswith("The paper's sizes") and {"fprf", "fprf-fast", "fprf-lite"} <= listed.keys()
+    assert listed["fprf"].startswith("The paper's sizes") and {"fprf", "fprf-lite"} <= listed.keys()
 
 
 @pytest.mark.parametrize(

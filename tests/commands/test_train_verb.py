@@ -98,7 +98,7 @@ def test_mistakes_in_the_data(capsys: pytest.CaptureFixture[str], tmp_path: Path
 def test_usage_lists_the_methods(capsys: pytest.CaptureFixture[str]) -> None:
     assert (cli.main(["train"]), cli.main(["train", "--help"])) == (2, 0)
     text = capsys.readouterr().out
-    assert text.count("usage: fprf train METHOD|CONFIG.json") == 2 and "fprf-lite" in text and "fprf-fast" in text
+    assert text.count("usage: fprf train METHOD|CONFIG.json") == 2 and "fprf-lite" in text
 
 
 def test_an_interrupt_is_130_and_the_run_goes_on(

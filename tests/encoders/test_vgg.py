@@ -183,7 +183,7 @@ def test_a_layer_beyond_the_file_names_those_it_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("kind", "file"), [(Vgg16Config, "vgg16-397923af.pth"), (Vgg19Config, "vgg19-dcbb9e9d.pth")])
 def test_absent_weights_say_what_to_put_where(tmp_path: Path, kind: type[Vgg19Config], file: str) -> None:
     with pytest.raises(WeightsError) as raised:
-        kind().build()
+        kind(layer="relu3_1").build()
     for part in (f"https://download.pytorch.org/models/{file}", file[6:14], ".cache/fprf/weights", "--content.en"):
         assert part in str(raised.value)
     assert not list((tmp_path / "home/.cache/fprf/weights").iterdir())
@@ -192,7 +192,7 @@ def test_absent_weights_say_what_to_put_where(tmp_path: Path, kind: type[Vgg19Co
 def test_a_download_of_another_hash_is_refused_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weight_sources.urllib.request, "urlopen", lambda *_, **__: io.BytesIO(b"not the weights"))
     with pytest.raises(WeightsError, match="promises dcbb9e9d"):
-        Vgg19Config().build()
+        Vgg19Config(layer="relu3_1").build()
     assert not list((tmp_path / "home/.cache/fprf/weights").iterdir())
 
 
@@ -207,7 +207,8 @@ def test_a_download_is_kept_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(weight_sources.urllib.request, "urlopen", serve)
     monkeypatch.setattr(weight_sources, "_expected", lambda _: None)
-    assert Vgg19Config().build().identity == Vgg19Config().build().identity
+    config = Vgg19Config(layer="relu3_1")
+    assert config.build().identity == config.build().identity
     assert calls == [SOURCES["vgg19"].origin]
     assert [file.name for file in (tmp_path / "home/.cache/fprf/weights").iterdir()] == [SOURCES["vgg19"].file]
 
@@ -275,3 +276,15 @@ def test_the_towns_means_are_nearly_those_of_photographs(shared: Path, tmp_path:
     ratio = (Vgg19Config(weights=tmp_path / "bare.safetensors").build().get_buffer("scale") / stated).log()
     assert float(ratio.std()) < 0.3
     assert float(ratio.abs().max()) < math.log(4)
+
+
+def test_vgg19_ships_up_to_relu2_1(shared: Path) -> None:
+    """The same features as those of the full file, and no download: the network is refused here."""
+    full = shared / "weights/vgg19_imagenet.safetensors"
+    image = torch.rand(1, 3, 20, 18)
+    for layer in ("relu1_1", "conv1_2", "relu2_1"):
+        found, expected = Vgg19Config(layer=layer).build(), Vgg19Config(layer=layer, weights=full).build()
+        assert found.identity == expected.identity
+        assert torch.equal(found(image), expected(image))
+    with pytest.raises(WeightsError, match="cannot be downloaded"):
+        Vgg19Config(layer="relu2_2").build()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fprf import __version__
 from fprf.errors import ConfigError, PluginError
-from fprf.methods import fprf, fprf_fast, fprf_lite
+from fprf.methods import fprf, fprf_lite
 from fprf.plugins import registry
 from fprf.plugins.codec import Missing, from_json, load_config, save_config, to_json
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
@@ -116,7 +116,7 @@ def test_what_json_cannot_hold_is_not_saved() -> None:
             to_json(bad)
 
 
-@pytest.mark.parametrize("method", [fprf, fprf_fast, fprf_lite])
+@pytest.mark.parametrize("method", [fprf, fprf_lite])
 def test_a_file_gives_back_config_and_method(tmp_path: Path, method: Callable[[], Any]) -> None:
     path = tmp_path / "config.json"
     save_config(path, method(), "some-method")

@@ -91,13 +91,14 @@ class Vgg16Config(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class Vgg19Config(EncoderConfig):
-    """VGG-19 of ImageNet, the paper's content encoder. torchvision's weights are downloaded once, unless named."""
+    """VGG-19 of ImageNet, the paper's content encoder. Ships up to relu2_1; torchvision's weights are downloaded for more."""
 
     layer: str = "relu2_1"
     """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
     weights: Path | None = None
     """torchvision's vgg19-dcbb9e9d.pth, Caffe's vgg19-d01eb7cb.pth, AdaIN's vgg_normalised.pth, or a safetensors file with
-    torchvision's keys. By default the download cache."""
+    torchvision's keys. By default the file that ships up to relu2_1 (the original weights, for which decoders ship), beyond it
+    the download cache."""
     normalise: bool = True
     """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
 

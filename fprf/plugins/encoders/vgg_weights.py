@@ -1,4 +1,7 @@
-"""VGG's weights as the various files hold them: torchvision's, Caffe's and Keras's, and the normalised ones of AdaIN."""
+"""VGG's weights as the various files hold them: torchvision's, Caffe's and Keras's, and the normalised ones of AdaIN.
+
+VGG-19 up to relu2_1, the paper's content encoder, ships with the package.
+"""
 
 import re
 from collections.abc import Mapping
@@ -24,6 +27,9 @@ CAFFE_FILES = r"vgg16-00b39a1b\.pth|vgg19-d01eb7cb\.pth"
 """The original networks under torchvision's names: BGR from 0 to 255 less the mean, which these files do not say."""
 RAREST = 0.05
 """Mean activation of the rarest filters, as a share of the mean over all: on photographs none of VGG-19 is below that."""
+BUNDLED = Path(__file__).parent / "weights" / "vgg19-relu2_1.safetensors"
+"""VGG-19's conv1_1, conv1_2 and conv2_1 (CC BY 4.0, Simonyan and Zisserman), which decoders ship for."""
+BUNDLED_LAYERS = ("1_1", "1_2", "2_1")
 CAFFE_MEAN = (123.68 / 255, 116.779 / 255, 103.939 / 255)
 
 
@@ -43,7 +49,9 @@ def build_vgg16(layer: str, *, weights: Path | None, normalise: bool) -> VggEnco
 
 
 def build_vgg19(layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
-    """The encoder from a file, the cache or the download. Raises WeightsError where none of them serves."""
+    """The encoder from a file, the package, the cache or the download. Raises WeightsError where none of them serves."""
+    if weights is None and layer[4:] in BUNDLED_LAYERS:
+        weights = BUNDLED
     return _build("vgg19", layer, weights=weights, normalise=normalise)
 
 

@@ -71,7 +71,7 @@ def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
     except ImportError as error:
         raise WeightsError(
             f"{family}: needs the package transformers ({error}); pip install 'fprf[encoders]', "
-            "or choose an encoder that ships: bundled-semantic, bundled-content"
+            "or choose one that ships: --semantic.encoder bundled-semantic"
         ) from error
     verbosity = logging.get_verbosity()
     logging.set_verbosity_error()  # else it lists the blocks that are left out
@@ -86,7 +86,8 @@ def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
         reason = str(error).strip().splitlines()[0]
         raise WeightsError(
             f"{family}: {name} cannot be loaded ({reason}); with a network run `hf download {name}` once, "
-            "or put config.json and model.safetensors into a folder and name it with --semantic.encoder.model FOLDER"
+            "or name a folder with its config.json and model.safetensors by --semantic.encoder.model FOLDER, "
+            "or choose an encoder that ships: --semantic.encoder bundled-semantic"
         ) from error
     finally:
         logging.set_verbosity(verbosity)
