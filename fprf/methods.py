@@ -3,6 +3,7 @@
 from .config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, TrainConfig
 from .datamanagers.config import RayBatchesConfig
 from .fields.config import PlanesConfig, SemanticPlanesConfig
+from .plugins.decoders.config import MlpDecoderConfig
 from .plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from .plugins.samplers.config import ProposalConfig
 
@@ -11,7 +12,8 @@ __all__ = ["fprf", "fprf_lite"]
 
 def fprf() -> TrainConfig:
     """The paper's sizes: VGG-19 relu2_1 content, DINO semantics, tri-planes 64 to 512, 256 + 128 + 48 samples."""
-    return TrainConfig(render=RenderConfig(train_budget=0.0))
+    content = ContentConfig(decoder=MlpDecoderConfig(objective="paper"))
+    return TrainConfig(content=content, render=RenderConfig(train_budget=0.0))
 
 
 def fprf_lite() -> TrainConfig:

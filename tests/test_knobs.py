@@ -61,6 +61,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "content.field.degree": (2, "model"),
     "content.encoder.weights": (Path("w.safetensors"), "file"),
     "content.decoder.weights": (Path("w.safetensors"), "file"),
+    "content.decoder.objective": ("paper", "model"),
     "semantic.encoder.weights": (Path("w.safetensors"), "file"),
     "semantic.field.resolutions": ((8, 16), "model"),
     "semantic.field.channels": (24, "model"),

@@ -72,7 +72,7 @@ def _paper(args: list[str]) -> int:
     from ..evidence.provenance import provenance
 
     with Display() as display:
-        document = paper(config, load_method(config.method)[0], display.count)
+        document = paper(config, *load_method(config.method), display.count)
     document["provenance"] = provenance(config.device)
     page = paper_page(document)
     print(page)

@@ -97,10 +97,12 @@ class PaperConfig(EvidenceConfig):
     """Run folder of a town, for the tables that train nothing but one scene; none = that one is trained first."""
     data: Path = Path("town")
     """Scene folder; the embedded town is also restyled, and judged by its truth."""
+    references: tuple[Path, ...] = ()
+    """Photographs that another scene is restyled by, judged by structure and by VGG-19's statistics; none = not restyled."""
     downscale: int = 1
     """Images at 1/downscale of their size."""
     method: str = "fprf-lite"
-    """Method that is changed."""
+    """Method that is changed: its name, or the config.json of a run."""
     steps: int = 400
     """Steps of each training."""
     trainings: tuple[int, ...] = (0,)

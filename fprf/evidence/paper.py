@@ -28,7 +28,7 @@ from ..evaluation.metrics import image_metrics, mean_metrics
 from ..plugins.decoders.config import ResidualDecoderConfig
 from ..plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from .config import PaperConfig
-from .paper_styles import Bench, restyled, set_up, style_rows
+from .paper_styles import Bench, restyled, set_up, style_rows, styled_by_photographs
 from .scene_decoder import SceneDecoderConfig
 from .scores import Row, mean_rows
 from .stage import town_folder
@@ -86,8 +86,8 @@ class Short(NamedTuple):
     seconds: float
 
 
-def paper(config: PaperConfig, method: TrainConfig, progress: Progress) -> dict[str, Any]:
-    """The document of one table; `method` is the config that `config.method` names."""
+def paper(config: PaperConfig, method: TrainConfig, name: str, progress: Progress) -> dict[str, Any]:
+    """The document of one table; `method` is the config that `config.method` stands for, `name` that of its method."""
     base = replace(method, data=config.data, downscale=config.downscale, device=config.device)
     base = replace(base, steps=config.steps, minutes=None, output=None)
     steps = config.steps
@@ -103,7 +103,8 @@ def paper(config: PaperConfig, method: TrainConfig, progress: Progress) -> dict[
         "table": config.table,
         "settings": {
             "data": config.data.name,
-            "method": config.method,
+            "method": name,
+            "references": [path.stem for path in config.references],
             "steps": steps,
             "trainings": list(config.trainings),
             "views": config.views,
@@ -145,6 +146,8 @@ def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progr
             rows[name] = _held_out(short.trained, config.views) | {"train_seconds": short.seconds}
             if town_folder(short.trained) is not None:
                 rows[name] |= _styled(set_up(short.trained, short.encoders, config, folder / f"references-{k}"))
+            elif config.references:
+                rows[name] |= styled_by_photographs(short.trained, short.encoders, config)
         return rows
     short = short_training(base, folder / "run", progress) if config.run is None else _finished(config.run, config.device)
     if town_folder(short.trained) is None:

@@ -14,11 +14,13 @@ COLUMNS: tuple[Column, ...] = (
     ("styled_psnr", "styled PSNR dB", ".2f"),
     ("styled_ssim", "styled SSIM", ".3f"),
     ("styled_delta_e", "styled ΔE2000", ".1f"),
+    ("style_distance", "style distance", ".3f"),
     ("structure", "structure", ".3f"),
     ("match_inside", "match inside", ".1%"),
     ("match_border", "match at borders", ".1%"),
     ("paper_styled_psnr", "local-adain PSNR dB", ".2f"),
     ("paper_styled_delta_e", "local-adain ΔE2000", ".1f"),
+    ("paper_style_distance", "local-adain style distance", ".3f"),
     ("paper_structure", "local-adain structure", ".3f"),
     ("consistency", "consistency", ".3f"),
     ("warp_short", "error to the next frame", ".3f"),
@@ -39,6 +41,10 @@ _ABOUT = {
     "restyled alone, and the scene restyled once.",
 }
 _KEPT = " *Structure*: of the unstylised render, 1 = all of it."
+_DISTANCE = (
+    " *Style distance*: of VGG-19's relu1_1 and relu2_1 statistics in regions that the run's semantic encoder finds in both, "
+    "0 = the references' own, 1 = no change."
+)
 _STEADY = " *Consistency*: what a style adds to the error between frames, and loses in sharpness; 0 is best."
 
 
@@ -49,6 +55,8 @@ def paper_page(document: Mapping[str, Any]) -> str:
     seeds = ", ".join(map(str, settings["trainings"]))
     styled = any("styled_psnr" in row for row in rows.values())
     how = f" *Styled*: against the truth of the palettes {', '.join(settings['palettes'])}.{_KEPT}" if styled else ""
+    if settings.get("references"):
+        how += f" Restyled by {', '.join(settings['references'])}.{_DISTANCE}{_KEPT}"
     how += _STEADY if any("consistency" in row for row in rows.values()) else ""
     return (
         f"# {document['table'].capitalize()}\n\n{_ABOUT[document['table']]}{how}\n\n"

@@ -12,14 +12,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..datamanagers.images import load_image
 from ..engine.cached_view import CachedView
 from ..engine.loading import Trained
-from ..engine.restyle import Encoders
+from ..engine.restyle import Encoders, apply_style
+from ..evaluation.contest import PLAIN, Exhibit, judge_exhibit
+from ..evaluation.looks import render_looks
+from ..evaluation.matched_regions import matched_regions
 from ..evaluation.steadiness import steadiness
 from ..evaluation.structure import structure
-from ..output.images import to_uint8, write_image
+from ..output.images import shrink, to_uint8, write_image
+from ..plugins.encoders.config import Vgg19Config
 from ..plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from ..style.config import StyleConfig
 from ..style.dictionary import StyleDictionary
+from ..style.files import StyleFile
+from ..style.look import Restyle
 from ..style.scene import scene_style
 from .cells import cell_dictionary
 from .codes import code_classes, match_rates, winners
@@ -29,7 +37,7 @@ from .references import Reference, photograph, places
 from .scores import Row, mean_rows, score
 from .stage import Stage, set_stage, true_views
 
-__all__ = ["ONE_TRAINING", "Bench", "restyled", "set_up", "style_rows"]
+__all__ = ["ONE_TRAINING", "Bench", "restyled", "set_up", "style_rows", "styled_by_photographs"]
 
 SEEDS = (7, 11, 13)
 """Towns of the references."""
@@ -37,6 +45,8 @@ _FRAMES = 8
 """Of the path, where consistency is asked for: enough for a pair seven apart."""
 _STRIDE = 4.0
 """Longer steps of the path in which places are seen from far apart."""
+_REGIONS = 6
+"""Regions that views and photographs are compared in, where nobody knows the true ones."""
 _SIDE = 11
 """Smaller pictures have no structure that could be judged."""
 
@@ -84,6 +94,30 @@ def style_rows(bench: Bench) -> dict[str, Row]:
 def restyled(bench: Bench, stylizer: StylizerConfig, references: str = "three", clusters: int | None = None) -> Row:
     """Figures of a style, means over the palettes; `clusters` None = the usual number."""
     return _row(bench, _cases(bench, references, clusters), _inside(bench, stylizer))
+
+
+def styled_by_photographs(trained: Trained, encoders: Encoders, config: PaperConfig) -> Row:
+    """Figures of `region-tone`, and as `paper_*` of `local-adain`, where no truth is known: how near views come to the
+    photographs of `config.references` in VGG-19's relu1_1 and relu2_1, and how much of their structure they keep.
+    """
+    paths = config.references
+    stylizers: Settings = {"": RegionToneConfig(), "paper_": LocalAdainConfig()}
+    looks: dict[str, Restyle | None] = {PLAIN: None}
+    for name, stylizer in stylizers.items():
+        style = StyleConfig(references=paths, stylizer=stylizer, clusters=config.codes, blend=config.blend)
+        looks[name] = apply_style(trained, StyleFile(style), encoders).restyle
+    known, render = trained.known, trained.config.render
+    views = (known.test or known.train)[: config.views]
+    shown = [render_looks(trained.model, known.facts, known.cameras, view, render, looks)[0] for view in views]
+    plain = [pictures[PLAIN] for pictures in shown]
+    side = max(plain[0].shape[:2])
+    images = [torch.from_numpy(shrink(load_image(path), side)).float() / 255 for path in paths]
+    observer = encoders.semantic if encoders.semantic is not None else encoders.content
+    here, there = matched_regions(observer.cpu(), plain, images, regions=_REGIONS, seed=0)
+    styled = {name: [pictures[name] for pictures in shown] for name in stylizers}
+    judges = {layer: Vgg19Config(layer=layer).build() for layer in ("relu1_1", "relu2_1")}
+    rows = judge_exhibit(Exhibit(plain, styled, here, images, there), judges)
+    return {f"{name}{key}": rows[name][key] for name in stylizers for key in ("style_distance", "structure")}
 
 
 def _clusters(bench: Bench) -> dict[str, Row]:

@@ -72,6 +72,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
     metadata = {
         "kind": DECODER_KIND,
         "encoder": encoder.identity,
+        "objective": "identity" if config.content == config.style == 0 else "paper",
         "made_by": f"fprf pretrain decoder, {steps} steps on {len(photos)} photographs, seed {config.seed}",
         "licence": "Apache-2.0; trained by this project",
     }

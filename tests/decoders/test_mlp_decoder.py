@@ -1,6 +1,7 @@
 """D_VGG: the formula, and never with another encoder's features."""
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -9,9 +10,9 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 
 from fprf.errors import WeightsError
-from fprf.plugins.decoders.config import MlpDecoderConfig
+from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
 from fprf.plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder
-from fprf.plugins.encoders.config import BundledContentConfig, Vgg19Config
+from fprf.plugins.encoders.config import BundledContentConfig, EncoderConfig, Vgg19Config
 from fprf.plugins.weightfiles import write_weights
 
 
@@ -60,16 +61,21 @@ def test_no_shipped_decoder_names_those_that_ship() -> None:
         MlpDecoderConfig().build(encoder="dinov2:dinov2-small:block12:stride8:0", channels=384)
 
 
-def test_the_bundled_encoder_has_its_decoder() -> None:
-    encoder = BundledContentConfig().build()
-    decoder = MlpDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels)
-    assert decoder(torch.zeros(2, encoder.channels)).shape == (2, 3)
+@pytest.mark.parametrize("config", [BundledContentConfig(), Vgg19Config()])
+def test_encoders_that_ship_have_a_decoder_of_each_objective(config: EncoderConfig) -> None:
+    encoder = config.build()
+    name, channels = encoder.identity, encoder.channels
+    made = [MlpDecoderConfig(objective=objective).build(encoder=name, channels=channels) for objective in get_args(Objective)]
+    content = torch.randn(2, channels)
+    identity, paper = (decoder(content) for decoder in made)
+    assert identity.shape == paper.shape == (2, 3) and not torch.equal(identity, paper)
 
 
-def test_colours_survive_encoding_and_decoding() -> None:
+@pytest.mark.parametrize("objective", get_args(Objective))
+def test_colours_survive_encoding_and_decoding(objective: Objective) -> None:
     """Flat colours and a ramp through the shipped pair: mean error below a tenth."""
     encoder = BundledContentConfig().build()
-    decoder = MlpDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels)
+    decoder = MlpDecoderConfig(objective=objective).build(encoder=encoder.identity, channels=encoder.channels)
     ramp = torch.linspace(0.15, 0.85, 64)
     for tint in ((1.0, 1.0, 1.0), (1.0, 0.8, 0.6), (0.6, 0.8, 1.0)):
         image = (ramp.view(1, 1, 1, -1) * torch.tensor(tint).view(1, 3, 1, 1)).expand(1, 3, 48, 64)

@@ -92,7 +92,7 @@ def test_rows_are_means_over_trainings(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("fprf.evidence.paper._table", table)
     config = PaperConfig(trainings=(0, 1, 5), steps=7, downscale=2, data=Path("fox"), device="cpu")
-    document = paper(config, replace(fprf_lite(), minutes=3.0), lambda done, total, what: None)
+    document = paper(config, replace(fprf_lite(), minutes=3.0), "fprf-lite", lambda done, total, what: None)
     assert document["rows"] == {"a": {"psnr": 22.0, "match_inside": 0.5}}
     assert [base.seed for base in seen] == [0, 1, 5]
     assert {(base.steps, base.minutes, base.downscale, base.data) for base in seen} == {(7, None, 2, Path("fox"))}

@@ -1,6 +1,7 @@
 """`fprf bench paper` on the tiny town."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -109,3 +110,17 @@ def test_a_finished_run_is_not_trained_again(world: World, tmp_path: Path) -> No
     rows = document["rows"]
     assert list(rows)[:2] == ["adain, one", "local-adain, one"] and len(rows) == 6
     assert "match_inside" not in rows["adain, one"] and rows["region-tone, three"]["match_inside"] is not None
+
+
+def test_other_scenes_are_restyled_by_photographs(world: World, tmp_path: Path) -> None:
+    """A saved config is the method; the scene is the town's pictures without what is known about them."""
+    scene = shutil.copytree(world.town, tmp_path / "scene", ignore=shutil.ignore_patterns("truth*", "town*"))
+    command = f"bench paper --table guided-filter --data {scene} --method {world.run / 'config.json'} --device cpu --steps 2"
+    references = ["--views", "2", "--references", *map(str, world.references)]
+    assert cli.main([*command.split(), *references, "--output", str(tmp_path / "a.json")]) == 0
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document["settings"]["method"] == "fprf-lite"
+    for row in document["rows"].values():
+        assert "styled_psnr" not in row
+        for name in ("", "paper_"):
+            assert 0 < row[f"{name}style_distance"] != 1 and -1 <= row[f"{name}structure"] < 1

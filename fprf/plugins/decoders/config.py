@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from ...checks import at_least, positive
 from ..config import PluginConfig
@@ -12,7 +12,10 @@ from ..config import PluginConfig
 if TYPE_CHECKING:
     from ...interfaces import Decoder
 
-__all__ = ["DecoderConfig", "MlpDecoderConfig", "ResidualDecoderConfig"]
+__all__ = ["DecoderConfig", "MlpDecoderConfig", "Objective", "ResidualDecoderConfig"]
+
+Objective = Literal["identity", "paper"]
+"""What a decoder was trained for: to return photographs, or with the paper's content and style losses as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +37,16 @@ class MlpDecoderConfig(DecoderConfig):
     """D_VGG of the paper: a small network, trained once on photographs, frozen ever after."""
 
     weights: Path | None = None
-    """A decoder made by `fprf pretrain decoder`. By default the one that ships for the chosen encoder."""
+    """A decoder made by `fprf pretrain decoder`. By default one that ships for the chosen encoder."""
+    objective: Objective = "identity"
+    """Which of the shipped decoders: trained to return photographs alone, or with the paper's content and style losses
+    (L_c + lambda L_s) as well. Not used where `weights` names a file."""
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         """The decoder whose file names this encoder."""
         from .mlp import load_decoder
 
-        return load_decoder(self.weights, encoder=encoder, channels=channels)
+        return load_decoder(self.weights, encoder=encoder, channels=channels, objective=self.objective)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from ...errors import WeightsError
 from ...interfaces import Decoder
 from ...ops import dense
 from ..weightfiles import read_weights
+from .config import Objective
 
 __all__ = ["DECODER_KIND", "MlpDecoder", "load_decoder"]
 
@@ -53,22 +54,20 @@ class MlpDecoder(Decoder):
         """None: it has no parameters of a scene."""
 
 
-def load_decoder(path: Path | None, *, encoder: str, channels: int) -> MlpDecoder:
-    """The frozen decoder of that encoder: from a file, or the shipped one that names it.
+def load_decoder(path: Path | None, *, encoder: str, channels: int, objective: Objective = "identity") -> MlpDecoder:
+    """The frozen decoder of that encoder: from a file, or the shipped one that names it and its objective.
 
     Raises WeightsError where the file belongs to another encoder, or none that ships belongs to this one.
     """
     if path is not None:
         return _loaded(path, *_read(path), encoder=encoder, channels=channels)
-    shipped = {}
+    shipped = set()
     for file in sorted(FOLDER.glob("*.safetensors")):
         tensors, metadata = _read(file)
-        if metadata["encoder"] == encoder:
+        if metadata["encoder"] == encoder and metadata.get("objective", "identity") == objective:
             return _loaded(file, tensors, metadata, encoder=encoder, channels=channels)
-        shipped[file.stem] = metadata["encoder"]
-    raise WeightsError(
-        f"no decoder ships for the encoder {encoder}; there are those of {', '.join(shipped.values()) or 'none'}"
-    )
+        shipped.add(metadata["encoder"])
+    raise WeightsError(f"no decoder ships for the encoder {encoder}; there are those of {', '.join(sorted(shipped)) or 'none'}")
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
