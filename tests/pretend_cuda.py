@@ -3,12 +3,17 @@
     with pretend_cuda() as seen:
         train(..., device="cuda:0")
     print(seen.syncs)      # what would have made the host wait, by operator
+    print(seen.uploads)    # copies from the host to the device, by operator
 
-Mixing devices raises, `.numpy()` raises, `.item()`, `nonzero` and copies to the host work and are counted. Real values flow,
-so whole training runs, renders and restyles can be driven through it and compared with the CPU. Works with a CPU-only torch.
+Mixing devices raises, `.numpy()` raises, `.item()`, `nonzero`, indexing by a mask and copies to the host work and are
+counted. Real values flow, so whole training runs, renders and restyles can be driven through it and compared with the
+CPU. Works with a CPU-only torch.
 
-Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda" alone.
-What it cannot show: memory, streams, kernels' own faults (Triton: run the same path under TRITON_INTERPRET=1 on `.inner`).
+Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda" alone; `auto`
+names it. What it cannot show: memory (`mem_get_info` answers `memory`), streams, kernels' own faults (Triton: run the same
+path under TRITON_INTERPRET=1 on `.inner`), CUDA's own draws (generators are the CPU's), autocast (wrappers have no autocast
+key), and other threads: operators there are neither counted nor pretended. Numbers that reach a kernel as arguments
+(`x + 1.0`, `torch.full`) are no copies, on a card neither.
 """
 
 import contextlib
@@ -26,7 +31,15 @@ SYNCS = (
     "aten.masked_select.default",
     "aten.equal.default",
     "aten._unique2.default",
+    "aten.unique_dim.default",
+    "aten.unique_consecutive.default",
+    "aten.bincount.default",
+    "aten.repeat_interleave.Tensor",
+    "aten._linalg_svd.default",
+    "aten._linalg_eigh.default",
+    "aten._linalg_check_errors.default",
 )
+INDEXED = ("aten.index.Tensor", "aten.index_put.default", "aten.index_put_.default", "aten._index_put_impl_.default")
 
 
 class Pretended(torch.Tensor):
@@ -69,28 +82,40 @@ class Pretended(torch.Tensor):
     def tolist(self):
         return self.to("cpu").tolist()
 
+    def new_tensor(self, data, dtype=None, device=None, requires_grad=False):
+        where = CUDA if device is None else device
+        return torch.tensor(data, dtype=dtype or self.dtype, device=where, requires_grad=requires_grad)
+
     def __repr__(self) -> str:
         return f"Pretended({self.inner})"
 
     @classmethod
     def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
-        return _run(func, args, kwargs or {}, Counter())
+        return _run(func, args, kwargs or {}, Counter(), Counter())
 
 
-def _run(func, args, kwargs, syncs: Counter):
+def _run(func, args, kwargs, syncs: Counter, uploads: Counter):
     name = str(func)
     tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
     ours = [x for x in tensors if isinstance(x, Pretended)]
     copies = name in ("aten._to_copy.default", "aten.copy_.default")
+    if name in INDEXED and isinstance(args[0], Pretended):
+        # As CUDA does: indices of the host are copied.
+        away = [isinstance(x, torch.Tensor) and not isinstance(x, Pretended) for x in args[1]]
+        uploads[name] += sum(away)
+        args = (args[0], [Pretended(x) if far else x for x, far in zip(args[1], away, strict=True)], *args[2:])
+        tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
     if ours and not copies and any(not isinstance(x, Pretended) and x.dim() > 0 for x in tensors):
         raise RuntimeError(
             f"{name}: Expected all tensors to be on the same device, but found at least two devices, cuda:0 and cpu!"
         )
     target = kwargs.get("device")
     there = bool(ours) if target is None else torch.device(target).type != "cpu"
-    if ours and (name in SYNCS or (name == "aten._to_copy.default" and not there)):
-        syncs[name] += 1
-    if name == "aten.copy_.default" and isinstance(args[0], Pretended) != isinstance(args[1], Pretended):
+    if name == "aten._to_copy.default" and bool(ours) != there:
+        (uploads if there else syncs)[name] += 1
+    elif name == "aten.copy_.default" and isinstance(args[0], Pretended) != isinstance(args[1], Pretended):
+        (uploads if isinstance(args[0], Pretended) else syncs)[name] += 1
+    elif ours and (name in SYNCS or (name in INDEXED and _masked(args))):
         syncs[name] += 1
     bare = lambda x: x.inner if isinstance(x, Pretended) else x  # noqa: E731
     kwargs = {k: torch.device("cpu") if k == "device" and v is not None else v for k, v in kwargs.items()}
@@ -102,29 +127,62 @@ def _run(func, args, kwargs, syncs: Counter):
     )
 
 
+def _masked(args) -> bool:
+    """Whether indices are found from a mask: CUDA waits for their number, unless one value is written to all."""
+    mask = any(isinstance(x, torch.Tensor) and x.dtype in (torch.bool, torch.uint8) for x in args[1])
+    return mask and (len(args) < 3 or args[2].dim() > 0)
+
+
 class _Mode(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.syncs: Counter = Counter()
+        self.uploads: Counter = Counter()
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        return _run(func, args, kwargs or {}, self.syncs)
+        return _run(func, args, kwargs or {}, self.syncs, self.uploads)
 
 
 @contextlib.contextmanager
-def pretend_cuda() -> Iterator[_Mode]:
-    """Within it, `cuda:0` is a device. Generators of it are the CPU's; inference mode is `no_grad`, which wrappers allow."""
-    real = torch.Generator
+def pretend_cuda(memory: int = 1 << 34) -> Iterator[_Mode]:
+    """Within it, `cuda:0` is a device of so many free bytes. Generators of it are the CPU's; inference mode is `no_grad`, which
+    wrappers allow.
+    """
+    real, made, given = torch.Generator, torch.tensor, torch.as_tensor
 
     class Generator:
         def __new__(cls, device="cpu"):
             return real("cpu")
 
-    kept = torch.Generator, torch.inference_mode, torch.cuda._lazy_init, torch.cuda.is_available, torch.cuda.device_count
-    torch.Generator, torch.inference_mode = Generator, torch.no_grad
-    torch.cuda._lazy_init, torch.cuda.is_available, torch.cuda.device_count = lambda: None, lambda: True, lambda: 1
+    def tensor(data, *, device=None, **kwargs):
+        if device is None or torch.device(device).type == "cpu":
+            return made(data, device=device, **kwargs)
+        return made(data, **kwargs).to(device)
+
+    def as_tensor(data, dtype=None, device=None):
+        if isinstance(data, torch.Tensor) or device is None or torch.device(device).type == "cpu":
+            return given(data, dtype=dtype, device=device)
+        return given(data, dtype=dtype).to(device)
+
+    replaced = {
+        torch: {"Generator": Generator, "inference_mode": torch.no_grad, "tensor": tensor, "as_tensor": as_tensor},
+        torch.Tensor: {"pin_memory": lambda self, *a: self},
+        torch.cuda: {
+            "_lazy_init": lambda: None,
+            "is_available": lambda: True,
+            "device_count": lambda: 1,
+            "current_device": lambda: 0,
+            "mem_get_info": lambda device=None: (memory, memory),
+            "synchronize": lambda device=None: None,
+        },
+    }
+    kept = {(owner, name): getattr(owner, name) for owner, names in replaced.items() for name in names}
+    for owner, names in replaced.items():
+        for name, value in names.items():
+            setattr(owner, name, value)
     try:
         with _Mode() as mode:
             yield mode
     finally:
-        torch.Generator, torch.inference_mode, torch.cuda._lazy_init, torch.cuda.is_available, torch.cuda.device_count = kept
+        for (owner, name), value in kept.items():
+            setattr(owner, name, value)
