@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
@@ -188,6 +189,12 @@ class TrainConfig:
     """Every draw is a function of it."""
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
+    device_memory: float = 0.5
+    """Share of a GPU's free memory that images and feature targets may take in training; where they need more they stay in host
+    memory, and each batch is copied one step ahead."""
+    precision: Literal["float32", "tf32", "bfloat16"] = "float32"
+    """Of matrix products on a GPU in training: tf32 rounds their factors to 11 bits, bfloat16 those of the networks to 8 bits;
+    geometry and sums stay in float32. docs/speed.md has the errors."""
     checkpoint_minutes: float = 5.0
     """Time between checkpoints."""
     datamanager: DataManagerConfig = RayBatchesConfig()
@@ -224,4 +231,5 @@ class TrainConfig:
         if self.minutes is not None:
             positive("minutes", self.minutes)
         positive("checkpoint_minutes", self.checkpoint_minutes)
+        between("device_memory", self.device_memory, 0.0, 1.0)
         between("poses", self.poses, 0.0, 1.0)

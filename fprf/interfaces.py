@@ -198,7 +198,18 @@ class DataManager(ABC):
 
     @abstractmethod
     def batch(self, step: int) -> Batch:
-        """The pixels of a step: a pure function of (seed, step), so that a resumed run sees the same ones."""
+        """The pixels of a step: a pure function of (seed, step), so that a resumed run sees the same ones.
+
+        In host memory, or on the device of `to`. Those in host memory are asked for by a thread of their own, one step ahead
+        of the device that they are copied to.
+        """
+
+    def to(self, device: torch.device, *, room: int) -> "DataManager":
+        """A data manager of the same batches that draws them on a device, from at most `room` bytes held there.
+
+        Itself, which draws in host memory, unless it says otherwise.
+        """
+        return self
 
     @abstractmethod
     def image(self, view: int) -> Annotated[Tensor, "H W 3"]:

@@ -164,8 +164,11 @@ def pretend_cuda(memory: int = 1 << 34) -> Iterator[_Mode]:
             return given(data, dtype=dtype, device=device)
         return given(data, dtype=dtype).to(device)
 
+    def inference_mode(mode=True):
+        return torch.no_grad() if mode else contextlib.nullcontext()
+
     replaced = {
-        torch: {"Generator": Generator, "inference_mode": torch.no_grad, "tensor": tensor, "as_tensor": as_tensor},
+        torch: {"Generator": Generator, "inference_mode": inference_mode, "tensor": tensor, "as_tensor": as_tensor},
         torch.Tensor: {"pin_memory": lambda self, *a: self},
         torch.cuda: {
             "_lazy_init": lambda: None,

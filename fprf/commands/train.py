@@ -166,7 +166,7 @@ def _check_same(folder: "Run", config: "TrainConfig") -> None:
     if not folder.exists:
         return
     old, _ = folder.load_config()
-    free = {"steps", "minutes", "output", "data", "device", "checkpoint_minutes"}
+    free = {"steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes"}
     if old.blocks.cuts and config.blocks.cuts:
         free |= {"blocks", "executor", "statistics", "render"}
     changed = [name for name in vars(old) if name not in free and getattr(old, name) != getattr(config, name)]

@@ -1,9 +1,11 @@
 """Training batches: random pixels of all training views with their colours and feature targets.
 
 A batch is a pure function of (seed, step): its generator is seeded by BLAKE2b of the two, so any step can be drawn without the
-ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share nothing.
+ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share nothing. A GPU that holds the images draws
+with a generator of its own: the same on every run there, but other pixels than on the CPU.
 """
 
+import copy
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -33,10 +35,12 @@ DECODE = 16
 WHITE = (1.0, 1.0, 1.0)
 
 
-def generator_of(seed: int, step: int) -> torch.Generator:
-    """The CPU generator of a step's pixels."""
+def generator_of(seed: int, step: int, device: torch.device | None = None) -> torch.Generator:
+    """The generator of a step's pixels, the CPU's unless a device is named."""
     name = f"fprf pixels {seed} {step}".encode()
-    return torch.Generator().manual_seed(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1)
+    return torch.Generator(device or "cpu").manual_seed(
+        int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1
+    )
 
 
 class _Marks(NamedTuple):
@@ -46,6 +50,29 @@ class _Marks(NamedTuple):
     """int64 among all training pixels."""
     distance: Annotated[Tensor, "O"]
     """World distance along the ray."""
+
+    def to(self, device: torch.device) -> "_Marks":
+        return _Marks(self.at.to(device), self.distance.to(device))
+
+
+class _Source(NamedTuple):
+    """What a batch is drawn from, on one device."""
+
+    pixels: Annotated[Tensor, "P 3"]
+    """uint8, all training views one after the other."""
+    view: Annotated[Tensor, "T"]
+    """int64 index of each training view in the scene."""
+    size: Annotated[Tensor, "T 2"]
+    """int64 width and height of each."""
+    ends: Annotated[Tensor, "T"]
+    """int64 pixels up to the end of each."""
+    chosen: Runs | None
+    """Pixels that may be drawn; None = all."""
+    sky: Runs | None
+    marks: _Marks | None
+
+    def to(self, device: torch.device) -> "_Source":
+        return _Source(*(None if part is None else part.to(device) for part in self))
 
 
 class RayBatches(DataManager):
@@ -83,8 +110,9 @@ class RayBatches(DataManager):
         self._pixels = self._load(cache)
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
         self._chosen = None if seen is None and not masks else self._choose(seen, masks)
-        self._sky = self._skies(skies) if skies else None
-        self._marks = self._marked() if config.depth_share > 0 else None
+        sky = self._skies(skies) if skies else None
+        marks = self._marked() if config.depth_share > 0 else None
+        self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marks)
         self.content_store: FeatureStore | None = None
         self.semantic_store: FeatureStore | None = None
         if content is not None:
@@ -98,23 +126,25 @@ class RayBatches(DataManager):
 
     def batch(self, step: int) -> Batch:
         """The pixels of a step; the first `semantic_share` of them carry semantics."""
-        chosen = self._chosen
-        room = len(self._pixels) if chosen is None else len(chosen)
-        generator = generator_of(self._seed, step)
-        at = torch.randint(room, (self._config.rays,), generator=generator)
-        at = at if chosen is None else chosen.pick(at)
+        source = self._source
+        device = source.pixels.device
+        room = len(source.pixels) if source.chosen is None else len(source.chosen)
+        generator = generator_of(self._seed, step, device)
+        at = torch.randint(room, (self._config.rays,), generator=generator, device=device)
+        at = at if source.chosen is None else source.chosen.pick(at)
         distance = None
-        if self._marks is not None:
+        if source.marks is not None:
             # The last rays: the first ones carry semantics, which must stay an even sample.
             count = round(self._config.depth_share * len(at))
-            mark = torch.randint(len(self._marks.at), (count,), generator=generator)
-            at = torch.cat([at[: len(at) - count], self._marks.at[mark]])
-            distance = torch.cat([torch.full((len(at) - count,), torch.nan), self._marks.distance[mark]])
-        slot = torch.searchsorted(self._ends, at, right=True)
-        width, height = self._sizes[slot].unbind(1)
-        local = at - (self._ends[slot] - width * height)
+            mark = torch.randint(len(source.marks.at), (count,), generator=generator, device=device)
+            at = torch.cat([at[: len(at) - count], source.marks.at[mark]])
+            unknown = torch.full((len(at) - count,), torch.nan, device=device)
+            distance = torch.cat([unknown, source.marks.distance[mark]])
+        slot = torch.searchsorted(source.ends, at, right=True)
+        width, height = source.size[slot].unbind(1)
+        local = at - (source.ends[slot] - width * height)
         pixel = torch.stack([local % width, local // width], 1) + 0.5
-        view, rgb = self._scene.train[slot], self._pixels[at].float() / 255
+        view, rgb = source.view[slot], source.pixels[at].float() / 255
         share = round(self._config.semantic_share * len(at))
         content, semantic = self.content_store, self.semantic_store
         return Batch(
@@ -124,8 +154,19 @@ class RayBatches(DataManager):
             content=content.at(view, pixel, rgb) if content is not None else None,
             semantic=semantic.at(view[:share], pixel[:share], rgb[:share]) if semantic is not None and share else None,
             distance=distance,
-            sky=None if self._sky is None else self._sky.holds(at),
+            sky=None if source.sky is None else source.sky.holds(at),
         )
+
+    def to(self, device: torch.device, *, room: int) -> "RayBatches":
+        """The same pixels drawn on a CUDA device, where images and coefficients take at most `room` bytes."""
+        stores = [store for store in (self.content_store, self.semantic_store) if store is not None]
+        if device.type != "cuda" or self._pixels.numel() + sum(store.bytes for store in stores) > room:
+            return self
+        there = copy.copy(self)
+        there._source = self._source.to(device)
+        there.content_store = None if self.content_store is None else self.content_store.to(device)
+        there.semantic_store = None if self.semantic_store is None else self.semantic_store.to(device)
+        return there
 
     def image(self, view: int) -> Annotated[Tensor, "H W 3"]:
         """One view of the scene as a float image in [0, 1]; held-out ones are read when asked for."""

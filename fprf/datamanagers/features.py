@@ -5,6 +5,7 @@ Extraction runs the encoder once a view at the image's own size and keeps guided
 never exist. Semantic features are projected on principal components of the training views before they are kept.
 """
 
+import copy
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
@@ -60,18 +61,45 @@ class FeatureStore:
         self._magnitude = max(float(e.centre.abs().max()) for e in self._entries.values())
         self._slots = {view: slot for slot, view in enumerate(self._entries)}
         self._table = _table(list(self._entries.values())) if _COMPILED else None
+        self._packed: guided.Packed | None = None
+        self._numbers = torch.zeros(0, dtype=torch.int64)
 
     @property
     def scale(self) -> float:
         """The unit of losses: `std`, or 1 where the features do not change but for rounding."""
         return self.std if self.std > 1e-6 * self._magnitude else 1.0
 
+    def to(self, device: torch.device) -> "FeatureStore":
+        """The same targets, with the coefficients on a device as well: what is asked there is answered there."""
+        entries = list(self._entries.values())
+        coefs = [entry.coefs.flatten(0, 1) for entry in entries]
+        ends = torch.tensor([len(part) for part in coefs]).cumsum(0)
+        packed = torch.empty(int(ends[-1]), *coefs[0].shape[1:], dtype=torch.float16, device=device)
+        for part, end in zip(coefs, ends.tolist(), strict=True):
+            packed[end - len(part) : end].copy_(part)
+        shapes = torch.tensor([entry.coefs.shape[:2] for entry in entries])
+        small = (
+            ends - shapes.prod(1),
+            shapes,
+            torch.stack([entry.size for entry in entries]),
+            torch.stack([entry.scale for entry in entries]),
+            torch.stack([entry.centre for entry in entries]),
+        )
+        numbers = torch.zeros(max(self._slots) + 1, dtype=torch.int64)
+        numbers[list(self._slots)] = torch.arange(len(self._slots))
+        there = copy.copy(self)
+        there._packed, there._numbers = guided.Packed(packed, *(part.to(device) for part in small)), numbers.to(device)
+        return there
+
     def at(
         self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"], rgb: Annotated[Tensor, "R 3"]
     ) -> Annotated[Tensor, "R C"]:
         """Features, float32, raw. `view` counts in the scene; pixel is x, y with centres at +0.5; rgb in [0, 1] is the
-        image's own colour there. Raises DataError for a view that is not in the store.
+        image's own colour there. Raises DataError for a view that is not in the store; on the device of `to`, where the host
+        would wait for the answer, it must not be asked for one.
         """
+        if self._packed is not None and view.device == self._numbers.device:
+            return guided.apply_packed(self._packed, self._numbers[view], pixel, rgb, grey=store_files.GREY)
         views, found = np.unique(view.detach().cpu().numpy(), return_inverse=True)
         missing = [v for v in views.tolist() if v not in self._slots]
         if missing:

@@ -1,5 +1,6 @@
 """Sets of pixels as runs of neighbours: which pixels of a million images may be drawn, in a few numbers a row."""
 
+import copy
 from collections.abc import Iterable
 from typing import Annotated
 
@@ -16,6 +17,7 @@ class Runs:
         self._start = start
         self._after = length.cumsum(0)
         self._before = self._after - length
+        self._count = int(self._after[-1]) if len(start) else 0
 
     @staticmethod
     def of(masks: Iterable[tuple[int, Annotated[Tensor, "P"]]]) -> "Runs":
@@ -35,7 +37,13 @@ class Runs:
 
     def __len__(self) -> int:
         """How many numbers there are."""
-        return int(self._after[-1]) if len(self._after) else 0
+        return self._count
+
+    def to(self, device: torch.device) -> "Runs":
+        """The same set on a device."""
+        there = copy.copy(self)
+        there._start, there._after, there._before = (x.to(device) for x in (self._start, self._after, self._before))
+        return there
 
     def pick(self, rank: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R"]:
         """The numbers of these ranks, 0 <= rank < len: the first, second ... of the set."""

@@ -23,7 +23,7 @@ from .checkpoint import reached
 from .lay_out import RAYS, asked_of, load_boxes
 from .lock import held
 from .model import Facts, Model
-from .prepare import Prepared, cache_folder
+from .prepare import Prepared, cache_folder, encoders_of
 from .run import Run
 from .trainer import Report, train
 
@@ -119,11 +119,11 @@ def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: 
         width, height = scene.cameras.size[view].tolist()
         return pixel_mask(rays["seen"][slots[view]].bool(), (width, height))
 
-    encoder = config.semantic.encoder
+    content, semantic = encoders_of(config)
     return config.datamanager.build(
         scene=scene,
-        content=config.content.encoder.build(),
-        semantic=encoder.build() if encoder is not None and facts.dim else None,
+        content=content,
+        semantic=semantic if facts.dim else None,
         dim=config.semantic.dim,
         cache=cache_folder() / "features",
         seed=config.seed,

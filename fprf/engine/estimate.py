@@ -178,10 +178,11 @@ def seconds_per_step(config: TrainConfig, facts: Facts, scene: Scene, built: Bui
     model = built.model.to(device)
     prepared = Prepared(scene, _MadeUp(scene, facts, rays), facts, None)
     loop = Loop(config, prepared, model, optimizer_of(config, model), device)
-    loop.step(0, 0.0)
+    loop.step(0, 0.0)(0.0, 0.0)
     start = time.perf_counter()
     for step in range(1, 1 + _STEPS):
-        loop.step(step, 0.0)
+        result = loop.step(step, 0.0)
+    result(0.0, 0.0)  # waits for the device
     return (time.perf_counter() - start) / _STEPS
 
 

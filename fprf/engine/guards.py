@@ -7,6 +7,9 @@ both: it takes a twentieth of the time of a look at each number.
 Moments of what is no longer seen decay into denormal numbers and, rounded, stay there; Adam takes 15 times as long over them.
 They are cleared by step number, not by the processor's own mode: that is set a thread, so that results would depend on which
 thread computed what.
+
+On CUDA nobody looks before the optimiser steps: the host would wait for the answer. `unfit` stays on the device, fused Adam
+reads it there and leaves everything as it is, and `Watch` counts; what it counted is read with the reports.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,7 +17,10 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor, nn
 
-__all__ = ["CLEAR_EVERY", "PATIENCE", "clear_denormals", "unfit_gradients", "unfit_terms"]
+__all__ = ["CLEAR_EVERY", "PATIENCE", "Watch", "clear_denormals", "unfit", "unfit_gradients", "unfit_terms"]
+
+SMOOTHING = 0.95
+"""Decay of running means."""
 
 PATIENCE = 3
 """Steps in a row that are not finite after which a run goes back to its last checkpoint: it will not recover by itself."""
@@ -45,6 +51,57 @@ def unfit_gradients(parameters: Iterable[tuple[str, nn.Parameter]]) -> str | Non
     bad = [name for name, grad in found if not bool(grad.norm() < LARGEST)]
     more = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
     return f"the gradient of {', '.join(bad[:_NAMED]) or 'all parameters together'}{more}"
+
+
+@torch.no_grad()
+def unfit(loss: Tensor, parameters: Iterable[nn.Parameter]) -> Tensor:
+    """1 where the loss or a gradient is not finite, or too large to be squared, else 0: float32, where the loss lies."""
+    norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    return (~(torch.isfinite(loss) & (norm < LARGEST))).float()
+
+
+class Watch:
+    """Running means of named numbers, and counts of those that were not finite, kept where they lie until they are read."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.names: list[str] = []
+        # A row each: sums of values, sums of weights, how often not finite. MPS has no float64.
+        self.rows = torch.zeros(3, 0, dtype=torch.float32 if device.type == "mps" else torch.float64, device=device)
+        self.none = torch.full((), torch.nan, device=device)
+        self.skipped, self.failed = torch.zeros((), device=device), torch.zeros((), device=device)
+        self._present: dict[tuple[str, ...], Tensor] = {}
+
+    @torch.no_grad()
+    def add(self, values: Mapping[str, Tensor]) -> None:
+        """One step's scalars. A name that is absent, or not finite, leaves its mean as it is."""
+        new = [name for name in values if name not in self.names]
+        if new:
+            self.names += new
+            self.rows = torch.nn.functional.pad(self.rows, (0, len(new)))
+            self._present.clear()
+        given = tuple(values)
+        if given not in self._present:
+            self._present[given] = self.rows.new_tensor([float(name in values) for name in self.names])
+        found = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
+        fit = torch.isfinite(found)
+        means = SMOOTHING * self.rows[:2] + (1 - SMOOTHING) * torch.stack([found, self._present[given]])
+        bad = self.rows[2] + self._present[given] * ~fit
+        self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
+
+    def count(self, unfit: Tensor) -> None:
+        """Whether this step was skipped, 1 or 0."""
+        self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
+
+    def means(self) -> dict[str, float]:
+        """The means, corrected for their start; names that never had a finite number are left out. The host waits."""
+        value, weight, _ = self.rows.tolist()
+        return {name: v / w for name, v, w in zip(self.names, value, weight, strict=True) if w > 0}
+
+    def faults(self) -> tuple[int, int, str]:
+        """Steps skipped so far, the last ones in a row, and the names of terms that were not finite since the last call."""
+        skipped, failed, *bad = torch.cat([torch.stack([self.skipped, self.failed]), self.rows[2]]).tolist()
+        self.rows[2].zero_()
+        return int(skipped), int(failed), ", ".join(name for name, b in zip(self.names, bad, strict=True) if b > 0)
 
 
 @torch.no_grad()

@@ -31,13 +31,26 @@ from . import tensorfiles
 from .blocks import SURROUNDINGS, folder_of
 from .decoder import build_decoder
 from .model import Facts
-from .prepare import behind, cache_folder, facts_of
+from .prepare import behind, cache_folder, encoders_of, facts_of
 from .renumber import renumber, trained_tasks
 from .run import Run
 
 __all__ = ["FREE", "RAYS", "Laid", "asked_of", "lay_out", "load_boxes", "plan_scene", "write_down"]
 
-FREE = ("steps", "minutes", "output", "data", "device", "checkpoint_minutes", "blocks", "executor", "statistics", "render")
+FREE = (
+    "steps",
+    "minutes",
+    "output",
+    "data",
+    "device",
+    "device_memory",
+    "precision",
+    "checkpoint_minutes",
+    "blocks",
+    "executor",
+    "statistics",
+    "render",
+)
 """Fields of a config that do not decide what a block of given bounds and rays learns."""
 
 
@@ -62,9 +75,8 @@ def plan_scene(config: TrainConfig) -> tuple[Scene, Plan]:
 
 def lay_out(config: TrainConfig, scene: Scene, plan: Plan, progress: Callable[[int, int, str], None] | None = None) -> Laid:
     """Extract the features of all training views. `progress(done, total, what)` is told of them."""
-    content = config.content.encoder.build()
+    content, semantic = encoders_of(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
-    semantic = config.semantic.encoder.build() if config.semantic.encoder is not None else None
     background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
 
     def image(view: int) -> Tensor:

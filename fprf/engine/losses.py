@@ -75,15 +75,22 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
 def ending(t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], distance: Annotated[Tensor, "R"]) -> Tensor | None:
     """How far rays of known distance (space units, NaN = unknown) are from ending there; None where none is known.
 
-    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1].
+    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. Elsewhere
+    than on the CPU it is 0 where none is known: the host would have to wait to tell.
     """
-    known = torch.isfinite(distance).nonzero()[:, 0]
-    if not len(known):
-        return None
-    middle = midpoints(t.index_select(0, known)) / distance.index_select(0, known)[:, None]
-    w = weights.index_select(0, known)
+    known = torch.isfinite(distance)
+    if t.device.type == "cpu":
+        index = known.nonzero()[:, 0]
+        if not len(index):
+            return None
+        return _missed(*(x.index_select(0, index) for x in (t, weights, distance))).mean()
+    return _mean_of(_missed(t, weights, torch.where(known, distance, 1.0)), known)
+
+
+def _missed(t: Tensor, weights: Tensor, distance: Tensor) -> Annotated[Tensor, "R"]:
+    middle = midpoints(t) / distance[:, None]
     there, before = (middle - 1).abs() <= NEARBY, middle < 1 - NEARBY
-    return ((1 - (w * there).sum(-1)).square() + (w * before).sum(-1).square()).mean()
+    return (1 - (weights * there).sum(-1)).square() + (weights * before).sum(-1).square()
 
 
 def emptiness(
@@ -91,13 +98,21 @@ def emptiness(
 ) -> Tensor | None:
     """How much rays into the sky meet before `within` (space units); None where there are none.
 
-    Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell.
+    Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell. Elsewhere than on the CPU
+    it is 0 where there are none.
     """
-    chosen = sky.nonzero()[:, 0]
-    if not len(chosen):
-        return None
-    before = midpoints(t.index_select(0, chosen)) < within
-    return (weights.index_select(0, chosen) * before).sum(-1).square().mean()
+    if t.device.type == "cpu":
+        chosen = sky.nonzero()[:, 0]
+        if not len(chosen):
+            return None
+        before = midpoints(t.index_select(0, chosen)) < within
+        return (weights.index_select(0, chosen) * before).sum(-1).square().mean()
+    return _mean_of((weights * (midpoints(t) < within)).sum(-1).square(), sky)
+
+
+def _mean_of(values: Annotated[Tensor, "R"], mask: Annotated[Tensor, "R"]) -> Tensor:
+    """Mean over the rays of a mask; 0 where it has none."""
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
 
 
 def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:

@@ -30,6 +30,7 @@ class Poses(nn.Module):
 
     known: Tensor
     learned: Tensor
+    """int64 numbers of the views that are learnt from."""
     gauge: Tensor
 
     def __init__(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...], *, reach: float, pace: float) -> None:
@@ -43,27 +44,27 @@ class Poses(nn.Module):
         self.reach, self.pace = reach, pace
         self.offset = nn.Parameter(torch.zeros(views, 6))
         self.register_buffer("known", torch.zeros(views, 6))
-        self.register_buffer("learned", learned, persistent=False)
+        self.register_buffer("learned", learned.nonzero()[:, 0], persistent=False)
         self.register_buffer("gauge", _gauge(centres[learned].double() / reach).float(), persistent=False)
 
     def moves(self) -> Annotated[Tensor, "V 6"]:
         """Turn and shift of each view."""
-        free = self.offset[self.learned].reshape(-1)
+        free = self.offset.index_select(0, self.learned).reshape(-1)
         free = free - self.gauge @ (self.gauge.T @ free)
-        moves: Tensor = self.known.index_add(0, self.learned.nonzero()[:, 0], self.pace * free.view(-1, 6))
+        moves: Tensor = self.known.index_add(0, self.learned, self.pace * free.view(-1, 6))
         return moves
 
     def forward(
         self, view: Annotated[Tensor, "R"], origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"]
     ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
         """World rays (float64, unit directions) of the views as they are now."""
-        move = self.moves().to(origin).index_select(0, view.to(origin.device))
+        move = _like(self.moves(), origin).index_select(0, view.to(origin.device))
         return origin + self.reach * move[:, 3:], rotated(direction, move[:, :3])
 
     def refined(self, cameras: Cameras) -> Cameras:
         """The cameras where they are now."""
         with torch.no_grad():
-            move = self.moves().to(cameras.pose)
+            move = _like(self.moves(), cameras.pose)
             return replace(cameras, pose=moved(cameras.pose, move[:, :3], self.reach * move[:, 3:]))
 
     def going_on(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...]) -> "Poses":
@@ -100,6 +101,11 @@ def moving(rays: Rays) -> Rays:
 def refined(poses: Poses | None, cameras: Cameras) -> Cameras:
     """The cameras as a model has them."""
     return cameras if poses is None else poses.refined(cameras)
+
+
+def _like(moves: Tensor, other: Tensor) -> Tensor:
+    """Moves where another tensor lies, in its type: one after the other, since MPS has no float64."""
+    return moves.to(other.device).to(other.dtype)
 
 
 def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:

@@ -22,7 +22,7 @@ from .decoder import build_decoder
 from .model import Facts
 from .tones import relative
 
-__all__ = ["Prepared", "behind", "cache_folder", "device_of", "facts_of", "prepare", "reach_of"]
+__all__ = ["Prepared", "behind", "cache_folder", "device_of", "encoders_of", "facts_of", "prepare", "reach_of"]
 
 
 class Prepared(NamedTuple):
@@ -44,7 +44,7 @@ def device_of(name: str) -> torch.device:
     """`auto` is CUDA, then MPS, then the CPU. Raises PluginError for a device that torch does not know here."""
     if name == "auto":
         if torch.cuda.is_available():
-            return torch.device("cuda")
+            return torch.device("cuda", torch.cuda.current_device())
         return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
     try:
         return torch.empty(0, device=name).device
@@ -60,9 +60,8 @@ def prepare(
     """Everything but the model. `progress(done, total, what)` is told of the features; `look` may refuse the scene before."""
     scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
     look(scene)
-    content = config.content.encoder.build()
+    content, semantic = encoders_of(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
-    semantic = config.semantic.encoder.build() if config.semantic.encoder is not None else None
     manager = config.datamanager.build(
         scene=scene,
         content=content,
@@ -76,6 +75,13 @@ def prepare(
     semantic_store = manager.semantic_store
     facts = facts_of(config, scene, find_space(scene), content, semantic, manager.content_store, semantic_store)
     return Prepared(scene, manager, facts, semantic_store.basis if semantic_store is not None else None)
+
+
+def encoders_of(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
+    """The content encoder and the semantic one, if there is one, on the device of the config."""
+    device = device_of(config.device)
+    semantic = config.semantic.encoder
+    return config.content.encoder.build().to(device), None if semantic is None else semantic.build().to(device)
 
 
 def facts_of(

@@ -14,7 +14,7 @@ from ..memory import in_parts
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import march
 from ..style.scene import SceneStyle, scene_style
-from ..style.statistics import Moments, empty, merge, moments
+from ..style.statistics import Moments, merge, moments
 from .model import Model
 from .poses import refined
 
@@ -54,7 +54,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
         rays = type(rays)(*(x.to(device) for x in rays))
         kept = march(rays, model.parts, budget=config.render.budget).kept
         content = model.field.content(kept.latent, kept.view)
-        own = moments(content, kept.weight)
+        own = Moments(*(x.cpu() for x in moments(content, kept.weight)))
         # Regions are found and measured on an even share of the points; whole moments above see every one.
         every = max(1, -(-len(content) * config.statistics.rays // (len(rays.near) * POINTS)))
         semantic = model.semantic(kept.point[::every]).cpu() if model.semantic is not None else None
@@ -62,7 +62,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
 
     contents, weights, semantics = [], [], []
     for own, content, weight, semantic in in_parts(len(view), config.render.chunk, part_of):
-        whole = merge(whole if whole is not None else empty(content.shape[1]), own)
+        whole = own if whole is None else merge(whole, own)
         contents.append(content)
         weights.append(weight)
         if semantic is not None:

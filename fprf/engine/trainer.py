@@ -1,9 +1,13 @@
-"""The training loop. Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped."""
+"""The training loop. Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped.
+
+On CUDA the host waits for the device at reports alone, twice a second: losses and faults stay on the device until then, batches
+are drawn there where they fit, else copied one step ahead.
+"""
 
 import hashlib
-import math
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
@@ -12,12 +16,14 @@ from torch.profiler import record_function
 
 from ..config import TrainConfig
 from ..errors import NumericsError
+from ..interfaces import DataManager
 from ..memory import out_of_memory, shortage
+from ..ops.precision import lowered
 from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays
 from . import checkpoint
-from .guards import CLEAR_EVERY, PATIENCE, clear_denormals, unfit_gradients, unfit_terms
+from .guards import CLEAR_EVERY, PATIENCE, Watch, clear_denormals, unfit, unfit_gradients, unfit_terms
 from .interrupts import held_back
 from .losses import terms, total, wanted
 from .model import Facts, Model, background_of, build_model
@@ -29,8 +35,6 @@ from .tones import toned
 
 __all__ = ["Loop", "Report", "optimizer_of", "step_generator", "train"]
 
-SMOOTHING = 0.95
-"""Decay of the running means that are shown."""
 REPORT_SECONDS = 0.5
 """Time between reports."""
 
@@ -78,8 +82,9 @@ def train(
 
     `model` is one at its start, where it is not simply that of the config: a block in its surroundings, whose sampler was
     trained for `lead` steps before. An interrupt saves first, then goes on upwards. Steps that are not finite change nothing
-    and are logged; several in a row lead back to the last checkpoint. Raises NumericsError where there is none, or where that
-    was of no use, OutOfMemoryError where a step finds too little memory.
+    and are logged; several in a row lead back to the last checkpoint: on CUDA with the next report, where they still go on.
+    Raises NumericsError where there is none, or where that was of no use, OutOfMemoryError where a step finds too little
+    memory.
     """
     device = device_of(config.device)
     model = (build_model(config, prepared.facts) if model is None else model).to(device)
@@ -99,6 +104,9 @@ def train(
             while progress(config, step, clock) < 1:
                 stop.obey()
                 result = loop.step(step, progress(config, step, clock))
+                due = time.perf_counter() - last_report > REPORT_SECONDS
+                if due or progress(config, step + 1, clock) >= 1:
+                    loop.look()
                 if loop.fault is not None:
                     run.log({"step": step, "skipped": loop.fault})
                 if loop.failed >= PATIENCE:
@@ -107,7 +115,7 @@ def train(
                 step += 1
                 now = time.perf_counter()
                 clock = before + now - start
-                if now - last_report > REPORT_SECONDS:
+                if due:
                     last_report = now
                     report(result(progress(config, step, clock), clock))
                 if now - last_saved > 60 * config.checkpoint_minutes:
@@ -146,7 +154,7 @@ def _go_back(run: Run, loop: "Loop", step: int, again: int) -> int:
     if saved.step == again:
         raise NumericsError(f"{why}, again after going back to step {again}; {remedy}")
     checkpoint.restore(saved, loop.model, loop.optimizer)
-    loop.failed = 0
+    loop.forgive()
     run.log({"step": step, "gone_back_to": saved.step, "because": why})
     return saved.step
 
@@ -169,41 +177,60 @@ class Loop:
         self.lead = lead
         self.config, self.model, self.optimizer, self.device = config, model, optimizer, device
         self.facts: Facts = prepared.facts
+        self.patient = device.type == "cuda"
+        """Whether faults are looked for with the reports alone."""
         self.manager = prepared.manager
+        if device.type != "cpu":
+            self.manager = prepared.manager.to(device, room=int(config.device_memory * _free(device)))
+        self.batches = Batches(self.manager, device)
         self.through = PixelRays(prepared.scene.cameras)
+        if device.type != "mps":  # which has no float64: rays are made on the CPU
+            self.through.to(device)
         self.background = background_of(prepared.facts, device)
-        self.mean: dict[str, float] = {}
-        self.seen: dict[str, float] = {}
+        self.watch = Watch(device)
         self.steps = self.skipped = self.failed = 0
         self.fault: str | None = None
-        """What was not finite in the last step; None where it was well."""
+        """What was not finite in the last step, or since the last look; None where all was well."""
         self.rays = 0
         self.begun = time.perf_counter()
 
     def step(self, step: int, share: float) -> Callable[[float, float], Report]:
         """One step; the answer makes a report when one is due."""
         with record_function("fprf.batch"):
-            batch = self._to_device(self.manager.batch(step))
-            rays = self._rays(batch)
+            drawn = self.batches(step)
+            batch = _moved(drawn, self.device)
+            rays = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
-        rendered = render_rays(
-            rays,
-            self.model.parts,
-            want=wanted(self.config.loss, batch),
-            budget=self.config.render.train_budget,
-            background=self.background,
-            step=step + self.lead,
-            generator=step_generator(self.config.seed, step, self.device),
-            semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
-            semantic_samples=self.config.semantic.samples,
-            content_moves_density=self.config.content.moves_density,
-        )
+        with lowered(self.config.precision, self.device):
+            rendered = render_rays(
+                rays,
+                self.model.parts,
+                want=wanted(self.config.loss, batch),
+                budget=self.config.render.train_budget,
+                background=self.background,
+                step=step + self.lead,
+                generator=step_generator(self.config.seed, step, self.device),
+                semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
+                semantic_samples=self.config.semantic.samples,
+                content_moves_density=self.config.content.moves_density,
+            )
         rendered = toned(rendered, self.model.tones, batch.view)
         with record_function("fprf.losses"):
             parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
             loss = total(self.config.loss, parts)
         self.optimizer.zero_grad(set_to_none=True)
+        if self.patient:
+            self._step_unseen(loss)
+        else:
+            self._step_seen(loss, parts, step)
+        kept = rendered.counts["kept"] / max(1, rendered.counts["samples"])
+        self.watch.add(parts | {"kept": torch.full((), kept, device=loss.device)})
+        self.steps, self.rays = self.steps + 1, self.rays + len(batch.rgb)
+        return lambda share, seconds: self.summary(step + 1, share, seconds)
+
+    def _step_seen(self, loss: Tensor, parts: dict[str, Tensor], step: int) -> None:
+        """Look first, then step."""
         self.fault = unfit_terms(loss, parts)
         if self.fault is None:
             with record_function("fprf.backward"):
@@ -217,36 +244,83 @@ class Loop:
             self.failed = 0
         else:
             self.skipped, self.failed = self.skipped + 1, self.failed + 1
-        self._remember(parts, rendered.counts["kept"] / max(1, rendered.counts["samples"]))
-        self.steps, self.rays = self.steps + 1, self.rays + len(batch.rgb)
-        return lambda share, seconds: self.summary(step + 1, share, seconds)
+
+    def _step_unseen(self, loss: Tensor) -> None:
+        """Step, unless the device finds that nothing may change."""
+        with record_function("fprf.backward"):
+            loss.backward()  # type: ignore[no-untyped-call]
+        flag = unfit(loss, self.model.parameters())
+        with record_function("fprf.optimizer"):
+            # What a gradient scaler tells an optimiser, which then leaves parameters, moments and its count of steps alone.
+            self.optimizer.found_inf = flag  # type: ignore[attr-defined]
+            self.optimizer.step()
+        self.watch.count(flag)
+
+    def look(self) -> None:
+        """Learn of the steps since the last look what was not told at once."""
+        if self.patient:
+            skipped, self.failed, names = self.watch.faults()
+            self.fault = (names or "a gradient") if skipped > self.skipped else None
+            self.skipped = skipped
+
+    def forgive(self) -> None:
+        """Count failures in a row anew."""
+        self.failed = 0
+        self.watch.failed.zero_()
 
     def summary(self, step: int, share: float, seconds: float) -> Report:
         """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
-        means = {name: value / self.seen[name] for name, value in self.mean.items()}
+        means = self.watch.means()
         losses = {name: value for name, value in means.items() if name != "kept"}
         rgb = torch.tensor(losses.get("rgb", 1.0)).clamp_min(1e-10)
         speed = self.rays / (time.perf_counter() - self.begun)
         return Report(step, share, seconds, float(-10 * rgb.log10()), speed, means.get("kept", 0.0), losses, self.skipped)
 
-    def _remember(self, parts: dict[str, Tensor], kept: float) -> None:
-        for name, value in {**{n: float(v.detach()) for n, v in parts.items()}, "kept": kept}.items():
-            if math.isfinite(value):
-                self.mean[name] = SMOOTHING * self.mean.get(name, 0.0) + (1 - SMOOTHING) * value
-                self.seen[name] = SMOOTHING * self.seen.get(name, 0.0) + (1 - SMOOTHING)
-
     def _rays(self, batch: Batch) -> Rays:
-        origin, direction = self.through(batch.view.cpu(), batch.pixel.cpu())
+        there = self.through.device
+        origin, direction = self.through(batch.view.to(there), batch.pixel.to(there))
         if self.model.poses is not None:
             rays = moving(self.model.space.rays(*self.model.poses(batch.view, origin, direction)))
         else:
             rays = self.model.space.rays(origin, direction)
-        return rays if self.device.type == "cpu" else Rays(*(x.to(self.device) for x in rays))
+        return Rays(*(x.to(self.device) for x in rays))
 
-    def _to_device(self, batch: Batch) -> Batch:
-        if self.device.type == "cpu":
-            return batch
-        content, semantic = (x.to(self.device) if x is not None else None for x in (batch.content, batch.semantic))
-        distance = batch.distance.to(self.device) if batch.distance is not None else None
-        sky = batch.sky.to(self.device) if batch.sky is not None else None
-        return Batch(batch.view, batch.pixel, batch.rgb.to(self.device), content, semantic, distance, sky)
+
+class Batches:
+    """A data manager's batches. Those of host memory are drawn a step ahead of an accelerator, by a thread of their own."""
+
+    def __init__(self, manager: DataManager, device: torch.device) -> None:
+        self.manager, self.device = manager, device
+        self._thread: ThreadPoolExecutor | None = None
+        self._next: tuple[int, Future[Batch]] | None = None
+
+    def __call__(self, step: int) -> Batch:
+        """The batch of a step, as the manager draws it, or in pinned memory."""
+        if self._next is None:
+            found = self.manager.batch(step)
+            if found.rgb.device.type != "cpu" or self.device.type == "cpu":
+                return found
+        elif self._next[0] == step:
+            found = self._next[1].result()
+        else:  # after going back
+            found = self._later(step).result()
+        self._next = (step + 1, self._later(step + 1))
+        return found
+
+    def _later(self, step: int) -> "Future[Batch]":
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, thread_name_prefix="fprf-batches")
+        return self._thread.submit(self._pinned, step)
+
+    def _pinned(self, step: int) -> Batch:
+        batch = self.manager.batch(step)
+        return Batch(*(x if x is None or self.device.type != "cuda" else x.pin_memory() for x in batch))
+
+
+def _moved(batch: Batch, device: torch.device) -> Batch:
+    return Batch(*(x if x is None else x.to(device, non_blocking=device.type == "cuda") for x in batch))
+
+
+def _free(device: torch.device) -> int:
+    """Bytes that a CUDA device has left."""
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0

@@ -4,7 +4,7 @@ World metres (or whatever unit the capture has), float64 throughout: the space t
 Axes are OpenGL's: x right, y up, the camera looks along -z. Pixel centres lie at +0.5.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Annotated
 
@@ -52,6 +52,10 @@ class Cameras:
             distortion=self.distortion[index],
             lens=self.lens[index],
         )
+
+    def to(self, device: torch.device) -> "Cameras":
+        """The same views, their numbers on a device."""
+        return Cameras(*(getattr(self, field.name).to(device) for field in fields(self)))
 
     def resized(self, size: Annotated[Tensor, "V 2"]) -> "Cameras":
         """The same views on another pixel grid: intrinsics move by the exact ratio of each axis."""

@@ -34,6 +34,17 @@ class PixelRays:
         if int(area.sum()) * 24 <= limit:
             self.table = torch.cat([self._solve(int(view)) for view in first])
 
+    @property
+    def device(self) -> torch.device:
+        """Where rays are made, and views and pixels are expected."""
+        return self.start.device
+
+    def to(self, device: torch.device) -> "PixelRays":
+        """Make rays there from now on."""
+        self.cameras, self.kind, self.start = self.cameras.to(device), self.kind.to(device), self.start.to(device)
+        self.table = None if self.table is None else self.table.to(device)
+        return self
+
     def __call__(
         self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"]
     ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:

@@ -5,6 +5,9 @@
 
 Only the kept samples meet the content network, the semantic field, the stylizer and the decoder; what is left out weighs at
 most `budget` a ray, which bounds the colour error (colours lie in [0, 1]).
+
+In training on an accelerator every sample is kept and what is left out has weight 0: how many are left only the device knows,
+and the host would wait for it in each step. Geometry stays in full precision under autocast: a density is an exponential.
 """
 
 from typing import Annotated, NamedTuple
@@ -14,6 +17,7 @@ from torch import Tensor
 
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
 from ..ops import march as compiled
+from ..ops.precision import full_precision
 from ..style.look import Restyle
 from ..types import Rays, Rendered, Sampled, Want
 from .space import Space
@@ -50,6 +54,8 @@ class Kept(NamedTuple):
     """What gradients of their features are multiplied by in training; None = nothing."""
     start: Annotated[Tensor, "R+1"] | None = None
     """Where the samples of each ray begin, and at last where they end; None = unknown."""
+    whole: bool = False
+    """Whether every sample of every ray is here, M = R S."""
 
 
 class March(NamedTuple):
@@ -68,6 +74,11 @@ def march(
     rays: Rays, parts: Parts, *, budget: float, step: int | None = None, generator: torch.Generator | None = None
 ) -> March:
     """Sample, weigh, and keep what matters."""
+    with full_precision(rays.origin):
+        return _march(rays, parts, budget, step, generator)
+
+
+def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator: torch.Generator | None) -> March:
     space = parts.space
     sampled = parts.sampler(_fixed(rays), space=space, step=step, generator=generator)
     # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
@@ -91,8 +102,15 @@ def march(
     with torch.no_grad():
         opacity = -torch.expm1(-optical)
         depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
-        index = keep_heaviest(weights, budget).view(-1).nonzero()[:, 0]
-        ray = index // middle.shape[1]
+        keep = keep_heaviest(weights, budget)
+    if step is not None and rays.origin.device.type != "cpu":
+        ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
+        heavy = torch.where(keep, weights, 0.0).view(-1)
+        flat = None if fair is None else fair.view(-1)
+        kept = Kept(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
+        return March(sampled, weights, depth, opacity, through, kept)
+    index = keep.view(-1).nonzero()[:, 0]
+    ray = index // middle.shape[1]
     kept = Kept(
         ray,
         weights.view(-1).index_select(0, index),
@@ -130,8 +148,11 @@ def _fairness(rays: Rays, middle: Annotated[Tensor, "R S"]) -> Annotated[Tensor,
 
 def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
+    values = values.to(kept.weight.dtype)  # under autocast networks answer in half precision
     if kept.start is not None and compiled.fit(kept.weight, values):
         return compiled.composite(kept.weight, values, kept.start)
+    if kept.whole and rays > 0:
+        return (values * kept.weight[:, None]).view(rays, -1, values.shape[1]).sum(1)
     return values.new_zeros(rays, values.shape[1]).index_add(0, kept.ray, values * kept.weight[:, None])
 
 

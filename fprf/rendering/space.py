@@ -66,8 +66,8 @@ class Space:
 
     def rays(self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"]) -> Rays:
         """World rays (float64, unit directions) as float32 rays of this space."""
-        turn = torch.tensor(self.rotation, dtype=origin.dtype, device=origin.device)
-        o = (origin - torch.tensor(self.centre, dtype=origin.dtype, device=origin.device)) @ turn.T
+        turn = self._constant("rotation", origin)
+        o = (origin - self._constant("centre", origin)) @ turn.T
         d = direction @ turn.T
         view = direction.float()
         if self.kind == "ndc":
@@ -87,7 +87,7 @@ class Space:
             return x
         if self.kind == "contraction":
             return contract(x)
-        low, high = x.new_tensor(self.low), x.new_tensor(self.high)
+        low, high = self._constant("low", x), self._constant("high", x)
         return (x - low) * (2 / (high - low)) - 1
 
     def distance(
@@ -117,8 +117,8 @@ class Space:
         """World distance along unit world rays of the ray parameter t; infinite at NDC's far plane."""
         if self.kind != "ndc":
             return t / self.scale
-        turn = torch.tensor(self.rotation, dtype=origin.dtype, device=origin.device)
-        o = (origin - torch.tensor(self.centre, dtype=origin.dtype, device=origin.device)) @ turn.T
+        turn = self._constant("rotation", origin)
+        o = (origin - self._constant("centre", origin)) @ turn.T
         d = direction @ turn.T
         to_near = -(self.near + o[:, 2]) / d[:, 2]
         start = o[:, 2] + to_near * d[:, 2]
@@ -139,6 +139,18 @@ class Space:
             low, high = torch.where(short, middle, low), torch.where(short, high, middle)
         return low
 
+    @cached_property
+    def _tensors(self) -> dict[tuple[str, torch.dtype, torch.device], Tensor]:
+        return {}
+
+    def _constant(self, name: str, like: Tensor) -> Tensor:
+        """A field as a tensor where another one lies, copied there once: not again in each training step."""
+        key = (name, like.dtype, like.device)
+        if key not in self._tensors:
+            with torch.inference_mode(False):
+                self._tensors[key] = torch.tensor(getattr(self, name), dtype=like.dtype, device=like.device)
+        return self._tensors[key]
+
     def _device_coordinates(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Rays from the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one."""
         dz = d[:, 2].clamp(max=-1e-6)
@@ -153,7 +165,7 @@ class Space:
 
     def _slab(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Where rays enter and leave the box; a ray that misses it gets an empty interval."""
-        low, high = o.new_tensor(self.low), o.new_tensor(self.high)
+        low, high = self._constant("low", o), self._constant("high", o)
         safe = torch.where(d.abs() < 1e-12, torch.full_like(d, 1e-12), d)
         a, b = (low - o) / safe, (high - o) / safe
         near = torch.minimum(a, b).amax(-1).clamp_min(self.near)

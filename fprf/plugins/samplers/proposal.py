@@ -45,7 +45,8 @@ class ProposalSampler(Sampler):
         levels = []
         for field, count in zip(self.levels, counts, strict=True):
             with torch.set_grad_enabled(learns):
-                if sharpness == 1 and isinstance(field, ProposalField) and field.planes.fused(rays.origin):
+                plain = sharpness == 1 and isinstance(field, ProposalField) and march.fit(rays.origin, s)
+                if plain and field.planes.fused(rays.origin):
                     s = self._compiled(field, rays, s, space, count, generator)
                     continue
                 t = space.distance(s, rays.near, rays.far)
@@ -77,11 +78,11 @@ class ProposalSampler(Sampler):
 
     def penalties(self) -> dict[str, Tensor]:
         """'proposal_variation' of all levels' planes."""
-        total = torch.zeros(())
+        parts = []
         for field in self.levels:
             assert isinstance(field, ProposalField)
-            total = total + field.planes.variation()
-        return {"proposal_variation": total}
+            parts.append(field.planes.variation())
+        return {"proposal_variation": torch.stack(parts).sum()}
 
     def learns(self, step: int) -> bool:
         """Every step at first, every `update_every` steps after the warm-up, evenly rarer between."""
