@@ -1,8 +1,8 @@
 """Training batches: random pixels of all training views with their colours and feature targets.
 
 A batch is a pure function of (seed, step): its generator is seeded by BLAKE2b of the two, so any step can be drawn without the
-ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share nothing. A GPU that holds the images draws
-with a generator of its own: the same on every run there, but other pixels than on the CPU.
+ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share nothing. A GPU that holds the images
+draws with a generator of its own: the same on every run there, but other pixels than on the CPU.
 """
 
 import copy
@@ -72,7 +72,7 @@ class _Source(NamedTuple):
     marks: _Marks | None
 
     def to(self, device: torch.device) -> "_Source":
-        return _Source(*(None if part is None else part.to(device) for part in self))
+        return _Source._make(None if part is None else part.to(device) for part in self)
 
 
 class RayBatches(DataManager):

@@ -314,11 +314,11 @@ class Batches:
 
     def _pinned(self, step: int) -> Batch:
         batch = self.manager.batch(step)
-        return Batch(*(x if x is None or self.device.type != "cuda" else x.pin_memory() for x in batch))
+        return Batch._make(x if x is None or self.device.type != "cuda" else x.pin_memory() for x in batch)
 
 
 def _moved(batch: Batch, device: torch.device) -> Batch:
-    return Batch(*(x if x is None else x.to(device, non_blocking=device.type == "cuda") for x in batch))
+    return Batch._make(x if x is None else x.to(device, non_blocking=device.type == "cuda") for x in batch)
 
 
 def _free(device: torch.device) -> int:
