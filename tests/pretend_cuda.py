@@ -10,10 +10,10 @@ counted. Real values flow, so whole training runs, renders and restyles can be d
 CPU. Works with a CPU-only torch.
 
 Name the device with its index ("cuda:0"): a CPU-only torch has no guard that could find the index of "cuda" alone; `auto`
-names it. What it cannot show: memory (`mem_get_info` answers `memory`), streams, kernels' own faults (Triton: run the same
-path under TRITON_INTERPRET=1 on `.inner`), CUDA's own draws (generators are the CPU's), autocast (wrappers have no autocast
-key), and other threads: operators there are neither counted nor pretended. Numbers that reach a kernel as arguments
-(`x + 1.0`, `torch.full`) are no copies, on a card neither.
+names it. What it cannot show: memory (`mem_get_info` answers `memory`), streams, compiled kernels (Triton's are interpreted
+with `triton=True`), CUDA's own draws (generators are the CPU's), autocast (wrappers have no autocast key), and other threads:
+operators there are neither counted nor pretended. Numbers that reach a kernel as arguments (`x + 1.0`, `torch.full`) are no
+copies, on a card neither.
 """
 
 import contextlib
@@ -22,7 +22,8 @@ from collections.abc import Iterator
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
+
+from fprf.ops import triplane_triton
 
 CUDA = torch.device("cuda:0")
 SYNCS = (
@@ -68,6 +69,10 @@ class Pretended(torch.Tensor):
     def is_cpu(self) -> bool:
         return False
 
+    @property
+    def is_meta(self) -> bool:
+        return False
+
     def cpu(self, *a: object, **k: object) -> torch.Tensor:
         return self.to("cpu")
 
@@ -96,35 +101,70 @@ class Pretended(torch.Tensor):
 
 def _run(func, args, kwargs, syncs: Counter, uploads: Counter):
     name = str(func)
-    tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
-    ours = [x for x in tensors if isinstance(x, Pretended)]
-    copies = name in ("aten._to_copy.default", "aten.copy_.default")
-    if name in INDEXED and isinstance(args[0], Pretended):
+    tensors: list[torch.Tensor] = []
+    _each((args, tuple(kwargs.values())), lambda x: tensors.append(x) or x)
+    ours = any(isinstance(x, Pretended) for x in tensors)
+    indexed = name in INDEXED
+    if indexed and isinstance(args[0], Pretended):
         # As CUDA does: indices of the host are copied.
-        away = [isinstance(x, torch.Tensor) and not isinstance(x, Pretended) for x in args[1]]
-        uploads[name] += sum(away)
-        args = (args[0], [Pretended(x) if far else x for x, far in zip(args[1], away, strict=True)], *args[2:])
-        tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
+        for x in args[1]:
+            if isinstance(x, torch.Tensor) and not isinstance(x, Pretended):
+                uploads[name] += 1
+                tensors = [other for other in tensors if other is not x]
+    copies = name in ("aten._to_copy.default", "aten.copy_.default")
     if ours and not copies and any(not isinstance(x, Pretended) and x.dim() > 0 for x in tensors):
         raise RuntimeError(
             f"{name}: Expected all tensors to be on the same device, but found at least two devices, cuda:0 and cpu!"
         )
     target = kwargs.get("device")
-    there = bool(ours) if target is None else torch.device(target).type != "cpu"
-    if name == "aten._to_copy.default" and bool(ours) != there:
+    there = ours if target is None else torch.device(target).type != "cpu"
+    if name == "aten._to_copy.default" and ours != there:
         (uploads if there else syncs)[name] += 1
     elif name == "aten.copy_.default" and isinstance(args[0], Pretended) != isinstance(args[1], Pretended):
         (uploads if isinstance(args[0], Pretended) else syncs)[name] += 1
-    elif ours and (name in SYNCS or (name in INDEXED and _masked(args))):
+    elif ours and (name in SYNCS or (indexed and _masked(args))):
         syncs[name] += 1
-    bare = lambda x: x.inner if isinstance(x, Pretended) else x  # noqa: E731
-    kwargs = {k: torch.device("cpu") if k == "device" and v is not None else v for k, v in kwargs.items()}
-    result = func(*tree_map(bare, args), **tree_map(bare, kwargs))
-    if name.split(".")[1].endswith("_") and args and isinstance(args[0], torch.Tensor):
+    if target is not None:
+        kwargs = {**kwargs, "device": torch.device("cpu")}
+    result = func(*_each(args, _inner), **_each(kwargs, _inner))
+    operator = name.split(".")[1]
+    in_place = operator.startswith("__i") or (operator.endswith("_") and not operator.endswith("__"))
+    if in_place and args and isinstance(args[0], torch.Tensor):
         return args[0]
-    return tree_map(
-        lambda x: Pretended(x) if there and isinstance(x, torch.Tensor) and not isinstance(x, Pretended) else x, result
-    )
+    return _each(result, _wrapped) if there else result
+
+
+def _each(x, change):
+    """A tree of lists, tuples and dicts with its tensors changed."""
+    if isinstance(x, torch.Tensor):
+        return change(x)
+    if isinstance(x, list | tuple):
+        return type(x)([_each(part, change) for part in x])
+    if isinstance(x, dict):
+        return {key: _each(part, change) for key, part in x.items()}
+    return x
+
+
+def _inner(x: torch.Tensor) -> torch.Tensor:
+    return x.inner if isinstance(x, Pretended) else x
+
+
+def _wrapped(x: torch.Tensor) -> torch.Tensor:
+    return x if isinstance(x, Pretended) else Pretended(x)
+
+
+def _kernels(interpreted: bool) -> dict:
+    """Triton's bridge as it is to be while CUDA is pretended."""
+    if not interpreted:
+        return {"usable": lambda points, table: False}
+
+    def inside(function):
+        def call(*args, **kwargs):
+            return _each(function(*_each(args, _inner), **_each(kwargs, _inner)), _wrapped)
+
+        return call
+
+    return {name: inside(getattr(triplane_triton, name)) for name in ("forward", "density", "backward")}
 
 
 def _masked(args) -> bool:
@@ -144,9 +184,10 @@ class _Mode(TorchDispatchMode):
 
 
 @contextlib.contextmanager
-def pretend_cuda(memory: int = 1 << 34) -> Iterator[_Mode]:
+def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False) -> Iterator[_Mode]:
     """Within it, `cuda:0` is a device of so many free bytes. Generators of it are the CPU's; inference mode is `no_grad`, which
-    wrappers allow.
+    wrappers allow. With `triton` its kernels are taken, interpreted (TRITON_INTERPRET=1 must be set before they are loaded),
+    else none of them, also where Triton is installed.
     """
     real, made, given = torch.Generator, torch.tensor, torch.as_tensor
 
@@ -164,11 +205,16 @@ def pretend_cuda(memory: int = 1 << 34) -> Iterator[_Mode]:
             return given(data, dtype=dtype, device=device)
         return given(data, dtype=dtype).to(device)
 
-    def inference_mode(mode=True):
-        return torch.no_grad() if mode else contextlib.nullcontext()
+    def enter(mode):
+        mode.before = torch.is_grad_enabled()
+        torch.set_grad_enabled(mode.before and not mode.mode)
+
+    def leave(mode, *error):
+        torch.set_grad_enabled(mode.before)
 
     replaced = {
-        torch: {"Generator": Generator, "inference_mode": inference_mode, "tensor": tensor, "as_tensor": as_tensor},
+        torch: {"Generator": Generator, "tensor": tensor, "as_tensor": as_tensor},
+        torch.inference_mode: {"__enter__": enter, "__exit__": leave},
         torch.Tensor: {"pin_memory": lambda self, *a: self},
         torch.cuda: {
             "_lazy_init": lambda: None,
@@ -178,6 +224,7 @@ def pretend_cuda(memory: int = 1 << 34) -> Iterator[_Mode]:
             "mem_get_info": lambda device=None: (memory, memory),
             "synchronize": lambda device=None: None,
         },
+        triplane_triton: _kernels(triton),
     }
     kept = {(owner, name): getattr(owner, name) for owner, names in replaced.items() for name in names}
     for owner, names in replaced.items():

@@ -5,14 +5,15 @@ The chart of the surroundings contracts: all blocks together fill the inner half
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from functools import cached_property
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..rendering.space import contract
 from ..types import Boxes
-from .windows import local
+from .windows import aligned, local
 
 __all__ = ["Chart", "chart_of", "surroundings_of"]
 
@@ -28,16 +29,40 @@ class Chart:
 
     def locate(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
         """Points of the space to the cube; a block's chart takes those inside its box alone to points inside the cube."""
-        x = local(points, self.turn)
-        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+        there = self._placed(points)
+        x = local(points, there.turn)
         # The middle is taken off before anything is scaled: float32 keeps what is left of a large coordinate.
-        y = (x - middle.to(x)) / half.to(x)
+        y = (x - there.middle) / there.half
         return contract(y) if self.contracted else y
 
     def inside(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """Whether points lie in the box."""
-        x = local(points, self.turn)
-        return ((x >= self.low.to(x)) & (x <= self.high.to(x))).all(-1)
+        there = self._placed(points)
+        x = local(points, there.turn)
+        return ((x >= there.low) & (x <= there.high)).all(-1)
+
+    @cached_property
+    def _numbers(self) -> "dict[tuple[torch.dtype, torch.device], _Placed]":
+        return {}
+
+    def _placed(self, points: Tensor) -> "_Placed":
+        """The chart's numbers where points lie, copied there once: not again in each training step."""
+        key = (points.dtype, points.device)
+        if key not in self._numbers:
+            middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+            turn = None if aligned(self.turn) else self.turn.to(points)
+            with torch.inference_mode(False):
+                self._numbers[key] = _Placed(turn, *(x.to(points) for x in (middle, half, self.low, self.high)))
+        return self._numbers[key]
+
+
+class _Placed(NamedTuple):
+    turn: Tensor | None
+    """None for the axes of the space."""
+    middle: Tensor
+    half: Tensor
+    low: Tensor
+    high: Tensor
 
 
 def chart_of(boxes: Boxes, block: int) -> Chart:

@@ -53,6 +53,11 @@ class BlockedField(ContentField):
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
         """Blended content features."""
         owner, points = latent[:, 0].detach(), latent[:, 1:4].detach()
+        whole = self.router.whole(points)
+        if whole is not None and whole.weight is None:
+            return self.members.member(whole.members[0]).field.content(latent[:, 4:], view)
+        if whole is not None:
+            return self._shared(points, view, whole)
         found, places = [], []
         for number in torch.unique(owner).tolist():
             index = (owner == number).nonzero()[:, 0]

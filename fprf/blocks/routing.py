@@ -41,26 +41,48 @@ class Router(ABC):
     def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
         """The groups of points of the space."""
 
+    def whole(self, points: Annotated[Tensor, "N 3"]) -> Group | None:
+        """The one group that all points are in; None where that cannot be told without looking at them."""
+        return None
+
 
 class Everywhere(Router):
     """One member over everything."""
 
     def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
         """One group."""
-        return [Group((0,), torch.arange(len(points), device=points.device), None)]
+        return [self.whole(points)]
+
+    def whole(self, points: Annotated[Tensor, "N 3"]) -> Group:
+        """All points."""
+        return Group((0,), _all(points), None)
 
 
 class Inset(Router):
-    """Member 0 inside of a chart's box, member 1 outside."""
+    """Member 0 inside of a chart's box, member 1 outside.
+
+    On an accelerator both look at all points, one of them with weight 0: how many lie inside only the device knows, and the
+    host would wait for it.
+    """
 
     def __init__(self, chart: Chart) -> None:
         self.chart = chart
 
     def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
         """Up to two groups."""
+        whole = self.whole(points)
+        if whole is not None:
+            return [whole]
         inside = self.chart.inside(points)
         parts = (Group((0,), inside.nonzero()[:, 0], None), Group((1,), (~inside).nonzero()[:, 0], None))
         return [part for part in parts if len(part.at)]
+
+    def whole(self, points: Annotated[Tensor, "N 3"]) -> Group | None:
+        """Both members at all points, on an accelerator."""
+        if points.device.type == "cpu":
+            return None
+        inside = self.chart.inside(points)
+        return Group((0, 1), _all(points), torch.stack([inside, ~inside], -1).to(points.dtype))
 
 
 class Blend(Router):
@@ -149,6 +171,10 @@ class Blend(Router):
             rank[torch.tensor(order)] = torch.arange(len(names))
             return rank[number], [names[k] for k in order]
         return number + 1, [(), *names]
+
+
+def _all(points: Tensor) -> Annotated[Tensor, "N"]:
+    return torch.arange(len(points), device=points.device)
 
 
 def _reaching(boxes: Boxes) -> Boxes:

@@ -13,12 +13,17 @@ from torch import Tensor
 
 from ..types import Boxes
 
-__all__ = ["local", "shares", "window"]
+__all__ = ["aligned", "local", "shares", "window"]
 
 
-def local(points: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "3 3"]) -> Annotated[Tensor, "N 3"]:
-    """Points in the axes of a cell."""
-    if bool((turn == torch.eye(3, dtype=turn.dtype, device=turn.device)).all()):
+def aligned(turn: Annotated[Tensor, "3 3"]) -> bool:
+    """Whether axes are those of the space."""
+    return bool((turn == torch.eye(3, dtype=turn.dtype, device=turn.device)).all())
+
+
+def local(points: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "3 3"] | None) -> Annotated[Tensor, "N 3"]:
+    """Points in the axes of a cell; None = those of the space."""
+    if turn is None or (turn.device.type == "cpu" and aligned(turn)):
         return points
     return points @ turn.to(points).T
 

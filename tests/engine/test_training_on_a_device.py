@@ -1,0 +1,343 @@
+"""Training on the pretended device gives what the CPU gives, and the host neither waits nor copies in a step."""
+
+import importlib.util
+import json
+import shutil
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from block_world import BlockWorld, tensors_of
+from pretend_cuda import CUDA, pretend_cuda
+from tiny_world import Altered, World, parameters
+
+from fprf.config import TrainConfig
+from fprf.engine import checkpoint, trainer
+from fprf.engine.block_task import BlockTask, train_block
+from fprf.engine.blocks import SURROUNDINGS
+from fprf.engine.model import build_model
+from fprf.engine.prepare import device_of, prepare
+from fprf.engine.run import Run
+from fprf.engine.style_pass import measure_style
+from fprf.engine.trainer import Report, train
+from fprf.errors import NumericsError
+from fprf.interfaces import DataManager
+from fprf.methods import fprf
+from fprf.ops import triplane_triton
+from fprf.plugins.decoders.config import ResidualDecoderConfig
+from fprf.plugins.samplers.config import UniformConfig
+from fprf.types import Batch
+
+STEPS = 4
+NAN = float("nan")
+Change = Callable[[int, Batch], Batch]
+
+
+class Meddled(Altered):
+    """Altered batches, on whatever device they are."""
+
+    def to(self, device: torch.device, *, room: int) -> DataManager:
+        return Meddled(self.inner.to(device, room=room), self.change)
+
+
+def marked(step: int, batch: Batch) -> Batch:
+    """Depths and sky, which the town has not."""
+    x, y = batch.pixel.unbind(1)
+    return batch._replace(distance=torch.where(x < 16, 0.5 + x / 16, NAN), sky=y < 8 - step)
+
+
+def stopping(at: int) -> Change:
+    def change(step: int, batch: Batch) -> Batch:
+        if step == at:
+            raise KeyboardInterrupt
+        return batch
+
+    return change
+
+
+def spoilt(*steps: int, value: float = NAN) -> Change:
+    return lambda step, batch: batch._replace(rgb=torch.full_like(batch.rgb, value)) if step in steps else batch
+
+
+class Steps:
+    """What the host did in each step of training on the pretended device."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.waits: list[int] = []
+        self.uploads: list[int] = []
+        self.seen: Any = None
+        plain = trainer.Loop.step
+
+        def counted(loop: trainer.Loop, step: int, share: float) -> Any:
+            before = self.seen.syncs.total(), self.seen.uploads.total()
+            result = plain(loop, step, share)
+            self.waits.append(self.seen.syncs.total() - before[0])
+            self.uploads.append(self.seen.uploads.total() - before[1])
+            return result
+
+        monkeypatch.setattr(trainer.Loop, "step", counted)
+        monkeypatch.setattr(trainer, "REPORT_SECONDS", 1e9)
+
+
+def trained(
+    config: TrainConfig, folder: Path, change: Change | None = None, wrap: type[Altered] = Meddled
+) -> tuple[Run, list[Report]]:
+    """Prepare and train; the reports."""
+    prepared, reports = prepare(config), []
+    if change is not None:
+        prepared = prepared._replace(manager=wrap(prepared.manager, change))
+    folder.mkdir(exist_ok=True)
+    train(config, prepared, Run(folder), reports.append)
+    return Run(folder), reports
+
+
+def on_device(config: TrainConfig, folder: Path, steps: Steps | None = None, **how: Any) -> tuple[Run, list[Report]]:
+    with pretend_cuda() as seen:
+        if steps is not None:
+            steps.seen = seen
+        return trained(replace(config, device="cuda:0"), folder, **how)
+
+
+def events(run: Run) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (run.root / "events.jsonl").read_text().splitlines()]
+
+
+def apart(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], start: dict[str, torch.Tensor]) -> float:
+    """Distance of two runs' parameters as a share of the way that one came."""
+    assert a.keys() == b.keys()
+    names = [name for name in a if name.startswith("model.") and a[name].is_floating_point()]
+    off = sum(float((a[name] - b[name]).double().square().sum()) for name in names)
+    way = sum(float((b[name] - start[name]).double().square().sum()) for name in names)
+    return float((off / way) ** 0.5)
+
+
+def variant(name: str, config: TrainConfig) -> TrainConfig:
+    config, content = replace(config, steps=STEPS), config.content
+    match name:
+        case "tones":
+            return replace(config, tones=True)
+        case "poses":
+            return replace(config, poses=0.02)
+        case "residual":
+            return replace(config, content=replace(content, decoder=ResidualDecoderConfig()))
+        case "uniform":
+            return replace(config, sampler=UniformConfig(samples=12))
+        case "no semantics":
+            return replace(config, semantic=replace(config.semantic, encoder=None))
+        case "paper":
+            # The method `fprf` with the sizes and encoders of the tiny one.
+            method = fprf()
+            return replace(
+                method,
+                data=config.data,
+                output=config.output,
+                steps=STEPS,
+                device=config.device,
+                datamanager=replace(method.datamanager, rays=128),
+                sampler=replace(method.sampler, samples=(12, 8), final=6, resolutions=(8, 8), channels=8, anneal_steps=2),
+                content=replace(method.content, encoder=content.encoder, field=content.field),
+                semantic=replace(config.semantic, samples=48),
+            )
+    return config
+
+
+@pytest.mark.parametrize("name", ["lite", "tones", "poses", "residual", "marked", "uniform", "no semantics", "paper"])
+def test_training_is_that_of_the_cpu_without_waits_or_copies(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    config, steps, change = variant(name, world.config), Steps(monkeypatch), marked if name == "marked" else None
+    run, reports = on_device(config, tmp_path / "device", steps, change=change)
+    assert steps.waits == [0] * STEPS
+    assert steps.uploads[2:] == [0] * (STEPS - 2), "constants are copied when they are first met"
+    other, expected = trained(config, tmp_path / "cpu", change)
+    start, _ = trained(replace(config, steps=0), tmp_path / "start")
+    assert reports[-1].losses == pytest.approx(expected[-1].losses, rel=1e-5, abs=1e-9)
+    # Compiled sums and torch's round differently, and Adam turns a gradient that is rounding alone into a whole step.
+    assert apart(parameters(run, STEPS), parameters(other, STEPS), parameters(start, 0)) < 1e-4
+
+
+def test_a_run_on_a_device_is_resumed_to_the_bit(world: World, tmp_path: Path) -> None:
+    config, halves = replace(world.config, steps=5), tmp_path / "halves"
+    straight, _ = on_device(config, tmp_path / "straight")
+    with pytest.raises(KeyboardInterrupt):
+        on_device(config, halves, change=stopping(3))
+    assert checkpoint.steps(Run(halves).checkpoints) == [3]
+    on_device(config, halves)
+    a, b = parameters(straight, 5), parameters(Run(halves), 5)
+    assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_step_that_is_not_finite_changes_nothing(world: World, tmp_path: Path) -> None:
+    """As on the CPU, but told at a report."""
+    config = replace(world.config, steps=4)
+    run, reports = on_device(config, tmp_path / "device", change=spoilt(1, 2))
+    other, expected = trained(config, tmp_path / "cpu", spoilt(1, 2))
+    start, _ = trained(replace(config, steps=0), tmp_path / "start")
+    assert apart(parameters(run, 4), parameters(other, 4), parameters(start, 0)) < 1e-4
+    steps = [value for name, value in parameters(run, 4).items() if name.endswith(".step")]
+    assert steps and all(float(step) == 2 for step in steps)
+    assert reports[-1].skipped == expected[-1].skipped == 2
+    assert reports[-1].losses == pytest.approx(expected[-1].losses, rel=1e-5, abs=1e-9)
+    assert [event["skipped"] for event in events(run) if "skipped" in event] == ["rgb"]
+
+
+def test_faults_that_go_on_lead_back_and_then_end_it(world: World, tmp_path: Path) -> None:
+    config, folder = replace(world.config, steps=9), tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        on_device(config, folder, change=stopping(2))
+    with pytest.raises(NumericsError, match=r"rgb is not finite for 3 steps in a row, again after going back to step 2; lower"):
+        on_device(config, folder, change=spoilt(*range(3, 9)))
+    assert len([event for event in events(Run(folder)) if "gone_back_to" in event]) == 1
+    assert checkpoint.steps(Run(folder).checkpoints) == [2]
+
+
+def test_gradients_that_are_too_large_are_found_on_the_device(world: World, tmp_path: Path) -> None:
+    reports: list[Report] = []
+    with pretend_cuda():
+        config = replace(world.config, steps=2, device="cuda:0")
+        prepared = prepare(config)
+        model = build_model(config, prepared.facts).to(CUDA)
+        model.learned()[1].register_hook(lambda gradient: torch.full_like(gradient, 3e38))
+        before = {name: value.clone() for name, value in model.state_dict().items()}
+        train(config, prepared, Run(tmp_path), reports.append, model=model)
+        assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert reports[-1].skipped == 2 and reports[-1].losses["rgb"] < 1
+    assert [event["skipped"] for event in events(Run(tmp_path)) if "skipped" in event] == ["a gradient"]
+
+
+class Foreign(Altered):
+    """A data manager of another package: it knows nothing of devices, and notes who asks for which step."""
+
+    def __init__(self, inner: DataManager, change: Change) -> None:
+        super().__init__(inner, change)
+        self.asked: list[tuple[int, bool]] = []
+
+    def batch(self, step: int) -> Batch:
+        self.asked.append((step, threading.current_thread() is threading.main_thread()))
+        return super().batch(step)
+
+
+@pytest.mark.parametrize("foreign", [True, False])
+def test_batches_of_host_memory_come_one_step_ahead(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, foreign: bool
+) -> None:
+    """Of a data manager that knows no devices, and where the device has no room."""
+    config, steps, made = replace(world.config, steps=STEPS), Steps(monkeypatch), []
+
+    def wrap(inner: DataManager, change: Change) -> DataManager:
+        made.append(Foreign(inner, change) if foreign else Meddled(inner, change))
+        return made[-1]
+
+    small = config if foreign else replace(config, device_memory=1e-9)
+    run, _ = on_device(small, tmp_path / "device", steps, change=lambda step, batch: batch, wrap=wrap)
+    assert steps.waits == [0] * STEPS
+    assert steps.uploads[2:] == [5] * (STEPS - 2), "view, pixel, colour and two kinds of features"
+    if foreign:
+        assert made[0].asked == [(0, True), *((step, False) for step in range(1, STEPS + 1))]
+    other, _ = trained(config, tmp_path / "cpu")
+    start, _ = trained(replace(config, steps=0), tmp_path / "start")
+    assert apart(parameters(run, STEPS), parameters(other, STEPS), parameters(start, 0)) < 1e-4
+
+
+def test_a_thread_draws_again_after_going_back() -> None:
+    asked = []
+
+    class Numbers(DataManager):
+        def batch(self, step: int) -> Batch:
+            asked.append(step)
+            if step == 5:
+                raise ValueError("no such step")
+            return Batch(torch.tensor([step]), torch.zeros(1, 2), torch.zeros(1, 3))
+
+        def image(self, view: int) -> torch.Tensor:
+            raise NotImplementedError
+
+    batches = trainer.Batches(Numbers(), torch.device("meta"))
+    assert [int(batches(step).view) for step in (0, 1, 2, 0, 1, 4)] == [0, 1, 2, 0, 1, 4]
+    with pytest.raises(ValueError, match="no such step"):
+        batches(5)
+    assert asked[:8] == [0, 1, 2, 3, 0, 1, 2, 4]
+
+
+def test_the_style_of_a_scene_is_that_of_the_cpu(world: World) -> None:
+    known = world.load()
+    scene = world.prepared.scene
+    expected = measure_style(world.config, known.model, scene.cameras, scene.train)
+    with pretend_cuda():
+        found = measure_style(world.config, world.load().model.to(CUDA), scene.cameras, scene.train)
+    for name, value in expected._asdict().items():
+        assert getattr(found, name).device.type == "cpu"
+        assert (getattr(found, name) - value).abs().max() <= 1e-5 * (1 + value.abs().max()), name
+
+
+def test_features_are_made_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pretend_cuda() as seen:
+        assert device_of("auto") == CUDA
+        there = prepare(replace(world.config, device="auto"))
+    assert seen.uploads["aten._to_copy.default"] > 2 * len(there.scene.train), "each image, to each encoder"
+    here = world.prepared.manager.batch(0)
+    batch = there.manager.batch(0)
+    assert batch.content is not None and here.content is not None and there.manager.content_store is not None
+    assert (batch.content - here.content).abs().max() <= 1e-3 * there.manager.content_store.scale
+    assert batch.semantic is not None and here.semantic is not None and there.manager.semantic_store is not None
+    assert (batch.semantic - here.semantic).abs().max() <= 1e-3 * there.manager.semantic_store.scale
+
+
+@pytest.mark.parametrize(("block", "name"), [(SURROUNDINGS, "surroundings"), (1, "01")])
+def test_blocks_are_trained_on_a_device(
+    block_world: BlockWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int, name: str
+) -> None:
+    """The surroundings, and a block inside of those that the CPU has trained."""
+    root, steps = tmp_path / "run", Steps(monkeypatch)
+    shutil.copytree(block_world.root, root)
+    config, method = Run(root).load_config()
+    Run(root).save_config(replace(config, device="cuda:0"), method)
+    shutil.rmtree(root / "blocks" / name / "checkpoints")
+    (root / "blocks" / name / "done.json").unlink()
+    with pretend_cuda() as steps.seen:
+        task = BlockTask(root=str(root), data=str(block_world.config.data), block=block, minutes=None, quiet=True)
+        assert train_block(task, lambda event: None)
+    assert set(steps.waits) == {0} and set(steps.uploads[2:]) == {0}
+    found, expected = tensors_of(root, name), tensors_of(block_world.root, name)
+    assert found.keys() == expected.keys()
+    for key, value in expected.items():
+        assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
+
+
+@pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
+def test_kernels_of_the_device_are_taken(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tri-planes by Triton, interpreted, in training, also where proposals are trusted and learn nothing in a step."""
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    sampler = replace(world.config.sampler, anneal_steps=0, warm_up=1, update_every=2)
+    config = replace(
+        world.config, steps=3, device="cuda:0", datamanager=replace(world.config.datamanager, rays=32), sampler=sampler
+    )
+    taken: Counter[str] = Counter()
+    for name in ("forward", "density", "backward"):
+        monkeypatch.setattr(triplane_triton, name, counting(taken, name))
+    steps = Steps(monkeypatch)
+    with pretend_cuda(triton=True) as steps.seen:
+        run, _ = trained(config, tmp_path / "triton")
+    # Of 3 steps: content and semantics there and back, the proposals' back where they learn.
+    assert (taken["density"], taken["forward"]) == (6, 3) and taken["backward"] == 8
+    assert steps.waits == [0, 0, 0]
+    monkeypatch.delenv("TRITON_INTERPRET")
+    other, _ = on_device(config, tmp_path / "plain")
+    start, _ = on_device(replace(config, steps=0), tmp_path / "start")
+    assert apart(parameters(run, 3), parameters(other, 3), parameters(start, 0)) < 1e-3
+
+
+def counting(taken: Counter[str], name: str) -> Callable[..., Any]:
+    function = getattr(triplane_triton, name)
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        taken[name] += args[0].dim() == 2 and len(args[0]) > 5  # not the few points that a new model is asked
+        return function(*args, **kwargs)
+
+    return call
