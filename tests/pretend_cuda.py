@@ -40,6 +40,7 @@ SYNCS = (
     "aten._linalg_eigh.default",
     "aten._linalg_check_errors.default",
 )
+RESHAPED = ("squeeze_", "unsqueeze_", "t_", "transpose_")
 INDEXED = ("aten.index.Tensor", "aten.index_put.default", "aten.index_put_.default", "aten._index_put_impl_.default")
 
 
@@ -130,6 +131,9 @@ def _run(func, args, kwargs, syncs: Counter, uploads: Counter):
     operator = name.split(".")[1]
     in_place = operator.startswith("__i") or (operator.endswith("_") and not operator.endswith("__"))
     if in_place and args and isinstance(args[0], torch.Tensor):
+        if operator in RESHAPED and isinstance(args[0], Pretended):
+            with torch._C._DisableTorchDispatch():
+                func(*args, **kwargs)  # the wrapper's own shape
         return args[0]
     return _each(result, _wrapped) if there else result
 
@@ -164,7 +168,11 @@ def _kernels(interpreted: bool) -> dict:
 
         return call
 
-    return {name: inside(getattr(triplane_triton, name)) for name in ("forward", "density", "backward")}
+    usable = triplane_triton.usable
+    return {
+        "usable": lambda points, table: isinstance(points, Pretended) and usable(points, table),
+        **{name: inside(getattr(triplane_triton, name)) for name in ("forward", "density", "backward")},
+    }
 
 
 def _masked(args) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, trained_for
 
 from fprf.commands.parsing import parse
@@ -23,8 +24,10 @@ from fprf.engine.model import build_model
 from fprf.engine.prepare import device_of, prepare
 from fprf.engine.schedule import progress
 from fprf.engine.style_pass import measure_style
+from fprf.engine.trainer import Loop, optimizer_of
 from fprf.engine.views import render_view
 from fprf.methods import fprf_lite
+from fprf.ops.precision import lowered
 from fprf.output.images import write_image
 from fprf.plugins.codec import from_json, to_json
 
@@ -36,6 +39,8 @@ SECOND: dict[str, tuple[Any, str]] = {
     "minutes": (0.25, "schedule"),
     "seed": (1, "model"),
     "device": ("tpu", "device"),
+    "device_memory": (0.25, "accelerator"),
+    "precision": ("tf32", "accelerator"),
     "checkpoint_minutes": (1e-9, "saving"),
     "datamanager.rays": (128, "training"),
     "datamanager.semantic_share": (0.75, "training"),
@@ -214,6 +219,23 @@ def test_it_names_a_file(path: str, world: World) -> None:
     }
     with pytest.raises(Exception, match=r"w\.safetensors"):
         builds[path]()
+
+
+def test_it_changes_what_an_accelerator_does(world: World) -> None:
+    """Where images lie, and how matrices are multiplied."""
+    assert shown("accelerator") == ["device_memory", "precision"]
+    manager = world.prepared.manager
+    assert isinstance(manager, RayBatches)
+    size = manager.held_bytes
+    with pretend_cuda(memory=3 * size):
+        for config, there in ((world.config, True), (changed(world.config, "device_memory", 0.25), False)):
+            prepared = prepare(config)
+            loop = Loop(config, prepared, model := build_model(config, prepared.facts), optimizer_of(config, model), CUDA)
+            assert (loop.manager.batch(0).rgb.device == CUDA) == there
+        with lowered(world.config.precision, CUDA):
+            assert torch.get_float32_matmul_precision() == "highest"
+        with lowered(changed(world.config, "precision", "tf32").precision, CUDA):
+            assert torch.get_float32_matmul_precision() == "high"
 
 
 def test_tones_and_poses_are_facts_of_the_scene(world: World) -> None:

@@ -157,10 +157,15 @@ class RayBatches(DataManager):
             sky=None if source.sky is None else source.sky.holds(at),
         )
 
+    @property
+    def held_bytes(self) -> int:
+        """Size of the images and the features' coefficients."""
+        stores = (self.content_store, self.semantic_store)
+        return self._pixels.numel() + sum(store.bytes for store in stores if store is not None)
+
     def to(self, device: torch.device, *, room: int) -> "RayBatches":
         """The same pixels drawn on a CUDA device, where images and coefficients take at most `room` bytes."""
-        stores = [store for store in (self.content_store, self.semantic_store) if store is not None]
-        if device.type != "cuda" or self._pixels.numel() + sum(store.bytes for store in stores) > room:
+        if device.type != "cuda" or self.held_bytes > room:
             return self
         there = copy.copy(self)
         there._source = self._source.to(device)

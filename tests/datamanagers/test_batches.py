@@ -1,11 +1,13 @@
 """Training batches: pure in (seed, step), uniform over pixels, right at every pixel."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 from fprf.datamanagers.batches import RayBatches, generator_of
@@ -184,3 +186,35 @@ def test_a_scene_without_training_views_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(DataError, match="empty: no training views"):
         make(empty, tmp_path)
+
+
+def test_a_device_draws_what_the_host_draws(tmp_path: Path) -> None:
+    """Pixels, colours, features, masks, sky and depths; its generator is the CPU's here, which on a card is another one."""
+    scene, _ = make_scene(tmp_path)
+    masks = tuple(tmp_path / f"half-{view}.png" for view in range(len(SIZES)))
+    for mask, (width, height) in zip(masks, SIZES, strict=True):
+        half = np.zeros((height, width), np.uint8)
+        half[: height // 2 + 1] = 255
+        assert cv2.imwrite(str(mask), half)
+    points = torch.tensor([[0.1, 0.2, -2.0], [-0.3, 0.1, -3.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    scene = replace(scene, masks=masks, sky_masks=(None, None, *masks[2:]), points=points)
+    config = RayBatchesConfig(rays=200, semantic_share=0.5, depth_share=0.2)
+    encoder = RandomConfig().build()
+    manager = RayBatches(config, scene=scene, content=encoder, semantic=encoder, dim=4, cache=tmp_path, seed=3)
+    with pretend_cuda() as seen:
+        assert manager.to(CUDA, room=manager.held_bytes - 1) is manager is manager.to(torch.device("mps"), room=1 << 40)
+        there = manager.to(CUDA, room=manager.held_bytes)
+        seen.syncs.clear()
+        seen.uploads.clear()
+        for step in (0, 7):
+            found = there.batch(step)
+            assert not seen.syncs and not seen.uploads
+            here = manager.batch(step)
+            for name, value, other in zip(found._fields, found, here, strict=True):
+                assert value.device == CUDA and other.device.type == "cpu"
+                if name in ("content", "semantic"):
+                    assert (value.cpu() - other).abs().max() <= 1e-5 * other.abs().max()
+                else:
+                    assert torch.equal(value.cpu().nan_to_num(-1.0), other.nan_to_num(-1.0)), name
+            seen.syncs.clear()
+        assert torch.equal(there.image(2), manager.image(2)), "views stay in host memory"

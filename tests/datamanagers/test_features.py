@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 from fprf.datamanagers import features as module
@@ -98,6 +99,20 @@ def test_compiled_and_plain_answers_agree(tmp_path: Path, monkeypatch: pytest.Mo
     compiled = store.at(*where)
     monkeypatch.setattr(module, "_COMPILED", False)
     assert (store.at(*where) - compiled).abs().max() <= 1e-5 * compiled.abs().max()
+
+
+def test_coefficients_on_a_device_answer_as_those_of_the_host(tmp_path: Path) -> None:
+    store, where = build(tmp_path, Counting(11)), draw()
+    where[1][:4] = torch.tensor([[0.0, 0.0], [1e3, 1e3], [-5.0, 3.0], [3.0, -5.0]])
+    expected = store.at(*where)
+    with pretend_cuda() as seen:
+        there, given = store.to(CUDA), [x.to(CUDA) for x in where]
+        seen.syncs.clear()
+        seen.uploads.clear()
+        found = there.at(*given)
+        assert not seen.syncs and not seen.uploads and found.device == CUDA
+        assert (found.cpu() - expected).abs().max() <= 1e-5 * expected.abs().max()
+        assert torch.equal(there.at(*where), expected), "what is asked in host memory is answered there"
 
 
 def test_offsets_and_magnitudes_cost_no_accuracy(tmp_path: Path) -> None:

@@ -1,12 +1,15 @@
 """Rays through points of the reconstruction: where they should end."""
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 from fprf.engine.losses import NEARBY, ending
 
+NAN = float("nan")
 EDGES = torch.linspace(0.0, 10.0, 101)
 
 
@@ -66,3 +69,24 @@ def test_it_does_not_depend_on_the_scale_of_space() -> None:
     one, other = ending(rays(4), weights, distance), ending(rays(4) * 8, weights, distance * 8)
     assert one is not None and other is not None
     torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("known", [[1.0, NAN, 5.0, NAN], [NAN] * 4])
+def test_a_device_gives_the_same_without_waiting(known: list[float]) -> None:
+    """But for 0 where nothing is known."""
+    weights, distance = torch.rand(4, 100), torch.tensor(known)
+    here = weights.clone().requires_grad_()
+    expected = ending(rays(4), here, distance)
+    if expected is not None:
+        expected.backward()
+    with pretend_cuda() as seen:
+        there = weights.to(CUDA).requires_grad_()
+        given = rays(4).to(CUDA), there, distance.to(CUDA)
+        found = ending(*given)
+        assert found is not None
+        found.backward()
+        assert not seen.syncs
+        gradient = there.grad
+        assert gradient is not None
+        torch.testing.assert_close(found.detach().cpu(), torch.zeros(()) if expected is None else expected.detach())
+        torch.testing.assert_close(gradient.cpu(), torch.zeros_like(weights) if here.grad is None else here.grad)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, trained_for
 
 from fprf.engine.losses import SHELL, emptiness
@@ -24,6 +25,18 @@ def test_what_sky_rays_meet_before_the_shell(shell: float, wanted: float) -> Non
 
 def test_without_sky_there_is_no_term() -> None:
     assert emptiness(torch.rand(2, 4), torch.rand(2, 3), torch.tensor([False, False]), within=SHELL) is None
+
+
+@pytest.mark.parametrize("sky", [[True, False, True], [False] * 3])
+def test_a_device_gives_the_same_without_waiting(sky: list[bool]) -> None:
+    """But for 0 where there is none."""
+    t, weights = torch.tensor([[1.0, 3.0, 6.0]]).repeat(3, 1), torch.tensor([[0.3, 0.6], [0.5, 0.5], [1.0, 0.0]])
+    expected = emptiness(t, weights, torch.tensor(sky), within=SHELL)
+    with pretend_cuda() as seen:
+        given = t.to(CUDA), weights.to(CUDA), torch.tensor(sky).to(CUDA)
+        found = emptiness(*given, within=SHELL)
+        assert found is not None and not seen.syncs
+        assert found.item() == pytest.approx(0.0 if expected is None else expected.item())
 
 
 def test_the_sky_is_cleared(world: World, tmp_path: Path) -> None:

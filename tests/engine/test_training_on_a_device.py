@@ -2,9 +2,11 @@
 
 import importlib.util
 import json
+import os
 import shutil
+import subprocess
+import sys
 import threading
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +30,6 @@ from fprf.engine.trainer import Report, train
 from fprf.errors import NumericsError
 from fprf.interfaces import DataManager
 from fprf.methods import fprf
-from fprf.ops import triplane_triton
 from fprf.plugins.decoders.config import ResidualDecoderConfig
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.types import Batch
@@ -46,7 +47,7 @@ class Meddled(Altered):
 
 
 def marked(step: int, batch: Batch) -> Batch:
-    """Depths and sky, which the town has not."""
+    """Depths and sky of made-up places."""
     x, y = batch.pixel.unbind(1)
     return batch._replace(distance=torch.where(x < 16, 0.5 + x / 16, NAN), sky=y < 8 - step)
 
@@ -310,34 +311,60 @@ def test_blocks_are_trained_on_a_device(
         assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
 
 
+TRITON = """
+import sys
+from collections import Counter
+from pathlib import Path
+from pretend_cuda import pretend_cuda
+from fprf.engine import trainer
+from fprf.engine.prepare import prepare
+from fprf.engine.run import Run
+from fprf.ops import triplane_triton
+
+taken = Counter()
+
+def counting(name, function):
+    def call(points, table, *args, **kwargs):
+        taken[name] += len(points) > 5  # not the few that a new model is asked
+        return function(points, table, *args, **kwargs)
+    return call
+
+for name in ("forward", "density", "backward"):
+    setattr(triplane_triton, name, counting(name, getattr(triplane_triton, name)))
+run, trainer.REPORT_SECONDS = Run(Path(sys.argv[1])), 1e9
+config, _ = run.load_config()
+with pretend_cuda(triton=True) as seen:
+    prepared = prepare(config)
+    step = trainer.Loop.step
+    def counted(loop, *args):
+        before = seen.syncs.total()
+        result = step(loop, *args)
+        taken["waits"] += seen.syncs.total() - before
+        return result
+    trainer.Loop.step = counted
+    trainer.train(config, prepared, run, lambda event: None)
+print(*(taken[name] for name in ("density", "forward", "backward", "waits")))
+"""
+
+
 @pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
-def test_kernels_of_the_device_are_taken(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tri-planes by Triton, interpreted, in training, also where proposals are trusted and learn nothing in a step."""
-    monkeypatch.setenv("TRITON_INTERPRET", "1")
+def test_kernels_of_the_device_are_taken(world: World, tmp_path: Path) -> None:
+    """Tri-planes by Triton, also where proposals are trusted and learn nothing in a step.
+
+    Triton is told to interpret its kernels before it is imported, so in a process of its own.
+    """
     sampler = replace(world.config.sampler, anneal_steps=0, warm_up=1, update_every=2)
-    config = replace(
-        world.config, steps=3, device="cuda:0", datamanager=replace(world.config.datamanager, rays=32), sampler=sampler
-    )
-    taken: Counter[str] = Counter()
-    for name in ("forward", "density", "backward"):
-        monkeypatch.setattr(triplane_triton, name, counting(taken, name))
-    steps = Steps(monkeypatch)
-    with pretend_cuda(triton=True) as steps.seen:
-        run, _ = trained(config, tmp_path / "triton")
-    # Of 3 steps: content and semantics there and back, the proposals' back where they learn.
-    assert (taken["density"], taken["forward"]) == (6, 3) and taken["backward"] == 8
-    assert steps.waits == [0, 0, 0]
-    monkeypatch.delenv("TRITON_INTERPRET")
+    batches = replace(world.config.datamanager, rays=16)
+    config = replace(world.config, steps=2, device="cuda:0", datamanager=batches, sampler=sampler)
+    run = Run(tmp_path / "triton")
+    run.root.mkdir()
+    run.save_config(config, "fprf-lite")
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    command = [sys.executable, "-c", TRITON, str(run.root)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    # Of each step: proposals and content have a density, semantics a lookup; the proposals learn in the first one.
+    assert done.stdout.split() == ["4", "2", "5", "0"]
     other, _ = on_device(config, tmp_path / "plain")
     start, _ = on_device(replace(config, steps=0), tmp_path / "start")
-    assert apart(parameters(run, 3), parameters(other, 3), parameters(start, 0)) < 1e-3
-
-
-def counting(taken: Counter[str], name: str) -> Callable[..., Any]:
-    function = getattr(triplane_triton, name)
-
-    def call(*args: Any, **kwargs: Any) -> Any:
-        taken[name] += args[0].dim() == 2 and len(args[0]) > 5  # not the few points that a new model is asked
-        return function(*args, **kwargs)
-
-    return call
+    assert apart(parameters(run, 2), parameters(other, 2), parameters(start, 0)) < 1e-3

@@ -172,6 +172,34 @@ def test_apply_clamps_at_the_border_and_reads_half_precision() -> None:
     torch.testing.assert_close(found, expected)
 
 
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 9999), views=st.integers(1, 4), channels=st.integers(1, 11))
+def test_packed_views_answer_what_each_one_says(seed: int, views: int, channels: int) -> None:
+    """Against `apply` in float64 for the very halves that are stored; also at borders and in a grid of one cell."""
+    draw = torch.Generator().manual_seed(seed)
+    cells = torch.randint(1, 7, (views, 2), generator=draw)
+    size = cells * 5 + torch.randint(0, 5, (views, 2), generator=draw)
+    padded = channels + 3
+    parts = [torch.randn(int(n), 4, padded, generator=draw).half() for n in cells.prod(1)]
+    ends = cells.prod(1).cumsum(0)
+    scale, centre = torch.rand(views, channels, generator=draw) + 0.1, 10 * torch.randn(views, channels, generator=draw)
+    packed = guided.Packed(torch.cat(parts), ends - cells.prod(1), cells, size, scale, centre)
+    view = torch.randint(views, (50,), generator=draw)
+    pixel = (1.4 * torch.rand(50, 2, generator=draw) - 0.2) * size[view].flip(1)
+    rgb = torch.rand(50, 3, generator=draw)
+    found = guided.apply_packed(packed, view, pixel, rgb, grey=0.5)
+    for number, part in enumerate(parts):
+        mine = view == number
+        rows, columns = cells[number].tolist()
+        coefs = part[..., :channels].double().transpose(1, 2).reshape(rows, columns, channels, 4)
+        height, width = size[number].tolist()
+        plain = guided.apply(coefs, pixel[mine], rgb[mine] - 0.5, (height, width))
+        expected = plain * scale[number] + centre[number]
+        # Two sums of sixteen products each, in another order, and what adding the centre rounds off.
+        largest = 16 * part.abs().max() * scale[number].max() + centre[number].abs().max()
+        assert (found[mine] - expected).abs().le(32 * UNIT * largest).all()
+
+
 def test_groups_of_channels_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     guide, features = photo(20, 20), torch.randn(7, 6, 6)
     whole = guided.upsample(features, guide, radius=4, eps=1e-3)
