@@ -247,6 +247,7 @@ class Loop:
 
     def _step_unseen(self, loss: Tensor) -> None:
         """Step, unless the device finds that nothing may change."""
+        self.fault = None
         with record_function("fprf.backward"):
             loss.backward()  # type: ignore[no-untyped-call]
         flag = unfit(loss, self.model.parameters())

@@ -173,8 +173,12 @@ def test_a_run_on_a_device_is_resumed_to_the_bit(world: World, tmp_path: Path) -
     assert a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_a_step_that_is_not_finite_changes_nothing(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("often", [True, False])
+def test_a_step_that_is_not_finite_changes_nothing(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, often: bool
+) -> None:
     """As on the CPU, but told at a report."""
+    monkeypatch.setattr(trainer, "REPORT_SECONDS", -1.0 if often else 1e9)
     config = replace(world.config, steps=4)
     run, reports = on_device(config, tmp_path / "device", change=spoilt(1, 2))
     other, expected = trained(config, tmp_path / "cpu", spoilt(1, 2))
@@ -184,7 +188,7 @@ def test_a_step_that_is_not_finite_changes_nothing(world: World, tmp_path: Path)
     assert steps and all(float(step) == 2 for step in steps)
     assert reports[-1].skipped == expected[-1].skipped == 2
     assert reports[-1].losses == pytest.approx(expected[-1].losses, rel=1e-5, abs=1e-9)
-    assert [event["skipped"] for event in events(run) if "skipped" in event] == ["rgb"]
+    assert [event["skipped"] for event in events(run) if "skipped" in event] == ["rgb"] * (1 + often)
 
 
 def test_faults_that_go_on_lead_back_and_then_end_it(world: World, tmp_path: Path) -> None:
@@ -367,4 +371,5 @@ def test_kernels_of_the_device_are_taken(world: World, tmp_path: Path) -> None:
     assert done.stdout.split() == ["4", "2", "5", "0"]
     other, _ = on_device(config, tmp_path / "plain")
     start, _ = on_device(replace(config, steps=0), tmp_path / "start")
-    assert apart(parameters(run, 2), parameters(other, 2), parameters(start, 0)) < 1e-3
+    # Adam makes a whole step of a gradient that is rounding alone: one parameter in some thousands.
+    assert apart(parameters(run, 2), parameters(other, 2), parameters(start, 0)) < 0.05
