@@ -26,6 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from fprf.ops import triplane_triton
 
 CUDA = torch.device("cuda:0")
+MPS = torch.device("mps:0")
 SYNCS = (
     "aten._local_scalar_dense.default",
     "aten.nonzero.default",
@@ -48,6 +49,7 @@ class Pretended(torch.Tensor):
     """A tensor of the pretended device around one of the CPU."""
 
     inner: torch.Tensor
+    where = CUDA
 
     @staticmethod
     def __new__(cls, inner: torch.Tensor) -> "Pretended":
@@ -60,11 +62,11 @@ class Pretended(torch.Tensor):
 
     @property
     def device(self) -> torch.device:
-        return CUDA
+        return self.where
 
     @property
     def is_cuda(self) -> bool:
-        return True
+        return self.where == CUDA
 
     @property
     def is_cpu(self) -> bool:
@@ -89,7 +91,7 @@ class Pretended(torch.Tensor):
         return self.to("cpu").tolist()
 
     def new_tensor(self, data, dtype=None, device=None, requires_grad=False):
-        where = CUDA if device is None else device
+        where = self.where if device is None else device
         return torch.tensor(data, dtype=dtype or self.dtype, device=where, requires_grad=requires_grad)
 
     def __repr__(self) -> str:
@@ -154,6 +156,8 @@ def _inner(x: torch.Tensor) -> torch.Tensor:
 
 
 def _wrapped(x: torch.Tensor) -> torch.Tensor:
+    if x.dtype == torch.float64 and Pretended.where == MPS:
+        raise TypeError("Cannot convert a MPS Tensor to float64 dtype as the MPS framework doesn't support float64.")
     return x if isinstance(x, Pretended) else Pretended(x)
 
 
@@ -192,10 +196,10 @@ class _Mode(TorchDispatchMode):
 
 
 @contextlib.contextmanager
-def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False) -> Iterator[_Mode]:
+def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False, mps: bool = False) -> Iterator[_Mode]:
     """Within it, `cuda:0` is a device of so many free bytes. Generators of it are the CPU's; inference mode is `no_grad`, which
     wrappers allow. With `triton` its kernels are taken, interpreted (TRITON_INTERPRET=1 must be set before they are loaded),
-    else none of them, also where Triton is installed.
+    else none of them, also where Triton is installed. With `mps` it is Apple's device instead, `mps:0`, which has no float64.
     """
     real, made, given = torch.Generator, torch.tensor, torch.as_tensor
 
@@ -238,9 +242,11 @@ def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False) -> Iterator[_Mo
     for owner, names in replaced.items():
         for name, value in names.items():
             setattr(owner, name, value)
+    Pretended.where = MPS if mps else CUDA
     try:
         with _Mode() as mode:
             yield mode
     finally:
+        Pretended.where = CUDA
         for (owner, name), value in kept.items():
             setattr(owner, name, value)

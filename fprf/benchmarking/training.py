@@ -59,5 +59,5 @@ def colour_gradient(model: Model, prepared: Prepared, config: TrainConfig, batch
 
 def batch_rays(model: Model, prepared: Prepared, batch: Batch) -> Rays:
     """Rays of a batch, on the model's device."""
-    rays = model.space.rays(*PixelRays(prepared.scene.cameras)(batch.view, batch.pixel))
+    rays = model.space.rays(*PixelRays(prepared.scene.cameras)(batch.view.cpu(), batch.pixel.cpu()))
     return Rays(*(x.to(next(model.parameters()).device) for x in rays))

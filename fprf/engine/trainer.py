@@ -319,6 +319,8 @@ class Batches:
 
 
 def _moved(batch: Batch, device: torch.device) -> Batch:
+    if device.type == "mps":  # which has no float64
+        batch = batch._replace(pixel=batch.pixel.float())
     return Batch._make(x if x is None else x.to(device, non_blocking=device.type == "cuda") for x in batch)
 
 

@@ -215,6 +215,20 @@ def test_gradients_that_are_too_large_are_found_on_the_device(world: World, tmp_
     assert [event["skipped"] for event in events(Run(tmp_path)) if "skipped" in event] == ["a gradient"]
 
 
+def test_apple_s_device_needs_no_float64(world: World, tmp_path: Path) -> None:
+    """Poses and tones as well; images stay in host memory, which it shares."""
+    config = replace(world.config, steps=2, poses=0.02, tones=True)
+    with pretend_cuda(mps=True):
+        run, reports = trained(replace(config, device="mps:0"), tmp_path / "mps")
+        prepared = prepare(config)
+        scene, model = prepared.scene, build_model(config, prepared.facts)
+        checkpoint.restore(checkpoint.load(run.checkpoints, 2), model, None)
+        found = measure_style(config, model.to("mps:0"), scene.cameras, scene.train)
+    _, expected = trained(config, tmp_path / "cpu")
+    assert reports[-1].losses == pytest.approx(expected[-1].losses, rel=1e-5, abs=1e-9)
+    assert bool(found.mean.isfinite().all())
+
+
 class Foreign(Altered):
     """A data manager of another package: it knows nothing of devices, and notes who asks for which step."""
 
