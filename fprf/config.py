@@ -193,8 +193,8 @@ class TrainConfig:
     """Share of a GPU's free memory that images and feature targets may take in training; where they need more they stay in host
     memory, and each batch is copied one step ahead."""
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
-    """Of matrix products on a GPU in training: tf32 rounds their factors to 11 bits, bfloat16 those of the networks to 8 bits;
-    geometry and sums stay in float32. docs/speed.md has the errors."""
+    """Of matrix products on a GPU in training: tf32 rounds their factors to 11 bits (CUDA), bfloat16 those of the networks to 8
+    bits; geometry and sums stay in float32. docs/speed.md has the errors."""
     checkpoint_minutes: float = 5.0
     """Time between checkpoints."""
     datamanager: DataManagerConfig = RayBatchesConfig()

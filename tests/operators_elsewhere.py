@@ -43,7 +43,7 @@ ELSEWHERE = {
     "look": "puts others together, in test_look",
     "guided.apply_packed": "guided.apply of several views, in test_guided",
     "precision.full_precision": "a switch",
-    "precision.lowered": "a switch, in test_precision",
+    "precision.tf32": "a switch, in test_precision",
     "references": "photographs, in test_references",
     "regional": "makes a stylizer, in test_regional",
     "scene.scene_style": "puts others together, in test_scene_style",

@@ -27,7 +27,6 @@ from fprf.engine.style_pass import measure_style
 from fprf.engine.trainer import Loop, optimizer_of
 from fprf.engine.views import render_view
 from fprf.methods import fprf_lite
-from fprf.ops.precision import lowered
 from fprf.output.images import write_image
 from fprf.plugins.codec import from_json, to_json
 
@@ -230,12 +229,16 @@ def test_it_changes_what_an_accelerator_does(world: World) -> None:
     with pretend_cuda(memory=3 * size):
         for config, there in ((world.config, True), (changed(world.config, "device_memory", 0.25), False)):
             prepared = prepare(config)
-            loop = Loop(config, prepared, model := build_model(config, prepared.facts), optimizer_of(config, model), CUDA)
+            loop = Loop(
+                config, prepared, model := build_model(config, prepared.facts).to(CUDA), optimizer_of(config, model), CUDA
+            )
             assert (loop.manager.batch(0).rgb.device == CUDA) == there
-        with lowered(world.config.precision, CUDA):
-            assert torch.get_float32_matmul_precision() == "highest"
-        with lowered(changed(world.config, "precision", "tf32").precision, CUDA):
-            assert torch.get_float32_matmul_precision() == "high"
+        products = []
+        loop.model.learned()[0].register_hook(lambda gradient: products.append(torch.get_float32_matmul_precision()))
+        loop.step(0, 0.0)
+        lower = Loop(changed(config, "precision", "tf32"), prepared, model, optimizer_of(config, model), CUDA)
+        lower.step(0, 0.0)
+        assert products == ["highest", "high"] and torch.get_float32_matmul_precision() == "highest"
 
 
 def test_tones_and_poses_are_facts_of_the_scene(world: World) -> None:

@@ -8,8 +8,8 @@ Moments of what is no longer seen decay into denormal numbers and, rounded, stay
 They are cleared by step number, not by the processor's own mode: that is set a thread, so that results would depend on which
 thread computed what.
 
-On CUDA nobody looks before the optimiser steps: the host would wait for the answer. `unfit` stays on the device, fused Adam
-reads it there and leaves everything as it is, and `Watch` counts; what it counted is read with the reports.
+On CUDA nobody looks before the optimiser steps: the host would wait for the answer. `unfit_step` stays on the device, fused
+Adam reads it there and leaves everything as it is, and `StepStatistics` counts; what it counted is read with the reports.
 """
 
 from collections.abc import Iterable, Mapping
@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor, nn
 
-__all__ = ["CLEAR_EVERY", "PATIENCE", "Watch", "clear_denormals", "unfit", "unfit_gradients", "unfit_terms"]
+__all__ = ["CLEAR_EVERY", "PATIENCE", "StepStatistics", "clear_denormals", "unfit_gradients", "unfit_step", "unfit_terms"]
 
 SMOOTHING = 0.95
 """Decay of running means."""
@@ -54,13 +54,13 @@ def unfit_gradients(parameters: Iterable[tuple[str, nn.Parameter]]) -> str | Non
 
 
 @torch.no_grad()
-def unfit(loss: Tensor, parameters: Iterable[nn.Parameter]) -> Tensor:
+def unfit_step(loss: Tensor, parameters: Iterable[nn.Parameter]) -> Tensor:
     """1 where the loss or a gradient is not finite, or too large to be squared, else 0: float32, where the loss lies."""
     norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
     return (~(torch.isfinite(loss) & (norm < LARGEST))).float()
 
 
-class Watch:
+class StepStatistics:
     """Running means of named numbers, and counts of those that were not finite, kept where they lie until they are read."""
 
     def __init__(self, device: torch.device) -> None:
@@ -88,7 +88,7 @@ class Watch:
         bad = self.rows[2] + self._present[given] * ~fit
         self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
 
-    def count(self, unfit: Tensor) -> None:
+    def count_skipped(self, unfit: Tensor) -> None:
         """Whether this step was skipped, 1 or 0."""
         self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
 

@@ -18,12 +18,12 @@ from ..config import TrainConfig
 from ..errors import NumericsError
 from ..interfaces import DataManager
 from ..memory import out_of_memory, shortage
-from ..ops.precision import lowered
+from ..ops.precision import tf32
 from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays
 from . import checkpoint
-from .guards import CLEAR_EVERY, PATIENCE, Watch, clear_denormals, unfit, unfit_gradients, unfit_terms
+from .guards import CLEAR_EVERY, PATIENCE, StepStatistics, clear_denormals, unfit_gradients, unfit_step, unfit_terms
 from .interrupts import held_back
 from .losses import terms, total, wanted
 from .model import Facts, Model, background_of, build_model
@@ -104,16 +104,16 @@ def train(
             while progress(config, step, clock) < 1:
                 stop.obey()
                 result = loop.step(step, progress(config, step, clock))
-                due = time.perf_counter() - last_report > REPORT_SECONDS
-                if due or progress(config, step + 1, clock) >= 1:
-                    loop.look()
+                now = time.perf_counter()
+                due = now - last_report > REPORT_SECONDS
+                if due or progress(config, step + 1, before + now - start) >= 1:
+                    loop.read_faults()
                 if loop.fault is not None:
                     run.log({"step": step, "skipped": loop.fault})
                 if loop.failed >= PATIENCE:
                     again = step = _go_back(run, loop, step, again)
                     continue
                 step += 1
-                now = time.perf_counter()
                 clock = before + now - start
                 if due:
                     last_report = now
@@ -154,7 +154,7 @@ def _go_back(run: Run, loop: "Loop", step: int, again: int) -> int:
     if saved.step == again:
         raise NumericsError(f"{why}, again after going back to step {again}; {remedy}")
     checkpoint.restore(saved, loop.model, loop.optimizer)
-    loop.forgive()
+    loop.reset_failures()
     run.log({"step": step, "gone_back_to": saved.step, "because": why})
     return saved.step
 
@@ -177,8 +177,10 @@ class Loop:
         self.lead = lead
         self.config, self.model, self.optimizer, self.device = config, model, optimizer, device
         self.facts: Facts = prepared.facts
-        self.patient = device.type == "cuda"
+        self.deferred = device.type == "cuda"
         """Whether faults are looked for with the reports alone."""
+        self.tf32 = config.precision == "tf32" and device.type == "cuda"
+        self.half = config.precision == "bfloat16" and device.type != "cpu"
         self.manager = prepared.manager
         if device.type != "cpu":
             self.manager = prepared.manager.to(device, room=int(config.device_memory * _free(device)))
@@ -187,22 +189,27 @@ class Loop:
         if device.type != "mps":  # which has no float64: rays are made on the CPU
             self.through.to(device)
         self.background = background_of(prepared.facts, device)
-        self.watch = Watch(device)
+        self.statistics = StepStatistics(device)
         self.steps = self.skipped = self.failed = 0
         self.fault: str | None = None
-        """What was not finite in the last step, or since the last look; None where all was well."""
+        """What was not finite in the last step, or since faults were last read; None where all was well."""
         self.rays = 0
         self.begun = time.perf_counter()
 
     def step(self, step: int, share: float) -> Callable[[float, float], Report]:
         """One step; the answer makes a report when one is due."""
+        with tf32(self.tf32):
+            self._step(step, share)
+        return lambda share, seconds: self.summary(step + 1, share, seconds)
+
+    def _step(self, step: int, share: float) -> None:
         with record_function("fprf.batch"):
             drawn = self.batches(step)
             batch = _moved(drawn, self.device)
             rays = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
-        with lowered(self.config.precision, self.device):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
             rendered = render_rays(
                 rays,
                 self.model.parts,
@@ -220,17 +227,16 @@ class Loop:
             parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
             loss = total(self.config.loss, parts)
         self.optimizer.zero_grad(set_to_none=True)
-        if self.patient:
-            self._step_unseen(loss)
+        if self.deferred:
+            self._step_deferred(loss)
         else:
-            self._step_seen(loss, parts, step)
+            self._step_checked(loss, parts, step)
         kept = rendered.counts["kept"] / max(1, rendered.counts["samples"])
-        self.watch.add(parts | {"kept": torch.full((), kept, device=loss.device)})
+        self.statistics.add(parts | {"kept": torch.full((), kept, device=loss.device)})
         self.steps, self.rays = self.steps + 1, self.rays + len(batch.rgb)
-        return lambda share, seconds: self.summary(step + 1, share, seconds)
 
-    def _step_seen(self, loss: Tensor, parts: dict[str, Tensor], step: int) -> None:
-        """Look first, then step."""
+    def _step_checked(self, loss: Tensor, parts: dict[str, Tensor], step: int) -> None:
+        """Check the loss and the gradients, then step."""
         self.fault = unfit_terms(loss, parts)
         if self.fault is None:
             with record_function("fprf.backward"):
@@ -245,33 +251,33 @@ class Loop:
         else:
             self.skipped, self.failed = self.skipped + 1, self.failed + 1
 
-    def _step_unseen(self, loss: Tensor) -> None:
+    def _step_deferred(self, loss: Tensor) -> None:
         """Step, unless the device finds that nothing may change."""
         self.fault = None
         with record_function("fprf.backward"):
             loss.backward()  # type: ignore[no-untyped-call]
-        flag = unfit(loss, self.model.parameters())
+        flag = unfit_step(loss, self.model.parameters())
         with record_function("fprf.optimizer"):
             # What a gradient scaler tells an optimiser, which then leaves parameters, moments and its count of steps alone.
             self.optimizer.found_inf = flag  # type: ignore[attr-defined]
             self.optimizer.step()
-        self.watch.count(flag)
+        self.statistics.count_skipped(flag)
 
-    def look(self) -> None:
-        """Learn of the steps since the last look what was not told at once."""
-        if self.patient:
-            skipped, self.failed, names = self.watch.faults()
+    def read_faults(self) -> None:
+        """Fetch what the device found in the steps since the last call."""
+        if self.deferred:
+            skipped, self.failed, names = self.statistics.faults()
             self.fault = (names or "a gradient") if skipped > self.skipped else None
             self.skipped = skipped
 
-    def forgive(self) -> None:
+    def reset_failures(self) -> None:
         """Count failures in a row anew."""
         self.failed = 0
-        self.watch.failed.zero_()
+        self.statistics.failed.zero_()
 
     def summary(self, step: int, share: float, seconds: float) -> Report:
         """Running means, corrected for their start; a term that comes every few steps counts when it comes."""
-        means = self.watch.means()
+        means = self.statistics.means()
         losses = {name: value for name, value in means.items() if name != "kept"}
         rgb = torch.tensor(losses.get("rgb", 1.0)).clamp_min(1e-10)
         speed = self.rays / (time.perf_counter() - self.begun)

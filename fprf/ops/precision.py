@@ -1,13 +1,12 @@
-"""What autocast and TF32 may lower, and what they must not."""
+"""What autocast must not lower, and TF32 for a while."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-__all__ = ["full_precision", "lowered"]
+__all__ = ["full_precision", "tf32"]
 
 
 def full_precision(x: Tensor) -> torch.autocast:
@@ -16,18 +15,14 @@ def full_precision(x: Tensor) -> torch.autocast:
 
 
 @contextmanager
-def lowered(precision: Literal["float32", "tf32", "bfloat16"], device: torch.device) -> Iterator[None]:
-    """Matrix products in this block on an accelerator: as they are, in TF32 (CUDA alone), or under bfloat16 autocast.
-
-    On the CPU nothing changes. TF32 is a setting of the whole process: it is put back afterwards.
-    """
-    if precision == "tf32" and device.type == "cuda":
-        before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("high")
-        try:
-            yield
-        finally:
-            torch.set_float32_matmul_precision(before)
-    else:
-        with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16" and device.type != "cpu"):
-            yield
+def tf32(enabled: bool) -> Iterator[None]:
+    """Matrix products of float32 numbers on CUDA in TF32; a setting of the whole process, put back after the block."""
+    if not enabled:
+        yield
+        return
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
