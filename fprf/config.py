@@ -16,6 +16,7 @@ from .plugins.samplers.config import ProposalConfig, SamplerConfig
 
 __all__ = [
     "ContentConfig",
+    "IncompleteConfig",
     "LossConfig",
     "OptimizerConfig",
     "RenderConfig",
@@ -233,3 +234,15 @@ class TrainConfig:
         positive("checkpoint_minutes", self.checkpoint_minutes)
         between("device_memory", self.device_memory, 0.0, 1.0)
         between("poses", self.poses, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class IncompleteConfig(TrainConfig):
+    """A saved config whose method is not installed here: enough to render, not to train, which may need the method's fields."""
+
+    reason: str
+    """Why the method cannot be loaded."""
+    unknown: str
+    """The fields that the method added, as JSON text."""
+    packages: str
+    """The packages of the method and of the plug-ins in its fields, by path, as JSON text."""

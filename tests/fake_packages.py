@@ -67,3 +67,29 @@ class {name}Config(EncoderConfig):
     def build(self):
         raise NotImplementedError
 '''
+
+METHOD = '''
+from dataclasses import dataclass
+from fprf.checks import at_least
+from fprf.config import TrainConfig
+from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
+
+@dataclass(frozen=True, kw_only=True)
+class AcmeConfig(TrainConfig):
+    """A stranger's method with fields of its own."""
+
+    knob: int = 1
+    """A number."""
+    shares: tuple[float, ...] = (0.5,)
+    """Shares."""
+    teacher: EncoderConfig | None = RandomConfig()
+    """A slot."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("knob", self.knob, 0)
+
+def acme() -> AcmeConfig:
+    """A stranger's method."""
+    return AcmeConfig(knob=2)
+'''

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import json
 import os
 import shutil
 import sys
@@ -10,9 +11,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from ..errors import ConfigError, FprfError, PluginError, UsageError
+from ..errors import ConfigError, PluginError, UsageError
 from ..plugins import registry
-from ..plugins.codec import Missing, load_config
+from ..plugins.codec import Missing, load_config, method_config
 from ..plugins.slots import Slot, hints_of, resolve, slots
 from .describe import describe
 from .flags import Flag, explain, flags_of, spell
@@ -70,23 +71,17 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
 
 def load_method(name: str) -> "tuple[TrainConfig, str]":
     """The config of a method, or of a saved `config.json` with the name of the method that it started from."""
-    from ..config import TrainConfig
+    from ..config import IncompleteConfig
 
     if name.endswith(".json"):
-        return load_config(Path(name))
+        config, method = load_config(Path(name))
+        if isinstance(config, IncompleteConfig):
+            package = json.loads(config.packages)["method"]
+            raise PluginError(f"{name}: {config.reason}; to train with this config install {package}")
+        return config, method
     if (Path(name) / "config.json").is_file() and name not in registry.installed("fprf.methods"):
         raise UsageError(f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}")
-    method = registry.load_object("fprf.methods", name)
-    origin = registry.entry("fprf.methods", name).origin
-    try:
-        config = method() if callable(method) else method
-    except FprfError as fault:
-        raise PluginError(f"fprf.methods: {name!r} ({origin}): {fault}") from fault
-    except Exception as fault:  # a stranger's function
-        raise PluginError(f"fprf.methods: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}") from fault
-    if not isinstance(config, TrainConfig):
-        raise PluginError(f"fprf.methods: {name!r} ({origin}) gives {type(config).__name__}, not a TrainConfig")
-    return config, name
+    return method_config(name), name
 
 
 def methods() -> Iterator[tuple[str, str]]:

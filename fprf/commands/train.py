@@ -169,7 +169,8 @@ def _check_same(folder: "Run", config: "TrainConfig") -> None:
     free = {"steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes"}
     if old.blocks.cuts and config.blocks.cuts:
         free |= {"blocks", "executor", "statistics", "render"}
-    changed = [name for name in vars(old) if name not in free and getattr(old, name) != getattr(config, name)]
+    mine, theirs = vars(old), vars(config)  # another method may have other fields
+    changed = [name for name in mine | theirs if name not in free and mine.get(name) != theirs.get(name)]
     if changed:
         raise UsageError(
             f"{folder.root}: holds a run with another {', '.join(changed)}; resume it with "

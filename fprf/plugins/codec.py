@@ -1,6 +1,9 @@
 """`config.json`: a config with its method, the version that wrote it and the packages of its plug-ins.
 
 Strict: duplicate keys, NaN, unknown keys and foreign formats are refused. Written whole or not at all.
+
+A method may return a subclass of `TrainConfig` with fields of its own: a file is read as the class that its method returns.
+Where that method is not installed, fields that fprf does not know are kept as data (`IncompleteConfig`).
 """
 
 import json
@@ -10,44 +13,97 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from .. import __version__
-from ..errors import ConfigError
+from ..errors import ConfigError, FprfError, PluginError
 from ..output.atomic import write_text
 from . import registry
-from .slots import slots
+from .slots import hints_of, slots
 from .typed_json import Missing, from_json, to_json
 
 if TYPE_CHECKING:
     from ..config import TrainConfig
 
-__all__ = ["Missing", "from_json", "load_config", "packages_of", "read_json", "save_config", "to_json"]
+__all__ = [
+    "Missing",
+    "from_json",
+    "load_config",
+    "method_config",
+    "packages_of",
+    "read_json",
+    "save_config",
+    "to_json",
+]
+
+_METHODS = "fprf.methods"
 
 _FORMAT = 1
 _KEYS = ("format", "fprf", "method", "plugins", "config")
 
 
 def save_config(path: Path, config: "TrainConfig", method: str) -> None:
-    """Write the config, synced and then renamed into place, so that a reader finds the old file or the new one."""
-    whole = {
-        "format": _FORMAT,
-        "fprf": __version__,
-        "method": method,
-        "plugins": packages_of(config),
-        "config": to_json(config),
-    }
-    text = json.dumps(whole, indent=1, allow_nan=False) + "\n"
-    write_text(path, text)
+    """Write the config, synced and then renamed into place, so that a reader finds the old file or the new one.
+
+    Raises ConfigError where the config has fields of its own and `method` would not give them back.
+    """
+    from ..config import IncompleteConfig, TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
+
+    fields, packages = to_json(config), packages_of(config)
+    if isinstance(config, IncompleteConfig):
+        fields = {name: value for name, value in fields.items() if name not in ("reason", "unknown", "packages")}
+        fields |= json.loads(config.unknown)
+        packages |= json.loads(config.packages)
+    elif type(config) is not TrainConfig:
+        if type(method_config(method)) is not type(config):
+            raise ConfigError(f"method {method!r} gives no {type(config).__name__}, so its fields could not be read again")
+        packages["method"] = registry.entry(_METHODS, method).package
+    whole = {"format": _FORMAT, "fprf": __version__, "method": method, "plugins": packages, "config": fields}
+    write_text(path, json.dumps(whole, indent=1, allow_nan=False) + "\n")
 
 
 def load_config(path: Path) -> "tuple[TrainConfig, str]":
     """The config of a file and the name of its method. Raises ConfigError naming the file and the field."""
-    from ..config import TrainConfig  # the knob tree is made of plug-in configs, which lie above this module
-
     whole = read_json(path)
     try:
         _check(whole)
-        return from_json(whole["config"], TrainConfig, packages=whole["plugins"]), whole["method"]
+        return _config(whole), whole["method"]
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
+
+
+def _config(whole: dict[str, Any]) -> "TrainConfig":
+    from ..config import IncompleteConfig, TrainConfig
+
+    fields, method, packages = whole["config"], whole["method"], whole["plugins"]
+    try:
+        return from_json(fields, type(method_config(method)), packages=packages)
+    except PluginError as fault:  # not installed, or broken
+        reason = str(fault)
+    known = hints_of(TrainConfig)
+    # Only a method whose package is on record had fields of its own; elsewhere an unknown field is a mistake.
+    if "method" not in packages or not isinstance(fields, dict):
+        return from_json(fields, TrainConfig, packages=packages)
+    unknown = {name: value for name, value in fields.items() if name not in known}
+    theirs = {path: text for path, text in packages.items() if path.partition(".")[0] in {*unknown, "method"}}
+    ours = from_json({name: value for name, value in fields.items() if name in known}, TrainConfig, packages=packages)
+    return IncompleteConfig(
+        **vars(ours), reason=reason, unknown=json.dumps(unknown, allow_nan=False), packages=json.dumps(theirs)
+    )
+
+
+def method_config(name: str) -> "TrainConfig":
+    """The config that an installed method returns. Raises PluginError naming the method and its package."""
+    from ..config import TrainConfig
+
+    method = registry.load_object(_METHODS, name)
+    origin = registry.entry(_METHODS, name).origin
+    try:
+        config = method() if callable(method) else method
+    except FprfError as fault:
+        raise PluginError(f"{_METHODS}: {name!r} ({origin}): {fault}") from fault
+    except Exception as fault:  # a stranger's function
+        raise PluginError(f"{_METHODS}: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}") from fault
+    if not isinstance(config, TrainConfig):
+        raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a TrainConfig")
+    return config
 
 
 def packages_of(config: object) -> dict[str, str]:

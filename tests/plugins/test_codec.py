@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from fake_packages import ENCODER, Packages
+from fake_packages import ENCODER, METHOD, Packages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf import __version__
+from fprf.commands.parsing import load_method, parse
+from fprf.config import IncompleteConfig
 from fprf.errors import ConfigError, PluginError
 from fprf.methods import fprf, fprf_lite
 from fprf.plugins import registry
@@ -250,3 +252,58 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="checkpoint_minutes: nan"):
         save_config(path, broken, "fprf")
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def acme(packages: Packages, folder: Path) -> Path:
+    """A saved config of a stranger's method with fields of its own."""
+    packages.install("acme-method", {"fprf.methods": {"acme": "acme_method:acme"}}, code={"acme_method": METHOD}, version="0.3")
+    config, name = load_method("acme")
+    args = ["--knob", "7", "--teacher", "random", "--teacher.channels", "5", "--steps", "3", "--shares", "0.25", "0.75"]
+    save_config(folder / "config.json", parse(config, args, prog="x", description=""), name)
+    return folder / "config.json"
+
+
+def test_a_strangers_method_keeps_its_own_fields(packages: Packages, tmp_path: Path) -> None:
+    path = acme(packages, tmp_path)
+    config, method = load_method(str(path))
+    assert method == "acme" and type(config) is type(load_method("acme")[0])
+    assert (config.knob, config.shares, config.teacher, config.steps) == (7, (0.25, 0.75), RandomConfig(channels=5), 3)  # type: ignore[attr-defined]
+    assert parse(config, ["--knob", "8"], prog="x", description="") == dataclasses.replace(config, knob=8)  # type: ignore[call-arg]
+    whole = json.loads(path.read_text())
+    assert whole["plugins"]["method"] == "acme-method 0.3" and "knob" in whole["config"]
+    refused = {
+        "config.knob: expected a whole number": {"knob": "7"},
+        "knob: -1 must be": {"knob": -1},
+        "AcmeConfig has no field 'knbo'; did you mean 'knob'?": {"knbo": 1},
+    }
+    for message, change in refused.items():
+        path.write_text(json.dumps(whole | {"config": whole["config"] | change}))
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            load_config(path)
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_the_fields_of_a_method_that_cannot_be_loaded_are_kept(packages: Packages, tmp_path: Path, broken: bool) -> None:
+    path = acme(packages, tmp_path)
+    before, info = load_config(path)[0], packages.root / "acme_method-0.3.dist-info" / "entry_points.txt"
+    info.write_text("[fprf.methods]\nacme = acme_method:no_such_thing\n" if broken else "")
+    registry.forget()
+
+    config, method = load_config(path)
+    assert isinstance(config, IncompleteConfig) and method == "acme" and hash(config)
+    assert (config.steps, config.sampler) == (before.steps, before.sampler)
+    save_config(tmp_path / "again.json", config, method)
+    assert (tmp_path / "again.json").read_text() == path.read_text()
+    with pytest.raises(PluginError, match=r"to train with this config install acme-method 0\.3$") as caught:
+        load_method(str(path))
+    assert "\n" not in str(caught.value)
+    whole = json.loads(path.read_text())
+    path.write_text(json.dumps(whole | {"config": whole["config"] | {"steps": "3"}}))
+    with pytest.raises(ConfigError, match=r"config\.steps: expected a whole number"):
+        load_config(path)
+
+
+def test_fields_that_could_not_be_read_again_are_not_saved(packages: Packages, tmp_path: Path) -> None:
+    config, _ = load_config(acme(packages, tmp_path))
+    with pytest.raises(ConfigError, match="method 'fprf-lite' gives no AcmeConfig"):
+        save_config(tmp_path / "other.json", config, "fprf-lite")
