@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from capture_files import Capture, write_colmap, write_llff, write_transforms
+from fake_packages import packages_in
 
 from fprf.datamanagers.parsers.config import ColmapConfig, DataParserConfig, LlffConfig, TownConfig, TransformsConfig
 from fprf.datamanagers.parsers.recognise import parse_scene, recognise
@@ -62,8 +63,14 @@ def test_formats_are_told_by_their_files(tmp_path: Path) -> None:
 
 
 def test_blender_and_a_single_file_of_another_name(tmp_path: Path) -> None:
-    (tmp_path / "transforms_4.json").write_text("{}")
-    assert recognise(tmp_path) == TransformsConfig(file="transforms_4.json")
+    write_transforms(tmp_path, Capture.make(3))
+    whole = parse_scene(tmp_path, 1, None)
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms_4.json")
+    assert recognise(tmp_path) == TransformsConfig()
+    assert_same(parse_scene(tmp_path, 1, None), whole)
+    (tmp_path / "transforms_8.json").write_text("{}")
+    with pytest.raises(DataError, match="but 4 entries"):
+        recognise(tmp_path)
     (tmp_path / "transforms_train.json").write_text("{}")
     assert recognise(tmp_path) == TransformsConfig()
 
@@ -85,6 +92,70 @@ def test_what_was_found_is_said(tmp_path: Path) -> None:
         recognise(tmp_path)
     with pytest.raises(DataError, match="a file; give the scene folder"):
         recognise(tmp_path / "a")
+
+
+PARSER = """
+from dataclasses import dataclass
+from fprf.datamanagers.parsers.config import DataParserConfig, Recognised
+
+@dataclass(frozen=True, kw_only=True)
+class ScanConfig(DataParserConfig):
+    def recognises(self, data):
+        return {answer}
+"""
+SCAN = 'Recognised({confidence}, "scan.bin") if (data / "scan.bin").is_file() else None'
+
+
+def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
+    folder, site = tmp_path / "scene", tmp_path / "site"
+    write_colmap(folder, Capture.make(2))
+    site.mkdir()
+    with packages_in(site) as packages:
+        for name, confidence in (("sure", 0.6), ("even", 0.5), ("faint", 0.2)):
+            code = {f"acme_{name}": PARSER.format(answer=SCAN.format(confidence=confidence).replace("scan", name))}
+            packages.install(f"acme-{name}", {"fprf.dataparsers": {name: f"acme_{name}:ScanConfig"}}, code=code)
+        (folder / "faint.bin").touch()
+        assert recognise(folder) == ColmapConfig()
+        (folder / "even.bin").touch()
+        with pytest.raises(
+            DataError, match=r"by 'colmap' \(a model in .*\) and by 'even' \(even\.bin\); choose one with --data"
+        ) as caught:
+            recognise(folder)
+        assert "\n" not in str(caught.value)
+        (folder / "sure.bin").touch()
+        assert type(recognise(folder)).__module__ == "acme_sure"
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("1 / 0", "ZeroDivisionError"),
+        ("raise SystemExit(3)", "SystemExit"),
+        (PARSER.format(answer="[][0]"), "IndexError"),
+        (PARSER.format(answer="exit(3)"), "SystemExit"),
+        (PARSER.format(answer="True"), "TypeError"),
+        (PARSER.format(answer='Recognised(2.0, "x")'), "ConfigError: confidence: 2.0 must lie in"),
+        (PARSER.format(answer='Recognised(float("nan"), "x")'), "ConfigError"),
+        ("from fprf.fields.layouts import SingleConfig as ScanConfig", "not a DataParserConfig"),
+    ],
+)
+def test_a_broken_parser_is_named_and_passed_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, told: str
+) -> None:
+    folder, site = tmp_path / "scene", tmp_path / "site"
+    write_colmap(folder, Capture.make(2))
+    site.mkdir()
+    with packages_in(site) as packages:
+        packages.install("acme-bad", {"fprf.dataparsers": {"bad": "acme_bad4:ScanConfig"}}, code={"acme_bad4": source})
+        assert recognise(folder) == ColmapConfig()
+        (line,) = capsys.readouterr().err.splitlines()
+        assert (
+            line.startswith("warning: data parser 'bad' (acme_bad4:ScanConfig from acme-bad 1) is passed over: ")
+            and told in line
+        )
+        (folder / "sparse").rename(folder / "elsewhere")
+        with pytest.raises(DataError, match=r"choose a parser with --datamanager\.parser NAME \(bad, blocknerf"):
+            recognise(folder)
 
 
 def test_a_named_parser_wins(tmp_path: Path) -> None:

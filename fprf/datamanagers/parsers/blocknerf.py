@@ -25,14 +25,19 @@ from .tfrecord import Example, read_examples
 from .town import cache_folder
 from .views import View, assemble, rigid
 
-__all__ = ["BlockNerfParser", "record_files"]
+__all__ = ["BlockNerfParser", "is_record", "record_files"]
 
 _FORMAT = 1
 
 
 def record_files(data: Path) -> list[Path]:
     """The TFRecord files of a folder and its folders, by name."""
-    return sorted(path for path in data.rglob("*") if re.search(r"\.tfrecord(-\d+-of-\d+)?$", path.name) and path.is_file())
+    return sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
+
+
+def is_record(name: str) -> bool:
+    """Whether a file's name is that of a TFRecord file, whole or a part."""
+    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
 
 
 class BlockNerfParser(DataParser):

@@ -1,9 +1,14 @@
-"""Parser configs. `build` imports the implementation."""
+"""Parser configs. `build` and `recognises` import the implementation.
+
+Confidence of the built-in formats: 0.6 to 0.9 where files were prepared for training, 0.5 for a reconstruction that comes
+with its images, 0.3 for raw recordings. Prepared folders often hold the reconstruction that they were made of.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from ...checks import at_least, positive
 from ...plugins.config import PluginConfig
@@ -20,10 +25,20 @@ __all__ = [
     "OdmConfig",
     "PhotoTourismConfig",
     "PolycamConfig",
+    "Recognised",
     "Record3DConfig",
     "TownConfig",
     "TransformsConfig",
 ]
+
+
+class Recognised(NamedTuple):
+    """How sure a parser is that it reads a folder."""
+
+    confidence: float
+    """In (0, 1]: the surest parser reads the folder; two that are equally sure are an error."""
+    reason: str
+    """What in the folder says so, for example `transforms.json`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +46,13 @@ class DataParserConfig(PluginConfig):
     """Reads one capture format."""
 
     group: ClassVar[str] = "fprf.dataparsers"
+
+    def recognises(self, data: Path) -> Recognised | None:
+        """Whether `data`, which may be absent or a file, is of this format, from the names that lie there; None = it is not.
+
+        A parser that does not say is used only where it is chosen by name.
+        """
+        return None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -44,6 +66,10 @@ class LlffConfig(DataParserConfig):
     images: str = ""
     """Image folder; empty = `images`, else the `images_N` that is reduced least."""
 
+    def recognises(self, data: Path) -> Recognised | None:
+        """By `poses_bounds.npy`."""
+        return Recognised(0.8, "poses_bounds.npy") if (data / "poses_bounds.npy").is_file() else None
+
     def build(self) -> DataParser:
         """The parser."""
         from .llff import LlffParser
@@ -56,7 +82,16 @@ class TransformsConfig(DataParserConfig):
     """Nerfstudio and instant-ngp `transforms.json`, or Blender's `transforms_train.json` and `transforms_test.json`."""
 
     file: str = ""
-    """One JSON file of the folder, for example transforms_4.json; empty = transforms.json, else Blender's pair."""
+    """One JSON file of the folder, for example transforms_4.json; empty = transforms.json, else Blender's pair, else the
+    only transforms*.json."""
+
+    def recognises(self, data: Path) -> Recognised | None:
+        """By `transforms.json` or `transforms_train.json`, less surely by the only other transforms*.json."""
+        names = sorted(path.name for path in data.glob("transforms*.json"))
+        known = [name for name in names if name in ("transforms.json", "transforms_train.json")]
+        if known:
+            return Recognised(0.9, known[0])
+        return Recognised(0.4, names[0]) if len(names) == 1 else None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -71,6 +106,13 @@ class ColmapConfig(DataParserConfig):
 
     images: str = "images"
     """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their size."""
+
+    def recognises(self, data: Path) -> Recognised | None:
+        """By a model in one of these places."""
+        from .colmap import model_folder
+
+        folder = model_folder(data)
+        return Recognised(0.5, f"a model in {folder}") if folder is not None else None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -103,6 +145,10 @@ class TownConfig(DataParserConfig):
         at_least("parser.width", self.width, 8)
         at_least("parser.height", self.height, 8)
 
+    def recognises(self, data: Path) -> Recognised | None:
+        """By the path `town`, where there is no such folder."""
+        return Recognised(1.0, "the embedded scene") if data == Path("town") and not data.exists() else None
+
     def build(self) -> DataParser:
         """The parser."""
         from .town import TownParser
@@ -124,6 +170,14 @@ class BlockNerfConfig(DataParserConfig):
             at_least("parser.cameras", number, 0)
         positive("parser.tolerance", self.tolerance)
 
+    def recognises(self, data: Path) -> Recognised | None:
+        """By TFRecord files, at most three folders down."""
+        from .blocknerf import is_record
+
+        names = (path.name for depth in ("*", "*/*", "*/*/*", "*/*/*/*") for path in data.glob(f"{depth}.tfrecord*"))
+        found = next(filter(is_record, names), None)
+        return Recognised(0.3, found) if found is not None else None
+
     def build(self) -> DataParser:
         """The parser."""
         from .blocknerf import BlockNerfParser
@@ -134,6 +188,10 @@ class BlockNerfConfig(DataParserConfig):
 @dataclass(frozen=True, kw_only=True)
 class MegaNerfConfig(DataParserConfig):
     """Mega-NeRF's layout: `train` and `val`, each with `metadata/*.pt` and `rgbs`."""
+
+    def recognises(self, data: Path) -> Recognised | None:
+        """By `train/metadata`."""
+        return Recognised(0.7, "train/metadata") if (data / "train/metadata").is_dir() else None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -149,6 +207,14 @@ class PhotoTourismConfig(DataParserConfig):
     list: str = ""
     """The table, a file of the folder; empty = its only *.tsv."""
 
+    def recognises(self, data: Path) -> Recognised | None:
+        """By the only *.tsv beside a model, or beside `dense` with a model."""
+        from .colmap import model_folder
+
+        tables = [path.name for path in data.glob("*.tsv")]
+        model = model_folder(data) or model_folder(data / "dense")
+        return Recognised(0.6, tables[0]) if len(tables) == 1 and model is not None else None
+
     def build(self) -> DataParser:
         """The parser."""
         from .phototourism import PhotoTourismParser
@@ -159,6 +225,13 @@ class PhotoTourismConfig(DataParserConfig):
 @dataclass(frozen=True, kw_only=True)
 class PolycamConfig(DataParserConfig):
     """Polycam's raw data: `keyframes` with images and a JSON file for each camera, corrected ones first."""
+
+    def recognises(self, data: Path) -> Recognised | None:
+        """By folders of images and cameras."""
+        from .polycam import keyframes
+
+        found = keyframes(data)
+        return Recognised(0.3, f"{found[1]}") if found is not None else None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -177,6 +250,13 @@ class Record3DConfig(DataParserConfig):
     def __post_init__(self) -> None:
         at_least("parser.frames", self.frames, 1)
 
+    def recognises(self, data: Path) -> Recognised | None:
+        """By the metadata and the folder of images."""
+        from .record3d import recording
+
+        found = recording(data)
+        return Recognised(0.3, found[0].name) if found is not None else None
+
     def build(self) -> DataParser:
         """The parser."""
         from .record3d import Record3DParser
@@ -190,6 +270,13 @@ class OdmConfig(DataParserConfig):
 
     images: str = "images"
     """Folder of the photographs, of any size."""
+
+    def recognises(self, data: Path) -> Recognised | None:
+        """By the reconstruction or the report."""
+        from .odm import project_file
+
+        found = project_file(data)
+        return Recognised(0.3, found.name) if found is not None else None
 
     def build(self) -> DataParser:
         """The parser."""

@@ -1,67 +1,51 @@
-"""Which parser a scene folder wants, from what lies in it."""
+"""Which parser a scene folder wants: every installed one is asked, built-in or not."""
 
+import sys
 from pathlib import Path
 
+from ...checks import between
 from ...errors import DataError
+from ...plugins import registry
 from ..scene import Scene
-from .blocknerf import record_files
-from .colmap import model_folder
-from .config import (
-    BlockNerfConfig,
-    ColmapConfig,
-    DataParserConfig,
-    LlffConfig,
-    MegaNerfConfig,
-    OdmConfig,
-    PhotoTourismConfig,
-    PolycamConfig,
-    Record3DConfig,
-    TownConfig,
-    TransformsConfig,
-)
-from .odm import project_file
-from .polycam import keyframes
-from .record3d import recording
+from .config import DataParserConfig
 
 __all__ = ["parse_scene", "recognise"]
 
 
 def recognise(data: Path) -> DataParserConfig:
-    """The parser for a folder, with its defaults: transforms before LLFF before others; `town` is the embedded scene.
+    """The parser that is surest of a folder, with its defaults; `town`, where no such folder exists, is the embedded scene.
 
-    The path `town`, where no such folder exists, is the embedded scene. Raises DataError saying what was looked for and
-    what lies there.
+    A parser that fails to load or to answer is named in a line on standard error and passed over. Raises DataError where no
+    parser recognises the folder, or where several are equally sure.
     """
+    group, best = DataParserConfig.group, 0.0
+    surest: dict[str, tuple[DataParserConfig, str]] = {}
+    for name, entries in registry.installed(group).items():
+        try:
+            config = registry.load(group, name, DataParserConfig)()
+            answer = config.recognises(data)
+            confidence, reason = answer or (0.0, "")
+            between("confidence", confidence, 0.0, 1.0)
+        except (Exception, SystemExit) as fault:  # a stranger's
+            origin = ", ".join(each.origin for each in entries)
+            print(f"warning: data parser {name!r} ({origin}) is passed over: {_line(fault)}", file=sys.stderr)
+            continue
+        if answer and confidence >= best:
+            surest = {name: (config, reason)} if confidence > best else {**surest, name: (config, reason)}
+            best = confidence
+    if len(surest) > 1:
+        claims = " and by ".join(f"{name!r} ({reason})" for name, (_, reason) in surest.items())
+        raise DataError(f"{data}: is recognised by {claims}; choose one with --datamanager.parser NAME")
+    for config, _ in surest.values():
+        return config
     if not data.exists():
-        if data == Path("town"):
-            return TownConfig()
         raise DataError(f"{data}: no such folder; give a scene folder, or `town` for the embedded scene")
     if not data.is_dir():
         raise DataError(f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field")
-    manifests = sorted(path.name for path in data.glob("transforms*.json"))
-    if {"transforms.json", "transforms_train.json"} & set(manifests):
-        return TransformsConfig()
-    if (data / "poses_bounds.npy").is_file():
-        return LlffConfig()
-    if (data / "train/metadata").is_dir():
-        return MegaNerfConfig()
-    if len(list(data.glob("*.tsv"))) == 1 and model_folder(data if model_folder(data) else data / "dense") is not None:
-        return PhotoTourismConfig()
-    if model_folder(data) is not None:
-        return ColmapConfig()
-    if len(manifests) == 1:
-        return TransformsConfig(file=manifests[0])
-    if record_files(data):
-        return BlockNerfConfig()
-    if keyframes(data) is not None:
-        return PolycamConfig()
-    if recording(data) is not None:
-        return Record3DConfig()
-    if project_file(data) is not None:
-        return OdmConfig()
     raise DataError(
-        f"{data}: no transforms.json, transforms_train.json, poses_bounds.npy or sparse/0/cameras.bin, "
-        f"but {_content(data)}; choose the parser by name, or make poses with `fprf process`"
+        f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {_content(data)}; "
+        f"choose a parser with --datamanager.parser NAME ({', '.join(registry.installed(group))}), "
+        "or make poses with `fprf process`"
     )
 
 
@@ -74,3 +58,7 @@ def parse_scene(data: Path, downscale: int, parser: DataParserConfig | None) -> 
 def _content(data: Path) -> str:
     names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
     return f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})" if names else "nothing"
+
+
+def _line(fault: BaseException) -> str:
+    return f"{type(fault).__name__}: {' '.join(str(fault).split())}"

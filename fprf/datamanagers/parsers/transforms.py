@@ -84,6 +84,9 @@ class TransformsParser(DataParser):
             return [(single, "")]
         if train.is_file():
             return [(train, "train"), (test, "test")] if test.is_file() else [(train, "")]
+        others = list(data.glob("transforms*.json"))
+        if len(others) == 1:
+            return [(others[0], "")]
         raise DataError(f"{data}: neither transforms.json nor transforms_train.json; name the file with parser.file")
 
 
