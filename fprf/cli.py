@@ -1,9 +1,12 @@
 """The command line: `fprf VERB ...`. A verb's module is imported when it is used; `--help` imports nothing heavy.
 
+Packages add verbs in the entry-point group `fprf.commands` (`commands/config.py`); where the names clash, ours win.
+
 Exit codes: 0 done, 1 our fault, 2 the user's mistake (one line on standard error), 130 interrupted.
 """
 
 import importlib
+import inspect
 import os
 import sys
 import traceback
@@ -13,10 +16,12 @@ from typing import NamedTuple
 from . import __version__
 from .errors import FprfError, UsageError
 from .memory import out_of_memory, shortage
-from .plugins.registry import nearest
+from .plugins.registry import installed, make, nearest
 from .process import settle
 
-__all__ = ["VERBS", "Verb", "main"]
+__all__ = ["VERBS", "Verb", "main", "packaged", "run_verb"]
+
+_GROUP = "fprf.commands"
 
 _PIPE_CLOSED = 141
 """What a shell reports for a program that SIGPIPE ended."""
@@ -86,20 +91,40 @@ def _dispatch(args: list[str]) -> int:
     if args[0] == "--version":
         print(f"fprf {__version__}")
         return 0
-    verb, rest = args[0], args[1:]
-    if verb not in VERBS:
-        raise UsageError(f"fprf {verb}: no such verb{nearest(verb, VERBS)} (verbs: {', '.join(VERBS)})")
     settle()
     try:
-        code = importlib.import_module(f".commands.{verb}", __package__).run(rest)
+        return run_verb(args[0], args[1:])
     except SystemExit as end:  # --help ends this way
         return end.code if isinstance(end.code, int) else int(end.code is not None)
-    return int(code)
+
+
+def packaged() -> dict[str, str]:
+    """Verbs that packages add, by name, with those that provide them. Imports nothing."""
+    return {
+        name: " and ".join(each.package for each in entries) for name, entries in installed(_GROUP).items() if name not in VERBS
+    }
+
+
+def run_verb(verb: str, args: list[str]) -> int:
+    """Run a verb, built-in or of a package, with its arguments. Raises UsageError where there is no such verb."""
+    if verb in VERBS:
+        return int(importlib.import_module(f".commands.{verb}", __package__).run(args))
+    others = packaged()
+    if verb not in others:
+        known = [*VERBS, *others]
+        raise UsageError(f"fprf {verb}: no such verb{nearest(verb, known)} (verbs: {', '.join(known)})")
+    from .commands.config import CommandConfig
+    from .commands.parsing import parse
+
+    config = make(_GROUP, verb, CommandConfig)
+    about = inspect.getdoc(type(config)) or ""
+    return parse(config, args, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
 
 
 def _help() -> str:
     bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if _colour() else ("", "", "")
-    width = max(map(len, VERBS))
+    others = packaged()
+    width = max(map(len, [*VERBS, *others]))
     broad = max(len(verb.usage) for verb in VERBS.values())
     lines = [
         f"{bold}fprf {__version__}{plain}: restyle 3D radiance fields with photographs, feed-forward",
@@ -108,6 +133,8 @@ def _help() -> str:
         "",
         *(f"  {bold}{name:<{width}}{plain}  {verb.usage:<{broad}}  {dim}{verb.summary}{plain}" for name, verb in VERBS.items()),
         "",
+        *(f"  {bold}{name:<{width}}{plain}  {dim}of {package}{plain}" for name, package in others.items()),
+        *([""] if others else []),
         "`fprf VERB --help` shows every flag of a verb, `fprf train` lists the methods. Start with `fprf demo`.",
     ]
     return "\n".join(lines)

@@ -5,7 +5,6 @@ its flags once, when the script is made, and pressing the key starts no program.
 """
 
 import contextlib
-import importlib
 import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -56,14 +55,15 @@ def run(args: list[str]) -> int:
 
 def offers() -> dict[str, Offer]:
     """Every verb with its words and flags; a verb that cannot say goes without flags."""
-    from ..cli import VERBS
+    from ..cli import VERBS, packaged
 
     found = {}
-    for verb, about in VERBS.items():
+    summaries = {verb: about.summary for verb, about in VERBS.items()}
+    for verb, summary in (summaries | {verb: f"of {package}" for verb, package in packaged().items()}).items():
         words = tuple(installed("fprf.methods")) if verb == "train" else _WORDS.get(verb, ())
         asked: Sequence[str | None] = words if verb in _FIRST or verb == "train" else (None,)
         flags = {flag for word in asked for flag in _flags(verb, word)}
-        found[verb] = Offer(about.summary, words, tuple(sorted({*flags, "--help"})))
+        found[verb] = Offer(summary, words, tuple(sorted({*flags, "--help"})))
     return found
 
 
@@ -73,10 +73,12 @@ def script(shell: str, known: Mapping[str, Offer]) -> str:
 
 
 def _flags(verb: str, word: str | None) -> list[str]:
+    from ..cli import run_verb
+
     heard = io.StringIO()
     args = [LIST_FLAGS] if word is None else [word, LIST_FLAGS]
     with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit, FprfError):
-        importlib.import_module(f".{verb}", __package__).run(args)
+        run_verb(verb, args)
     return [line for line in heard.getvalue().splitlines() if line.startswith("--")]
 
 

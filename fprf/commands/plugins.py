@@ -20,6 +20,7 @@ from ..plugins.encoders.config import EncoderConfig
 from ..plugins.executors.config import ExecutorConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
+from .config import CommandConfig
 from .parsing import load_method, parse
 
 __all__ = ["KINDS", "METHODS", "Row", "faults", "rows", "run"]
@@ -35,8 +36,9 @@ KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.datamanagers": (DataManagerConfig,),
     "fprf.dataparsers": (DataParserConfig,),
     "fprf.executors": (ExecutorConfig,),
+    "fprf.commands": (CommandConfig,),
 }
-"""The groups that slots are filled from, and what a plug-in of each must derive from."""
+"""The groups of configs, and what a plug-in of each must derive from."""
 
 
 class Row(NamedTuple):
@@ -101,17 +103,16 @@ def faults() -> Iterator[tuple[Row, str]]:
 
 
 def _check(row: Row) -> None:
+    from ..cli import VERBS
+
     kinds = KINDS[row.group]
     loaded = registry.load_object(row.group, row.name)
     if not (isinstance(loaded, type) and issubclass(loaded, kinds)):
         registry.load(row.group, row.name, kinds[0])
         return
+    origin = f"{row.value} from {row.package}"
     if row.name == "none":
-        raise PluginError(f"{row.group}: 'none' ({row.value} from {row.package}) can never be chosen: none empties a slot")
-    try:
-        loaded()
-    except Exception as fault:  # a stranger's defaults
-        raise PluginError(
-            f"{row.group}: {row.name!r} ({row.value} from {row.package}) has no defaults to start from ({fault}); "
-            "every field of a plug-in's config needs one"
-        ) from fault
+        raise PluginError(f"{row.group}: 'none' ({origin}) can never be chosen: none empties a slot")
+    if row.group == CommandConfig.group and row.name in VERBS:
+        raise PluginError(f"{row.group}: {row.name!r} ({origin}) is never called: fprf has a verb of that name; rename it")
+    registry.make(row.group, row.name, loaded)

@@ -15,7 +15,20 @@ from typing import NamedTuple, TypeVar
 from ..errors import PluginError
 from ..process import entry_points_of
 
-__all__ = ["Entry", "entry", "forget", "groups", "installed", "load", "load_object", "name_of", "nearest", "peek", "unreadable"]
+__all__ = [
+    "Entry",
+    "entry",
+    "forget",
+    "groups",
+    "installed",
+    "load",
+    "load_object",
+    "make",
+    "name_of",
+    "nearest",
+    "peek",
+    "unreadable",
+]
 
 T = TypeVar("T")
 
@@ -100,6 +113,18 @@ def load(group: str, name: str, kind: type[T]) -> type[T]:
     )
 
 
+def make(group: str, name: str, kind: type[T]) -> T:
+    """The config of that name with its defaults. Raises PluginError, also where it has none to start from."""
+    chosen = load(group, name, kind)
+    try:
+        return chosen()
+    except Exception as error:  # a stranger's defaults
+        raise PluginError(
+            f"{group}: {name!r} ({entry(group, name).origin}) has no defaults to start from ({error}); "
+            "every field of a plug-in's config needs one"
+        ) from error
+
+
 def name_of(group: str, cls: type) -> str:
     """The name that a plug-in is saved under: the inverse of `load`. Imports nothing."""
     value = f"{cls.__module__}:{cls.__qualname__}"
@@ -140,7 +165,9 @@ def _scan() -> _Scan:
     seen: set[str] = set()
     for distribution in distributions():
         try:
-            package, points = f"{distribution.name} {distribution.version}", list(entry_points_of(distribution))
+            package = _package(distribution)
+            ours = f"[{_PREFIX}" in (distribution.read_text("entry_points.txt") or "")
+            points = list(entry_points_of(distribution)) if ours else []
         except Exception as error:  # whatever a damaged file makes the reader raise
             bad.extend(_complaint(distribution, error))
             continue
@@ -156,6 +183,13 @@ def _scan() -> _Scan:
         for group, names in found.items()
     }
     return _Scan(MappingProxyType(groups), tuple(bad))
+
+
+def _package(distribution: Distribution) -> str:
+    """Name and version. Their two lines are looked for in the text: to parse it whole takes ten times as long, per package."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    name, version = (re.search(rf"^{key}: *(\S+)", text, re.MULTILINE) for key in ("Name", "Version"))
+    return f"{name[1]} {version[1]}" if name and version else f"{distribution.name} {distribution.version}"
 
 
 def _complaint(distribution: Distribution, error: Exception) -> list[str]:

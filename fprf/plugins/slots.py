@@ -112,13 +112,7 @@ def _fill(config: C, slot: Slot, name: str) -> C:
         chosen = registry.load(slot.kind.group, name, slot.kind)
         if type(slot.value) is chosen:
             return config
-        value = chosen()
+        value = registry.make(slot.kind.group, name, slot.kind)
     except PluginError as error:
         raise PluginError(f"--{slot.path}: {error}") from error
-    except TypeError as error:
-        origin = registry.entry(slot.kind.group, name).origin
-        raise PluginError(
-            f"--{slot.path}: {name!r} ({origin}) has no defaults to start from ({error}); "
-            "every field of a plug-in's config needs one"
-        ) from error
     return replace(config, slot.path, value)

@@ -22,7 +22,7 @@ def recognise(data: Path) -> DataParserConfig:
     surest: dict[str, tuple[DataParserConfig, str]] = {}
     for name, entries in registry.installed(group).items():
         try:
-            config = registry.load(group, name, DataParserConfig)()
+            config = registry.make(group, name, DataParserConfig)
             answer = config.recognises(data)
             confidence, reason = answer or (0.0, "")
             between("confidence", confidence, 0.0, 1.0)
