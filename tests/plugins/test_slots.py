@@ -128,9 +128,7 @@ def test_errors_say_which_slot() -> None:
 def test_a_config_without_defaults_is_the_strangers_fault(packages: Packages) -> None:
     source = ENCODER.format(name="Needy").replace("tile: int = 224", "tile: int")
     packages.install("acme-needy", {"fprf.encoders": {"needy": "acme_needy:NeedyConfig"}}, code={"acme_needy": source})
-    with pytest.raises(
-        PluginError, match=r"'needy' \(acme_needy.*acme-needy 1\) has no defaults"
-    ):
+    with pytest.raises(PluginError, match=r"'needy' \(acme_needy.*acme-needy 1\) has no defaults"):
         resolve(fprf(), ["--semantic.encoder", "needy"])
 
 
