@@ -12,6 +12,7 @@ from .fields.layouts import LayoutConfig, SingleConfig
 from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig
 from .plugins.encoders.config import DinoConfig, EncoderConfig, Vgg19Config
 from .plugins.executors.config import ExecutorConfig, SerialConfig
+from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
 
 __all__ = [
@@ -72,8 +73,10 @@ class LossConfig:
     """Total variation of the content planes."""
     proposal_variation: float = 1e-4
     """Total variation of the proposal planes."""
+    penalties: tuple[tuple[str, float], ...] = ()
+    """Names and weights of other penalties of fields and samplers; those that are not named weigh 1."""
     penalty_every: int = 1
-    """Steps between total-variation terms, which then weigh as many times more."""
+    """Steps between penalties, which then weigh as many times more."""
     interlevel: float = 1.0
     """Proposals must bound the field's weights from above."""
     distortion: float = 1e-3
@@ -82,6 +85,8 @@ class LossConfig:
     """Rays through points of the reconstruction should end there (where `datamanager.depth_share` draws such rays)."""
     sky: float = 0.1
     """Rays into the sky should meet nothing before it (where the capture has masks of its sky)."""
+    extra: LossTermConfig | None = None
+    """A term of a package."""
 
     def __post_init__(self) -> None:
         for name in (
@@ -96,6 +101,13 @@ class LossConfig:
             "sky",
         ):
             at_least(f"loss.{name}", getattr(self, name), 0.0)
+        names = [name for name, _ in self.penalties]
+        for name, weight in self.penalties:
+            if name in ("variation", "proposal_variation"):
+                raise ConfigError(f"loss.penalties: {name} has a field of its own; set loss.{name}")
+            if names.count(name) > 1:
+                raise ConfigError(f"loss.penalties: {name} stands there twice; name it once")
+            at_least(f"loss.penalties: {name}", weight, 0.0)
         at_least("loss.penalty_every", self.penalty_every, 1)
         if self.rgb == self.content == self.semantic == 0:
             raise ConfigError("loss: rgb, content and semantic are all 0, so nothing would be learnt; raise one of them")

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .types import Batch, Boxes, FieldSample, Rays, Sampled, Site, Want
+from .types import Batch, Boxes, FieldSample, Rays, Rendered, Sampled, Site, Want
 
 if TYPE_CHECKING:
     from .datamanagers.features import FeatureStore
     from .datamanagers.scene import Scene
+    from .rendering.renderer import Parts
     from .rendering.space import Space
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Decoder",
     "Encoder",
     "Executor",
+    "LossTerm",
     "Sampler",
     "SemanticField",
     "Stylizer",
@@ -67,7 +69,12 @@ class ContentField(nn.Module, ABC):
 
     @abstractmethod
     def penalties(self) -> dict[str, Tensor]:
-        """Regularisers by loss name, each a scalar (for example 'variation')."""
+        """Regularisers by name, each a scalar, the same names at each call.
+
+        'variation' and 'proposal_variation' weigh what `loss.variation` and `loss.proposal_variation` say; any other name
+        weighs 1, so its own weight belongs into the scalar, unless `loss.penalties` says otherwise. One name in several parts
+        is added up.
+        """
 
 
 class SemanticField(nn.Module, ABC):
@@ -79,7 +86,7 @@ class SemanticField(nn.Module, ABC):
 
     @abstractmethod
     def penalties(self) -> dict[str, Tensor]:
-        """Regularisers by loss name."""
+        """Regularisers by name, as of `ContentField`."""
 
     def projected(self, matrix: Annotated[Tensor, "D T"]) -> "SemanticField | None":
         """A field of the products of these features with a matrix, for rendering alone: T channels; None = nothing is saved.
@@ -113,7 +120,7 @@ class Sampler(nn.Module, ABC):
 
     @abstractmethod
     def penalties(self) -> dict[str, Tensor]:
-        """Regularisers by loss name."""
+        """Regularisers by name, as of `ContentField`."""
 
 
 class Decoder(nn.Module, ABC):
@@ -170,6 +177,29 @@ class Stylizer(nn.Module, ABC):
     @abstractmethod
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """Attention of each point to each style code; rows sum to 1."""
+
+
+class LossTerm(ABC):
+    """A training term beside the built-in ones. Without parameters: nothing of it is saved.
+
+    It runs in every step: nothing in it may wait for the device (no `.item()`, no `bool` of a tensor).
+    """
+
+    @property
+    @abstractmethod
+    def needs(self) -> Want:
+        """What must be rendered for it; `Want.DENSITY` where weights and sample edges are enough."""
+
+    @abstractmethod
+    def __call__(
+        self, rendered: Rendered, batch: Batch, parts: "Parts", *, step: int, generator: torch.Generator | None
+    ) -> Tensor:
+        """The unweighted term, a scalar: by convention a mean over the rays.
+
+        Gradients go through `weights` [R S] of `rendered`, its colour and its features, not through depth and opacity.
+        `semantic`, and targets of the batch, are None where the scene or the method has none. `parts` are the scene's space
+        and networks. Draws come from the generator of the step; None = deterministic.
+        """
 
 
 class BlockLayout(ABC):

@@ -26,6 +26,7 @@ from fprf.engine.schedule import progress
 from fprf.engine.style_pass import measure_style
 from fprf.engine.trainer import Loop, optimizer_of
 from fprf.engine.views import render_view
+from fprf.errors import ConfigError
 from fprf.methods import fprf_lite
 from fprf.output.images import write_image
 from fprf.plugins.codec import from_json, to_json
@@ -78,6 +79,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "loss.semantic": (0.0, "training"),
     "loss.variation": (0.5, "training"),
     "loss.proposal_variation": (0.5, "training"),
+    "loss.penalties": ((("opacity", 0.5), ("other", 2.0)), "penalties"),
     "loss.penalty_every": (3, "training"),
     "loss.interlevel": (0.25, "training"),
     "loss.distortion": (0.5, "training"),
@@ -122,7 +124,7 @@ def differ(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
 
 
 def spelled(value: Any) -> list[str]:
-    return [str(each) for each in value] if isinstance(value, tuple) else [str(value)]
+    return [word for each in value for word in spelled(each)] if isinstance(value, tuple) else [str(value)]
 
 
 def shown(where: str) -> list[str]:
@@ -130,7 +132,7 @@ def shown(where: str) -> list[str]:
 
 
 def test_every_leaf_has_a_second_value() -> None:
-    slots = {"datamanager.parser", "executor", "blocks"}
+    slots = {"datamanager.parser", "executor", "blocks", "loss.extra"}
     assert set(leaves(fprf_lite())) - slots == set(SECOND)
 
 
@@ -260,6 +262,13 @@ def test_a_loss_on_points_changes_the_training(world: World, tmp_path: Path) -> 
         for name, config in (("a", base), ("b", changed(base, "loss.depth", SECOND["loss.depth"][0])))
     )
     assert differ(first, second) and shown("points") == ["loss.depth"]
+
+
+def test_penalties_are_looked_up_in_the_parts(world: World, tmp_path: Path) -> None:
+    """The built-in ones have fields of their own; tests/engine/test_losses.py weighs another."""
+    assert shown("penalties") == ["loss.penalties"]
+    with pytest.raises(ConfigError, match=r"has a penalty 'opacity' \(penalties that can be named: none\)"):
+        trained_for(world, tmp_path / "run", changed(world.config, "loss.penalties", SECOND["loss.penalties"][0]))
 
 
 def test_masks_count_where_there_are_some(world: World, tmp_path: Path) -> None:

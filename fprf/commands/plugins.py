@@ -18,6 +18,7 @@ from ..plugins.config import PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig
 from ..plugins.executors.config import ExecutorConfig
+from ..plugins.losses.config import LossTermConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
 from .config import CommandConfig
@@ -36,6 +37,7 @@ KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.datamanagers": (DataManagerConfig,),
     "fprf.dataparsers": (DataParserConfig,),
     "fprf.executors": (ExecutorConfig,),
+    "fprf.losses": (LossTermConfig,),
     "fprf.commands": (CommandConfig,),
 }
 """The groups of configs, and what a plug-in of each must derive from."""

@@ -14,13 +14,14 @@ from ..errors import FprfError, PluginError
 from ..interfaces import Stylizer
 from ..plugins import registry
 from ..plugins.config import PluginConfig
+from ..plugins.losses.config import LossTermConfig
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.renderer import Parts
 from ..style.dictionary import StyleDictionary
 from ..style.scene import SceneStyle
 from ..types import Rays, Want
 
-__all__ = ["check_parts", "check_stylizer"]
+__all__ = ["check_parts", "check_stylizer", "check_term"]
 
 T = TypeVar("T")
 POINTS = 5
@@ -74,6 +75,15 @@ def check_stylizer(config: StylizerConfig, stylizer: Stylizer, dictionary: Style
         raise _breach(config, "matches", "rows that sum to 1", f"a sum of {float(shares[0].sum()):g}")
 
 
+def check_term(config: LossTermConfig, term: Tensor, like: Tensor) -> None:
+    """Raise PluginError unless a training term is a scalar of the kind of another tensor. Reads no number of it."""
+    expected = f"{_kind(like)} [] on {like.device}"
+    if not isinstance(term, Tensor):
+        raise _breach(config, "the term", expected, type(term).__name__)
+    if term.ndim or term.dtype != like.dtype or term.device != like.device:
+        raise _breach(config, "the term", expected, f"{_kind(term)} [{' '.join(map(str, term.shape))}] on {term.device}")
+
+
 def _points() -> Annotated[Tensor, "N 3"]:
     return 0.9 * torch.sin(torch.arange(3.0 * POINTS).view(POINTS, 3))
 
@@ -112,8 +122,7 @@ def _look(
     own = tuple(found.shape)
     fits = len(own) == len(shape) and all(want in (None, size) for want, size in zip(shape, own, strict=True))
     if not fits or found.dtype != torch.float32 or found.device.type != "cpu":
-        kind = str(found.dtype).removeprefix("torch.")
-        raise _breach(config, what, expected, f"{kind} [{' '.join(map(str, own))}] on {found.device}")
+        raise _breach(config, what, expected, f"{_kind(found)} [{' '.join(map(str, own))}] on {found.device}")
     if not bool(found.isfinite().all()):
         raise _breach(config, what, "finite numbers", f"{int((~found.isfinite()).sum())} of {found.numel()} that are not")
     if found.numel() and not low - 1e-5 <= float(found.min()) <= float(found.max()) <= high + 1e-5:
@@ -129,6 +138,10 @@ def _breach(config: PluginConfig, what: str, expected: str, found: str) -> Plugi
     return PluginError(
         f"{who}: {what}: expected {expected}, found {found}; mend or uninstall that package, or choose another plug-in"
     )
+
+
+def _kind(tensor: Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")
 
 
 def _line(error: Exception) -> str:

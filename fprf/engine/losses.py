@@ -1,4 +1,7 @@
-"""The training terms (paper, Eq. 3 and 4, and K-Planes' regularisers). A term of weight 0 is never computed."""
+"""The training terms (paper, Eq. 3 and 4, and K-Planes' regularisers), and those of plug-ins.
+
+A term of weight 0 is never computed.
+"""
 
 import math
 from typing import Annotated
@@ -8,11 +11,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..config import LossConfig
+from ..errors import ConfigError, PluginError
+from ..interfaces import LossTerm
+from ..plugins.registry import nearest
 from ..rendering.stepfun import distortion, interlevel, midpoints
 from ..types import Batch, Rendered, Want
+from .first_use import check_term
 from .model import Facts, Model
 
-__all__ = ["NEARBY", "SHELL", "emptiness", "ending", "terms", "total", "wanted"]
+__all__ = ["NEARBY", "SHELL", "check_penalties", "emptiness", "ending", "extra_term", "terms", "total", "wanted"]
 
 
 SHELL = 4.0
@@ -21,9 +28,28 @@ NEARBY = 0.1
 """Share of its distance by which a ray's end may miss a point: what a reconstruction is uncertain by, and samples are apart."""
 
 
-def wanted(config: LossConfig, batch: Batch) -> Want:
+def extra_term(config: LossConfig) -> LossTerm | None:
+    """The term of a package that `loss.extra` chooses; None where there is none, or where it weighs nothing."""
+    return config.extra.build() if config.extra is not None and config.extra.weight > 0 else None
+
+
+def check_penalties(config: LossConfig, model: Model) -> None:
+    """Raise ConfigError where a weight is given to a penalty that is not there, PluginError where one has a term's name."""
+    names = model.penalty_names
+    for name, _ in config.penalties:
+        if name not in names:
+            known = sorted(names - {"variation", "proposal_variation"})
+            raise ConfigError(
+                f"loss.penalties: no part of this model has a penalty {name!r}{nearest(name, known)} "
+                f"(penalties that can be named: {', '.join(known) or 'none'})"
+            )
+    for name in sorted(names & _weights(config, 1.0).keys()):
+        raise PluginError(f"a penalty of a field or a sampler is called {name!r}, as a term of its own is; rename it there")
+
+
+def wanted(config: LossConfig, batch: Batch, extra: LossTerm | None = None) -> Want:
     """What must be rendered for the terms that count."""
-    want = Want.DENSITY
+    want = Want.DENSITY if extra is None else Want.DENSITY | extra.needs
     if config.rgb > 0:
         want |= Want.COLOUR
     if config.content > 0 and batch.content is not None:
@@ -33,10 +59,21 @@ def wanted(config: LossConfig, batch: Batch) -> Want:
     return want
 
 
-def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, model: Model, *, step: int) -> dict[str, Tensor]:
+def terms(
+    config: LossConfig,
+    facts: Facts,
+    rendered: Rendered,
+    batch: Batch,
+    model: Model,
+    *,
+    step: int,
+    extra: LossTerm | None = None,
+    generator: torch.Generator | None = None,
+) -> dict[str, Tensor]:
     """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits any encoder.
 
-    Penalties walk over every parameter of the planes, whatever the batch: they come every `penalty_every` steps.
+    Penalties walk over every parameter of the planes, whatever the batch: they come every `penalty_every` steps. `extra` is
+    what `extra_term` gave; it draws from the generator.
     """
     result: dict[str, Tensor] = {}
     if rendered.rgb is not None and config.rgb > 0:
@@ -44,9 +81,9 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
         if rendered.unaided is not None:
             # Else the scene's own part of a decoder would do the frozen part's work, and a new style would have nothing.
             result["unaided"] = F.mse_loss(rendered.unaided, batch.rgb)
-    if rendered.content is not None and batch.content is not None:
+    if config.content > 0 and rendered.content is not None and batch.content is not None:
         result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
-    if rendered.semantic is not None and batch.semantic is not None:
+    if config.semantic > 0 and rendered.semantic is not None and batch.semantic is not None:
         result["semantic"] = F.l1_loss(rendered.semantic, batch.semantic) / facts.semantic_scale
     sampled, weights = rendered.sampled, rendered.weights
     assert sampled is not None and weights is not None
@@ -64,11 +101,11 @@ def terms(config: LossConfig, facts: Facts, rendered: Rendered, batch: Batch, mo
         found = emptiness(sampled.t, weights, batch.sky, within=math.inf if facts.space.kind in ("box", "ndc") else SHELL)
         if found is not None:
             result["sky"] = found
-    due = step % config.penalty_every == 0 and (config.variation > 0 or config.proposal_variation > 0)
-    penalties = model.penalties() if due else {}
-    for name, weight in (("variation", config.variation), ("proposal_variation", config.proposal_variation)):
-        if weight > 0 and name in penalties:
-            result[name] = penalties[name]
+    if config.extra is not None and extra is not None:
+        result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
+        check_term(config.extra, result["extra"], rendered.opacity)
+    if step % config.penalty_every == 0 and any(_penalty_weight(config, name) > 0 for name in model.penalty_names):
+        result |= {name: value for name, value in model.penalties().items() if _penalty_weight(config, name) > 0}
     return result
 
 
@@ -118,8 +155,16 @@ def _mean_of(values: Annotated[Tensor, "R"], mask: Annotated[Tensor, "R"]) -> Te
 def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
     """Weighted sum."""
     # Both colours of a decoder with a part of the scene's own share one weight: the regularisers keep theirs.
-    colour = config.rgb / 2 if "unaided" in parts else config.rgb
-    weights = {
+    weights = _weights(config, config.rgb / 2 if "unaided" in parts else config.rgb)
+    every = config.penalty_every
+    return torch.stack(
+        [(weights[name] if name in weights else _penalty_weight(config, name) * every) * value for name, value in parts.items()]
+    ).sum()
+
+
+def _weights(config: LossConfig, colour: float) -> dict[str, float]:
+    """Weights of the terms that are no penalties."""
+    return {
         "rgb": colour,
         "unaided": colour,
         "content": config.content,
@@ -128,7 +173,10 @@ def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
         "distortion": config.distortion,
         "depth": config.depth,
         "sky": config.sky,
-        "variation": config.variation * config.penalty_every,
-        "proposal_variation": config.proposal_variation * config.penalty_every,
+        "extra": config.extra.weight if config.extra is not None else 0.0,
     }
-    return torch.stack([weights[name] * value for name, value in parts.items()]).sum()
+
+
+def _penalty_weight(config: LossConfig, name: str) -> float:
+    own = {"variation": config.variation, "proposal_variation": config.proposal_variation}
+    return (own | dict(config.penalties)).get(name, 1.0)

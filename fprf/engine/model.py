@@ -1,6 +1,7 @@
 """A scene's networks together, built from a config and what was found out about the scene. No data, no losses, no files."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import torch
@@ -69,9 +70,18 @@ class Model(nn.Module):
         return [p for p in self.parameters() if p.requires_grad]
 
     def penalties(self) -> dict[str, Tensor]:
-        """Regularisers of all parts by loss name."""
-        terms = self.field.penalties() | self.sampler.penalties()
-        return terms | self.semantic.penalties() if self.semantic is not None else terms
+        """Regularisers of all parts by name; what several parts call the same is added up."""
+        terms = self.field.penalties()
+        for part in (self.sampler, self.semantic):
+            for name, value in (part.penalties() if part is not None else {}).items():
+                terms = {**terms, name: terms[name] + value if name in terms else value}
+        return terms
+
+    @cached_property
+    def penalty_names(self) -> frozenset[str]:
+        """Names of `penalties`, which takes one look at them."""
+        with torch.no_grad():
+            return frozenset(self.penalties())
 
 
 def background_of(facts: Facts, device: torch.device) -> Annotated[Tensor, "3"] | None:

@@ -25,7 +25,7 @@ from ..types import Batch, Rays
 from . import checkpoint
 from .guards import CLEAR_EVERY, PATIENCE, StepStatistics, clear_denormals, unfit_gradients, unfit_step, unfit_terms
 from .interrupts import held_back
-from .losses import terms, total, wanted
+from .losses import check_penalties, extra_term, terms, total, wanted
 from .model import Facts, Model, background_of, build_model
 from .poses import moving
 from .prepare import Prepared, device_of
@@ -181,6 +181,8 @@ class Loop:
         """Whether faults are looked for with the reports alone."""
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
         self.half = config.precision == "bfloat16" and device.type != "cpu"
+        check_penalties(config.loss, model)
+        self.extra = extra_term(config.loss)
         self.manager = prepared.manager
         if device.type != "cpu":
             self.manager = prepared.manager.to(device, room=int(config.device_memory * _free(device)))
@@ -209,22 +211,25 @@ class Loop:
             rays = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
+        draws = step_generator(self.config.seed, step, self.device)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
             rendered = render_rays(
                 rays,
                 self.model.parts,
-                want=wanted(self.config.loss, batch),
+                want=wanted(self.config.loss, batch, self.extra),
                 budget=self.config.render.train_budget,
                 background=self.background,
                 step=step + self.lead,
-                generator=step_generator(self.config.seed, step, self.device),
+                generator=draws,
                 semantic_rays=len(batch.semantic) if batch.semantic is not None else None,
                 semantic_samples=self.config.semantic.samples,
                 content_moves_density=self.config.content.moves_density,
             )
         rendered = toned(rendered, self.model.tones, batch.view)
         with record_function("fprf.losses"):
-            parts = terms(self.config.loss, self.facts, rendered, batch, self.model, step=step)
+            parts = terms(
+                self.config.loss, self.facts, rendered, batch, self.model, step=step, extra=self.extra, generator=draws
+            )
             loss = total(self.config.loss, parts)
         self.optimizer.zero_grad(set_to_none=True)
         if self.deferred:

@@ -1,16 +1,20 @@
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
 import torch
-from tiny_world import World, rays_of
+from tiny_world import World, parameters, rays_of, trained_for
 
 from fprf.config import LossConfig
 from fprf.engine import losses
-from fprf.engine.losses import terms, total, wanted
+from fprf.engine.losses import check_penalties, extra_term, terms, total, wanted
 from fprf.engine.model import Model, build_model
-from fprf.errors import ConfigError
-from fprf.rendering.renderer import render_rays
+from fprf.engine.trainer import Report
+from fprf.errors import ConfigError, PluginError
+from fprf.interfaces import LossTerm
+from fprf.plugins.losses.config import LossTermConfig
+from fprf.rendering.renderer import Parts, render_rays
 from fprf.types import Batch, Rendered, Want
 
 ZERO: dict[str, float] = {
@@ -95,6 +99,7 @@ def test_a_term_of_weight_0_is_never_computed(world: World, monkeypatch: pytest.
     config = replace(LossConfig(), **{name: 0.0})  # type: ignore[arg-type]
     if name in ("variation", "proposal_variation"):
         config = replace(config, variation=0.0, proposal_variation=0.0)
+        assert model.penalty_names, "looked up once, before training"
         monkeypatch.setattr(model, "penalties", forbidden)
     if name in ("interlevel", "distortion"):
         monkeypatch.setattr(losses, name, forbidden)
@@ -118,6 +123,94 @@ def test_penalties_come_when_they_are_due_and_weigh_as_many_times_more(world: Wo
     assert due == [0, 4, 8]
     parts = {"variation": torch.tensor(2.0), "proposal_variation": torch.tensor(3.0)}
     assert float(total(config, parts)) == pytest.approx(4 * (2 * config.variation + 3 * config.proposal_variation))
+
+
+def test_a_penalty_of_any_name_counts(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the weight that the plug-in states, unless a weight is named."""
+    model, batch = world.load().model, world.prepared.manager.batch(0)
+    monkeypatch.setattr(model.field, "penalties", lambda: {"entropy": torch.tensor(3.0)})
+    for penalties, weight in (((), 1.0), ((("entropy", 0.5),), 0.5), ((("entropy", 0.0),), 0.0)):
+        config = replace(only(rgb=1.0), penalties=penalties, penalty_every=4)
+        check_penalties(config, model)
+        out = rendered(world, model, batch, config)
+        found = terms(config, world.prepared.facts, out, batch, model, step=4)
+        assert set(found) == {"rgb", *(["entropy"] if weight else [])}
+        assert float(total(config, found)) == pytest.approx(float(found["rgb"]) + 4 * weight * 3, rel=1e-6)
+        assert set(terms(config, world.prepared.facts, out, batch, model, step=3)) == {"rgb"}
+    with pytest.raises(ConfigError, match=r"no part of this model has a penalty 'entrpy'; did you mean 'entropy'\?") as caught:
+        check_penalties(LossConfig(penalties=(("entrpy", 1.0),)), model)
+    assert "(penalties that can be named: entropy)" in str(caught.value)
+
+
+def test_a_penalty_that_is_called_like_a_term_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = world.load().model
+    monkeypatch.setattr(model.field, "penalties", lambda: {"content": torch.tensor(3.0)})
+    with pytest.raises(PluginError, match="is called 'content'"):
+        check_penalties(LossConfig(), model)
+
+
+def test_weights_of_penalties_are_checked() -> None:
+    for penalties in ((("a", -1.0),), (("a", 1.0), ("a", 2.0)), (("variation", 1.0),)):
+        with pytest.raises(ConfigError, match=r"loss\.penalties"):
+            LossConfig(penalties=penalties)
+
+
+class Weights(LossTerm):
+    """Mean square of the weights, times noise."""
+
+    def __init__(self, wrong: str = "") -> None:
+        self.wrong = wrong
+
+    @property
+    def needs(self) -> Want:
+        return Want.SEMANTIC
+
+    def __call__(
+        self, rendered: Rendered, batch: Batch, parts: Parts, *, step: int, generator: torch.Generator | None
+    ) -> torch.Tensor:
+        assert rendered.semantic is not None and rendered.weights is not None and parts.space is not None and step >= 0
+        value = rendered.weights.square().mean() * (1 if generator is None else torch.rand((), generator=generator))
+        wrong = {"type": 3.0, "shape": value[None], "dtype": value.double(), "device": value.to("meta")}
+        return wrong.get(self.wrong, value)  # type: ignore[return-value]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsConfig(LossTermConfig):
+    wrong: str = ""
+
+    def build(self) -> LossTerm:
+        return Weights(self.wrong)
+
+
+def test_a_term_of_a_package_counts(world: World) -> None:
+    model, batch = build_model(world.config, world.prepared.facts), world.prepared.manager.batch(0)
+    config = replace(only(rgb=1.0), extra=WeightsConfig(weight=0.5))
+    extra = extra_term(config)
+    assert extra is not None and wanted(config, batch, extra) == Want.DENSITY | Want.COLOUR | Want.SEMANTIC
+    out = render_rays(rays_of(world, world.load(), batch), model.parts, want=wanted(config, batch, extra), budget=0.0, step=0)
+    found = terms(config, world.prepared.facts, out, batch, model, step=7, extra=extra)
+    assert out.weights is not None and set(found) == {"rgb", "extra"}
+    assert float(found["extra"].detach()) == pytest.approx(float(out.weights.detach().square().mean()))
+    summed = float(found["rgb"].detach()) + 0.5 * float(found["extra"].detach())
+    assert float(total(config, found).detach()) == pytest.approx(summed)
+    total(config, found).backward()  # type: ignore[no-untyped-call]
+    assert extra_term(replace(config, extra=WeightsConfig(weight=0.0))) is None
+    for wrong in ("type", "shape", "dtype", "device"):
+        bad = replace(config, extra=WeightsConfig(wrong=wrong))
+        with pytest.raises(PluginError, match=r"WeightsConfig: the term: expected float32 \[\] on cpu, found"):
+            terms(bad, world.prepared.facts, out, batch, model, step=0, extra=extra_term(bad))
+
+
+def test_training_with_a_term_of_a_package_is_reproducible(world: World, tmp_path: Path) -> None:
+    def after(config: LossConfig, folder: str) -> tuple[dict[str, torch.Tensor], set[str]]:
+        seen: list[Report] = []
+        run = trained_for(world, tmp_path / folder, replace(world.config, steps=2, loss=config), report=seen.append)
+        return parameters(run, 2), set(seen[-1].losses)
+
+    plain, extra = world.config.loss, replace(world.config.loss, extra=WeightsConfig())
+    (a, _), (b, names), (c, others) = after(extra, "a"), after(extra, "b"), after(plain, "c")
+    assert all(torch.equal(a[name], b[name]) for name in a) and not all(torch.equal(a[name], c[name]) for name in a)
+    assert names - others == {"extra"}
 
 
 def test_the_total_is_the_weighted_sum() -> None:

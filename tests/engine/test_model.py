@@ -45,6 +45,17 @@ def test_penalties_come_from_every_part(world: World) -> None:
     assert plain.semantic is None and set(plain.penalties()) == {"variation"}
 
 
+def test_penalties_of_one_name_are_added_up(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = build_model(world.config, world.prepared.facts)
+    assert model.semantic is not None
+    before = {name: value.detach() for name, value in model.penalties().items()}
+    monkeypatch.setattr(model.semantic, "penalties", lambda: {"variation": torch.tensor(2.0), "own": torch.tensor(5.0)})
+    after = {name: value.detach() for name, value in model.penalties().items()}
+    assert list(after) == ["variation", "proposal_variation", "own"] and float(after["own"]) == 5
+    assert float(after["variation"]) == pytest.approx(float(before["variation"]) + 2)
+    assert torch.equal(after["proposal_variation"], before["proposal_variation"])
+
+
 def test_a_model_without_semantics_renders(world: World) -> None:
     model = build_model(world.config, replace(world.prepared.facts, dim=0))
     rays = rays_of(world, world.load(), world.prepared.manager.batch(0))
