@@ -1,11 +1,13 @@
 """Requirements that say in one sentence what was found where."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
-__all__ = ["close", "penalties", "pointwise", "require", "same", "same_parameters", "tensor", "trainable"]
+__all__ = ["Unread", "close", "follows", "penalties", "pointwise", "require", "same", "same_parameters", "tensor", "trainable"]
 
 
 def require(condition: bool, breach: str) -> None:
@@ -52,16 +54,64 @@ def pointwise(function: Callable[[Tensor], Tensor], points: Tensor, name: str) -
     tensor(function(points[:0]), (0, *whole.shape[1:]), f"{name} of no points")
 
 
-def penalties(found: dict[str, Tensor], name: str) -> None:
-    """Scalars by loss name."""
+def follows(call: Callable[[], Tensor], like: Tensor, name: str) -> None:
+    """What a call gives, and makes on the way, takes device and dtype from its inputs, which are of the kind of `like`.
+
+    Called with float64 on the CPU, while new tensors that name no device are put elsewhere: those cannot be computed with.
+    """
+    plain = call()
+    found, kind = f"{plain.dtype} on {plain.device}", f"{like.dtype} on {like.device}"
+    require(found == kind, f"{name}: expected {kind} for inputs of that kind, found {found}")
+    try:
+        with torch.device("meta"):
+            again = call()
+    except (RuntimeError, TypeError, ValueError) as fault:
+        line = " ".join(str(fault).split())
+        raise AssertionError(f"{name}: makes a tensor that is not on the device of its inputs ({line})") from fault
+    whole = again.device == plain.device and torch.equal(again, plain)
+    require(whole, f"{name}: makes a tensor that is not on the device of its inputs")
+
+
+class Regularised(Protocol):
+    """A part with penalties."""
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Scalars by name."""
+
+
+def penalties(part: Regularised, name: str) -> None:
+    """Finite scalars by name, the same names at each call, of a part in float64."""
+    found = part.penalties()
+    require(part.penalties().keys() == found.keys(), f"{name}: must have the same penalties at each call")
     for key, value in found.items():
         require(isinstance(key, str) and value.ndim == 0, f"{name}: penalty {key!r} must be a scalar")
         require(bool(value.isfinite()), f"{name}: penalty {key!r} is not finite")
+        follows(lambda key=key: part.penalties()[key], value, f"{name}: penalty {key!r}")  # type: ignore[misc]
+
+
+class Unread(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Raise AssertionError where the host would wait for the device: `.item()`, `bool`, `nonzero`, a boolean index."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.name = name
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        """Look at one operator."""
+        aten = torch.ops.aten
+        mask = func is aten.index.Tensor and any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1])
+        waits = func.overloadpacket in (aten._local_scalar_dense, aten.nonzero, aten.equal, aten.masked_select)
+        require(not (mask or waits), f"{self.name}: reads numbers of the device in a step ({func.overloadpacket.__name__})")
+        return func(*args, **(kwargs or {}))
 
 
 def trainable(module: nn.Module, loss: Tensor, name: str) -> None:
     """Every parameter gets a finite gradient."""
-    names, parameters = zip(*module.named_parameters(), strict=True)
-    for key, gradient in zip(names, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
+    named = dict(module.named_parameters())
+    require(loss.requires_grad or not named, f"{name}: no gradient goes through its answer")
+    found = torch.autograd.grad(loss, list(named.values()), allow_unused=True) if named else ()
+    for key, gradient in zip(named, found, strict=True):
         require(gradient is not None, f"{name}: no gradient reaches {key}")
         require(bool(gradient.isfinite().all()), f"{name}: the gradient of {key} is not finite")

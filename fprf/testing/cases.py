@@ -1,16 +1,24 @@
 """Inputs for the contracts: small, seeded, of every letter in `fprf.types`."""
 
+from pathlib import Path
 from typing import Annotated
 
 import torch
 from torch import Tensor
 
+from ..datamanagers.scene import Scene
+from ..fields.config import PlanesConfig, SemanticPlanesConfig
+from ..interfaces import Decoder
+from ..output.images import write_image
+from ..plugins.samplers.config import UniformConfig
+from ..rendering.cameras import Cameras
+from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from ..style.dictionary import StyleDictionary
 from ..style.scene import SceneStyle
-from ..types import Rays, Site
+from ..types import Batch, Rays, Site
 
-__all__ = ["dictionary", "normal", "points", "rays", "scene", "site", "space", "uniform"]
+__all__ = ["batch", "capture", "dictionary", "normal", "parts", "points", "rays", "scene", "site", "space", "uniform"]
 
 
 def uniform(*shape: int) -> Tensor:
@@ -48,6 +56,50 @@ def space() -> Space:
     """The unit cube as it is, for `rays`."""
     eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return Space("box", centre=(0.0, 0.0, 0.0), rotation=eye, scale=1.0, near=0.5, far=3.5)
+
+
+def capture(folder: Path) -> Scene:
+    """Five pictures of noise of several sizes, written to a folder; the second is held out."""
+    sizes = torch.tensor([[24, 16], [30, 20], [18, 26], [24, 16], [12, 10]])
+    paths = [folder / f"{view}.png" for view in range(len(sizes))]
+    for path, (width, height) in zip(paths, sizes.tolist(), strict=True):
+        write_image(path, (255 * uniform(height, width, 3)).byte().numpy())
+    cameras = Cameras(
+        pose=torch.eye(4, dtype=torch.float64)[:3].repeat(len(sizes), 1, 1),
+        focal=torch.full((len(sizes), 2), 20.0, dtype=torch.float64),
+        centre=sizes / 2.0,
+        size=sizes,
+        distortion=torch.zeros(len(sizes), 6, dtype=torch.float64),
+        lens=torch.zeros(len(sizes), dtype=torch.int64),
+    )
+    train, test = torch.tensor([0, 2, 3, 4]), torch.tensor([1])
+    return Scene(name="noise", paths=tuple(paths), cameras=cameras, train=train, test=test, alpha=False)
+
+
+def parts() -> Parts:
+    """Small networks in the unit cube: 7 content and 5 semantic channels."""
+    field = PlanesConfig(resolutions=(4, 8), channels=2, hidden=8).build(channels=7, seed=0)
+    semantic = SemanticPlanesConfig(resolutions=(4, 8), channels=2, hidden=8).build(channels=5, seed=0)
+    return Parts(space(), UniformConfig(samples=8).build(seed=0), field, semantic, _Sigmoid())
+
+
+def batch(count: int) -> Batch:
+    """Targets of `rays` for `parts`; semantics of the first half."""
+    view, pixel = torch.zeros(count, dtype=torch.int64), torch.full((count, 2), 0.5)
+    return Batch(view, pixel, uniform(count, 3), normal(count, 7), normal(count // 2, 5))
+
+
+class _Sigmoid(Decoder):
+    """Three channels as colours."""
+
+    def forward(self, content: Tensor) -> Tensor:
+        return content[:, :3].sigmoid()
+
+    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
+        return styled[:, :3].sigmoid()
+
+    def unaided(self, content: Tensor) -> None:
+        return None
 
 
 def dictionary(codes: int, channels: int, dims: int) -> StyleDictionary:

@@ -6,35 +6,53 @@ breach. They take a second or so on a CPU and need no data but what is passed to
 
 import dataclasses
 import math
+import tempfile
 from pathlib import Path
 
 import torch
 from torch import nn
 
 from ..blocks.windows import shares
+from ..datamanagers.config import DataManagerConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import DataError
 from ..fields.config import ContentFieldConfig, SemanticFieldConfig
 from ..fields.layouts import LayoutConfig
-from ..interfaces import BlockLayout, ContentField, DataParser, Decoder, Encoder, Executor, Sampler, SemanticField, Stylizer
+from ..interfaces import (
+    BlockLayout,
+    ContentField,
+    DataManager,
+    DataParser,
+    Decoder,
+    Encoder,
+    Executor,
+    LossTerm,
+    Sampler,
+    SemanticField,
+    Stylizer,
+)
 from ..plugins.config import PluginConfig
 from ..plugins.decoders.config import DecoderConfig
-from ..plugins.encoders.config import EncoderConfig
+from ..plugins.encoders.config import EncoderConfig, RandomConfig
 from ..plugins.executors.config import ExecutorConfig
+from ..plugins.losses.config import LossTermConfig
 from ..plugins.samplers.config import SamplerConfig
 from ..plugins.stylizers.config import StylizerConfig
 from ..plugins.typed_json import from_json, to_json
-from ..types import Rays, Sampled, Want
+from ..rendering.renderer import render_rays
+from ..types import Batch, Rays, Rendered, Sampled, Want
 from . import cases
-from .breaches import close, penalties, pointwise, require, same, same_parameters, tensor, trainable
+from .breaches import Unread, close, follows, penalties, pointwise, require, same, same_parameters, tensor, trainable
 
 __all__ = [
     "check_config",
     "check_content_field",
+    "check_data_manager",
     "check_decoder",
     "check_encoder",
     "check_executor",
     "check_layout",
+    "check_loss_term",
     "check_parser",
     "check_sampler",
     "check_semantic_field",
@@ -78,6 +96,9 @@ def check_encoder(config: EncoderConfig) -> None:
         tensor(features, (1, encoder.channels, None, None), f"{name} of {height} x {width} pixels")
     for level in (0.0, 1.0):
         tensor(encoder(torch.full((1, 3, 40, 40), level)), (1, encoder.channels, None, None), f"{name} of a flat image")
+    image = cases.uniform(1, 3, 40, 40).double()
+    encoder.double()
+    follows(lambda: encoder(image), image, name)
 
 
 def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None:
@@ -109,6 +130,10 @@ def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None
         tensor(alone, (18, 3), f"{name}.unaided")
         moved = torch.autograd.grad(alone.sum() + colour.sum(), own, allow_unused=True)
         require(all(each is not None for each in moved), f"{name}: no gradient reaches a parameter that wants one")
+    decoder.double()
+    content, styled = content.double(), styled.double()
+    follows(lambda: decoder(content), content, name)
+    follows(lambda: decoder.restyled(content, styled, 0.6), content, f"{name}.restyled")
 
 
 def check_stylizer(config: StylizerConfig) -> None:
@@ -134,6 +159,7 @@ def check_stylizer(config: StylizerConfig) -> None:
         tensor(match, (11, codes), f"{name}.match")
         whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(11), 1e-4)
         require(whole, f"{name}.match: rows must be shares that sum to 1")
+        _stylizer_follows(stylizer.double(), content.double(), semantic.double(), name)
     if config.heeds_regions:
         both = cases.dictionary(4, 8, 4)._replace(reference=torch.tensor([0, 0, 1, 1]), names=("one", "other"))
         pinned = both._replace(allowed=torch.tensor([[True, False]] * 3))
@@ -164,7 +190,11 @@ def check_sampler(config: SamplerConfig) -> None:
                 shape = (count, level.s.shape[1] - 1)
                 tensor(level.weights, shape, f"{name}: weights of a proposal level")
                 require(bool((level.weights >= 0).all()), f"{name}: proposal weights must be at least 0")
-    penalties(sampler.penalties(), name)
+    sampler.double()
+    penalties(sampler, name)
+    rays = Rays(*(x.double() for x in cases.rays(6)))
+    for seed in (None, 3):
+        follows(lambda seed=seed: _sample(sampler, rays, seed).t, rays.near, f"{name}: t")  # type: ignore[misc]
 
 
 def check_content_field(config: ContentFieldConfig) -> None:
@@ -182,8 +212,13 @@ def check_content_field(config: ContentFieldConfig) -> None:
     same(field.content(sample.latent[4:9], view[4:9]), content[4:9], 1e-4, f"{name}: points must not depend on others")
     pointwise(lambda some: field.density(some).density, points, name)
     tensor(field.content(sample.latent[:0], view[:0]), (0, 7), f"{name}: content of no points")
-    penalties(field.penalties(), name)
     trainable(field, sample.density.sum() + content.square().sum(), name)
+    field.double()
+    penalties(field, name)
+    points, view = points.double(), view.double()
+    latent = field.density(points).latent
+    follows(lambda: field.density(points).density, points, f"{name}: density")
+    follows(lambda: field.content(latent, view), points, f"{name}: content")
 
 
 def check_semantic_field(config: SemanticFieldConfig) -> None:
@@ -196,8 +231,11 @@ def check_semantic_field(config: SemanticFieldConfig) -> None:
     features = field(points)
     tensor(features, (13, 5), name)
     pointwise(lambda some: field(some), points, name)
-    penalties(field.penalties(), name)
     trainable(field, features.square().sum(), name)
+    field.double()
+    penalties(field, name)
+    points = points.double()
+    follows(lambda: field(points), points, name)
 
 
 def check_layout(config: LayoutConfig) -> None:
@@ -241,11 +279,102 @@ def check_parser(config: DataParserConfig, data: Path) -> None:
     require(len(scene.train) > 0 and 0 <= int(views.min()) <= int(views.max()) < count, f"{name}: splits must index views")
     require(bool((half.cameras.size - scene.cameras.size / 2).abs().max() <= 1), f"{name}: downscale=2 must halve the size")
     require(parser.parse(data, 1).paths == scene.paths, f"{name}: the order of the views must be the same each time")
+    known = config.recognises(data)
+    require(known is None or 0 < known.confidence <= 1, f"{name}: its confidence must lie in (0, 1], or None be given")
+    require(config.recognises(data / "no-such-folder") is None, f"{name}: must not recognise a folder that is absent")
+    require(config.recognises(scene.paths[0]) is None, f"{name}: must not recognise an image as a folder")
     try:
         parser.parse(data / "no-such-folder", 1)
     except DataError:
         return
     raise AssertionError(f"{name}: a folder that is absent must be a DataError")
+
+
+def check_data_manager(config: DataManagerConfig) -> None:
+    """Batches that are a function of (seed, step), of training views alone, with the colours and features of their pixels."""
+    check_config(config)
+    name, encoder = type(config).__name__, RandomConfig(channels=5, stride=3).build()
+    with tempfile.TemporaryDirectory() as folder:
+        scene = cases.capture(Path(folder))
+
+        def build(seed: int = 0, *, features: bool = True) -> DataManager:
+            given = encoder if features else None
+            return config.build(scene=scene, content=given, semantic=given, dim=3, cache=Path(folder, "cache"), seed=seed)
+
+        manager, again, plain = build(), build(), build(features=False)
+        require(isinstance(manager, DataManager), f"{name}: build() gives {type(manager).__name__}, not a DataManager")
+        batch, later = manager.batch(3), manager.batch(4)
+        for other in (manager, again):
+            _same_batch(other.batch(3), batch, f"{name}: a batch must be a function of the seed and the step")
+        count = len(batch.rgb)
+        require(config.batch_rays() == count, f"{name}: batch_rays() must be the rays of a batch, {count}")
+        require(not torch.equal(batch.pixel, later.pixel), f"{name}: another step must bring other pixels")
+        require(not torch.equal(batch.pixel, build(1).batch(3).pixel), f"{name}: another seed must bring other pixels")
+        tensor(batch.pixel, (count, 2), f"{name}: pixel")
+        tensor(batch.rgb, (count, 3), f"{name}: rgb")
+        require(batch.view.dtype == torch.int64 and batch.view.shape == (count,), f"{name}: view must be int64 [R]")
+        require(bool(torch.isin(batch.view, scene.train).all()), f"{name}: batches must be of training views alone")
+        corner = batch.pixel - 0.5
+        inside = (corner == corner.floor()) & (corner >= 0) & (corner < scene.cameras.size[batch.view])
+        require(bool(inside.all()), f"{name}: pixels must be centres, at +0.5, within their image")
+        images = [manager.image(view) for view in range(len(scene.paths))]
+        for image, (width, height) in zip(images, scene.cameras.size.tolist(), strict=True):
+            tensor(image, (height, width, 3), f"{name}: image")
+            require(bool(((image >= 0) & (image <= 1)).all()), f"{name}: images must lie in [0, 1]")
+        shown = torch.stack([images[v][y, x] for v, (x, y) in zip(batch.view.tolist(), corner.long().tolist(), strict=True)])
+        same(batch.rgb, shown, 1e-6, f"{name}: rgb must be the colour of the pixel, as image() gives it")
+        content, semantic = manager.content_store, manager.semantic_store
+        require(content is not None and semantic is not None, f"{name}: must have stores where encoders are given")
+        assert content is not None and semantic is not None
+        require((content.channels, semantic.channels) == (5, 3), f"{name}: stores must have the encoder's channels, and `dim`")
+        require(batch.content is not None and batch.semantic is not None, f"{name}: batches must bring what stores hold")
+        assert batch.content is not None and batch.semantic is not None
+        tensor(batch.content, (count, 5), f"{name}: content")
+        tensor(batch.semantic, (None, 3), f"{name}: semantic")
+        require(0 < len(batch.semantic) <= count, f"{name}: semantic must be of the first Q rays, 0 < Q <= R")
+        require(plain.content_store is None and plain.semantic_store is None, f"{name}: no encoder, no store")
+        bare = plain.batch(3)
+        require(bare.content is None and bare.semantic is None, f"{name}: no encoder, no targets")
+        require(torch.equal(bare.pixel, batch.pixel), f"{name}: pixels must not depend on the encoders")
+
+
+def check_loss_term(config: LossTermConfig) -> None:
+    """A finite scalar with a gradient, a function of render, batch, step and generator, which reads no number of the device."""
+    check_config(config)
+    term, name = config.build(), type(config).__name__
+    require(isinstance(term, LossTerm), f"{name}: build() gives {type(term).__name__}, not an fprf.interfaces.LossTerm")
+    require(isinstance(term.needs, Want), f"{name}: needs must be a Want")
+    parts, count = cases.parts(), 6
+    rendered = render_rays(
+        cases.rays(count), parts, want=Want.DENSITY | term.needs, budget=0.0, step=10, semantic_rays=count // 2
+    )
+    assert rendered.weights is not None
+    bare = cases.batch(count)._replace(content=None, semantic=None)
+
+    def value(rendered: Rendered, batch: Batch, seed: int | None = None) -> torch.Tensor:
+        generator = None if seed is None else torch.Generator().manual_seed(seed)
+        return term(rendered, batch, parts, step=10, generator=generator)
+
+    for batch, render in ((cases.batch(count), rendered), (bare, rendered._replace(semantic=None))):
+        for seed in (None, 3):
+            with Unread(name):
+                found = value(render, batch, seed)
+            tensor(found, (), f"{name}: the term")
+            same(value(render, batch, seed), found, 0.0, f"{name}: must be a function of its inputs and the generator")
+    found = value(rendered, cases.batch(count))
+    require(found.requires_grad, f"{name}: no gradient goes through the term")
+    for gradient in torch.autograd.grad(
+        found, [p for m in parts if isinstance(m, nn.Module) for p in m.parameters()], allow_unused=True
+    ):
+        require(gradient is None or bool(gradient.isfinite().all()), f"{name}: its gradient is not finite")
+    nothing = torch.zeros_like(rendered.weights)
+    for weights, kind in ((nothing, "that meet nothing"), (nothing.index_fill(1, torch.tensor([2]), 1.0), "that end at once")):
+        weights.requires_grad_()
+        found = value(rendered._replace(weights=weights, opacity=weights.detach().sum(1)), cases.batch(count))
+        tensor(found, (), f"{name} of rays {kind}")
+        moved = torch.autograd.grad(found, weights, allow_unused=True)[0] if found.requires_grad else None
+        require(moved is None or bool(moved.isfinite().all()), f"{name}: its gradient for rays {kind} is not finite")
+    follows(lambda: value(rendered, cases.batch(count)), rendered.weights, name)
 
 
 def check_executor(config: ExecutorConfig) -> None:
@@ -260,6 +389,18 @@ def check_executor(config: ExecutorConfig) -> None:
     except ValueError:
         return
     raise AssertionError(f"{name}: an error in a task must reach the caller")
+
+
+def _stylizer_follows(stylizer: Stylizer, content: torch.Tensor, semantic: torch.Tensor, name: str) -> None:
+    given = semantic if Want.SEMANTIC in stylizer.needs else None
+    follows(lambda: stylizer(content, given), content, name)
+    follows(lambda: stylizer.match(semantic), content, f"{name}.match")
+
+
+def _same_batch(one: Batch, other: Batch, breach: str) -> None:
+    for mine, theirs in zip(one, other, strict=True):
+        equal = mine is theirs is None or (mine is not None and theirs is not None and torch.equal(mine, theirs))
+        require(equal, breach)
 
 
 def _sample(sampler: Sampler, rays: Rays, seed: int | None) -> Sampled:
