@@ -8,12 +8,16 @@ from pathlib import Path
 
 import pytest
 from fake_packages import packages_in
+from tiny_world import World, trained_for
 
 from fprf.commands.parsing import load_method, parse
 from fprf.commands.plugins import run as plugins
+from fprf.engine.trainer import Report
 from fprf.plugins import registry
 from fprf.plugins.codec import Missing, load_config, save_config
-from fprf.testing import check_encoder
+from fprf.plugins.encoders.config import EncoderConfig
+from fprf.plugins.losses.config import LossTermConfig
+from fprf.testing import check_encoder, check_loss_term
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "plugin"
 
@@ -47,7 +51,8 @@ def test_the_example_is_chosen_by_name_with_its_own_fields(installed: Path) -> N
 
 
 def test_the_example_keeps_to_the_contract(installed: Path) -> None:
-    check_encoder(registry.load_object("fprf.encoders", "gabor")())  # type: ignore[operator]
+    check_encoder(registry.make("fprf.encoders", "gabor", EncoderConfig))
+    check_loss_term(registry.make("fprf.losses", "opacity", LossTermConfig))
 
 
 def test_its_method_and_its_listing(installed: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -55,7 +60,19 @@ def test_its_method_and_its_listing(installed: Path, capsys: pytest.CaptureFixtu
     assert name == "fprf-gabor" and type(config.semantic.encoder).__name__ == "GaborConfig"
     assert plugins(["--check"]) == 0
     text = capsys.readouterr().out
-    assert "gabor" in text and "fprf-gabor 0.2.0" in text and "broken" not in text
+    assert "gabor" in text and "fprf-gabor 0.3.0" in text and "broken" not in text
+
+
+def test_its_loss_trains(site: Path, world: World, tmp_path: Path) -> None:
+    args = ["--loss.extra", "opacity", "--loss.extra.weight", "0.5", "--steps", "2"]
+    seen: list[Report] = []
+    with packages_in(site):
+        config = parse(world.config, args, prog="x", description="")
+        run = trained_for(world, tmp_path / "run", config, report=seen.append)
+        run.save_config(config, "fprf-lite")
+        assert run.load_config()[0].loss.extra == config.loss.extra
+    assert 0 < seen[-1].losses["extra"] < 1
+    assert isinstance(run.load_config()[0].loss.extra, Missing), "where it is not installed"
 
 
 def test_a_run_with_it_opens_where_it_is_not_installed(site: Path, tmp_path: Path) -> None:
@@ -65,7 +82,7 @@ def test_a_run_with_it_opens_where_it_is_not_installed(site: Path, tmp_path: Pat
         save_config(path, config, name)
     loaded, name = load_config(path)
     assert name == "fprf-gabor" and isinstance(loaded.semantic.encoder, Missing)
-    assert loaded.semantic.encoder.package == "fprf-gabor 0.2.0"
+    assert loaded.semantic.encoder.package == "fprf-gabor 0.3.0"
     save_config(tmp_path / "again.json", loaded, name)
     assert (tmp_path / "again.json").read_text() == path.read_text()
     with packages_in(site):

@@ -38,6 +38,7 @@ PARSED = {
 """Verbs whose commands are parsed whole, with the files that they name."""
 ELSEWHERE = {
     "gabor": "the encoder of examples/plugin: tests/test_example_plugin.py installs and runs it",
+    "opacity": "the loss of examples/plugin, likewise",
     "--tone": "needs a run whose photographs differ in exposure: tests/engine/test_tones.py",
 }
 """Commands with these words, and where they are tested instead."""

@@ -1,4 +1,4 @@
-"""A Gabor filter bank as an encoder for fprf, and a method that uses it. Importing this imports no torch."""
+"""A Gabor filter bank as an encoder for fprf, a loss on opacity, and a method. Importing this imports no torch."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from fprf.config import TrainConfig
 from fprf.errors import ConfigError
 from fprf.methods import fprf_lite
 from fprf.plugins.encoders.config import EncoderConfig
+from fprf.plugins.losses.config import LossTermConfig
 
 if TYPE_CHECKING:
-    from fprf.interfaces import Encoder
+    from fprf.interfaces import Encoder, LossTerm
 
-__all__ = ["GaborConfig", "fprf_gabor"]
+__all__ = ["GaborConfig", "OpacityConfig", "fprf_gabor"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +42,20 @@ class GaborConfig(EncoderConfig):
         from .bank import GaborEncoder
 
         return GaborEncoder(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpacityConfig(LossTermConfig):
+    """Rays should meet something or nothing: for objects before an empty background, against half-transparent haze."""
+
+    weight: float = 0.01
+    """Weight of the term, which is 1 for rays of opacity 0.5 and 0 for those of opacity 0 or 1."""
+
+    def build(self) -> LossTerm:
+        """The term."""
+        from .opacity import OpacityTerm
+
+        return OpacityTerm()
 
 
 def fprf_gabor() -> TrainConfig:
