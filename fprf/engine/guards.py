@@ -17,7 +17,16 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor, nn
 
-__all__ = ["CLEAR_EVERY", "PATIENCE", "StepStatistics", "clear_denormals", "unfit_gradients", "unfit_step", "unfit_terms"]
+__all__ = [
+    "CLEAR_EVERY",
+    "PATIENCE",
+    "SMOOTHING",
+    "StepStatistics",
+    "clear_denormals",
+    "unfit_gradients",
+    "unfit_step",
+    "unfit_terms",
+]
 
 SMOOTHING = 0.95
 """Decay of running means."""

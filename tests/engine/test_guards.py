@@ -13,7 +13,7 @@ from torch import nn
 
 from fprf.config import TrainConfig
 from fprf.engine import checkpoint
-from fprf.engine.guards import CLEAR_EVERY, clear_denormals, unfit_gradients, unfit_terms
+from fprf.engine.guards import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, unfit_gradients, unfit_terms
 from fprf.engine.model import build_model
 from fprf.engine.run import Run
 from fprf.engine.trainer import train
@@ -202,3 +202,23 @@ def test_clearing_leaves_what_matters_alone_and_can_be_repeated() -> None:
     clear_denormals(optimizer)
     assert all(torch.equal(once[key], state[key]) for key in once)
     clear_denormals(torch.optim.SGD([parameter], lr=1.0, momentum=0.9))
+
+
+def test_means_and_counts_are_those_of_a_plain_loop() -> None:
+    """Names come and go, and some numbers are not finite."""
+    statistics = StepStatistics(torch.device("cpu"))
+    mean: dict[str, float] = {}
+    seen: dict[str, float] = {}
+    drawn = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)).tolist()
+    for step, (a, b, c) in enumerate(drawn):
+        values = {"a": a, **({"b": NAN if step % 3 == 0 else b} if step > 4 else {}), **({"c": c} if step % 5 == 0 else {})}
+        statistics.add({name: torch.tensor(value) for name, value in values.items()})
+        statistics.count_skipped(torch.tensor(float(step % 3 == 0 and step > 4)))
+        for name, value in values.items():
+            if value == value:
+                number = float(torch.tensor(value))
+                mean[name] = SMOOTHING * mean.get(name, 0.0) + (1 - SMOOTHING) * number
+                seen[name] = SMOOTHING * seen.get(name, 0.0) + (1 - SMOOTHING)
+    assert statistics.means() == pytest.approx({name: value / seen[name] for name, value in mean.items()}, rel=1e-12)
+    assert statistics.faults() == (12, 1, "b")
+    assert statistics.faults() == (12, 1, "")
