@@ -49,9 +49,9 @@ class Chart:
         """The chart's numbers where points lie, copied there once: not again in each training step."""
         key = (points.dtype, points.device)
         if key not in self._numbers:
-            middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-            turn = None if aligned(self.turn) else self.turn.to(points)
             with torch.inference_mode(False):
+                middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+                turn = None if aligned(self.turn) else self.turn.to(points)
                 self._numbers[key] = _Placed(turn, *(x.to(points) for x in (middle, half, self.low, self.high)))
         return self._numbers[key]
 

@@ -13,7 +13,7 @@ Spacing maps s in [0, 1] to the ray parameter t. In the contraction g(t) = t/2 u
 the far half works with the complement 1/(2t), which keeps its relative accuracy at any distance.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Literal
 
@@ -138,6 +138,10 @@ class Space:
             short = self.metric(origin, direction, middle) < distance
             low, high = torch.where(short, middle, low), torch.where(short, high, middle)
         return low
+
+    def __getstate__(self) -> dict[str, object]:
+        """The fields alone: a copy in another process makes its tensors itself."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def _tensors(self) -> dict[tuple[str, torch.dtype, torch.device], Tensor]:
