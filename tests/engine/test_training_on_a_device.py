@@ -14,20 +14,23 @@ from typing import Any
 
 import pytest
 import torch
-from block_world import BlockWorld, tensors_of
+from block_world import BlockWorld, small, tensors_of
 from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import Altered, World, parameters
 
+from fprf.commands.train import train_scene
 from fprf.config import TrainConfig
 from fprf.engine import checkpoint, trainer
 from fprf.engine.block_task import BlockTask, train_block
 from fprf.engine.blocks import SURROUNDINGS
+from fprf.engine.loading import load_run
 from fprf.engine.model import build_model
 from fprf.engine.prepare import device_of, prepare
 from fprf.engine.run import Run
 from fprf.engine.style_pass import measure_style
 from fprf.engine.trainer import Report, train
 from fprf.errors import NumericsError
+from fprf.fields.layouts import StreetConfig
 from fprf.interfaces import DataManager
 from fprf.methods import fprf
 from fprf.plugins.decoders.config import ResidualDecoderConfig
@@ -327,6 +330,19 @@ def test_blocks_are_trained_on_a_device(
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
+
+
+def test_a_scene_of_blocks_is_trained_and_measured_on_a_device(block_world: BlockWorld, tmp_path: Path) -> None:
+    """By the command: features, surroundings, blocks one after the other, and the style of the whole."""
+    config = small(block_world.config.data, tmp_path / "run", steps=1, blocks=StreetConfig(segments=2))
+    with pretend_cuda():
+        train_scene(replace(config, device="cuda:0"), "fprf-lite", quiet=True)
+    run, trained = Run(tmp_path / "run"), load_run(tmp_path / "run", "cpu")
+    scene = trained.known
+    expected = measure_style(config, trained.model, scene.cameras, torch.tensor(scene.train))._asdict()
+    found = run.load_tensors("style")
+    assert found.keys() == expected.keys()
+    assert all((found[name] - value).abs().max() <= 1e-5 * (1 + value.abs().max()) for name, value in expected.items())
 
 
 TRITON = """
