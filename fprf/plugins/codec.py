@@ -99,7 +99,7 @@ def method_config(name: str) -> "TrainConfig":
         config = method() if callable(method) else method
     except FprfError as fault:
         raise PluginError(f"{_METHODS}: {name!r} ({origin}): {fault}") from fault
-    except Exception as fault:  # a stranger's function
+    except (Exception, SystemExit) as fault:  # a stranger's function
         raise PluginError(f"{_METHODS}: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}") from fault
     if not isinstance(config, TrainConfig):
         raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a TrainConfig")
