@@ -4,11 +4,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from fake_packages import METHOD, packages_in
 from tiny_world import World
 
+from fprf.commands.parsing import load_method
+from fprf.commands.train import train_scene
+from fprf.config import IncompleteConfig
 from fprf.engine.loading import load_run, load_style
 from fprf.engine.views import render_view
-from fprf.errors import CheckpointError, PluginError
+from fprf.errors import CheckpointError, PluginError, UsageError
 
 
 @pytest.fixture
@@ -79,6 +83,25 @@ def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -
     (moved / "scene.json").unlink()
     with pytest.raises(CheckpointError, match=r"scene\.json: cannot be read.*train the scene again"):
         load_run(moved)
+
+
+def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp_path: Path) -> None:
+    """It goes on with its own fields alone, and renders where the method is not installed."""
+    trained, site = load_run(moved), tmp_path / "site"
+    site.mkdir()
+    with packages_in(site) as packages:
+        packages.install("acme-method", {"fprf.methods": {"acme": "acme_method2:acme"}}, code={"acme_method2": METHOD})
+        config = replace(load_method("acme")[0], **vars(trained.config))
+        trained.run.save_config(config, "acme")
+        saved = (moved / "config.json").read_text()
+        with pytest.raises(UsageError, match="a run with another knob; resume it"):
+            train_scene(replace(config, knob=8, output=moved), "acme", quiet=True)  # type: ignore[call-arg]
+    there = load_run(moved)
+    assert isinstance(there.config, IncompleteConfig) and there.method == "acme"
+    a, b = (render_view(t.model, t.known.facts, t.known.cameras, 0, t.config.render) for t in (trained, there))
+    assert torch.equal(a.rgb, b.rgb)
+    there.run.save_config(there.config, there.method)
+    assert (moved / "config.json").read_text() == saved
 
 
 def test_an_unknown_device_is_told(world: World) -> None:
