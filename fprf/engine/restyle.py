@@ -50,6 +50,8 @@ class Encoders(NamedTuple):
     semantic: Encoder | None
     basis: Basis | None
     scene: SceneStyle
+    device: torch.device = torch.device("cpu")
+    """Where the encoders lie."""
 
 
 class Codes(NamedTuple):
@@ -89,7 +91,8 @@ def encoders_of(trained: Trained, scene: SceneStyle, basis: Basis | None) -> Enc
                 f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
                 "use the same weights, or train the scene again"
             )
-    return Encoders(content, semantic, basis, scene)
+    device = next(trained.model.parameters()).device
+    return Encoders(content.to(device), None if semantic is None else semantic.to(device), basis, scene, device)
 
 
 @torch.inference_mode()
@@ -179,6 +182,7 @@ def encode_photograph(
         guided=trained.config.datamanager.guided,
         mask=mask,
         name=name,
+        device=encoders.device,
     )
 
 

@@ -75,9 +75,9 @@ def flat_scene(
     seed: int = 0,
 ) -> Flat:
     """The photograph of these features, with its statistics; all pixels weigh alike."""
-    some = torch.arange(0, len(content), max(1, -(-len(content) // _SAMPLES)))
+    some = slice(0, None, max(1, -(-len(content) // _SAMPLES)))
     parts = None if semantic is None else semantic[some]
-    style = scene_style(content[some], parts, torch.ones(len(some)), None, regions, seed)
+    style = scene_style(content[some], parts, content.new_ones(len(content[some])), None, regions, seed)
     return Flat(content, semantic, size, style)
 
 
@@ -90,16 +90,17 @@ def flat_reference(
     samples: int = 20_000,
 ) -> Reference:
     """A photograph's features, and its colours, as a reference; about `samples` pixels of it, in even steps."""
-    some = torch.arange(0, len(content), max(1, len(content) // samples))
-    parts = content.new_zeros(len(some), 0) if semantic is None else semantic[some]
+    some = slice(0, None, max(1, len(content) // samples))
+    parts = content.new_zeros(len(content[some]), 0) if semantic is None else semantic[some]
     return Reference(name, content[some], parts, colour=None if colour is None else colour[some])
 
 
 def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder) -> Restyle:
     """What `fprf stylize` would do to the photograph."""
-    stylizer = config.build(dictionary=dictionary, scene=flat.style)
+    device = flat.content.device
+    stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
     colours = colour_maps(stylizer, dictionary, flat.style, decoder, features=config.features, share=config.colours)
-    return Restyle(stylizer, features=config.features, colours=colours)
+    return Restyle(stylizer, features=config.features, colours=None if colours is None else colours.to(device))
 
 
 @torch.no_grad()

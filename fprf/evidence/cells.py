@@ -36,8 +36,8 @@ def cell_dictionary(
         raise DataError("style cells: the scene has no semantics; train it with a semantic encoder")
     guided = trained.config.datamanager.guided
     parts = []
-    for image in images.values():
-        label = cells(*image.shape[:2])
+    for image in (each.to(encoders.device) for each in images.values()):
+        label = cells(*image.shape[:2]).to(image.device)
         member = torch.nn.functional.one_hot(label).double()
         content, colour = encoded(image, encoders.content, guided), image.reshape(-1, 3)
         semantic = encoded(image, encoders.semantic, guided, encoders.basis)
@@ -45,11 +45,11 @@ def cell_dictionary(
         found = []
         for values in (content, colour):
             mean, spread, _ = group_moments(values, member)
-            whole = moments(values, torch.ones(len(values)))
+            whole = moments(values, values.new_ones(len(values)))
             at = mean.new_full((len(mean),), blend)
             found += [x.float() for x in blend_codes(mean, spread, whole.mean, covariance(whole), at)]
         parts.append((keys.float(), share.float(), *found))
-    keys, share, mean, spread, tint, tint_spread = (torch.cat(part) for part in zip(*parts, strict=True))
+    keys, share, mean, spread, tint, tint_spread = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
     count = torch.tensor([len(part[0]) for part in parts])
     return StyleDictionary(
         keys=keys,

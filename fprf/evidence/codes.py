@@ -52,8 +52,8 @@ def code_classes(
     found = torch.full((len(dictionary.keys),), -1, dtype=torch.int64)
     for i, name in enumerate(dictionary.names):
         own = (dictionary.reference == i).nonzero().squeeze(1)
-        semantic = encoded(references[name].image, encoders.semantic, guided, encoders.basis)
-        nearest = torch.cdist(semantic, dictionary.keys[own]).argmin(1)
+        semantic = encoded(references[name].image.to(encoders.device), encoders.semantic, guided, encoders.basis)
+        nearest = torch.cdist(semantic, dictionary.keys[own].to(semantic)).argmin(1).cpu()
         for place, code in enumerate(own.tolist()):
             kinds = references[name].classes.flatten()[nearest == place]
             if len(kinds):

@@ -114,15 +114,15 @@ def one_by_one(
     taken = []
 
     def restyled(view: Picture) -> Picture:
-        semantic = None
+        view, semantic = view.to(encoders.device), None
         if encoders.semantic is not None:
             semantic = encoded(view, encoders.semantic, guided, encoders.basis)
         size = (view.shape[0], view.shape[1])
         flat = flat_scene(encoded(view, encoders.content, guided), semantic, size, regions=regions, seed=seed)
         look = flat_look(flat, dictionary, config, decoder)
         if semantic is not None:
-            taken.append(look.match(semantic))
-        return render_flat(flat, look, decoder)
+            taken.append(look.match(semantic).cpu())
+        return render_flat(flat, look, decoder).cpu()
 
     with torch.inference_mode():
         pictures, seconds = _each(plain, restyled)

@@ -18,7 +18,7 @@ from ..datamanagers.images import load_image
 from ..datamanagers.parsers.recognise import parse_scene
 from ..engine.loading import Trained, load_run
 from ..engine.prepare import prepare
-from ..engine.restyle import Encoders, open_encoders
+from ..engine.restyle import Encoders, encoders_of, open_encoders
 from ..engine.run import Run
 from ..engine.style_pass import measure_style
 from ..engine.trainer import Report, train
@@ -134,8 +134,7 @@ def short_training(config: TrainConfig, folder: Path, progress: Progress) -> Sho
     spent = time.perf_counter() - start
     scene = measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
     trained = Trained(run, config, "", run.load_known(), model, config.steps, spent)
-    semantic = None if config.semantic.encoder is None else config.semantic.encoder.build()
-    return Short(trained, Encoders(config.content.encoder.build(), semantic, prepared.basis, scene), spent)
+    return Short(trained, encoders_of(trained, scene, prepared.basis), spent)
 
 
 def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progress) -> dict[str, Row]:

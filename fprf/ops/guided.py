@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ..checks import at_least
 from ..errors import DataError
-from .precision import full_precision
+from .precision import full_precision, wide_device
 
 __all__ = ["Packed", "apply", "apply_packed", "coefficients", "upsample"]
 
@@ -73,8 +73,9 @@ def coefficients(
     y = _axis(height, features.shape[1], radius, stride, fineness)
     x = _axis(width, features.shape[2], radius, stride, fineness)
 
-    # Guide statistics on the CPU: float64 is not there on every accelerator, and they are a hundredth of the work.
-    pixels = guide.detach().cpu().double().permute(2, 0, 1)
+    wide = wide_device(features.device)
+    y, x = (_Axis(*(operator.to(wide) for operator in axis)) for axis in (y, x))
+    pixels = guide.detach().to(device=wide, dtype=torch.float64).permute(2, 0, 1)
     colour = pixels.mean((1, 2), keepdim=True)
     pixels = pixels - colour
     mean, inverse = _statistics(pixels, y, x, eps)
@@ -197,14 +198,15 @@ def _solve(
 
 def _statistics(pixels: Tensor, y: _Axis, x: _Axis, eps: float) -> tuple[Tensor, Tensor]:
     """Mean [3 c d] and regularised inverse covariance [3 3 c d] of the guide in every window, float64."""
-    first, second = torch.triu_indices(3, 3)
+    first, second = torch.triu_indices(3, 3, device=pixels.device)
     stack = torch.cat([pixels, pixels[first] * pixels[second]])
     means = (y.window @ y.hat) @ (stack @ (x.window @ x.hat).T)
     mean, square = means[:3], means[3:]
     covariance = square.new_empty(3, 3, *square.shape[1:])
     covariance[first, second] = square - mean[first] * mean[second]
     covariance[second, first] = covariance[first, second]
-    covariance[range(3), range(3)] = covariance[range(3), range(3)].clamp_min(0) + eps
+    variance = covariance.diagonal(dim1=0, dim2=1)
+    variance.copy_(variance.clamp_min(0) + eps)
     return mean, torch.linalg.inv(covariance.permute(2, 3, 0, 1)).permute(2, 3, 0, 1)
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-__all__ = ["full_precision", "tf32"]
+__all__ = ["double", "full_precision", "tf32", "wide_device"]
 
 
 def full_precision(x: Tensor) -> torch.autocast:
@@ -26,3 +26,13 @@ def tf32(enabled: bool) -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+
+
+def double(x: Tensor) -> Tensor:
+    """The tensor in float64; on a device that has none (MPS), on the CPU."""
+    return x.to(device=wide_device(x.device), dtype=torch.float64)
+
+
+def wide_device(device: torch.device) -> torch.device:
+    """The device, or the CPU where that one has no float64."""
+    return torch.device("cpu") if device.type == "mps" else device

@@ -92,7 +92,8 @@ def build_dictionary(
     """Cluster each reference by its semantics; a code is the mean and covariance of the content inside, float32.
 
     A code takes `blend` of its whole image's statistics, and more the further its members fall short of `min_members`. The
-    order of the references plays no part: they are sorted by what they hold. Raises DataError for no references, one
+    order of the references plays no part: they are sorted by what they hold. Statistics are taken where the samples lie;
+    their tables, a few kB of which stylizers are built, lie on the CPU. Raises DataError for no references, one
     without pixels, sizes that differ, or values that are not finite.
     """
     at_least("clusters", clusters, 1)
@@ -101,7 +102,7 @@ def build_dictionary(
     _check(references)
     ordered = sorted(references, key=lambda r: (_content_hash(r), r.name, r.weight))
     parts = [_codes(r, clusters, blend, seed, min_members) for r in ordered]
-    keys, mean, covariances, share = (torch.cat(part) for part in zip(*(p.fields for p in parts), strict=True))
+    keys, mean, covariances, share = (torch.cat(part).cpu() for part in zip(*(p.fields for p in parts), strict=True))
     colours = [p.colours for p in parts if p.colours is not None]
     coloured = len(colours) == len(parts)
     count = torch.tensor([len(p.fields[0]) for p in parts])
@@ -114,8 +115,8 @@ def build_dictionary(
         weight=torch.tensor([float(r.weight) for r in ordered]).repeat_interleave(count),
         names=tuple(r.name for r in ordered),
         blend=float(blend),
-        colour_mean=torch.cat([mean for mean, _ in colours]) if coloured else None,
-        colour_covariance=torch.cat([spread for _, spread in colours]) if coloured else None,
+        colour_mean=torch.cat([mean for mean, _ in colours]).cpu() if coloured else None,
+        colour_covariance=torch.cat([spread for _, spread in colours]).cpu() if coloured else None,
     )
 
 
@@ -218,23 +219,24 @@ def _stored(d: StyleDictionary) -> tuple[str, ...]:
 
 def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> _Codes:
     label, centres = _cluster(r.semantic, clusters, seed)
-    whole = moments(r.content, torch.ones(len(r.content)))
-    member = torch.nn.functional.one_hot(label, len(centres)).double()
+    alike = r.content.new_ones(len(r.content), dtype=torch.float32)
+    whole = moments(r.content, alike)
+    member = double(torch.nn.functional.one_hot(label, len(centres)))
     mean, covariances, share = group_moments(r.content, member)
     at = 1 - (1 - blend) * (share * len(label) / min_members).clamp_max(1.0)
     mean, covariances = blend_codes(mean, covariances, whole.mean, covariance(whole), at)
     fields = (centres.float(), mean.float(), covariances.float(), share.float())
     if r.colour is None:
         return _Codes(fields, None)
-    overall, (tint, spread, _) = moments(r.colour, torch.ones(len(r.colour))), group_moments(r.colour, member)
+    overall, (tint, spread, _) = moments(r.colour, alike.to(r.colour)), group_moments(r.colour, member)
     tint, spread = blend_codes(tint, spread, overall.mean, covariance(overall), at)
     return _Codes(fields, (tint.float(), spread.float()))
 
 
 def _cluster(semantic: Tensor, clusters: int, seed: int) -> tuple[Tensor, Tensor]:
     if semantic.shape[1] == 0:
-        return torch.zeros(len(semantic), dtype=torch.int64), semantic[:1].float()
-    found = kmeans(semantic.cpu(), clusters, seed=seed)
+        return semantic.new_zeros(len(semantic), dtype=torch.int64), semantic[:1].float()
+    found = kmeans(semantic, clusters, seed=seed)
     return found.label, found.centres
 
 

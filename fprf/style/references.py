@@ -55,18 +55,20 @@ def read_reference(
     guided: GuidedConfig | None = None,
     mask: Path | None = None,
     name: str | None = None,
+    device: torch.device | None = None,
 ) -> Reference:
     """Encode a photograph, reduced to `longest` pixels a side (the scene's images' own is best), and sample it.
 
     `basis` projects the semantics as the scene's were; without encoder or basis D is 0. `guided` is the scene's. Of a
     photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of it.
-    `name` is the file's by default. Raises DataError where a file is no readable image, or a mask does not fit.
+    `name` is the file's by default. All of it happens on `device`, where the encoders are; None = the CPU. Raises DataError where a file is no readable image, or a mask does not fit.
     """
     at_least("longest", longest, _SHORTEST)
     photo = load_image(path)
-    image = torch.from_numpy(_reduced(photo, longest)).float() / 255
+    image = torch.from_numpy(_reduced(photo, longest)).to(device).float() / 255
     height, width = image.shape[:2]
     pixel = _grid(height, width) if mask is None else _inside(_mask(mask, path, photo, (width, height)))
+    pixel = pixel.to(image.device)
     guided, name = GuidedConfig() if guided is None else guided, path.name if name is None else name
     samples, colour = _sampled(_encode(content, image), image, pixel, guided), image[pixel[:, 1], pixel[:, 0]]
     if semantic is None or basis is None:
@@ -87,7 +89,7 @@ def _reduced(photo: Image, longest: int) -> Image:
 
 def _encode(encoder: Encoder, image: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "C h w"]:
     features: Tensor = encoder(image.permute(2, 0, 1)[None])
-    return features[0].float().cpu()
+    return features[0].float()
 
 
 def _sampled(

@@ -54,7 +54,8 @@ def scene_style(
     """The scene's style from weighted points, float32.
 
     Regions are k-means clusters of the semantics; their statistics are taken over the same soft `membership` by which the
-    region stylizers assign points. `moments` are those of the whole scene, where a longer pass has them already. Raises
+    region stylizers assign points. Its tables, a few kB of which stylizers are built, lie on the CPU, wherever the points
+    do. `moments` are those of the whole scene, where a longer pass has them already. Raises
     DataError for no weight, NumericsError for values that are not finite.
     """
     if not bool(weights.any()):
@@ -70,15 +71,8 @@ def scene_style(
     alive, belongs = _regions(semantic, keys, middle)
     keys, belongs = keys[alive], belongs * double(weights)[:, None]
     mean, covariances, share = group_moments(content, belongs)
-    return SceneStyle(
-        mean=whole.mean.float(),
-        covariance=covariance(whole).float(),
-        keys=keys.float(),
-        region_mean=mean.float(),
-        region_covariance=covariances.float(),
-        share=share.float(),
-        semantic_mean=middle.float(),
-    )
+    found = (whole.mean, covariance(whole), keys, mean, covariances, share, middle)
+    return SceneStyle(*(table.float().cpu() for table in found))
 
 
 def region_units(keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"]) -> tuple[Annotated[Tensor, "K D"], float]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import NumericsError
+from ..ops.precision import double, wide_device
 
 __all__ = ["Moments", "covariance", "dead_channels", "deviation", "double", "empty", "group_moments", "merge", "mix", "moments"]
 
@@ -43,7 +44,7 @@ def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"])
 
     Raises NumericsError where a row that counts, or a weight, is not finite.
     """
-    total = empty(features.shape[1], device=_wide_device(features))
+    total = empty(features.shape[1], device=wide_device(features.device))
     for rows, mass in _chunks(features, weights):
         weight = mass.sum()
         mean = mass @ rows / weight
@@ -80,7 +81,7 @@ def group_moments(
     sharp memberships cost one group. An empty group has the mean and covariance of nothing: zero.
     """
     groups = [
-        moments(features[inside], membership[inside, k])
+        moments(features[inside.to(features.device)], membership[inside, k])
         for k, inside in enumerate((column > 0).nonzero().squeeze(1) for column in membership.T)
     ]
     weight = torch.stack([g.weight for g in groups])
@@ -118,15 +119,6 @@ def _least(mean: Tensor, sigma: Tensor) -> Tensor:
     floor = _FLOOR * sigma.median(dim=-1, keepdim=True).values
     rounding = _RESOLUTION * mean.abs().amax(dim=-1, keepdim=True)
     return floor.maximum(rounding).clamp_min(1e-12)
-
-
-def double(x: Tensor) -> Tensor:
-    """The tensor in float64; on a device that has none (MPS), on the CPU."""
-    return x.to(device=_wide_device(x), dtype=torch.float64)
-
-
-def _wide_device(x: Tensor) -> torch.device:
-    return torch.device("cpu") if x.device.type == "mps" else x.device
 
 
 def _chunks(features: Tensor, weights: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
