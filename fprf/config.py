@@ -151,7 +151,7 @@ class RenderConfig:
     resolution: float = 1.0
     """Share of an image's width and height that is rendered, in (0, 1]; what lies between is interpolated."""
     chunk: int = 8192
-    """Rays rendered at a time."""
+    """Rays rendered at a time on the CPU; an accelerator takes as many as half of its free memory holds, but no fewer."""
     background: tuple[float, float, float] | None = None
     """Colour behind everything; none = white where images have transparency, else nothing is assumed."""
     tone: tuple[float, float, float] | None = None

@@ -9,14 +9,21 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from .errors import OutOfMemoryError
 
-__all__ = ["LEAST", "in_parts", "out_of_memory", "peak", "shortage", "wanted"]
+if TYPE_CHECKING:
+    import torch
+
+__all__ = ["LEAST", "at_once", "free_memory", "in_parts", "out_of_memory", "peak", "shortage", "wanted"]
 
 LEAST = 1024
 """Rays below which parts are not halved: their share of the memory is small beside the model's."""
+_RAY = 192 << 10
+"""Bytes a ray on an accelerator, at most: in plain torch `fprf` with nothing skipped takes 173 KiB, `fprf-lite` 21."""
+_SHARE = 0.5
+"""Of an accelerator's free memory, what a chunk of rays may take."""
 _TEXT = re.compile(r"can't allocate memory|not enough memory|Cannot allocate memory|Tried to allocate|out of memory|bad_alloc")
 _ASKED = re.compile(r"(?:allocate|allocate array of|llocate) ([\d.]+) (bytes|KiB|MiB|GiB|TiB)", re.IGNORECASE)
 _UNITS = {"bytes": 1, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30, "tib": 1 << 40}
@@ -61,6 +68,25 @@ def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator
         else:
             yield found
             start += size
+
+
+def at_once(size: int, device: "torch.device") -> int:
+    """Rays to render at a time: `size` on the CPU; on an accelerator as many as its memory has room for, but no fewer."""
+    free = free_memory(device)
+    return size if free is None else max(size, int(_SHARE * free) // _RAY)
+
+
+def free_memory(device: "torch.device") -> int | None:
+    """Bytes of an accelerator that can be had; None for the CPU, and for a device that does not tell."""
+    if device.type == "cuda":
+        from torch import cuda
+
+        return cuda.mem_get_info(device)[0] + cuda.memory_reserved(device) - cuda.memory_allocated(device)
+    if device.type == "mps":
+        from torch import mps
+
+        return max(0, mps.recommended_max_memory() - mps.driver_allocated_memory())
+    return None
 
 
 def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:

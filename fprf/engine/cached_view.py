@@ -14,12 +14,12 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..interfaces import Decoder
-from ..memory import in_parts
+from ..memory import at_once, in_parts
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Restyle, composite, march
 from ..types import Rays, Want
 from .model import Facts, Model, background_of
-from .views import View, view_rays
+from .views import View, on_host, view_rays
 
 __all__ = ["CachedView", "Part", "cache_view", "view_parts"]
 
@@ -56,8 +56,8 @@ class Part:
             points: Tensor = decoder(self.content)
         else:
             points = restyle.colour(decoder, self.content, self.semantic if Want.SEMANTIC in restyle.needs else None)
-        rgb = (composite(self.kept, points, self.rays) + self.behind).cpu()
-        return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * torch.tensor(self.tone)).clamp(0, 1)
+        rgb = composite(self.kept, points, self.rays) + self.behind
+        return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * rgb.new_tensor(self.tone)).clamp(0, 1).cpu()
 
     @torch.inference_mode()
     def mean(self, values: Annotated[Tensor, "M X"]) -> Annotated[Tensor, "R X"]:
@@ -103,7 +103,7 @@ class CachedView:
 
 
 def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
-    """Render everything but a style, in chunks of `config.chunk` rays."""
+    """Render everything but a style, in chunks of rays (see `memory.at_once`)."""
     width, height = (int(v) for v in cameras.size[view])
     return CachedView(model.decoder, tuple(view_parts(model, facts, cameras, view, config)), (height, width))
 
@@ -123,8 +123,9 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
         behind = 0.0 if background is None else marched.through[:, None] * background
         # Points and latents have done their part.
         bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
-        depth = model.space.metric(origin[here], direction[here], marched.depth.cpu())
-        opacity, samples, tone = marched.opacity.cpu(), marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
+        metric = model.space.metric(origin[here], direction[here], marched.depth.to(origin.device))
+        depth, opacity = on_host(metric.to(chunk.near.device), marched.opacity)
+        samples, tone = marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
         return Part(bare, content, semantic, behind, len(chunk.near), depth, opacity, samples, tone)
 
-    yield from in_parts(len(rays.near), config.chunk, part)
+    yield from in_parts(len(rays.near), at_once(config.chunk, rays.near.device), part)

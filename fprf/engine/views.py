@@ -1,7 +1,6 @@
 """Whole images from a trained model."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import torch
@@ -10,14 +9,15 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..interfaces import Stylizer
-from ..memory import in_parts
+from ..memory import at_once, in_parts
+from ..ops.precision import wide_device
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.pixel_rays import grid_rays
 from ..rendering.renderer import Restyle, composite, march, render_rays
 from ..types import Rays, Rendered, Want
 from .model import Facts, Model, background_of
 
-__all__ = ["View", "match_view", "paint_pixels", "render_view", "view_rays"]
+__all__ = ["View", "match_view", "on_host", "paint_pixels", "render_view", "view_rays"]
 
 
 class View(NamedTuple):
@@ -34,13 +34,26 @@ class View(NamedTuple):
 def view_rays(
     model: Model, cameras: Cameras, view: int, pixel: Annotated[Tensor, "R 2"] | None = None
 ) -> tuple[Rays, Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
-    """Rays through some pixels of a view, or all, on the model's device; their origins and directions in the world."""
-    if pixel is None:
-        origin, direction = grid_rays(cameras, view)
-    else:
-        origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+    """Rays through some pixels of a view, or all, on the model's device; their origins and directions in the world.
+
+    The latter are float64: on the CPU where the device has none.
+    """
     device = next(model.parameters()).device
+    wide = wide_device(device)
+    if pixel is None:
+        origin, direction = grid_rays(cameras, view, wide)
+    else:
+        origin, direction = (x.to(wide) for x in rays_through(cameras, torch.full((len(pixel),), view), pixel))
     return Rays(*(x.to(device) for x in model.space.rays(origin, direction))), origin, direction
+
+
+def on_host(*tensors: Tensor) -> list[Tensor]:
+    """Tensors of one type on the CPU: from an accelerator all of them in one copy, since the host waits for each."""
+    if all(each.device.type == "cpu" for each in tensors):
+        return list(tensors)
+    flat = torch.cat([each.reshape(-1) for each in tensors]).cpu()
+    parts = flat.split([each.numel() for each in tensors])
+    return [part.view(each.shape) for part, each in zip(parts, tensors, strict=True)]
 
 
 @torch.inference_mode()
@@ -53,7 +66,9 @@ def render_view(
     restyle: Restyle | None = None,
     factor: Annotated[Tensor, "3"] | None = None,
 ) -> View:
-    """Colour and depth of one view, in chunks of `config.chunk` rays; below `config.resolution` 1 from fewer of them.
+    """Colour and depth of one view, in chunks of rays (see `memory.at_once`) and in one copy to the host.
+
+    Below `config.resolution` 1 fewer rays are rendered, and what lies between is interpolated.
 
     Colours are multiplied by `factor`, if one is given: how a camera took them (`tones`); else by the config's tone.
     """
@@ -61,8 +76,23 @@ def render_view(
         factor = torch.tensor(config.tone)
     if config.resolution < 1:
         small = cameras.select(torch.tensor([view])).scaled(1 / config.resolution)
-        whole = replace(config, resolution=1.0)
-        return _enlarged(render_view(model, facts, small, 0, whole, restyle, factor), cameras.size[view].tolist())
+        shown = _enlarged(_rendered(model, facts, small, 0, config, restyle, factor), cameras.size[view].tolist())
+    else:
+        shown = _rendered(model, facts, cameras, view, config, restyle, factor)
+    rgb, depth, opacity = on_host(shown.rgb, shown.depth, shown.opacity)
+    return View(rgb, depth, opacity, shown.kept)
+
+
+def _rendered(
+    model: Model,
+    facts: Facts,
+    cameras: Cameras,
+    view: int,
+    config: RenderConfig,
+    restyle: Restyle | None,
+    factor: Annotated[Tensor, "3"] | None,
+) -> View:
+    """All pixels of a view, still on the model's device."""
     rays, origin, direction = view_rays(model, cameras, view)
     background = background_of(facts, rays.origin.device)
     rgb, depth, opacity, kept, samples = [], [], [], 0, 0
@@ -71,20 +101,18 @@ def render_view(
         part = Rays(*(x[here] for x in rays))
         return render_rays(part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=restyle)
 
-    for out in in_parts(len(rays.near), config.chunk, render):
+    for out in in_parts(len(rays.near), at_once(config.chunk, rays.near.device), render):
         assert out.rgb is not None
-        rgb.append(out.rgb.cpu())
-        depth.append(out.depth.cpu())
-        opacity.append(out.opacity.cpu())
+        rgb.append(out.rgb)
+        depth.append(out.depth)
+        opacity.append(out.opacity)
         kept, samples = kept + out.counts["kept"], samples + out.counts["samples"]
     width, height = (int(v) for v in cameras.size[view])
-    metric = model.space.metric(origin, direction, torch.cat(depth))
-    return View(
-        (torch.cat(rgb) * (1.0 if factor is None else factor.cpu())).view(height, width, 3).clamp(0, 1),
-        metric.view(height, width),
-        torch.cat(opacity).view(height, width),
-        kept / max(1, samples),
-    )
+    colour = torch.cat(rgb)
+    colour = (colour if factor is None else colour * factor.to(colour.device)).clamp(0, 1)
+    metric = model.space.metric(origin, direction, torch.cat(depth).to(origin.device)).to(colour.device)
+    shape = (height, width)
+    return View(colour.view(*shape, 3), metric.view(shape), torch.cat(opacity).view(shape), kept / max(1, samples))
 
 
 def _enlarged(small: View, size: list[int]) -> View:
@@ -131,7 +159,8 @@ def paint_pixels(
         kept, field = marched.kept, model.semantic if semantic else None
         found = values(kept.point[:, :0] if field is None else field(kept.point))
         mass = composite(kept, torch.ones_like(kept.weight)[:, None], len(chunk.near))
-        return (composite(kept, found, len(chunk.near)) / mass.clamp_min(1e-10)).cpu(), marched.opacity.cpu()
+        return composite(kept, found, len(chunk.near)) / mass.clamp_min(1e-10), marched.opacity
 
-    painted, opacity = zip(*in_parts(len(rays.near), config.chunk, paint), strict=True)
-    return torch.cat(painted), torch.cat(opacity)
+    painted, opacity = zip(*in_parts(len(rays.near), at_once(config.chunk, rays.near.device), paint), strict=True)
+    shown, seen = on_host(torch.cat(painted), torch.cat(opacity))
+    return shown, seen

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..engine.model import Facts, Model, background_of
-from ..memory import in_parts
+from ..engine.views import on_host
+from ..memory import at_once, in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import composite, march
 from ..style.look import Restyle
@@ -38,12 +39,15 @@ def render_looks(
         for name, look in looks.items():
             colour = model.decoder(content) if look is None else look.colour(model.decoder, content, semantic)
             rgb = composite(marched.kept, colour, len(part.near))
-            pictures[name] = (rgb if background is None else rgb + marched.through[:, None] * background).cpu()
-        return pictures, marched.depth.cpu()
+            pictures[name] = rgb if background is None else rgb + marched.through[:, None] * background
+        return pictures, marched.depth
 
-    found = list(in_parts(len(pixel), config.chunk, shown))
+    found = list(in_parts(len(pixel), at_once(config.chunk, device), shown))
     width, height = (int(side) for side in cameras.size[view])
+    *colours, depth = on_host(
+        *(torch.cat([part[name] for part, _ in found]) for name in looks), torch.cat([d for _, d in found])
+    )
     return (
-        {name: torch.cat([part[name] for part, _ in found]).view(height, width, 3).clamp(0, 1) for name in looks},
-        model.space.metric(origin, direction, torch.cat([depth for _, depth in found])).view(height, width),
+        {name: colour.view(height, width, 3).clamp(0, 1) for name, colour in zip(looks, colours, strict=True)},
+        model.space.metric(origin, direction, depth).view(height, width),
     )

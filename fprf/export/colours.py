@@ -12,6 +12,8 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..engine.model import Facts, Model, background_of
+from ..engine.views import on_host
+from ..memory import at_once
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Parts, Restyle, composite, march
 from ..types import Rays, Want
@@ -65,8 +67,9 @@ def seen_colours(
     light, share = torch.zeros(len(points)), torch.zeros(len(points))
     total = int((seen.weight > 0).sum())
     done = 0
+    size = at_once(config.chunk, next(model.parameters()).device)
     for rank in range(seen.view.shape[1]):
-        for part in torch.split((seen.weight[:, rank] > 0).nonzero()[:, 0], config.chunk):
+        for part in torch.split((seen.weight[:, rank] > 0).nonzero()[:, 0], size):
             report(done, total)
             done += len(part)
             found, opacity = _looked(model, facts, cameras, points[part], seen.view[part, rank], config, styles, tolerance)
@@ -109,4 +112,5 @@ def _looked(
     background = background_of(facts, device) if tolerance is None else None
     behind = 0.0 if background is None else marched.through[:, None] * background
     colours = [composite(marched.kept, colour, len(points)) + behind for colour in paint(marched.kept, model.parts, styles)]
-    return torch.cat(colours, 1).cpu(), marched.opacity.cpu()
+    found, opacity = on_host(torch.cat(colours, 1), marched.opacity)
+    return found, opacity

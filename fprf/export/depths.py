@@ -9,6 +9,8 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..engine.model import Model
+from ..engine.views import on_host
+from ..memory import at_once, in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import march
 from ..rendering.space import Space
@@ -83,13 +85,14 @@ def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reac
     pixel = pixel_grid(cameras, view)
     origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
     rays = model.space.rays(origin, direction)
-    t, opacity = [], []
-    for start in range(0, len(pixel), config.chunk):
-        part = Rays(*(x[start : start + config.chunk].to(device) for x in rays))
-        met = march(part, model.parts, budget=config.budget)
-        t.append(half_way(met.weights, met.sampled.t, 0.5 * met.opacity).cpu())
-        opacity.append(met.opacity.cpu())
-    depth = model.space.metric(origin, direction, torch.cat(t)).float()
-    seen = (torch.cat(opacity) > _SOLID) & (depth < reach) & (depth > 0)
+
+    def met(here: slice) -> tuple[Tensor, Tensor]:
+        marched = march(Rays(*(x[here].to(device) for x in rays)), model.parts, budget=config.budget)
+        return half_way(marched.weights, marched.sampled.t, 0.5 * marched.opacity), marched.opacity
+
+    parts = zip(*in_parts(len(pixel), at_once(config.chunk, device), met), strict=True)
+    t, opacity = on_host(*(torch.cat(part) for part in parts))
+    depth = model.space.metric(origin, direction, t).float()
+    seen = (opacity > _SOLID) & (depth < reach) & (depth > 0)
     width, height = (int(v) for v in cameras.size[view])
     return torch.where(seen, depth, torch.inf).view(height, width)

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..engine.model import Model
 from ..engine.style_pass import lattice
+from ..memory import at_once
 from ..output.atomic import write_text
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import Restyle, composite, march
@@ -54,13 +55,14 @@ def look_pairs(
     view, pixel = lattice(cameras, torch.tensor(list(views)), rays)
     every = model.space.rays(*rays_through(cameras, view, pixel))
     found = []
-    for start in range(0, len(view), config.chunk):
-        part = Rays(*(x[start : start + config.chunk].to(device) for x in every))
+    size = at_once(config.chunk, device)
+    for start in range(0, len(view), size):
+        part = Rays(*(x[start : start + size].to(device) for x in every))
         kept = march(part, model.parts, budget=config.budget).kept
         colours = paint(kept, model.parts, [None, *styles])
         semantic = model.semantic(kept.point) if model.semantic is not None and weight.divided else kept.point[:, :0]
-        found.append(composite(kept, torch.cat([*colours, weight(semantic)], 1), len(part.near)).cpu())
-    whole = torch.cat(found)
+        found.append(composite(kept, torch.cat([*colours, weight(semantic)], 1), len(part.near)))
+    whole = torch.cat(found).cpu()
     solid = whole[:, 3 * len(styles) + 3 :].sum(1).clamp_min(1e-6)
     colour = (whole[:, : 3 * len(styles) + 3] / solid[:, None]).clamp(0, 1).view(len(whole), -1, 3)
     return Pairs(colour[:, 0], colour[:, 1:].transpose(0, 1), whole[:, 3 * len(styles) + 3 :])

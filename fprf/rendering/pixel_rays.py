@@ -63,26 +63,34 @@ class PixelRays:
         return world @ self.cameras.pose[view, :, :3]
 
 
-def grid_rays(cameras: Cameras, view: int) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"]]:
-    """`rays_through` all pixels of a view (`pixel_grid`), within float64 rounding.
+def grid_rays(
+    cameras: Cameras, view: int, device: torch.device | None = None
+) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"]]:
+    """`rays_through` all pixels of a view (`pixel_grid`), within float64 rounding; on a device, else where the cameras lie.
 
     The frames of a path, and mostly the views of a capture, look through one lens: the last two are remembered.
     """
     numbers = (cameras.focal, cameras.centre, cameras.distortion)
     width, height = cameras.size[view].tolist()
-    local = _local(*(tuple(x[view].tolist()) for x in numbers), width, height, int(cameras.lens[view]))
-    pose = cameras.pose[view]
-    direction = local.to(pose) @ pose[:, :3].T
+    pose = cameras.pose[view].to(device)
+    local = _local(*(tuple(x[view].tolist()) for x in numbers), width, height, int(cameras.lens[view]), pose.device)
+    direction = local @ pose[:, :3].T
     return pose[:, 3].expand_as(direction), direction
 
 
 @lru_cache(maxsize=2)
 def _local(
-    focal: tuple[float, ...], centre: tuple[float, ...], distortion: tuple[float, ...], width: int, height: int, lens: int
+    focal: tuple[float, ...],
+    centre: tuple[float, ...],
+    distortion: tuple[float, ...],
+    width: int,
+    height: int,
+    lens: int,
+    device: torch.device,
 ) -> Annotated[Tensor, "N 3"]:
     """Unit directions in camera axes: a function of the lens alone."""
     still = torch.cat([torch.eye(3, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)], 1)
     focals, centres, bends = (torch.tensor([x], dtype=torch.float64) for x in (focal, centre, distortion))
     camera = Cameras(still[None], focals, centres, torch.tensor([[width, height]]), bends, torch.tensor([lens]))
     pixel = pixel_grid(camera, 0)
-    return rays_through(camera, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1]
+    return rays_through(camera, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1].to(device)
