@@ -235,6 +235,8 @@ def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False, mps: bool = Fal
             "current_device": lambda: 0,
             "mem_get_info": lambda device=None: (memory, memory),
             "synchronize": lambda device=None: None,
+            "get_device_name": lambda device=None: "pretended",
+            "is_bf16_supported": lambda including_emulation=True: True,
         },
         triplane_triton: _kernels(triton),
     }
@@ -243,10 +245,13 @@ def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False, mps: bool = Fal
         for name, value in names.items():
             setattr(owner, name, value)
     Pretended.where = MPS if mps else CUDA
+    # Else `module.double()` changes the type of a wrapper and leaves what it wraps.
+    torch.__future__.set_overwrite_module_params_on_conversion(True)
     try:
         with _Mode() as mode:
             yield mode
     finally:
         Pretended.where = CUDA
+        torch.__future__.set_overwrite_module_params_on_conversion(False)
         for (owner, name), value in kept.items():
             setattr(owner, name, value)

@@ -52,7 +52,7 @@ def on_host(*tensors: Tensor) -> list[Tensor]:
     if all(each.device.type == "cpu" for each in tensors):
         return list(tensors)
     flat = torch.cat([each.reshape(-1) for each in tensors]).cpu()
-    parts = flat.split([each.numel() for each in tensors])
+    parts = torch.split_with_sizes(flat, [each.numel() for each in tensors])
     return [part.view(each.shape) for part, each in zip(parts, tensors, strict=True)]
 
 
