@@ -33,6 +33,8 @@ class DemoConfig:
     """Training time."""
     frames: int = 36
     """Frames of the film."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
 
     def __post_init__(self) -> None:
         positive("minutes", self.minutes)
@@ -61,12 +63,13 @@ def run(args: list[str]) -> int:
         data=Path("town"),
         output=config.output / "run",
         minutes=config.minutes,
+        device=config.device,
         datamanager=replace(manager, parser=TownConfig()),
         content=replace(method.content, field=replace(field, resolutions=PLANES)),
         loss=replace(method.loss, variation=VARIATION),
     )
     root = train_scene(training, "fprf-lite")
-    trained = load_run(root)
+    trained = load_run(root, config.device)
     scene = parse_scene(training.data, 1, TownConfig())
     references = _references(config.output / "references")
     with Display() as display:

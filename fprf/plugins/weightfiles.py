@@ -31,7 +31,7 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     """Write all or nothing: a reader never meets half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_bytes(save({name: tensor.detach().contiguous() for name, tensor in tensors.items()}, dict(metadata)))
+    partial.write_bytes(save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, dict(metadata)))
     partial.replace(path)
 
 

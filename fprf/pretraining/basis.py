@@ -6,6 +6,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from ..ops.precision import double
+
 __all__ = ["Basis", "fit_basis"]
 
 
@@ -29,7 +31,7 @@ class Basis:
 
 def fit_basis(samples: Annotated[Tensor, "N F"], choices: tuple[int, ...], energy: float) -> Basis:
     """The fewest channels among `choices` that keep `energy` of the centred variance (or the most, if none does)."""
-    x = samples.double()
+    x = double(samples)
     mean = x.mean(0)
     centred = x - mean
     values, vectors = torch.linalg.eigh(centred.T @ centred / len(x))

@@ -31,6 +31,8 @@ class PretrainConfig:
     """Learning rate at its height."""
     seed: int = 0
     """Every draw is a function of it."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto. Draws are the same on each."""
     samples: float = 60.0
     """Seconds between sample pictures, in a folder beside the output; 0 = none."""
 

@@ -12,8 +12,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..datamanagers.config import GuidedConfig
+from ..engine.prepare import device_of
 from ..errors import UsageError
 from ..interfaces import Encoder
+from ..ops.precision import double
 from ..plugins.encoders.bundled import CONTENT_KIND, load_content_encoder
 from ..plugins.encoders.students import ContentStudent
 from ..plugins.encoders.vgg_weights import build_vgg19
@@ -41,20 +43,21 @@ def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], No
     """Train, write `output`, and measure it on held-out photographs."""
     if len(config.teachers) != 1:
         raise UsageError(f"--teachers: {len(config.teachers)} files; `content` takes one, the weights of VGG-19")
-    teacher = build_vgg19("relu2_1", weights=config.teachers[0], normalise=True)
+    device = device_of(config.device)
+    teacher = build_vgg19("relu2_1", weights=config.teachers[0], normalise=True).to(device)
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
-    basis = content_basis(teacher, photos[:BASIS_PHOTOS], config.seed)
+    basis = content_basis(teacher, photos[:BASIS_PHOTOS], config.seed, device)
     say(f"{len(basis.axes)} channels keep {100 * basis.kept:.2f} % of the filtered energy")
-    images, targets = prepared(lambda: _crops(teacher, basis, photos, config), config, output)
+    images, targets = prepared(lambda: _crops(teacher, basis, photos, config, device), config, output)
     say(f"{len(images)} crops prepared")
 
     torch.manual_seed(config.seed)
-    student = ContentStudent(len(basis.axes))
+    student = ContentStudent(len(basis.axes)).to(device)
 
     def loss(generator: torch.Generator) -> Tensor:
         index = torch.randint(0, len(images), (config.batch,), generator=generator)
-        return F.mse_loss(student(images[index].float() / 255), targets[index].float())
+        return F.mse_loss(student(images[index].to(device).float() / 255), targets[index].to(device).float())
 
     steps = train(student, loss, config, output, say)
     metadata = {
@@ -64,35 +67,37 @@ def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], No
         "licence": "Apache-2.0; trained by this project, holds no weights of its teacher",
     }
     write_weights(output, {name: value.half() for name, value in student.state_dict().items()}, metadata)
-    report = content_report(load_content_encoder(output), teacher, basis, held[:REPORT_PHOTOS])
+    report = content_report(load_content_encoder(output).to(device), teacher, basis, held[:REPORT_PHOTOS], device)
     prepared_path(output).unlink(missing_ok=True)
     return {"steps": steps, "channels": len(basis.axes), "energy_kept": round(basis.kept, 5), **report}
 
 
-def content_basis(teacher: Encoder, photos: Sequence[Path], seed: int) -> Basis:
+def content_basis(teacher: Encoder, photos: Sequence[Path], seed: int, device: torch.device | None = None) -> Basis:
     """Principal components of the teacher's guided-filtered features."""
     samples = []
     for index, path in enumerate(photos):
-        photo = load_photo(path)
+        photo = load_photo(path).to(device)
         pixels = random_pixels(photo, BASIS_PIXELS, generator_of(seed, index))
         samples.append(filtered_at(teacher, photo, pixels, GuidedConfig())[0])
     return fit_basis(torch.cat(samples), CHOICES, ENERGY)
 
 
-def content_report(student: Encoder, teacher: Encoder, basis: Basis, photos: Sequence[Path]) -> Report:
+def content_report(
+    student: Encoder, teacher: Encoder, basis: Basis, photos: Sequence[Path], device: torch.device | None = None
+) -> Report:
     """Relative L2 error of the student against its projected teacher, raw and guided-filtered, over whole photographs."""
     error, energy = torch.zeros(2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     projected = _Projected(teacher, basis)
     for path in photos:
-        photo = load_photo(path)
+        photo = load_photo(path).to(device)
         image = photo.permute(2, 0, 1)[None]
         pairs = [
             (student(image), projected(image)),
             (filtered_whole(student, photo, GuidedConfig()), filtered_whole(projected, photo, GuidedConfig())),
         ]
         for row, (found, wanted) in enumerate(pairs):
-            error[row] += (found - wanted).double().square().mean()
-            energy[row] += wanted.double().square().mean()
+            error[row] += double(found - wanted).square().mean().cpu()
+            energy[row] += double(wanted).square().mean().cpu()
     raw, filtered = (error / energy).sqrt().tolist()
     return {"photos": len(photos), "relative_l2": round(raw, 4), "relative_l2_filtered": round(filtered, 4)}
 
@@ -118,7 +123,7 @@ class _Projected(Encoder):
 
 @torch.no_grad()
 def _crops(
-    teacher: Encoder, basis: Basis, photos: Sequence[Path], config: DistilConfig
+    teacher: Encoder, basis: Basis, photos: Sequence[Path], config: DistilConfig, device: torch.device
 ) -> tuple[Annotated[Tensor, "N 3 s s"], Annotated[Tensor, "N C t t"]]:
     """Crops as bytes and their targets in half precision; some darker, flatter or tinted, as night scenes are."""
     images, targets = [], []
@@ -128,5 +133,5 @@ def _crops(
         batch = torch.stack([toned(crop(photo, config.size, SCALES, generator), generator) for _ in range(config.crops)])
         batch = (batch * 255).round()
         images.append(batch.byte())
-        targets.append(basis.project(teacher(batch / 255)).half())
+        targets.append(basis.project(teacher((batch / 255).to(device))).half().cpu())
     return torch.cat(images), torch.cat(targets)

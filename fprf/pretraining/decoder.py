@@ -14,10 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..datamanagers.config import GuidedConfig
+from ..engine.prepare import device_of
 from ..interfaces import Decoder, Encoder
 from ..plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder
 from ..plugins.weightfiles import write_weights
-from ..style.statistics import deviation
+from ..style.statistics import deviation, double
 from .config import PretrainDecoderConfig
 from .filtered import filtered_at, filtered_whole, random_pixels
 from .loop import generator_of, train
@@ -37,18 +38,19 @@ Decode = Callable[[Annotated[Tensor, "N C"]], Annotated[Tensor, "N 3"]]
 
 def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[[str], None]) -> Report:
     """Train, write `output`, and measure it on held-out photographs."""
-    encoder = config.encoder.build()
+    device = device_of(config.device)
+    encoder = config.encoder.build().to(device)
     network = _style_network(config)
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
     features, colours = _samples(encoder, photos, config)
-    mean = features.mean(0)
-    std = features.std(0, correction=0).clamp_min(1e-3 * float(features.std()))  # dead channels are not blown up
+    mean = features.mean(0).to(device)
+    std = features.std(0, correction=0).clamp_min(1e-3 * float(features.std())).to(device)  # dead channels are not blown up
     say(f"{len(features)} pixels prepared")
     crops = _crops(encoder, network, photos[: config.crops], config, measure=True)
 
     torch.manual_seed(config.seed)
-    decoder = MlpDecoder(encoder.channels, config.hidden)
+    decoder = MlpDecoder(encoder.channels, config.hidden).to(device)
 
     def decode(content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         colour: Tensor = decoder((content - mean) / std)
@@ -56,18 +58,18 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
 
     def loss(generator: torch.Generator) -> Tensor:
         index = torch.randint(0, len(features), (config.batch,), generator=generator)
-        content = (features[index] - mean) / std
-        noise = torch.randn(content.shape, generator=generator)
-        identity = F.mse_loss(decoder(content + config.noise * noise), colours[index])
+        content = (features[index].to(device) - mean) / std
+        noise = torch.randn(content.shape, generator=generator).to(device)
+        identity = F.mse_loss(decoder(content + config.noise * noise), colours[index].to(device))
         if network is None or crops is None or config.content == config.style == 0:
             return identity
         if int(torch.randint(0, config.every, (), generator=generator)) != 0:
             return identity
-        pairs = _pairs(len(crops.mean), config.pairs, generator)
+        pairs = (each.to(device) for each in _pairs(len(crops.mean), config.pairs, generator))
         structure, style = restyling_losses(crops, network, decode, *pairs)
         return identity + config.every * (config.content * structure + config.style * style)
 
-    steps = train(decoder, loss, config, output, say, _picture(encoder, held, decode))
+    steps = train(decoder, loss, config, output, say, _picture(encoder, held, decode, device))
     _fold(decoder.first, mean, std)
     metadata = {
         "kind": DECODER_KIND,
@@ -77,21 +79,21 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
         "licence": "Apache-2.0; trained by this project",
     }
     write_weights(output, decoder.state_dict(), metadata)
-    trained = load_decoder(output, encoder=encoder.identity, channels=encoder.channels)
+    trained = load_decoder(output, encoder=encoder.identity, channels=encoder.channels).to(device)
     report: Report = {"encoder": encoder.identity, "steps": steps, "learned_photos": len(photos)}
-    report |= decoder_report(encoder, trained, held[:REPORT_PHOTOS])
+    report |= decoder_report(encoder, trained, held[:REPORT_PHOTOS], device)
     others = _crops(encoder, network, held[:REPORT_PHOTOS], config, measure=False)
     return report | (restyling_report(others, network, trained) if others is not None and network is not None else {})
 
 
 @torch.no_grad()
-def decoder_report(encoder: Encoder, decoder: Decoder, photos: Sequence[Path]) -> Report:
+def decoder_report(encoder: Encoder, decoder: Decoder, photos: Sequence[Path], device: torch.device | None = None) -> Report:
     """PSNR of decode(encode(photo)) over whole photographs: the mean of the photographs' own, and the worst."""
     found = []
     for path in photos:
-        photo = load_photo(path, LONGEST)
+        photo = load_photo(path, LONGEST).to(device)
         content = filtered_whole(encoder, photo, GuidedConfig())
-        error = float((decoder(content) - photo.flatten(0, 1)).double().square().mean())
+        error = float(double(decoder(content) - photo.flatten(0, 1)).square().mean())
         found.append(-10 * math.log10(max(error, 1e-10)))
     return {
         "photos": len(found),
@@ -104,7 +106,7 @@ def decoder_report(encoder: Encoder, decoder: Decoder, photos: Sequence[Path]) -
 def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Report:
     """Content and style loss of every crop in the style of the next one, in the units of `network`."""
     count = len(crops.mean)
-    index = torch.arange(count)
+    index = torch.arange(count, device=crops.mean.device)
     found = [restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count) for i in index]
     content, style = (sum(float(each) for each in column) / count for column in zip(*found, strict=True))
     return {"content_loss": round(content, 4), "style_loss": round(style, 4)}
@@ -114,7 +116,7 @@ def _style_network(config: PretrainDecoderConfig) -> StyleNetwork | None:
     """None where neither loss counts and nobody named the weights to measure them with."""
     if config.style_weights is None and config.content == config.style == 0:
         return None
-    return load_style_network(config.style_weights)
+    return load_style_network(config.style_weights).to(device_of(config.device))
 
 
 def _crops(
@@ -123,7 +125,9 @@ def _crops(
     if network is None:
         return None
     seed = config.seed + (2 if measure else 3)
-    return prepare_crops(encoder, network, photos, side=config.size, longest=LONGEST, seed=seed, measure=measure)
+    return prepare_crops(
+        encoder, network, photos, side=config.size, longest=LONGEST, seed=seed, measure=measure, device=device_of(config.device)
+    )
 
 
 def _pairs(count: int, size: int, generator: torch.Generator) -> tuple[Annotated[Tensor, "B"], Annotated[Tensor, "B"]]:
@@ -133,9 +137,11 @@ def _pairs(count: int, size: int, generator: torch.Generator) -> tuple[Annotated
     return content, (content + further) % count
 
 
-def _picture(encoder: Encoder, held: Sequence[Path], decode: Decode) -> Callable[[], Annotated[Tensor, "H W 3"]]:
+def _picture(
+    encoder: Encoder, held: Sequence[Path], decode: Decode, device: torch.device
+) -> Callable[[], Annotated[Tensor, "H W 3"]]:
     """Rows of photo | decoded | decoded in the style of the next photo."""
-    photos = [load_photo(path, SAMPLE_LONGEST) for path in held[:SAMPLE_PHOTOS]]
+    photos = [load_photo(path, SAMPLE_LONGEST).to(device) for path in held[:SAMPLE_PHOTOS]]
     features = [filtered_whole(encoder, photo, GuidedConfig())[None] for photo in photos]
     styles = []
     for each in features:
@@ -155,19 +161,20 @@ def _picture(encoder: Encoder, held: Sequence[Path], decode: Decode) -> Callable
 def _samples(
     encoder: Encoder, photos: Sequence[Path], config: PretrainDecoderConfig
 ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
-    features, colours = [], []
+    """On the CPU: they may be more than an accelerator holds."""
+    device, features, colours = device_of(config.device), [], []
     for index, path in enumerate(photos):
-        photo = load_photo(path, LONGEST)
+        photo = load_photo(path, LONGEST).to(device)
         pixels = random_pixels(photo, config.pixels, generator_of(config.seed + 1, index))
         content, rgb = filtered_at(encoder, photo, pixels, GuidedConfig())
-        features.append(content)
-        colours.append(rgb)
+        features.append(content.cpu())
+        colours.append(rgb.cpu())
     return torch.cat(features), torch.cat(colours)
 
 
 @torch.no_grad()
 def _fold(layer: nn.Linear, mean: Annotated[Tensor, "C"], std: Annotated[Tensor, "C"]) -> None:
     """W (f - mean) / std + b as one linear layer of f, in float64."""
-    weight = layer.weight.double() / std.double()
-    layer.bias.copy_(layer.bias.double() - weight @ mean.double())
+    weight = double(layer.weight) / double(std)
+    layer.bias.copy_(double(layer.bias) - weight @ double(mean))
     layer.weight.copy_(weight)

@@ -25,6 +25,7 @@ def filtered_at(
 ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
     """Features and colours at pixels (row, column)."""
     height, width = photo.shape[:2]
+    pixels = pixels.to(photo.device)
     features = encoder(photo.permute(2, 0, 1)[None])[0]
     coefs = coefficients(features, photo, radius=_radius(photo, guided), eps=guided.eps, stride=guided.stride)
     rgb = photo[pixels[:, 0], pixels[:, 1]]

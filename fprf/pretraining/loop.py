@@ -100,7 +100,7 @@ def _show(picture: Callable[[], Tensor], output: Path, step: int) -> None:
 
 
 def _key(config: PretrainConfig) -> str:
-    return repr(replace(config, samples=0.0))
+    return repr(replace(config, samples=0.0, device="auto"))
 
 
 def _save(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainConfig, output: Path, progress: _Progress) -> None:

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import WeightsError
+from ..ops.precision import double
 from ..plugins.encoders.config import Vgg19Config
 from ..plugins.encoders.frozen import reflect_pad
 
@@ -62,7 +63,7 @@ class StyleNetwork(nn.Module):
     @torch.no_grad()
     def measure(self, images: Sequence[Annotated[Tensor, "3 H W"]]) -> None:
         """Take each filter's mean deviation over the images as its unit; filters that hardly fire are not blown up."""
-        deviations = [[x[0].double().std((1, 2), correction=0) for x in self(image[None])] for image in images]
+        deviations = [[double(x[0]).std((1, 2), correction=0) for x in self(image[None])] for image in images]
         for layer, found in zip(self.layers, zip(*deviations, strict=True), strict=True):
             unit = self.get_buffer(f"unit{layer.removeprefix('relu')}")
             own = torch.stack(found).mean(0).to(unit) * unit[:, 0, 0]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..datamanagers.config import GuidedConfig
 from ..interfaces import Encoder
-from ..style.statistics import deviation
+from ..style.statistics import deviation, double
 from .filtered import filtered_crop
 from .loop import generator_of
 from .perceptual import CONTENT, StyleNetwork, style_distance, style_statistics
@@ -50,13 +50,21 @@ def adain(
 
 @torch.no_grad()
 def prepare_crops(
-    encoder: Encoder, network: StyleNetwork, photos: Sequence[Path], *, side: int, longest: int, seed: int, measure: bool
+    encoder: Encoder,
+    network: StyleNetwork,
+    photos: Sequence[Path],
+    *,
+    side: int,
+    longest: int,
+    seed: int,
+    measure: bool,
+    device: torch.device | None = None,
 ) -> Crops:
     """One square of each photograph that is large enough on both sides (else as large as it gets). Draws by `seed`.
 
-    `measure` sets the network's units from these crops.
+    `measure` sets the network's units from these crops. Encoder and network lie on `device`; None = the CPU.
     """
-    loaded = [load_photo(path, longest) for path in photos]
+    loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
     made = [filtered_crop(encoder, photo, side, GuidedConfig(), generator_of(seed, i)) for i, photo in enumerate(loaded)]
     images = [rgb.view(side, side, 3).permute(2, 0, 1) for _, rgb in made]
@@ -64,12 +72,13 @@ def prepare_crops(
         network.measure(images)
     seen = [network(image[None]) for image in images]
     statistics = [style_statistics(each) for each in seen]
-    own = [(features.double().mean(0), features.double().var(0, correction=0)) for features, _ in made]
+    wide = [double(features) for features, _ in made]
+    own = [(each.mean(0), each.var(0, correction=0)) for each in wide]
     return Crops(
         side,
         torch.stack([features.half() for features, _ in made]),
-        torch.stack([mean for mean, _ in own]).float(),
-        torch.stack([deviation(mean, variance) for mean, variance in own]).float(),
+        torch.stack([mean for mean, _ in own]).to(made[0][0]),
+        torch.stack([deviation(mean, variance) for mean, variance in own]).to(made[0][0]),
         torch.cat([_whitened(each[CONTENT]).half() for each in seen]),
         tuple(torch.cat(layer) for layer in zip(*statistics, strict=True)),
     )

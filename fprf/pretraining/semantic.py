@@ -11,8 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..engine.prepare import device_of
 from ..errors import UsageError
 from ..interfaces import Encoder
+from ..ops.precision import double
 from ..plugins.encoders.bundled import SEMANTIC_KIND, load_semantic_encoder
 from ..plugins.encoders.students import SemanticStudent
 from ..plugins.weightfiles import write_weights
@@ -48,7 +50,8 @@ def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[
         raise UsageError("--teachers: none; `semantic` takes the weights of MobileNetV2, of DeepLab's backbone, or both")
     if config.size % STRIDE:
         raise UsageError(f"--size: {config.size}; `semantic` takes multiples of {STRIDE}, its stride")
-    teachers = [load_teacher(path) for path in config.teachers]
+    device = device_of(config.device)
+    teachers = [load_teacher(path).to(device) for path in config.teachers]
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
     samples = [
@@ -61,12 +64,13 @@ def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[
     say(f"{len(images)} crops prepared")
 
     torch.manual_seed(config.seed)
-    student = SemanticStudent(sum(len(basis.axes) for _, basis in ensemble))
+    student = SemanticStudent(sum(len(basis.axes) for _, basis in ensemble)).to(device)
 
     def loss(generator: torch.Generator) -> Tensor:
         index = torch.randint(0, len(images), (config.batch,), generator=generator).tolist()
         views = [view(images[i], targets[i], generator) for i in index]
-        found, wanted = student(torch.stack([seen for seen, _ in views])), torch.stack([right for _, right in views])
+        seen, wanted = (torch.stack(part).to(device) for part in zip(*views, strict=True))
+        found = student(seen)
         own = F.mse_loss(found, wanted) + (1 - F.cosine_similarity(found, wanted, dim=1).mean())
         return own + RELATIONS * relations(found, wanted, RELATED, generator)
 
@@ -79,7 +83,7 @@ def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[
         "licence": "Apache-2.0; trained by this project, holds no weights of its teachers",
     }
     write_weights(output, {name: _stored(value) for name, value in student.state_dict().items()}, metadata)
-    report = semantic_report(load_semantic_encoder(output), ensemble, held, config)
+    report = semantic_report(load_semantic_encoder(output).to(device), ensemble, held, config)
     prepared_path(output).unlink(missing_ok=True)
     return {"steps": steps, **report}
 
@@ -92,7 +96,7 @@ def relations(
     Each side is centred on its own mean, as the matching of scenes and references is.
     """
     index = torch.randint(0, found[:, 0].numel(), (cells,), generator=generator)
-    sides = [side.permute(0, 2, 3, 1).flatten(0, 2)[index] for side in (found, wanted)]
+    sides = [side.permute(0, 2, 3, 1).flatten(0, 2)[index.to(side.device)] for side in (found, wanted)]
     unit = [F.normalize(side - side.mean(0), dim=1) for side in sides]
     return F.mse_loss(unit[0] @ unit[0].T, unit[1] @ unit[1].T)
 
@@ -101,16 +105,17 @@ def relations(
 def semantic_report(student: Encoder, ensemble: Ensemble, photos: Sequence[Path], config: SemanticDistilConfig) -> Report:
     """Agreement with the teachers on held-out crops, and of each crop with itself at night; mean cosines."""
     images, wanted = _crops(ensemble, photos, config, config.seed + 3)
-    generator = generator_of(config.seed + 4, 0)
+    generator, device = generator_of(config.seed + 4, 0), device_of(config.device)
     cosines, nights, error, energy = 0.0, 0.0, 0.0, 0.0
     for image, target in zip(images, wanted.float(), strict=True):
         day = image[None].float() / 255
-        found = student(day)
-        night = student(nightfall(day[0], generator)[None])
+        target = target.to(device)
+        found = student(day.to(device))
+        night = student(nightfall(day[0], generator)[None].to(device))
         cosines += float(F.cosine_similarity(found, target[None], dim=1).mean())
         nights += float(F.cosine_similarity(found, night, dim=1).mean())
-        error += float((found - target).double().square().mean())
-        energy += float(target.double().square().mean())
+        error += float(double(found - target).square().mean())
+        energy += float(double(target).square().mean())
     return {
         "crops": len(images),
         "relative_l2": round((error / energy) ** 0.5, 4),
@@ -163,7 +168,7 @@ def _crops(
         batch = torch.stack([crop(photo, config.size, SCALES, generator) for _ in range(config.crops)])
         batch = (batch * 255).round()
         images.append(batch.byte())
-        targets.append(taught(ensemble, batch / 255, STRIDE).half())
+        targets.append(taught(ensemble, batch / 255, STRIDE).half().cpu())
     return torch.cat(images), torch.cat(targets)
 
 

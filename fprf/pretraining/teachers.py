@@ -1,5 +1,6 @@
 """MobileNetV2 and DeepLab's MobileNetV2 backbone as teachers: features of images of any size, one per 16 pixels."""
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +24,16 @@ class MobileNetTeacher:
 
     def __init__(self, name: str, network: MobileNetV2) -> None:
         self.name, self._network = name, network
+
+    def to(self, device: torch.device) -> "MobileNetTeacher":
+        """Look there from now on."""
+        self._network.to(device)
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        """Where images are looked at."""
+        return next(chain(self._network.parameters(), self._network.buffers())).device
 
     @torch.no_grad()
     def __call__(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B F h w"]:

@@ -53,7 +53,7 @@ def render_streets(count: int, size: int, stride: int) -> Streets:
 
 def street_targets(ensemble: Ensemble, streets: Streets, stride: int) -> Annotated[Tensor, "V C t t"]:
     """What the teachers say of each view by day, half-way to the mean of the cell's classes over all views."""
-    said = torch.cat([taught(ensemble, views[:1].float() / 255, stride) for views in streets.images])
+    said = torch.cat([taught(ensemble, views[:1].float() / 255, stride).cpu() for views in streets.images])
     weight = streets.classes.sum((0, 2, 3)).clamp_min(1e-6)  # a class that no view shows has no mean, and needs none
     mean = torch.einsum("vkij,vcij->kc", streets.classes, said) / weight[:, None]
     return torch.lerp(said, torch.einsum("vkij,kc->vcij", streets.classes, mean), TO_CLASS)
