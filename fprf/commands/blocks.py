@@ -41,6 +41,7 @@ def train_blocks(
     from ..engine.blocks import SURROUNDINGS
     from ..engine.lay_out import lay_out, write_down
     from ..engine.loading import load_run
+    from ..engine.prepare import device_of
     from ..engine.style_pass import measure_style
     from ..style.scene import to_tensors
 
@@ -48,7 +49,7 @@ def train_blocks(
     write_down(folder, config, method, laid)
     count = len(plan.boxes.low)
     display.say(f"{scene.name}: {len(scene.train)} + {len(scene.test)} views, {count} blocks and their surroundings")
-    executor = config.executor.build()
+    executor = config.executor.on(device_of(config.device).type).build()
     around, each = block_minutes(config, count, time.perf_counter() - start)
     root, data = str(folder.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
 

@@ -17,6 +17,7 @@ import fprf.methods
 from fprf import cli
 from fprf.datamanagers.parsers.config import TownConfig
 from fprf.ops import backend
+from fprf.plugins.weightfiles import read_weights
 
 VIEW = ["--views", "0000"]
 QUICK = ["--clusters", "3"]
@@ -40,6 +41,9 @@ def content(path: Path) -> Any:
     """What a file says, without times; of a page its pictures."""
     if path.suffix == ".json":
         return timeless(json.loads(path.read_text()))
+    if path.suffix == ".safetensors":
+        tensors, metadata = read_weights(path)
+        return metadata, {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
     if path.suffix == ".html":
         return re.findall(r"data:[^\"')]*", path.read_text())
     return path.read_bytes()
@@ -73,7 +77,17 @@ def between(world: World, folder: Path) -> list[str]:
     style = {"format": 1, "style": {"references": [str(world.references[1])], "clusters": 3}}
     (folder / "other.json").write_text(json.dumps(style))
     controls = ["--keep", "0", "--pin", "1=dusk.png", "--forbid", "2=snow.png", "--strength", "0.7", "--luminance", "0.5"]
-    return [*references(world), *controls, "--between", str(folder / "other.json"), "--at", "0.3", "--pixels", "--output", "OUT"]
+    return [
+        *references(world),
+        *controls,
+        "--between",
+        str(folder / "other.json"),
+        "--at",
+        "0.3",
+        "--pixels",
+        "--output",
+        "OUT",
+    ]
 
 
 def references(world: World) -> list[str]:
@@ -97,9 +111,8 @@ def test_a_verb_writes_what_the_cpu_writes(world: World, tmp_path: Path, name: s
     outputs = [tmp_path / device for device in ("cpu", "cuda")]
     for output, device in zip(outputs, ("cpu", DEVICE), strict=True):
         output.mkdir()
-        verb, *args = name.split()[0], str(world.run), *VERBS[name](world, tmp_path)
-        args += ["--explain"] if name.endswith("--explain") and "--explain" not in args else []
-        ran([verb, *(arg.replace("OUT", str(output)) for arg in args)], device)
+        args = [name.split()[0], str(world.run), *VERBS[name](world, tmp_path)]
+        ran([arg.replace("OUT", str(output)) for arg in args], device)
     same(*outputs)
 
 
@@ -114,7 +127,9 @@ def test_eval_copies_each_frame_once(world: World, tmp_path: Path) -> None:
 
 
 def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.evaluation.alignment.AlignmentConfig.__init__.__kwdefaults__", {"steps": 2, "rays": 32, "rate": 2e-3})
+    monkeypatch.setattr(
+        "fprf.evaluation.alignment.AlignmentConfig.__init__.__kwdefaults__", {"steps": 2, "rays": 32, "rate": 2e-3}
+    )
     found = []
     for device in ("cpu", DEVICE):
         shutil.copytree(world.run, tmp_path / device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from ...checks import at_least, positive
@@ -19,6 +19,10 @@ class ExecutorConfig(PluginConfig):
     """Runs independent tasks."""
 
     group: ClassVar[str] = "fprf.executors"
+
+    def on(self, device: str) -> ExecutorConfig:
+        """The config for tasks that train on a kind of device (cpu, cuda, mps): another one where executors reserve devices."""
+        return self
 
     def build(self) -> Executor:
         """The executor."""
@@ -46,6 +50,8 @@ class RayConfig(ExecutorConfig):
     """Tasks at a time, where the cluster is started here."""
     processors: float = 1.0
     """Processors that a task takes; the cluster runs as many tasks as have room."""
+    gpus: float | None = None
+    """GPUs that a task takes, or its share of one; 0 hides them from it. None = 1 where training is on CUDA, else 0."""
     retries: int = 3
     """How often a task whose worker died is started again."""
 
@@ -53,6 +59,12 @@ class RayConfig(ExecutorConfig):
         at_least("executor.workers", self.workers, 1)
         positive("executor.processors", self.processors)
         at_least("executor.retries", self.retries, 0)
+        if self.gpus is not None:
+            at_least("executor.gpus", self.gpus, 0.0)
+
+    def on(self, device: str) -> RayConfig:
+        """With the GPUs that tasks on this device take."""
+        return self if self.gpus is not None else replace(self, gpus=float(device == "cuda"))
 
     def build(self) -> Executor:
         """The executor."""

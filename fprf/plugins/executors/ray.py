@@ -14,12 +14,17 @@ from ...errors import PluginError
 from ...interfaces import Executor
 from .config import RayConfig
 
-__all__ = ["RayExecutor"]
+__all__ = ["RayExecutor", "resources"]
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 _LOOPBACK = "127.0.0.1"
+
+
+def resources(config: RayConfig) -> dict[str, float]:
+    """What Ray is asked for on behalf of each task."""
+    return {"num_cpus": config.processors, "num_gpus": config.gpus or 0.0, "max_retries": config.retries}
 
 
 class RayExecutor(Executor):
@@ -31,15 +36,21 @@ class RayExecutor(Executor):
     def map(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
         """Results in the order of the tasks; the first error cancels the rest and reaches the caller as it was raised.
 
-        Raises PluginError where Ray is not installed or its cluster cannot be reached.
+        Raises PluginError where Ray is not installed, its cluster cannot be reached, or has fewer GPUs than a task takes.
         """
         ray = _ray(private=not self.config.address)
         self._join(ray)
+        wanted, there = self.config.gpus or 0.0, float(ray.cluster_resources().get("GPU", 0.0))
+        if wanted > there:  # Ray would wait for a machine that has them
+            raise PluginError(
+                f"executor: each task takes {wanted:g} GPUs and the cluster has {there:g}; start Ray on machines with GPUs, or "
+                "train with --device cpu --executor.gpus 0"
+            )
 
         def work(task: Task) -> Result:  # Ray takes functions alone, and not every callable is one
             return function(task)
 
-        remote = ray.remote(num_cpus=self.config.processors, max_retries=self.config.retries)(work)
+        remote = ray.remote(**resources(self.config))(work)
         waiting = [remote.remote(task) for task in tasks]
         try:
             return [ray.get(reference) for reference in waiting]

@@ -4,6 +4,7 @@ import importlib.util
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,12 +12,13 @@ import pytest
 from fprf.commands.cluster import run as cluster
 from fprf.errors import ConfigError, DataError, PluginError
 from fprf.plugins.executors.config import RayConfig
+from fprf.plugins.executors.ray import resources
 from fprf.testing import check_config, check_executor
 
 
 def test_the_config() -> None:
     check_config(RayConfig())
-    for values in ({"workers": 0}, {"processors": 0.0}, {"retries": -1}):
+    for values in ({"workers": 0}, {"processors": 0.0}, {"retries": -1}, {"gpus": -1.0}):
         with pytest.raises(ConfigError, match=rf"executor\.{next(iter(values))}"):
             RayConfig(**values)  # type: ignore[arg-type]
 
@@ -55,6 +57,29 @@ def test_only_a_cluster_that_is_named_is_joined(monkeypatch: pytest.MonkeyPatch,
     assert ray.asked["address"] == joined
 
 
+@pytest.mark.parametrize(
+    ("gpus", "device", "asked"),
+    [(None, "cuda", 1.0), (None, "cpu", 0.0), (None, "mps", 0.0), (0.25, "cuda", 0.25), (1.0, "cpu", 1.0)],
+)
+def test_tasks_on_cuda_ask_for_a_gpu(gpus: float | None, device: str, asked: float) -> None:
+    config = RayConfig(gpus=gpus, processors=0.5, retries=2).on(device)
+    assert resources(config) == {"num_cpus": 0.5, "num_gpus": asked, "max_retries": 2}
+    assert config.on("cpu") == config, "what was chosen stays"
+
+
+def test_a_cluster_without_gpus_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Poor(Refusing):
+        def init(self, **asked: object) -> None:
+            pass
+
+        def cluster_resources(self) -> dict[str, float]:
+            return {"CPU": 8.0}
+
+    monkeypatch.setitem(sys.modules, "ray", Poor())
+    with pytest.raises(PluginError, match="each task takes 1 GPUs and the cluster has 0; start Ray on machines with GPUs"):
+        RayConfig().on("cuda").build().map(abs, [1])
+
+
 def test_the_steps_name_the_machine_and_its_port(capsys: pytest.CaptureFixture[str]) -> None:
     assert cluster(["--head", "mars", "--port", "7777"]) == 0
     said = capsys.readouterr().out
@@ -75,6 +100,14 @@ def test_the_contract(executor: RayConfig) -> None:
     check_executor(executor)
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert os.environ["RAY_AUTH_MODE"] == "token" and len(os.environ["RAY_AUTH_TOKEN"]) == 64
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_ray_itself_says_that_there_are_no_gpus(executor: RayConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    with pytest.raises(PluginError, match="the cluster has 0"):
+        replace(executor, gpus=1.0).build().map(abs, [1])
 
 
 @pytest.mark.slow
