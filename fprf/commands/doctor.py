@@ -4,9 +4,11 @@ import os
 import platform
 import shlex
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +22,7 @@ from ..plugins.codec import Missing
 from ..plugins.slots import slots
 from .parsing import parse
 
-__all__ = ["Finding", "machine", "run", "run_folder", "scene_folder", "speed"]
+__all__ = ["Finding", "machine", "run", "run_folder", "scene_folder", "self_test", "speed"]
 
 _MIB = 1 << 20
 _LEAST_DISK = 1 << 30
@@ -44,16 +46,21 @@ class DoctorConfig:
 
     target: Path | None = None
     """A run or a scene folder; none = this machine."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto: what of this machine is tested."""
 
 
 def run(args: list[str]) -> int:
     """Print the findings; 1 if something that is needed is wrong."""
     if len(args) == 1 and not args[0].startswith("-"):  # tyro has no positional argument that may be absent
         args = ["--target", args[0]]
-    about = "`fprf doctor` looks over this machine, `fprf doctor RUN` a run, `fprf doctor DIR` a scene folder."
-    target = parse(DoctorConfig(), args, prog="fprf doctor", description=about).target
+    about = (
+        "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene folder."
+    )
+    config = parse(DoctorConfig(), args, prog="fprf doctor", description=about)
+    target = config.target
     if target is None:
-        findings = machine()
+        findings: Iterator[Finding] = chain(machine(), self_test(config.device))
     elif (target / "config.json").is_file():
         findings = run_folder(target)
     else:
@@ -82,6 +89,35 @@ def machine() -> Iterator[Finding]:
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
     for complaint in bad:
         yield Finding("plug-ins", complaint, "reinstall or uninstall that package")
+
+
+def self_test(name: str) -> Iterator[Finding]:
+    """What a device is fast by, and whether a tiny training step, render and restyle on it are the CPU's; a few seconds.
+
+    Raises PluginError for a device that is not here.
+    """
+    from ..engine.device_check import compare, fast_paths
+    from ..engine.prepare import device_of
+
+    device = device_of(name)
+    yield Finding("device", f"`--device {name}` is {device}")
+    remedy = f"train and render with --device cpu; update torch and the driver of {device}"
+    start = time.perf_counter()
+    try:
+        for what, found in fast_paths(device):
+            yield Finding(what, found)
+        outcomes = compare(device)
+    except Exception as error:
+        yield Finding("self-test", f"{device} fails: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}", remedy)
+        return
+    wrong = [f"{each.what} is off by {each.error:.2g}, {each.allowed:g} is allowed" for each in outcomes if not each.right]
+    if wrong:
+        yield Finding("self-test", f"{device} computes something else than the CPU: {'; '.join(wrong)}", remedy)
+        return
+    worst = max(outcomes, key=lambda each: each.error / each.allowed)
+    figure = f"at worst the {worst.what} is off by {worst.error:.1g}, {worst.allowed:g} is allowed"
+    names = ", ".join(each.what for each in outcomes)
+    yield Finding("self-test", f"{names} as on the CPU: {figure}; {time.perf_counter() - start:.1f} s")
 
 
 def speed(environment: Mapping[str, str]) -> Iterator[Finding]:

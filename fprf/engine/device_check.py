@@ -1,0 +1,164 @@
+"""Does a device compute what the CPU computes? A tiny scene of seeded numbers: no files, no network, a few seconds.
+
+The CPU's values are those of plain torch, so that on the CPU its compiled kernels are what is looked at.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..config import ContentConfig, RenderConfig, SemanticConfig, TrainConfig
+from ..fields.config import PlanesConfig, SemanticPlanesConfig
+from ..memory import free_memory
+from ..ops import backend, march, triplane_triton
+from ..ops.precision import double
+from ..plugins.encoders.config import BundledContentConfig
+from ..plugins.samplers.config import ProposalConfig
+from ..plugins.stylizers.config import RegionToneConfig
+from ..rendering.cameras import Cameras
+from ..rendering.paths import look_at, pinhole
+from ..rendering.renderer import render_rays
+from ..rendering.space import Space
+from ..style.colours import colour_maps
+from ..style.dictionary import Reference, build_dictionary
+from ..style.look import Restyle
+from ..style.scene import scene_style
+from ..types import Want
+from .model import Facts, Model, build_model
+from .views import render_view, view_rays
+
+__all__ = ["Outcome", "compare", "fast_paths"]
+
+_DIM = 8
+_KINDS = 4
+_ALLOWED = {"encoder": 5e-3, "training step": 2e-3, "render": 1e-3, "restyle": 1e-3}
+"""Encoders may convolve in TF32, which keeps 11 bits. Colours: a quarter of an 8-bit step."""
+
+
+class Outcome(NamedTuple):
+    """One thing that was computed on both."""
+
+    what: str
+    error: float
+    """Largest difference of colours in [0, 1]; of features and gradients the length of the difference relative to theirs."""
+    allowed: float
+
+    @property
+    def right(self) -> bool:
+        """The device computes the same, but for rounding."""
+        return self.error <= self.allowed
+
+
+def compare(device: torch.device) -> list[Outcome]:
+    """Features, gradients, a render and a restyle on a device, against plain torch on the CPU."""
+    with backend.plain():
+        expected = _computed(torch.device("cpu"))
+    found = _computed(device)
+    outcomes = []
+    for what, allowed in _ALLOWED.items():
+        away, like = double(found[what].cpu()) - double(expected[what]), double(expected[what])
+        error = float(away.abs().max() if what in ("render", "restyle") else away.norm() / like.norm())
+        outcomes.append(Outcome(what, math.inf if math.isnan(error) else error, allowed))
+    return outcomes
+
+
+def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
+    """What runs faster than plain torch on a device, and how much memory is free: names and plain words."""
+    probe = torch.zeros(1, 3, device=device)
+    if march.fit(probe):
+        yield "kernels", "numba's: tri-planes, networks, marching, matching, guided filter"
+    elif triplane_triton.usable(probe, probe):
+        yield "kernels", "Triton's for tri-planes; the rest by torch"
+    else:
+        yield "kernels", "none: everything by torch"
+    if device.type == "cuda":
+        products = "float32" if torch.get_float32_matmul_precision() == "highest" else "TF32"
+        convolutions = "TF32" if torch.backends.cudnn.allow_tf32 else "float32"
+        yield "precision", f"matrix products in {products}, convolutions of encoders in {convolutions}"
+    free = free_memory(device)
+    if free is not None:
+        yield "device memory", f"{free / 2**30:.1f} GiB free"
+
+
+def _computed(device: torch.device) -> dict[str, Tensor]:
+    """All that is compared, by name, on the device."""
+    encoder = BundledContentConfig().build()
+    config, facts = _tiny(encoder.identity, encoder.channels)
+    model, cameras = build_model(config, facts).to(device), _camera()
+    encoder = encoder.to(device)
+    image = _uniform(3, 48, 64).to(device)
+    with torch.no_grad():
+        features: Tensor = encoder(image[None])[0]
+    found = {"encoder": features, "training step": _gradients(model, cameras, image)}
+    model.requires_grad_(False).eval()
+    look = _restyle(model, features.flatten(1).T, image)
+    for name, restyle in (("render", None), ("restyle", look)):
+        found[name] = render_view(model, facts, cameras, 0, config.render, restyle).rgb
+    return found
+
+
+def _tiny(encoder: str, channels: int) -> tuple[TrainConfig, Facts]:
+    config = TrainConfig(
+        sampler=ProposalConfig(samples=(16,), final=8, resolutions=(8,)),
+        content=ContentConfig(
+            encoder=BundledContentConfig(), field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)
+        ),
+        semantic=SemanticConfig(field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=_DIM),
+        render=RenderConfig(budget=0.0),
+    )
+    axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    space = Space(kind="contraction", centre=(0.0, 0.0, 0.0), rotation=axes, scale=1.0, near=0.1, far=100.0)
+    facts = Facts(
+        space=space,
+        channels=channels,
+        dim=_DIM,
+        content_encoder=encoder,
+        semantic_encoder="",
+        content_scale=1.0,
+        semantic_scale=1.0,
+        background=None,
+    )
+    return config, facts
+
+
+def _camera() -> Cameras:
+    place, target, up = (torch.tensor([x], dtype=torch.float64) for x in ((0.0, -0.4, 0.1), (0.1, 0.5, 0.0), (0.0, 0.0, 1.0)))
+    return pinhole(look_at(place, target, up[0]), width=32, height=24, fov=60.0)
+
+
+def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]) -> Annotated[Tensor, "P"]:
+    """Of everything that is learnt, by all terms, after a step along the first of them."""
+    rays, _, _ = view_rays(model, cameras, 0)
+    learned = model.learned()
+    gradients: list[Tensor] = []
+    for _ in range(2):
+        out = render_rays(rays, model.parts, want=Want.COLOUR | Want.CONTENT | Want.SEMANTIC, budget=0.0, step=0)
+        assert out.rgb is not None and out.content is not None and out.semantic is not None
+        target = torch.nn.functional.interpolate(image[None], (24, 32))[0].flatten(1).T
+        loss = (out.rgb - target).square().mean() + (out.content - 0.1).square().mean() + (out.semantic - 0.1).square().mean()
+        gradients = list(torch.autograd.grad(loss, learned, allow_unused=True, materialize_grads=True))
+        with torch.no_grad():
+            for parameter, gradient in zip(learned, gradients, strict=True):
+                parameter.sub_(gradient, alpha=0.1)
+    return torch.cat([gradient.reshape(-1) for gradient in gradients])
+
+
+@torch.no_grad()
+def _restyle(model: Model, features: Annotated[Tensor, "N C"], image: Annotated[Tensor, "3 H W"]) -> Restyle:
+    """The picture's style on points that are what it shows, in other light; both fall into a few clear kinds."""
+    kinds = torch.arange(len(features), device=features.device) % _KINDS
+    semantic = torch.nn.functional.one_hot(kinds, _DIM).float() + 0.05 * _uniform(len(features), _DIM).to(features)
+    colour = torch.nn.functional.interpolate(image[None], (24, 32), mode="area")[0].flatten(1).T
+    dictionary = build_dictionary([Reference("picture", features, semantic, colour=colour)], clusters=_KINDS)
+    scene = scene_style(0.5 * features + 0.2, semantic, torch.ones_like(features[:, 0]), None, _KINDS, 0)
+    chosen = RegionToneConfig()
+    stylizer = chosen.build(dictionary=dictionary, scene=scene).to(features.device)
+    colours = colour_maps(stylizer, dictionary, scene, model.decoder, features=chosen.features, share=chosen.colours)
+    return Restyle(stylizer, features=chosen.features, colours=None if colours is None else colours.to(features.device))
+
+
+def _uniform(*shape: int) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(3))
