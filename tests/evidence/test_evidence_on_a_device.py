@@ -59,7 +59,6 @@ BENCHES = {
     "paper statistics": ["--table", "statistics", *PAPER],
     "speed": ["--repeats", "2", "--rays", "64"],
     "pareto": ["--repeats", "2", "--rays", "64"],
-    "scaling": ["--repeats", "2", "--rays", "64"],
 }
 
 
