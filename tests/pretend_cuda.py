@@ -238,6 +238,7 @@ def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False, mps: bool = Fal
             "get_device_name": lambda device=None: "pretended",
             "is_bf16_supported": lambda including_emulation=True: True,
         },
+        torch.mps: {"recommended_max_memory": lambda: memory, "driver_allocated_memory": lambda: 0},
         triplane_triton: _kernels(triton),
     }
     kept = {(owner, name): getattr(owner, name) for owner, names in replaced.items() for name in names}

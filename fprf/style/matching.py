@@ -35,8 +35,8 @@ _FLAT = 1e-6
 def unit(x: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"]) -> Annotated[Tensor, "N D"]:
     """Directions from the centre; what lies at the centre has none and becomes 0, which matches everything alike."""
     away = x - centre
-    norm = away.norm(dim=-1, keepdim=True)
-    flat = norm <= _FLAT * centre.norm()
+    norm = torch.linalg.vector_norm(away, dim=-1, keepdim=True)
+    flat = norm <= _FLAT * torch.linalg.vector_norm(centre)
     return torch.where(flat, 0.0, away / norm.clamp_min(torch.finfo(x.dtype).tiny))
 
 
@@ -109,7 +109,7 @@ def point_shares(
     Shares below `faint` of a point's largest become 0. Rows sum to 1. Within 4 (D + 4) u / temperature of the exact shares.
     """
     if usable(x) and keys.dtype == torch.float32 and len(x) > 0 and temperature > 0:
-        flat = 0.0 if centre is None else _FLAT * float(centre.norm())
+        flat = 0.0 if centre is None else _FLAT * float(torch.linalg.vector_norm(centre))
         return mixture.attention(x, keys, temperature, centre=centre, flat=flat, prior=prior, faint=faint)
     share = attention(x if centre is None else unit(x, centre), keys, temperature, prior)
     if faint > 0:

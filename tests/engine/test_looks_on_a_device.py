@@ -1,5 +1,6 @@
 """Renders, restyles, match maps and blocks on the pretended device: the CPU's, bit for bit, where both take plain torch."""
 
+import copy
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,8 +18,10 @@ from fprf.engine.cached_view import cache_view
 from fprf.engine.folding import folded
 from fprf.engine.loading import Trained, load_run
 from fprf.engine.matches import match_map
+from fprf.engine.poses import Poses
 from fprf.engine.quality import QualityConfig, at_quality
 from fprf.engine.restyle import Encoders, dress, encode_photograph, open_encoders
+from fprf.engine.tones import Tones
 from fprf.engine.views import render_view
 from fprf.memory import at_once, free_memory
 from fprf.ops import backend
@@ -128,6 +131,29 @@ def test_a_frame_is_one_copy_whatever_its_chunks(world: World) -> None:
         assert torch.equal(cached.restyled().rgb, pictures[0])
         assert seen.syncs == {"aten._to_copy.default": 1}
     assert torch.equal(*pictures)
+
+
+def test_a_device_without_float64(world: World, _made: dict[str, Here]) -> None:
+    found = []
+    for device, within in (PLACES[0], ("mps:0", lambda: pretend_cuda(mps=True))):
+        with within():
+            found.append(shown(here(world, _made, device), RegionToneConfig(), world.references))
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_learnt_poses_and_tones(world: World) -> None:
+    cameras = world.prepared.scene.cameras
+    draw = torch.Generator().manual_seed(5)
+    poses = Poses(cameras.pose[:, :, 3], (1,), reach=2.0, pace=0.1)
+    tones = Tones(torch.rand(len(cameras), generator=draw), (1,))
+    with torch.no_grad():
+        poses.offset.copy_(torch.rand(poses.offset.shape, generator=draw))
+        tones.gain.copy_(torch.rand(tones.gain.shape, generator=draw))
+    mixed = (0, 2), (0.25, 0.75)
+    expected = [poses.refined(cameras).pose, tones.mixed(*mixed)]
+    with pretend_cuda():
+        found = [copy.deepcopy(poses).to(CUDA).refined(cameras).pose, copy.deepcopy(tones).to(CUDA).mixed(*mixed).cpu()]
+    assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
 
 
 def test_chunks_follow_the_memory_of_an_accelerator_alone() -> None:
