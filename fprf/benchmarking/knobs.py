@@ -162,7 +162,8 @@ def _fewer_channels(trained: Trained, styled: Styled, stylizer: StylizerConfig, 
     parts = trained.model.parts
     assert parts.semantic is not None
     scene = styled.scene._replace(keys=styled.scene.keys[:, :channels], semantic_mean=styled.scene.semantic_mean[:channels])
-    dictionary = styled.dictionary._replace(keys=styled.dictionary.keys[:, :channels])
+    origin = None if styled.dictionary.origin is None else styled.dictionary.origin[:channels]
+    dictionary = styled.dictionary._replace(keys=styled.dictionary.keys[:, :channels], origin=origin)
     device = next(trained.model.parameters()).device
     built = stylizer.build(dictionary=dictionary, scene=scene).to(device)
     model = Model(parts._replace(semantic=_Leading(parts.semantic, channels))).eval()

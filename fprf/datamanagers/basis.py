@@ -1,7 +1,8 @@
 """Principal components of a scene's semantic features: centred, orthonormal, fitted in float64.
 
 y = (x - mean) matrix. Distances and inner products of centred features survive up to the energy that is dropped, so scores
-between a scene and its references, both projected, are what they were.
+between a scene and its references, both projected, are what they were. Inner products of features as the encoder gives them
+are those of y - origin, up to a constant that all keys of a query share: x . x' = (y - origin) . y' + c(y).
 """
 
 from collections.abc import Mapping
@@ -32,6 +33,10 @@ class Basis(NamedTuple):
     def lift(self, y: Annotated[Tensor, "... D"]) -> Annotated[Tensor, "... I"]:
         """Back to the encoder's channels: what `project` gives `y` for, as near to the mean as can be."""
         return y @ self.matrix.to(y).T + self.mean.to(y)
+
+    def origin(self) -> Annotated[Tensor, "D"]:
+        """Where the encoder's zero lies in the basis."""
+        return -(self.mean @ self.matrix)
 
     def tensors(self) -> dict[str, Tensor]:
         """What `from_tensors` takes: for a tensor file."""

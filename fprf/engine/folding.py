@@ -48,8 +48,9 @@ def folded(model: Model, styled: Styled, config: StylizerConfig) -> Folded | Non
     field = model.semantic.projected(directions.to(device))
     if field is None:
         return None
+    origin = None if dictionary.origin is None else dictionary.origin @ directions
     stylizer = config.build(
-        dictionary=dictionary._replace(keys=torch.eye(directions.shape[1]).to(dictionary.keys)),
+        dictionary=dictionary._replace(keys=torch.eye(directions.shape[1]).to(dictionary.keys), origin=origin),
         scene=scene._replace(keys=scene.keys @ directions, semantic_mean=scene.semantic_mean @ directions),
     )
     return Folded(

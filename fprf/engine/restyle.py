@@ -123,8 +123,10 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
 
     The dictionary's names are the labels of the style's references. Raises UsageError for wishes that the scene does not know.
     """
-    style, scene = file.style, encoders.scene
-    regions = Regions(trained, scene, encoders.basis, file.regions, file.semantic_encoder)
+    style, scene, basis = file.style, encoders.scene, encoders.basis
+    if basis is not None:
+        dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
+    regions = Regions(trained, scene, basis, file.regions, file.semantic_encoder)
     orders = take_orders(regions, dictionary, style)
     chosen = style.stylizer
     stylizer = regional(dictionary, scene, orders.allowed, chosen)

@@ -79,6 +79,8 @@ class StyleDictionary(NamedTuple):
     colour_covariance: Annotated[Tensor, "T 3 3"] | None = None
     allowed: Annotated[Tensor, "K references"] | None = None
     """On one scene: which references each of its regions may take from, bool; None = all. See `style.regional`. Not saved."""
+    origin: Annotated[Tensor, "D"] | None = None
+    """Where the encoder's zero lies in the scene's semantic basis; None = at 0. Not saved: it follows from the basis."""
 
 
 def build_dictionary(

@@ -1,7 +1,7 @@
 """Stylizer configs. `build` imports the implementation.
 
-Temperatures are relative: 1 is the spread of the matching scores between this scene and these references, so that one
-default serves every encoder. Small = each point takes one style code, large = all codes mix.
+Temperatures are relative unless said otherwise: 1 is the spread of the matching scores between this scene and these
+references, so that one default serves every encoder. Small = each point takes one style code, large = all codes mix.
 """
 
 from __future__ import annotations
@@ -84,9 +84,14 @@ class LocalAdainConfig(StylizerConfig):
     """Local AdaIN (paper, Eq. 5 and 6): every point mixes the style codes that its semantics resemble."""
 
     temperature: float = 0.4
-    """Softness of the match, relative to the spread of the scores; above 0."""
+    """Softness of the match; above 0. The paper's is 1, its released code's 100, both with `relative` False."""
+    relative: bool = True
+    """Temperature is in units of the spread of the scores; False = in those of the scores themselves (paper)."""
     similarity: Literal["cosine", "dot"] = "cosine"
-    """Score of a match: cosine of centred features, or the paper's dot product."""
+    """Score of a match: cosine of the features, or their dot product (paper)."""
+    centred: bool = True
+    """Features are taken from the mean of the scene, keys from that of the references; False = as the encoder gives them
+    (paper)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,7 +106,14 @@ class LocalAdainConfig(StylizerConfig):
         """Local AdaIN towards these references."""
         from .local import LocalAdainStylizer
 
-        return LocalAdainStylizer(dictionary, scene, temperature=self.temperature, similarity=self.similarity)
+        return LocalAdainStylizer(
+            dictionary,
+            scene,
+            temperature=self.temperature,
+            relative=self.relative,
+            similarity=self.similarity,
+            centred=self.centred,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +125,7 @@ class _RegionConfig(StylizerConfig):
     temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     similarity: Literal["cosine", "dot"] = "cosine"
-    """Score of a match: cosine of centred features, or the paper's dot product."""
+    """Score of a match: cosine of centred features, or their dot product."""
     whitening: float = 0.5
     """How far both sides' semantics are whitened before they are scored as cosines, in [0, 1]; 0 = not at all."""
     recentred: int = 5

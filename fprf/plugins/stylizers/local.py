@@ -1,11 +1,12 @@
 """Local AdaIN (paper, Eq. 5 and 6): each point mixes the style codes that its semantics resemble.
 
 M_w = R^S M and Sigma_w = R^S Sigma over the codes' means and deviations, then Sigma_w (F - mu_c) / sigma_c + M_w with the
-statistics of the whole scene.
+statistics of the whole scene. With dot products, not centred, at the absolute temperature 1, R^S is the paper's softmax(R).
 """
 
 from typing import Annotated
 
+import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
@@ -24,31 +25,49 @@ class LocalAdainStylizer(Stylizer):
     """AdaIN towards a per-point mixture. With one code, or without semantics, the mixture is the same everywhere."""
 
     content_mean: Annotated[Tensor, "C"]
-    semantic_mean: Annotated[Tensor, "D"]
+    centre: Annotated[Tensor, "D"] | None
+    """What directions are taken from; None for dot products."""
+    origin: Annotated[Tensor, "D"] | None
+    """The encoder's zero, for dot products of features as it gives them."""
     keys: Annotated[Tensor, "T D"]
     prior: Annotated[Tensor, "T"]
     odds: Annotated[Tensor, "T"]
     style_mean: Annotated[Tensor, "T C"]
     gain: Annotated[Tensor, "T C"]
 
-    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, *, temperature: float, similarity: Similarity) -> None:
+    def __init__(
+        self,
+        dictionary: StyleDictionary,
+        scene: SceneStyle,
+        *,
+        temperature: float,
+        relative: bool,
+        similarity: Similarity,
+        centred: bool,
+    ) -> None:
         super().__init__()
         check_fit(dictionary, scene)
-        self.similarity = similarity
         self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
-        centre = share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
-        queries, keys = compared(
-            scene.keys, dictionary.keys, similarity, queries_centre=scene.semantic_mean, keys_centre=centre
-        )
+        centre, theirs = scene.semantic_mean, share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
+        regions, origin = scene.keys, None
+        if not centred:
+            origin = torch.zeros_like(centre) if dictionary.origin is None else dictionary.origin
+            if similarity == "cosine":
+                centre, theirs = origin, origin
+            else:
+                regions = regions - origin
+        queries, keys = compared(regions, dictionary.keys, similarity, queries_centre=centre, keys_centre=theirs)
         # The only region of an undivided scene lies at its mean, where it says nothing about scores.
-        self.temperature = temperature * score_spread(queries if len(queries) > 1 else keys, keys)
+        spread = score_spread(queries if len(queries) > 1 else keys, keys) if relative else 1.0
+        self.temperature = temperature * spread
         mean, covariance = double(dictionary.mean), double(dictionary.covariance)
         if not self.matched:
             mean, covariance = (part[None] for part in whole_style(dictionary))
         scene_sigma = deviation(double(scene.mean), double(scene.covariance).diagonal())
         gain = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)) / scene_sigma
         self.register_buffer("content_mean", scene.mean.float())
-        self.register_buffer("semantic_mean", scene.semantic_mean.float())
+        self.register_buffer("centre", centre.float() if similarity == "cosine" else None)
+        self.register_buffer("origin", None if origin is None or similarity == "cosine" else origin.float())
         self.register_buffer("keys", keys.float())
         self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
         self.register_buffer("odds", code_odds(dictionary).to(keys.device).float())
@@ -76,5 +95,6 @@ class LocalAdainStylizer(Stylizer):
         if not self.matched:
             return self.odds.expand(len(semantic), -1)
         query = semantic.to(self.keys)
-        centre = self.semantic_mean if self.similarity == "cosine" else None
-        return point_shares(query, self.keys, self.temperature, centre=centre, prior=self.prior)
+        if self.origin is not None:
+            query = query - self.origin
+        return point_shares(query, self.keys, self.temperature, centre=self.centre, prior=self.prior)

@@ -12,7 +12,8 @@ from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene import SceneStyle, own_style, scene_style
 from fprf.types import Want
 
-ALL = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), LocalAdainConfig(similarity="dot"))
+PAPER = LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)
+ALL = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), LocalAdainConfig(similarity="dot"), PAPER)
 
 
 def points(n: int = 400, c: int = 6, d: int = 4, *, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
