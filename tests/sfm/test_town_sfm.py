@@ -1,6 +1,7 @@
 """A phone-like folder, the town's views as JPEG without poses, through COLMAP itself and back to the truth."""
 
 import shutil
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -32,6 +33,27 @@ def test_the_measure_is_blind_to_similarities_and_to_nothing_else() -> None:
     assert misses(shaken, truth).degrees > 4
 
 
+def photographed(town: Path, folder: Path) -> None:
+    """The town's views as a phone would leave them."""
+    folder.mkdir()
+    for k, path in enumerate(sorted((town / "images").glob("*.png"))):
+        cv2.imwrite(str(folder / f"{k:04d}.jpg"), cv2.imread(str(path)), [cv2.IMWRITE_JPEG_QUALITY, 92])
+
+
+@pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed (extra sfm)")
+def test_a_few_small_photographs_find_their_poses(tmp_path: Path) -> None:
+    """COLMAP itself, in processes of its own; the long test below asks for more."""
+    town, scene = tmp_path / "town", tmp_path / "scene"
+    write_town(town, seed=0, palette="day", views=16, width=320, height=240)
+    photographed(town, tmp_path / "phone")
+    assert cli.main(["process", str(tmp_path / "phone"), "--output", str(scene)]) == 0
+    assert "pycolmap" not in sys.modules
+    found, truth = parse_scene(scene, 1, None), parse_scene(town, 1, None)
+    views = [int(path.stem.removeprefix("frame_")) for path in found.paths]
+    miss = misses(found.cameras.pose.numpy(), truth.cameras.pose[views].numpy())
+    assert len(views) >= 12 and miss.position < 0.03 and miss.degrees < 4
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed (extra sfm)")
@@ -39,15 +61,13 @@ def test_the_measure_is_blind_to_similarities_and_to_nothing_else() -> None:
 def test_poses_of_the_town_are_within_a_percent_of_the_truth(tmp_path: Path, kind: str) -> None:
     town = tmp_path / "town"
     write_town(town, seed=0, palette="day", views=40, width=640, height=480)
-    views = [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in sorted((town / "images").glob("*.png"))]
     if kind == "photographs":
         source = tmp_path / "phone"
-        source.mkdir()
-        for k, view in enumerate(views):
-            cv2.imwrite(str(source / f"{k:04d}.jpg"), cv2.cvtColor(view, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92])
+        photographed(town, source)
         numbers = range(40)
     else:  # each view twice, the second time as a shaking hand takes it
         source = tmp_path / "clip.mp4"
+        views = [cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB) for path in sorted((town / "images").glob("*.png"))]
         pairs = [frame for view in views for frame in (view, cv2.blur(view, (15, 1)))]
         write_video(source, pairs, 12)
         numbers = range(0, 80, 2)

@@ -19,9 +19,6 @@ __all__ = ["RayExecutor", "resources"]
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_LOOPBACK = "127.0.0.1"
-
-
 def resources(config: RayConfig) -> dict[str, float]:
     """What Ray is asked for on behalf of each task."""
     return {"num_cpus": config.processors, "num_gpus": config.gpus or 0.0, "max_retries": config.retries}
@@ -76,7 +73,7 @@ class RayExecutor(Executor):
                 return
             count = self.config.workers * self.config.processors
             # Without "local" Ray would look for any cluster that runs, or ran, on this machine.
-            ray.init(address="local", num_cpus=count, include_dashboard=False, _node_ip_address=_LOOPBACK, **common)
+            ray.init(address="local", num_cpus=count, include_dashboard=False, **common)
         except (ConnectionError, RuntimeError, ValueError, OSError) as error:
             where = self.config.address or "this machine"
             raise PluginError(f"executor: no Ray cluster at {where} ({error}); `fprf cluster` says how to start one") from error
@@ -85,6 +82,9 @@ class RayExecutor(Executor):
 def _ray(*, private: bool) -> Any:
     """The module; it reads the environment when it is imported, so what it shall know is said before."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    if private:
+        # No cluster means the loopback, on Linux too; an address of it given to `init` is replaced by one for others.
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     if private and not {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"} & os.environ.keys():
         os.environ.setdefault("RAY_AUTH_MODE", "token")
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)

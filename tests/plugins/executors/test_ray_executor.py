@@ -1,9 +1,10 @@
-"""The Ray executor; all but the refusals need Ray (extra `cluster`) and seconds to start it."""
+"""The Ray executor; all but the refusals need Ray (extra `cluster`) and seconds to start it, once for all of them."""
 
 import importlib.util
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +51,7 @@ class Refusing:
 def test_only_a_cluster_that_is_named_is_joined(monkeypatch: pytest.MonkeyPatch, address: str, joined: str) -> None:
     ray = Refusing()
     monkeypatch.setitem(sys.modules, "ray", ray)
-    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_USAGE_STATS_ENABLED"):
+    for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"):
         monkeypatch.setenv(name, "set before")
     with pytest.raises(PluginError, match="nobody there"):
         RayConfig(address=address).build().map(abs, [1])
@@ -88,21 +89,31 @@ def test_the_steps_name_the_machine_and_its_port(capsys: pytest.CaptureFixture[s
 
 
 @pytest.fixture(scope="module")
-def executor() -> RayConfig:
+def executor() -> Iterator[RayConfig]:
     if importlib.util.find_spec("ray") is None:  # not imported here: it reads its environment when it is
         pytest.skip("Ray is not installed")
-    return RayConfig(workers=2, processors=0.5)
+    yield RayConfig(workers=2, processors=0.5)
+    sys.modules["ray"].shutdown()
 
 
-@pytest.mark.slow
+def listening() -> set[str]:
+    """Addresses and ports that something on this machine listens on, in the kernel's spelling."""
+    tables = [table for table in (Path("/proc/net/tcp"), Path("/proc/net/tcp6")) if table.is_file()]
+    rows = [row.split() for table in tables for row in table.read_text().splitlines()[1:]]
+    return {row[1] for row in rows if row[3] == "0A"}
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_the_contract(executor: RayConfig) -> None:
+    before = listening()
     check_executor(executor)
+    new = {port.partition(":")[0] for port in listening() - before}
+    assert all(address.endswith("7F") for address in new), "127.0.0.1, whose bytes are written backwards"
+    assert new or not Path("/proc/net/tcp").exists()
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert os.environ["RAY_AUTH_MODE"] == "token" and len(os.environ["RAY_AUTH_TOKEN"]) == 64
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_ray_itself_says_that_there_are_no_gpus(executor: RayConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
@@ -110,7 +121,6 @@ def test_ray_itself_says_that_there_are_no_gpus(executor: RayConfig, monkeypatch
         replace(executor, gpus=1.0).build().map(abs, [1])
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_tasks_run_elsewhere_and_a_killed_worker_is_started_again(executor: RayConfig, tmp_path: Path) -> None:
     def once_killed(name: str) -> int:
@@ -124,7 +134,6 @@ def test_tasks_run_elsewhere_and_a_killed_worker_is_started_again(executor: RayC
     assert os.getpid() not in found and len(found) == 2
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_errors_arrive_as_they_were_raised(executor: RayConfig) -> None:
     def broken(task: int) -> int:
@@ -134,7 +143,6 @@ def test_errors_arrive_as_they_were_raised(executor: RayConfig) -> None:
         executor.build().map(broken, [1, 2])
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_worker_that_keeps_dying_is_told(executor: RayConfig) -> None:
     def killed(task: int) -> int:
