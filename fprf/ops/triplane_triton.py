@@ -100,7 +100,7 @@ def backward(
 
 def summed(raw: Tensor, latent: Tensor) -> Tensor:
     """raw [N] @ latent [N C]."""
-    return raw @ latent
+    return latent.T @ raw
 
 
 def _constants(table: Tensor, resolutions: Sequence[int]) -> tuple[tuple[int, ...], int, int, int]:
