@@ -210,7 +210,8 @@ def build(kernel, capability, **constants):
     numbers = {"count": "i64", "limit": "fp32"} | dict.fromkeys(constants, "constexpr")
     kinds = {name: numbers.get(name, "*fp32") for name in names}
     source = ASTSource(fn=kernel, signature=kinds, constexprs=constants)
-    return triton.compile(source, target=GPUTarget("cuda", capability, 32), options={"num_warps": 4, "enable_fp_fusion": True}).asm
+    target, options = GPUTarget("cuda", capability, 32), {"num_warps": 4, "enable_fp_fusion": True}
+    return triton.compile(source, target=target, options=options).asm
 
 shape = dict(SIZES=(64, 512), CHANNELS=24, LANES=32, BLOCK=64)
 assert "ld.global" in build(kernels.forward, 90, **shape)["ptx"]
