@@ -1,20 +1,28 @@
 #!/usr/bin/env bash
-# The GPU figures: a scene trained for a given time, restyled frames a second, a new style to its first frame, and the
-# tri-plane kernel against the memory's speed. Writes one JSON with rows and goals.
+# What a machine with a GPU says, in about ten minutes: the tests of devices, a scene trained for a given time, restyled frames
+# a second, a new style to its first frame, Triton's tri-planes against plain torch. Writes one JSON with rows and goals.
 #
-#   benchmarks/gpu.sh --scene DIR [--minutes 3] [--method fprf] [--long STEPS] [--output FILE] [-- FLAGS OF fprf train]
+#   benchmarks/gpu.sh --scene DIR [--images images_4] [--minutes 3] [--method fprf] [--long STEPS] [--output FILE]
+#                     [-- FLAGS OF fprf train]
 #   benchmarks/gpu.sh --dry            the same steps on a CPU, at a tiny size, on the embedded scene
 #
-# --scene is an LLFF capture with a folder images_4; encoder weights are named after the `--`, for example
-#   -- --content.encoder.weights vgg19.safetensors --semantic.encoder.weights dino.safetensors
+# --scene is an LLFF capture. Semantics are those of the bundled encoder, which needs no download; name another after the `--`,
+# for example -- --semantic.encoder dino --semantic.encoder.model FOLDER
 # --long also trains that many steps (30000 in the paper) and compares; it can take an hour.
-set -euo pipefail
+#
+# A step that fails or takes too long is reported and the others go on; the exit status is then 1. Nothing is downloaded or
+# installed: where fprf is not installed, this checkout is used, with packages from PYTHONPATH (a wheel's path will do).
+# PYTHON names another interpreter than `python`.
+set -uo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
+root=$(dirname "$here")
+python=${PYTHON:-python}
 
-scene="" minutes=3 method=fprf long=0 output="$here/results/gpu.json" dry=0
+scene="" images=images_4 minutes=3 method=fprf long=0 output="$here/results/gpu.json" dry=0
 while [ $# -gt 0 ]; do
     case "$1" in
         --scene) scene=$2; shift 2 ;;
+        --images) images=$2; shift 2 ;;
         --minutes) minutes=$2; shift 2 ;;
         --method) method=$2; shift 2 ;;
         --long) long=$2; shift 2 ;;
@@ -28,31 +36,54 @@ done
 
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
+export PYTHONPATH="$root${PYTHONPATH:+:$PYTHONPATH}"
+"$python" "$here/gpu_check.py" "$work/site" || exit 2
+[ ! -d "$work/site" ] || export PYTHONPATH="$work/site:$PYTHONPATH"
+
+tests=(-q -c "$root/pyproject.toml" -o addopts= -o filterwarnings=default -W "ignore::pytest.PytestConfigWarning")
 if [ "$dry" = 1 ]; then
-    method=fprf-lite
+    method=fprf-lite device=cpu limit=3600
     data=(--data town --datamanager.parser town --datamanager.parser.views 6 --datamanager.parser.width 48
         --datamanager.parser.height 36)
-    time=(--steps 20 --device cpu) again=(--steps 40 --device cpu)
-    size=(--rays 500 --repeats 2 --device cpu) points=(--points 2000)
+    time=(--steps 20) again=(--steps 40)
+    size=(--rays 500 --repeats 2) points=(--points 2000)
+    tests+=(-k "pretended and views" "$root/tests/device")
     [ "$long" = 0 ] || long=40
     export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 else
     if [ -z "$scene" ]; then echo "error: --scene is missing; name an LLFF capture, or try --dry" >&2; exit 2; fi
-    if ! python -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
+    if ! "$python" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
         echo "error: torch sees no CUDA device here; try --dry" >&2
         exit 2
     fi
-    data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images images_4)
-    time=(--minutes "$minutes" --device cuda) again=(--steps "$long" --device cuda)
-    size=(--rays 762048 --repeats 10 --device cuda) points=(--points 1048576)
+    device=cuda:0 limit=0
+    data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images "$images")
+    time=(--minutes "$minutes") again=(--steps "$long")
+    size=(--rays 762048 --repeats 5) points=(--points 262144)
+    tests+=(-k "not pretended" "$root/tests/device" "$root/tests/ops/test_triplane_triton.py")
+    case " $* " in *" --semantic.encoder "*) ;; *) set -- --semantic.encoder bundled-semantic "$@" ;; esac
 fi
 
-python -m fprf train "$method" "${data[@]}" "${time[@]}" --output "$work/run" "$@"
-python -m fprf eval "$work/run" --no-images --device "${time[3]}"
-python -m fprf bench speed "$work/run" "${size[@]}" "${points[@]}" --output "$work/speed.json"
-python -m fprf bench profile "$work/run" "${size[@]}" --operators 15 --output "$work/profile.json"
+# step NAME SECONDS COMMAND...: run it, note how it ended, say the end of what it said where it failed.
+step() {
+    local name=$1 seconds=$2 begun=$SECONDS status=0
+    shift 2
+    [ "$limit" = 0 ] || seconds=$limit
+    echo "== $name: $*"
+    timeout -k 5 "$seconds" "$@" >"$work/$name.log" 2>&1 || status=$?
+    printf '{"step": "%s", "status": %d, "seconds": %d}\n' "$name" "$status" $((SECONDS - begun)) >>"$work/steps.jsonl"
+    [ "$status" = 0 ] || tail -n 25 "$work/$name.log"
+}
+
+whole=$(awk "BEGIN { print int(60 * $minutes + 60) }")
+fprf=("$python" -m fprf)
+step tests 150 "$python" -m pytest "${tests[@]}"
+step train "$whole" "${fprf[@]}" train "$method" "${data[@]}" "${time[@]}" --device "$device" --output "$work/run" "$@"
+step eval 40 "${fprf[@]}" eval "$work/run" --no-images --device "$device"
+step speed 130 "${fprf[@]}" bench speed "$work/run" "${size[@]}" "${points[@]}" --device "$device" --output "$work/speed.json"
+step profile 40 "${fprf[@]}" bench profile "$work/run" "${size[@]}" --device "$device" --operators 15 --output "$work/profile.json"
 if [ "$long" != 0 ]; then
-    python -m fprf train "$method" "${data[@]}" "${again[@]}" --output "$work/long" "$@"
-    python -m fprf eval "$work/long" --no-images --device "${again[3]}"
+    step train-long 7200 "${fprf[@]}" train "$method" "${data[@]}" "${again[@]}" --device "$device" --output "$work/long" "$@"
+    step eval-long 60 "${fprf[@]}" eval "$work/long" --no-images --device "$device"
 fi
-python "$here/gpu_rows.py" "$work" --output "$output"
+"$python" "$here/gpu_rows.py" "$work" --output "$output"

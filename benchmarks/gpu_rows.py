@@ -1,101 +1,114 @@
-"""What `gpu.sh` measured, as one JSON: rows with their goals, and the profile that explains them.
+"""What `gpu.sh` measured, as one JSON: its steps, rows with their goals, and the profile that explains them.
 
     python benchmarks/gpu_rows.py WORK --output FILE
 
-WORK holds run/metrics.json, speed.json, profile.json and, where a long training was asked for, long/metrics.json.
+WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json, profile.json and
+long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
 """
 
 import argparse
 import json
-import math
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
 
-from fprf.benchmarking.report import Row, document, rows_table
+from fprf.benchmarking.report import Row, document, rows_table, table
 from fprf.ops import triplane_numba, triplane_triton
 from fprf.output.atomic import write_json
 
 FRAME = 1008 * 756
 STYLES = ("stylised, region-tone", "stylised, region-ot", "stylised, local-adain")
+SAID = 3000
+"""Characters of what a failed step said last that are kept."""
 
 
-def rows(work: Path) -> list[Row]:
-    metrics, speed = read(work / "run" / "metrics.json"), read(work / "speed.json")
-    measured = {row["name"]: row for row in speed["rows"]}
-    found = [
-        Row(
-            name="training, features included",
-            figure=metrics["train_seconds"] / 60,
-            unit="min",
-            goal=3.0,
-            note=size_of(metrics),
-        ),
-        Row(name="held-out PSNR", figure=metrics["psnr"], unit="dB", more_is_better=True, goal=long_psnr(work)),
-        Row(name="training", figure=measured["train"]["figure"], unit="rays/s"),
-    ]
-    for name in STYLES:
-        row = measured[name]
-        found.append(
-            Row(
-                name=f"{name}, frames of 1008x756",
-                figure=row["figure"] / FRAME,
-                low=row["low"] / FRAME,
-                high=row["high"] / FRAME,
-                unit="1/s",
-                goal=60.0,
-                more_is_better=True,
-                error=row["error"],
-                error_kind=row["error_kind"],
-                note=f"measured on views of {speed['settings']['view']}",
-            )
-        )
-    first = measured["new reference to the first view"]
-    found.append(Row(name="a new style to its first frame", figure=1e3 * first["figure"], unit="ms", goal=100.0))
-    for name, row in measured.items():
-        if name.endswith("of the memory's speed"):
-            found.append(Row(name=name, figure=row["figure"], unit="%", goal=50.0, more_is_better=True, note=row["note"]))
+def steps(work: Path) -> list[dict[str, Any]]:
+    """Every step with its seconds; of those that failed the last that they said."""
+    found = [json.loads(line) for line in (work / "steps.jsonl").read_text().splitlines()]
+    for each in found:
+        each["passed"] = each["status"] == 0
+        log = work / f"{each['step']}.log"
+        if log.is_file() and (not each["passed"] or each["step"] == "tests"):
+            each["said"] = log.read_text(errors="replace")[-SAID:]
     return found
 
 
-def long_psnr(work: Path) -> float | None:
-    """0.1 dB less than the long training reached, if there was one."""
-    file = work / "long" / "metrics.json"
-    return math.floor(1e3 * (read(file)["psnr"] - 0.1)) / 1e3 if file.is_file() else None
-
-
-def size_of(metrics: dict[str, Any]) -> str:
-    return f"{metrics['method']} on {metrics['scene']}, {metrics['train_steps']} steps, {metrics['views']} views judged"
+def rows(work: Path, form: str) -> Iterator[Row]:
+    """`form` names the tri-plane kernels that run here."""
+    run, measured = read(work / "run" / "metrics.json"), read(work / "speed.json")
+    if run is not None:
+        about = f"{run['method']} on {run['scene']}, {run['train_steps']} steps, {run['views']} views judged"
+        yield Row(name="training, features included", figure=run["train_seconds"] / 60, unit="min", note=about)
+        yield Row(name="held-out PSNR", figure=run["psnr"], unit="dB", more_is_better=True, goal=26.0)
+    far = read(work / "long" / "metrics.json")
+    if far is not None:
+        note = f"{far['train_steps']} steps, {far['train_seconds'] / 60:.1f} min"
+        yield Row(name="held-out PSNR of the long training", figure=far["psnr"], unit="dB", note=note)
+    if measured is None:
+        return
+    of = {row["name"]: row for row in measured["rows"]}
+    if "train" in of:
+        yield Row(name="training", figure=of["train"]["figure"], unit="rays/s")
+    for name in STYLES:
+        yield Row(
+            name=f"{name}, frames of 1008x756",
+            figure=of[name]["figure"] / FRAME,
+            low=of[name]["low"] / FRAME,
+            high=of[name]["high"] / FRAME,
+            unit="1/s",
+            goal=60.0,
+            more_is_better=True,
+            error=of[name]["error"],
+            error_kind=of[name]["error_kind"],
+            note=f"measured on views of {measured['settings']['view']}",
+        )
+    first, dictionary = (of[f"new reference to {what}"]["figure"] for what in ("the first view", "its dictionary"))
+    yield Row(name="a new style to its dictionary", figure=1e3 * dictionary, unit="ms")
+    yield Row(name="a new style to its first frame", figure=1e3 * first, unit="ms", goal=100.0)
+    for name, row in of.items():
+        if name.startswith("tri-plane forward + backward"):
+            kept = ("figure", "unit", "low", "high", "peer", "error", "error_kind", "peer_error", "note")
+            yield Row(name=f"{form} {name}", **{key: row[key] for key in kept})
+        elif name.endswith("of the memory's speed"):
+            yield Row(name=name, figure=row["figure"], unit="%", goal=50.0, more_is_better=True, note=row["note"])
 
 
 def kernels(device: torch.device) -> str:
-    """Which form of the tri-planes ran."""
+    """Which form of the tri-planes runs."""
     points, table = torch.zeros(1, 3, device=device), torch.zeros(12, 8, device=device)
     return "triton" if triplane_triton.usable(points, table) else "numba" if triplane_numba.usable(points, table) else "plain"
 
 
 def read(path: Path) -> Any:
-    return json.loads(path.read_text())
+    return json.loads(path.read_text()) if path.is_file() else None
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
-    speed = read(options.work / "speed.json")
-    device = torch.device("cpu" if speed["machine"]["device"] == "cpu" else "cuda")
-    found = rows(options.work)
-    profile = read(options.work / "profile.json")["parts"]
-    extra = {"speed": speed["rows"], "counters": speed["counters"], "profile": profile}
-    settings = speed["settings"] | {"tri_planes": kernels(device)}
+    work, gone = options.work, steps(options.work)
+    speed, profile = read(work / "speed.json") or {}, read(work / "profile.json") or {}
+    device = torch.device("cuda:0" if torch.cuda.is_available() else "cpu")
+    form = kernels(device)
+    found = list(rows(work, form))
+    extra = {"steps": gone, "speed": speed.get("rows"), "counters": speed.get("counters"), "profile": profile.get("parts")}
+    settings = speed.get("settings", {}) | {"tri_planes": form}
     write_json(options.output, document("gpu", found, device=device, settings=settings, extra=extra))
     console = Console(highlight=False, width=120)
+    ended = (
+        (each["step"], "passed" if each["passed"] else f"failed ({each['status']})", f"{each['seconds']} s") for each in gone
+    )
+    console.print(table("steps", ("step", "", "took"), ended))
     console.print(rows_table("on this device", found))
     console.print(f"written to {options.output}")
+    return 0 if all(each["passed"] for each in gone) else 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -2,6 +2,7 @@
 
 import importlib.util
 import itertools
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -224,6 +225,7 @@ for capability in (80, 90):
 
 def test_kernels_compile_for_a_gpu() -> None:
     """To machine code, on any machine: the interpreter takes more than the compiler does."""
-    environment = {"PATH": "/usr/bin:/bin", "HOME": "/tmp", "NUMBA_DISABLE_JIT": "1"}
+    packages = os.environ.get("PYTHONPATH", "")
+    environment = {"PATH": "/usr/bin:/bin", "HOME": "/tmp", "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": packages}
     done = subprocess.run([sys.executable, "-c", COMPILE], capture_output=True, text=True, env=environment, timeout=120)
     assert done.returncode == 0, done.stderr[-2000:]
