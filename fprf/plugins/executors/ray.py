@@ -19,6 +19,7 @@ __all__ = ["RayExecutor", "resources"]
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
+
 def resources(config: RayConfig) -> dict[str, float]:
     """What Ray is asked for on behalf of each task."""
     return {"num_cpus": config.processors, "num_gpus": config.gpus or 0.0, "max_retries": config.retries}
