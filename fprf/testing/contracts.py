@@ -304,7 +304,7 @@ def check_data_manager(config: DataManagerConfig) -> None:
         manager, again, plain = build(), build(), build(features=False)
         require(isinstance(manager, DataManager), f"{name}: build() gives {type(manager).__name__}, not a DataManager")
         batch, later = manager.batch(3), manager.batch(4)
-        for other in (manager, again):
+        for other in (manager, again, manager.to(torch.device("cpu"), room=0)):
             _same_batch(other.batch(3), batch, f"{name}: a batch must be a function of the seed and the step")
         count = len(batch.rgb)
         require(config.batch_rays() == count, f"{name}: batch_rays() must be the rays of a batch, {count}")
