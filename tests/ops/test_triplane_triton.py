@@ -1,5 +1,6 @@
 """The Triton form of the tri-planes against fp64: on a GPU where there is one, else through Triton's interpreter."""
 
+import importlib
 import importlib.util
 import itertools
 import os
@@ -20,9 +21,16 @@ GPU = torch.cuda.is_available()
 DEVICE = torch.device("cuda" if GPU else "cpu")
 
 
+if not GPU and importlib.util.find_spec("triton") is not None:
+    # Triton's own functions and ours are interpreted or not from the moment they are loaded: at collection, before any test
+    # runs that has torch or transformers load Triton.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TRITON_INTERPRET", "1")
+        importlib.import_module("fprf.ops.triplane_triton_kernels")
+
+
 @pytest.fixture(autouse=True)
 def _form(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Kernels are interpreted or not from the moment they are loaded."""
     if not GPU:
         monkeypatch.setenv("TRITON_INTERPRET", "1")
     yield
