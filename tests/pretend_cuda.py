@@ -224,7 +224,16 @@ def pretend_cuda(memory: int = 1 << 34, *, triton: bool = False, mps: bool = Fal
     def leave(mode, *error):
         torch.set_grad_enabled(mode.before)
 
+    convert = torch.nn.Module._apply
+
+    def apply(self, fn, recurse=True):
+        # A module that is there already keeps its parameters, with their hooks, as on a card.
+        pairs = ((x, fn(x)) for x in (*self.parameters(), *self.buffers()))
+        unchanged = all((x.device, x.dtype) == (y.device, y.dtype) for x, y in pairs)
+        return self if unchanged else convert(self, fn, recurse)
+
     replaced = {
+        torch.nn.Module: {"_apply": apply},
         torch: {"Generator": Generator, "tensor": tensor, "as_tensor": as_tensor},
         torch.inference_mode: {"__enter__": enter, "__exit__": leave},
         torch.Tensor: {"pin_memory": lambda self, *a: self},
