@@ -1,14 +1,17 @@
 """Tri-planes on a GPU: one launch over all planes and scales, forward and backward (device code: `triplane_triton_kernels`).
 
-Triton comes with torch for CUDA; where it is not installed nothing here is usable, and the reference runs. With
-TRITON_INTERPRET=1 the same code runs on the CPU, number by number: slow, for tests.
+Triton comes with torch for CUDA. Where it is not installed, or cannot compile (it needs a C compiler and Python's headers),
+nothing here is usable, and the reference runs. With TRITON_INTERPRET=1 the same code runs on the CPU, number by number: slow,
+for tests.
 
 Gradients are summed up by atomic additions, whose order differs from run to run: bits may differ, within rounding.
 """
 
 import importlib.util
+import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -38,7 +41,27 @@ def usable(points: Tensor, table: Tensor) -> bool:
         return False
     fixed = not (torch.is_grad_enabled() and table.requires_grad)
     stored = table.dtype == torch.float32 or (table.dtype == torch.float16 and fixed)
-    return stored and (points.device.type == "cuda" or (points.device.type == "cpu" and interpreted()))
+    if not stored or points.device.type not in ("cuda", "cpu"):
+        return False
+    return interpreted() or (points.device.type == "cuda" and _launches(points.device))
+
+
+@cache
+def _launches(device: torch.device) -> bool:
+    """Whether a kernel can be compiled and launched there: tried once, and told where it cannot."""
+    try:
+        forward(torch.zeros(1, 3, device=device), torch.zeros(12, 1, device=device), (2,))
+    except torch.OutOfMemoryError:
+        raise
+    except Exception as error:  # whatever a compiler, a linker or a driver raises
+        reason = (str(error).splitlines() or [""])[0]
+        warnings.warn(
+            f"Triton cannot compile for {device} ({type(error).__name__}: {reason}): tri-planes run in plain torch, slower; "
+            "install a C compiler and Python's headers (apt install gcc python3-dev)",
+            stacklevel=2,
+        )
+        return False
+    return True
 
 
 def forward(points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Tensor:

@@ -2,7 +2,7 @@
 
 A program takes `BLOCK` points through all scales and planes; `LANES` is the number of channels rounded up to a power of two.
 Resolutions are constants of the compiled code, so that strides and borders cost nothing. Tables may be stored in half
-precision; coordinates, arithmetic and sums are float32.
+precision; coordinates, arithmetic and sums are float32. One build serves any number of points: `count` is not specialised.
 """
 
 # triton has no types, and what is passed to device code is none of Python's.
@@ -47,7 +47,7 @@ def _feature(points, table, n, c, inside, mask, START, SIZE: tl.constexpr, CHANN
     return value * _sample(table, START + 2 * SIZE * SIZE + k * SIZE + j, c, mask, v, w, SIZE, CHANNELS)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def forward(points, table, out, count, SIZES: tl.constexpr, CHANNELS: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr):
     """out [count scales CHANNELS] = products of the samples."""
     n, c = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, LANES)
@@ -60,7 +60,7 @@ def forward(points, table, out, count, SIZES: tl.constexpr, CHANNELS: tl.constex
         start += 3 * SIZES[scale] * SIZES[scale]
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def density(
     points, table, weight, limit, latent, out, count,
     SIZES: tl.constexpr, CHANNELS: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr, KEEP: tl.constexpr,
@@ -109,7 +109,7 @@ def _spread_product(
     _spread(out, third, c, mask, v, w, slope * x * y, SIZE, CHANNELS)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def backward(
     points, table, grad, raw, weight, out, count,
     SIZES: tl.constexpr, CHANNELS: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,

@@ -208,6 +208,28 @@ def test_on_cuda_planes_of_the_papers_sizes_are_those_of_fp64(
     assert ((values[3] - exact[3]).abs() <= (20 + count + 2 * float(logits / u)) * u * exact[0].sum()).all()
 
 
+def test_without_a_compiler_the_plain_form_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is tried once, and said once."""
+    usable, tried = triplane_triton.usable, []
+
+    def forward(points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Tensor:
+        tried.append(points.device)
+        raise RuntimeError("Failed to find C compiler.")
+
+    monkeypatch.setattr(triplane_triton, "interpreted", lambda: False)
+    monkeypatch.setattr(triplane_triton, "forward", forward)
+    triplane_triton._launches.cache_clear()
+    try:
+        with pretend_cuda():
+            points, table = torch.zeros(3, 3).to(CUDA), torch.zeros(12, 8).to(CUDA)
+            with pytest.warns(UserWarning, match=r"cuda:0 \(RuntimeError: Failed to find C compiler.\)"):
+                assert not usable(points, table)
+            assert not usable(points, table)
+    finally:
+        triplane_triton._launches.cache_clear()
+    assert tried == [CUDA]
+
+
 COMPILE = """
 import triton
 from triton.backends.compiler import GPUTarget
