@@ -25,7 +25,11 @@ def local(points: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "3 3"] | Non
     """Points in the axes of a cell; None = those of the space."""
     if turn is None or (turn.device.type == "cpu" and aligned(turn)):
         return points
-    return points @ turn.to(points).T
+    turn = turn.to(points)
+    if points.device.type == "cpu":
+        return points @ turn.T
+    # No product of matrices: in TF32 a coordinate would be off by a two thousandth of itself.
+    return (points[:, None] * turn).sum(-1)
 
 
 def window(points: Annotated[Tensor, "N 3"], boxes: Boxes, block: int) -> Annotated[Tensor, "N"]:

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 from fprf.blocks.windows import local, shares, window
@@ -101,3 +102,13 @@ def test_level_axes_are_not_multiplied() -> None:
     points = torch.randn(5, 3)
     assert local(points, torch.eye(3, dtype=torch.float64)) is points
     assert torch.allclose(local(points, turned(0.3)), points @ turned(0.3).float().T)
+
+
+def test_on_cuda_places_are_no_products_of_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which TF32 would round."""
+    points, turn = torch.randn(50, 3), turned(0.3)
+    expected = local(points, turn)
+    monkeypatch.setattr(torch.Tensor, "__matmul__", None, raising=False)
+    with pretend_cuda():
+        found = local(points.to(CUDA), turn.to(CUDA)).cpu()
+    assert (found - expected).abs().max() <= 1e-6
