@@ -24,7 +24,10 @@ _RAY = 192 << 10
 """Bytes a ray on an accelerator, at most: in plain torch `fprf` with nothing skipped takes 173 KiB, `fprf-lite` 21."""
 _SHARE = 0.5
 """Of an accelerator's free memory, what a chunk of rays may take."""
-_TEXT = re.compile(r"can't allocate memory|not enough memory|Cannot allocate memory|Tried to allocate|out of memory|bad_alloc")
+_TEXT = re.compile(
+    r"can't allocate memory|not enough memory|Cannot allocate memory|Tried to allocate|out of memory|bad_alloc|_ALLOC_FAILED"
+)
+_GPU = re.compile(r"GPU \d+ has a total capacity of [\d.]+ \w+ of which [\d.]+ \w+ is free")
 _ASKED = re.compile(r"(?:allocate|allocate array of|llocate) ([\d.]+) (bytes|KiB|MiB|GiB|TiB)", re.IGNORECASE)
 _UNITS = {"bytes": 1, "kib": 1 << 10, "mib": 1 << 20, "gib": 1 << 30, "tib": 1 << 40}
 _OPENCV_NO_MEMORY = -4
@@ -91,7 +94,10 @@ def free_memory(device: "torch.device") -> int | None:
 
 def shortage(what: str, error: BaseException, remedy: str) -> OutOfMemoryError:
     """One line: what was going on, what it took, what there is, and what to do."""
-    more = wanted(error)
+    more, card = wanted(error), _GPU.search(str(error))
+    if card is not None:  # what the process and the machine have says nothing of it
+        asked = "" if more is None else f", {_told(more)} more were wanted"
+        return OutOfMemoryError(f"{what}: not enough memory{asked} ({card[0]}); {remedy}")
     asked = "" if more is None else f" and wanted {_told(more)} more"
     held = peak()
     took = "" if held is None else f"; the process held up to {_told(held)}{asked}"

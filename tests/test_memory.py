@@ -33,6 +33,7 @@ def caused(error: Exception, cause: Exception) -> Exception:
         (MemoryError(), True, None),
         (RuntimeError(TORCH), True, 4096),
         (torch.OutOfMemoryError(CUDA), True, 3 << 29),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"), True, None),
         (RuntimeError("std::bad_alloc"), True, None),
         (opencv(-4), True, 2_700_000_000),
         (opencv(-215), False, 2_700_000_000),
@@ -98,6 +99,8 @@ def test_the_line_says_what_was_needed() -> None:
     line = str(shortage("training step 7", MemoryError("Unable to allocate 8.00 GiB for an array"), "do this"))
     assert line.startswith("training step 7: not enough memory; the process held up to ")
     assert " and wanted 8.00 GiB more" in line and line.endswith("; do this") and "\n" not in line
+    line = str(shortage("training step 7", torch.OutOfMemoryError(CUDA), "do this"))
+    assert line.endswith(", 1.50 GiB more were wanted (GPU 0 has a total capacity of 79 GiB of which 1 GiB is free); do this")
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError(TORCH), opencv(-4)])
