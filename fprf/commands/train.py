@@ -132,7 +132,7 @@ def train_scene(
         spent = time.perf_counter() - start
         folder.log({"part": "preparing", "seconds": round(spent, 3)})
         if view is None:
-            model = config.executor.build().map(train, [None])[0]
+            model = config.executor.on(prepare.device_of(config.device).type).build().map(train, [None])[0]
         else:  # here, where its parameters can be looked at
             model = build_model(config, prepared.facts).to(prepare.device_of(config.device))
             view.begin(output, model, config.device)

@@ -12,6 +12,7 @@ from fprf.engine import checkpoint
 from fprf.engine.run import Run
 from fprf.errors import UsageError
 from fprf.methods import fprf_lite
+from fprf.plugins.executors.config import SerialConfig
 
 
 def mistake(capsys: pytest.CaptureFixture[str], *args: str) -> str:
@@ -127,8 +128,13 @@ def test_where_runs_go(tmp_path: Path) -> None:
     assert default_output(replace(config, data=Path("/")), "m") == Path("runs/scene-m")
 
 
-def test_a_quiet_run_says_nothing(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_quiet_run_says_nothing(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(SerialConfig, "on", lambda self, device: asked.append(device) or self)
     assert train_scene(replace(world.config, output=tmp_path / "run", steps=1), "fprf-lite", quiet=True) == tmp_path / "run"
+    assert asked == ["cpu"], "executors are told where a scene is trained: Ray hides GPUs that nobody asks for"
     assert capsys.readouterr() == ("", "")
     with pytest.raises(UsageError, match="holds a run with another seed"):
         train_scene(replace(world.config, output=tmp_path / "run", seed=3), "fprf-lite", quiet=True)
