@@ -90,7 +90,9 @@ class StepStatistics:
             self._present.clear()
         given = tuple(values)
         if given not in self._present:
-            self._present[given] = self.rows.new_tensor([float(name in values) for name in self.names])
+            # Filled on the device: a term that comes every few steps must not have the host wait for a copy.
+            marks = [torch.full_like(self.none, float(name in values)) for name in self.names]
+            self._present[given] = torch.stack(marks).to(self.rows.dtype)
         found = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
         fit = torch.isfinite(found)
         means = SMOOTHING * self.rows[:2] + (1 - SMOOTHING) * torch.stack([found, self._present[given]])

@@ -17,7 +17,7 @@ from torch.profiler import record_function
 from ..config import TrainConfig
 from ..errors import NumericsError
 from ..interfaces import DataManager
-from ..memory import out_of_memory, shortage
+from ..memory import free_memory, out_of_memory, shortage
 from ..ops.precision import tf32
 from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
@@ -185,7 +185,8 @@ class Loop:
         self.extra = extra_term(config.loss)
         self.manager = prepared.manager
         if device.type != "cpu":
-            self.manager = prepared.manager.to(device, room=int(config.device_memory * _free(device)))
+            free = free_memory(device) if device.type == "cuda" else None
+            self.manager = prepared.manager.to(device, room=int(config.device_memory * (free or 0)))
         self.batches = Batches(self.manager, device)
         self.through = PixelRays(prepared.scene.cameras)
         if device.type != "mps":  # which has no float64: rays are made on the CPU
@@ -333,8 +334,3 @@ def _moved(batch: Batch, device: torch.device) -> Batch:
     if device.type == "mps":  # which has no float64
         batch = batch._replace(pixel=batch.pixel.float())
     return Batch._make(x if x is None else x.to(device, non_blocking=device.type == "cuda") for x in batch)
-
-
-def _free(device: torch.device) -> int:
-    """Bytes that a CUDA device has left."""
-    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else 0

@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import Altered, World, parameters, trained_for
 from torch import nn
 
@@ -222,3 +223,13 @@ def test_means_and_counts_are_those_of_a_plain_loop() -> None:
     assert statistics.means() == pytest.approx({name: value / seen[name] for name, value in mean.items()}, rel=1e-12)
     assert statistics.faults() == (12, 1, "b")
     assert statistics.faults() == (12, 1, "")
+
+
+def test_terms_that_come_every_few_steps_are_counted_without_a_copy() -> None:
+    with pretend_cuda() as seen:
+        statistics, one = StepStatistics(CUDA), torch.ones(()).to(CUDA)
+        before = seen.uploads.total(), seen.syncs.total()
+        for step in range(6):
+            statistics.add({"a": one, **({"b": one} if step % 2 else {}), **({"c": one} if step % 3 == 0 else {})})
+        assert (seen.uploads.total(), seen.syncs.total()) == before
+        assert statistics.means() == pytest.approx({"a": 1, "b": 1, "c": 1})
