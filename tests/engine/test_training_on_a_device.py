@@ -24,7 +24,7 @@ from fprf.engine import checkpoint, trainer
 from fprf.engine.block_task import BlockTask, train_block
 from fprf.engine.blocks import SURROUNDINGS
 from fprf.engine.loading import load_run
-from fprf.engine.model import build_model
+from fprf.engine.model import Model, build_model
 from fprf.engine.prepare import device_of, prepare
 from fprf.engine.run import Run
 from fprf.engine.style_pass import measure_style
@@ -204,13 +204,22 @@ def test_faults_that_go_on_lead_back_and_then_end_it(world: World, tmp_path: Pat
     assert checkpoint.steps(Run(folder).checkpoints) == [2]
 
 
-def test_gradients_that_are_too_large_are_found_on_the_device(world: World, tmp_path: Path) -> None:
+def test_gradients_that_are_too_large_are_found_on_the_device(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     reports: list[Report] = []
+    optimizer_of = trainer.optimizer_of
+
+    def spoilt_optimizer(config: TrainConfig, model: Model) -> torch.optim.Optimizer:
+        # Here, not before: on the pretended device `model.to` makes new parameters, without hooks.
+        model.learned()[1].register_hook(lambda gradient: torch.full_like(gradient, 3e38))
+        return optimizer_of(config, model)
+
+    monkeypatch.setattr(trainer, "optimizer_of", spoilt_optimizer)
     with pretend_cuda():
         config = replace(world.config, steps=2, device="cuda:0")
         prepared = prepare(config)
         model = build_model(config, prepared.facts).to(CUDA)
-        model.learned()[1].register_hook(lambda gradient: torch.full_like(gradient, 3e38))
         before = {name: value.clone() for name, value in model.state_dict().items()}
         train(config, prepared, Run(tmp_path), reports.append, model=model)
         assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
