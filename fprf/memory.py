@@ -16,7 +16,7 @@ from .errors import OutOfMemoryError
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["LEAST", "at_once", "free_memory", "in_parts", "out_of_memory", "peak", "shortage", "wanted"]
+__all__ = ["LEAST", "chunk_size", "free_memory", "in_parts", "out_of_memory", "peak", "shortage", "wanted"]
 
 LEAST = 1024
 """Rays below which parts are not halved: their share of the memory is small beside the model's."""
@@ -73,7 +73,7 @@ def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator
             start += size
 
 
-def at_once(size: int, device: "torch.device") -> int:
+def chunk_size(size: int, device: "torch.device") -> int:
     """Rays to render at a time: `size` on the CPU; on an accelerator as many as its memory has room for, but no fewer."""
     free = free_memory(device)
     return size if free is None else max(size, int(_SHARE * free) // _RAY)

@@ -113,7 +113,7 @@ def half_networks(model: Model) -> Iterator[None]:
     """Content, semantics and decoder in bfloat16; planes, density and compositing stay in float32. For `plainly` alone: kernels
     have one precision.
     """
-    device = next(model.parameters()).device.type
+    device = model.device.type
 
     def around(method: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any) -> Any:
@@ -164,7 +164,7 @@ def _fewer_channels(trained: Trained, styled: Styled, stylizer: StylizerConfig, 
     scene = styled.scene._replace(keys=styled.scene.keys[:, :channels], semantic_mean=styled.scene.semantic_mean[:channels])
     origin = None if styled.dictionary.origin is None else styled.dictionary.origin[:channels]
     dictionary = styled.dictionary._replace(keys=styled.dictionary.keys[:, :channels], origin=origin)
-    device = next(trained.model.parameters()).device
+    device = trained.model.device
     built = stylizer.build(dictionary=dictionary, scene=scene).to(device)
     model = Model(parts._replace(semantic=_Leading(parts.semantic, channels))).eval()
     look = replace(styled.restyle, stylizer=built)

@@ -12,7 +12,7 @@ from ..errors import FprfError
 from .config import MemoryConfig
 from .memory_part import PARTS
 from .report import Outcome, Row, document, rows_table
-from .subject import attempt, device_of, find, fresh_model, settings
+from .subject import attempt, find, fresh_model, settings
 
 __all__ = ["memory", "mib"]
 
@@ -53,7 +53,7 @@ def memory(config: MemoryConfig, root: Path, folder: Path, progress: Callable[[i
     learned = sum(p.numel() * p.element_size() for p in model.learned())
     rows.append(Row(name="gradients and moments while training", figure=3 * learned / 2**20, unit="MiB"))
     about = settings(config, trained, missing) | {"views": len(trained.known.names), "rays": config.rays}
-    made = document("memory", rows, device=device_of(trained), settings=about)
+    made = document("memory", rows, device=trained.model.device, settings=about)
     return Outcome(made, [rows_table("memory", rows)])
 
 

@@ -41,7 +41,7 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
     """Most device memory in MiB, where the device has its own."""
     import torch
 
-    from .subject import device_of, find, fresh_model, test_view
+    from .subject import find, fresh_model, test_view
     from .training import loop_of
 
     if part == "import":
@@ -69,7 +69,7 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
             loop = loop_of(trained.config, prepared, fresh_model(trained))
             for step in range(STEPS):
                 loop.step(trained.step + step, 0.5)
-    device = device_of(trained)
+    device = trained.model.device
     return torch.cuda.max_memory_allocated(device) / 2**20 if device.type == "cuda" else None
 
 

@@ -26,7 +26,7 @@ from .knobs import BUDGETS, as_rendered, plain_settings, styled_settings
 from .plot import Panel, draw
 from .points import Scenes, measure
 from .report import Outcome, document, table
-from .subject import Subject, device_of, find, settings, size_of, small_view, watch_of
+from .subject import Subject, find, settings, size_of, small_view, watch_of
 from .timing import Watch
 from .train_knobs import trained_points
 from .views import count, exact, view_rays
@@ -127,7 +127,7 @@ def _outcome(
         "fronts": fronts,
         "counters_by_budget": counters,
     }
-    made = document("pareto", [], device=device_of(trained), settings=about, extra=extra)
+    made = document("pareto", [], device=trained.model.device, settings=about, extra=extra)
     plot = config.plot or (config.output.with_suffix(".png") if config.output is not None else None)
     if plot is not None:
         write_image(plot, draw(panels))

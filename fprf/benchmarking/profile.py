@@ -23,7 +23,7 @@ from ..types import Rays, Want
 from .config import ProfileConfig
 from .labels import PREFIX, REST, Range, attribute, exclusive, labelled
 from .report import Outcome, document, table
-from .subject import attempt, device_of, find, fresh_model, settings, test_view, watch_of
+from .subject import attempt, find, fresh_model, settings, test_view, watch_of
 from .timing import Spread, Watch
 from .training import loop_of, stepper
 from .views import view_rays
@@ -52,7 +52,7 @@ class Parts(NamedTuple):
 def profile(config: ProfileConfig, root: Path, folder: Path, progress: Progress) -> Outcome:
     """A training step, a plain chunk and a restyled one."""
     subject = find(root, config, folder)
-    trained, device = subject.trained, device_of(subject.trained)
+    trained, device = subject.trained, subject.trained.model.device
     watch = watch_of(config, trained)
     found: dict[str, Parts] = {}
     progress(0, 3, "training")

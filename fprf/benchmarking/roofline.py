@@ -15,7 +15,7 @@ from ..engine.loading import Trained
 from ..ops import triplane
 from .config import SpeedConfig
 from .report import Row
-from .subject import device_of, watch_of
+from .subject import watch_of
 from .timing import Watch, spread
 from .triplane import draw_points, largest_planes
 
@@ -29,7 +29,7 @@ GOAL = 50.0
 
 def roofline_rows(config: SpeedConfig, trained: Trained) -> list[Row]:
     """Percent of the memory's speed, forward and backward."""
-    planes, device, watch = largest_planes(trained.model), device_of(trained), watch_of(config, trained)
+    planes, device, watch = largest_planes(trained.model), trained.model.device, watch_of(config, trained)
     if planes is None:
         return []
     points, resolutions = draw_points(config.points, config.seed, device), planes.resolutions

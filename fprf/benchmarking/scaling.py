@@ -15,7 +15,7 @@ from ..output.figures import number
 from ..plugins.stylizers.config import RegionOtConfig
 from .config import ScalingConfig
 from .report import Outcome, document, table
-from .subject import Subject, attempt, device_of, find, settings, test_view, watch_of
+from .subject import Subject, attempt, find, settings, test_view, watch_of
 from .timing import Spread, spread
 from .triplane import draw_points, forward_backward, largest_planes
 
@@ -63,7 +63,7 @@ def scaling(config: ScalingConfig, root: Path, folder: Path, progress: Progress)
     found += _points(config, subject)
     progress(4, 4, "done")
     extra = {"series": [series.json() for series in found]}
-    made = document("scaling", [], device=device_of(trained), settings=settings(config, trained, missing), extra=extra)
+    made = document("scaling", [], device=trained.model.device, settings=settings(config, trained, missing), extra=extra)
     return Outcome(made, [table("cost against size", ("", "size", "ms", "ms each", "grows as"), _cells(found))])
 
 
@@ -131,7 +131,7 @@ def _references(config: ScalingConfig, subject: Subject) -> list[Series]:
 
 
 def _points(config: ScalingConfig, subject: Subject) -> list[Series]:
-    planes, device = largest_planes(subject.trained.model), device_of(subject.trained)
+    planes, device = largest_planes(subject.trained.model), subject.trained.model.device
     if planes is None:
         return []
     table, resolutions = planes.table.detach().clone(), planes.resolutions

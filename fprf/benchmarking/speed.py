@@ -21,7 +21,7 @@ from .naive import plain_planes, without_skipping
 from .report import Outcome, Row, document, rows_table
 from .reuse import cached_rows, folding_rows
 from .roofline import roofline_rows
-from .subject import Subject, attempt, device_of, find, fresh_model, settings, size_of, test_view, watch_of
+from .subject import Subject, attempt, find, fresh_model, settings, size_of, test_view, watch_of
 from .timing import ratio, spread
 from .training import batch_rays, colour_gradient, loop_of, stepper
 from .triplane import triplane_rows
@@ -60,7 +60,7 @@ def speed(config: SpeedConfig, root: Path, folder: Path, progress: Progress) -> 
     progress(5, 5, "done")
     trained = subject.trained
     about = settings(config, trained, missing) | {"view": size_of(test_view(config, trained)), "points": config.points}
-    made = document("speed", rows, device=device_of(trained), settings=about, extra={"counters": counters})
+    made = document("speed", rows, device=trained.model.device, settings=about, extra={"counters": counters})
     return Outcome(made, [rows_table("speed, beside the naive path", rows)])
 
 

@@ -8,7 +8,7 @@ from ..stress import files, pipeline, rays, styles
 from ..stress.check import Check, markdown
 from .config import StressConfig
 from .report import Outcome, machine, table
-from .subject import attempt, device_of, find, settings, test_view
+from .subject import attempt, find, settings, test_view
 
 __all__ = ["stress"]
 
@@ -42,7 +42,7 @@ def stress(config: StressConfig, root: Path, folder: Path, progress: Progress) -
     document = {
         "benchmark": "stress",
         "settings": settings(config, trained, missing),
-        "machine": machine(device_of(trained)),
+        "machine": machine(trained.model.device),
         "rows": [check.json() for check in checks],
         "falls_short": [f"{check.stage}: {check.input}" for check in broken],
     }

@@ -26,7 +26,6 @@ __all__ = [
     "LOOKS",
     "Subject",
     "attempt",
-    "device_of",
     "find",
     "fresh_model",
     "settings",
@@ -83,17 +82,12 @@ def fresh_model(trained: Trained) -> Model:
     """A copy of the run's model that may be trained."""
     model = build_model(trained.config, trained.known.facts)
     model.load_state_dict(trained.model.state_dict())
-    return model.to(device_of(trained))
-
-
-def device_of(trained: Trained) -> torch.device:
-    """Where the run's model lies."""
-    return next(trained.model.parameters()).device
+    return model.to(trained.model.device)
 
 
 def watch_of(config: BenchConfig, trained: Trained) -> Watch:
     """How times of this run are taken."""
-    return Watch(config.repeats, device_of(trained), config.clock)
+    return Watch(config.repeats, trained.model.device, config.clock)
 
 
 def settings(config: BenchConfig, trained: Trained, missing: str) -> dict[str, object]:

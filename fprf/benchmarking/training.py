@@ -21,7 +21,7 @@ SHARE = 0.5
 
 def loop_of(config: TrainConfig, prepared: Prepared, model: Model) -> Loop:
     """The trainer's own loop around a model."""
-    device = next(model.parameters()).device
+    device = model.device
     return Loop(config, prepared, model, optimizer_of(config, model), device)
 
 
@@ -60,4 +60,4 @@ def colour_gradient(model: Model, prepared: Prepared, config: TrainConfig, batch
 def batch_rays(model: Model, prepared: Prepared, batch: Batch) -> Rays:
     """Rays of a batch, on the model's device."""
     rays = model.space.rays(*PixelRays(prepared.scene.cameras)(batch.view.cpu(), batch.pixel.cpu()))
-    return Rays(*(x.to(next(model.parameters()).device) for x in rays))
+    return Rays(*(x.to(model.device) for x in rays))

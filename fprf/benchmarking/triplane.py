@@ -12,7 +12,7 @@ from ..ops import triplane
 from .config import SpeedConfig
 from .naive import grid_sample_lookup
 from .report import Row
-from .subject import device_of, watch_of
+from .subject import watch_of
 from .timing import ratio, spread
 
 __all__ = ["Lookup", "draw_points", "forward_backward", "largest_planes", "triplane_rows"]
@@ -29,7 +29,7 @@ GOAL = 8.0
 
 def triplane_rows(config: SpeedConfig, trained: Trained) -> list[Row]:
     """Milliseconds of forward and backward together, on the largest planes of the model."""
-    planes, device = largest_planes(trained.model), device_of(trained)
+    planes, device = largest_planes(trained.model), trained.model.device
     if planes is None:
         return []
     points = draw_points(config.points, config.seed, device)

@@ -56,7 +56,7 @@ def view_rays(model: Model, cameras: Cameras, view: int) -> Rays:
     """Rays of all pixels, on the model's device."""
     pixel = pixel_grid(cameras, view)
     rays = model.space.rays(*rays_through(cameras, torch.full((len(pixel),), view), pixel))
-    return _to(rays, next(model.parameters()).device)
+    return _to(rays, model.device)
 
 
 @torch.inference_mode()

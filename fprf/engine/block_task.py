@@ -23,7 +23,7 @@ from .checkpoint import reached
 from .lay_out import RAYS, asked_of, load_boxes
 from .lock import held
 from .model import Facts, Model
-from .prepare import Prepared, cache_folder, encoders_of
+from .prepare import Prepared, build_encoders, cache_folder
 from .run import Run
 from .trainer import Report, train
 
@@ -119,7 +119,7 @@ def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: 
         width, height = scene.cameras.size[view].tolist()
         return pixel_mask(rays["seen"][slots[view]].bool(), (width, height))
 
-    content, semantic = encoders_of(config)
+    content, semantic = build_encoders(config)
     return config.datamanager.build(
         scene=scene,
         content=content,

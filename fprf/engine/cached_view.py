@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..interfaces import Decoder
-from ..memory import at_once, in_parts
+from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Restyle, composite, march
 from ..types import Rays, Want
@@ -103,7 +103,7 @@ class CachedView:
 
 
 def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:
-    """Render everything but a style, in chunks of rays (see `memory.at_once`)."""
+    """Render everything but a style, in chunks of rays (see `memory.chunk_size`)."""
     width, height = (int(v) for v in cameras.size[view])
     return CachedView(model.decoder, tuple(view_parts(model, facts, cameras, view, config)), (height, width))
 
@@ -128,4 +128,4 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
         samples, tone = marched.weights.numel(), config.tone or (1.0, 1.0, 1.0)
         return Part(bare, content, semantic, behind, len(chunk.near), depth, opacity, samples, tone)
 
-    yield from in_parts(len(rays.near), at_once(config.chunk, rays.near.device), part)
+    yield from in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), part)

@@ -72,7 +72,7 @@ def explain(trained: Trained, regions: Regions, styled: Styled | None = None) ->
         found.append(Region(k, float(regions.scene.share[k]), names[view], pixel, highlight(colour, share[..., k])))
     if styled is None:
         return found
-    device = next(trained.model.parameters()).device
+    device = trained.model.device
     attention = styled.restyle.stylizer.match(regions.scene.keys.to(device)).cpu().double()
     return [_matched(region, styled, attention[region.number]) for region in found]
 

@@ -44,7 +44,7 @@ def folded(model: Model, styled: Styled, config: StylizerConfig) -> Folded | Non
         return None
     # Softmax does not see what is subtracted from all keys; the smaller numbers round less.
     directions = (dictionary.keys - share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))).T
-    device = next(model.parameters()).device
+    device = model.device
     field = model.semantic.projected(directions.to(device))
     if field is None:
         return None

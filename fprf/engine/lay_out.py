@@ -31,7 +31,7 @@ from . import tensorfiles
 from .blocks import SURROUNDINGS, folder_of
 from .decoder import build_decoder
 from .model import Facts
-from .prepare import behind, cache_folder, encoders_of, facts_of
+from .prepare import behind, build_encoders, cache_folder, facts_of
 from .renumber import renumber, trained_tasks
 from .run import Run
 
@@ -75,7 +75,7 @@ def plan_scene(config: TrainConfig) -> tuple[Scene, Plan]:
 
 def lay_out(config: TrainConfig, scene: Scene, plan: Plan, progress: Callable[[int, int, str], None] | None = None) -> Laid:
     """Extract the features of all training views. `progress(done, total, what)` is told of them."""
-    content, semantic = encoders_of(config)
+    content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
 

@@ -58,7 +58,7 @@ class MatchMap(NamedTuple):
 def match_map(trained: Trained, styled: Styled, view: int) -> MatchMap:
     """Matches of a view: geometry and semantics alone are computed."""
     cameras, scene, look = trained.known.cameras, styled.scene, styled.restyle
-    device = next(trained.model.parameters()).device
+    device = trained.model.device
     belongs = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
     centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 

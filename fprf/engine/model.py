@@ -65,6 +65,11 @@ class Model(nn.Module):
         """For the renderer."""
         return Parts(self.space, self.sampler, self.field, self.semantic, self.decoder)
 
+    @property
+    def device(self) -> torch.device:
+        """The device of all parameters."""
+        return next(self.parameters()).device
+
     def learned(self) -> list[nn.Parameter]:
         """Parameters that training moves, in a fixed order: everything but what decoders bring frozen."""
         return [p for p in self.parameters() if p.requires_grad]

@@ -22,7 +22,7 @@ from .decoder import build_decoder
 from .model import Facts
 from .tones import relative
 
-__all__ = ["Prepared", "behind", "cache_folder", "device_of", "encoders_of", "facts_of", "prepare", "reach_of"]
+__all__ = ["Prepared", "behind", "build_encoders", "cache_folder", "device_of", "facts_of", "prepare", "reach_of"]
 
 
 class Prepared(NamedTuple):
@@ -60,7 +60,7 @@ def prepare(
     """Everything but the model. `progress(done, total, what)` is told of the features; `look` may refuse the scene before."""
     scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
     look(scene)
-    content, semantic = encoders_of(config)
+    content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     manager = config.datamanager.build(
         scene=scene,
@@ -77,7 +77,7 @@ def prepare(
     return Prepared(scene, manager, facts, semantic_store.basis if semantic_store is not None else None)
 
 
-def encoders_of(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
+def build_encoders(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
     """The content encoder and the semantic one, if there is one, on the device of the config."""
     device = device_of(config.device)
     semantic = config.semantic.encoder

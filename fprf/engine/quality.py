@@ -133,7 +133,7 @@ def _resampled(trained: "Trained", samples: float) -> "Trained":
     if trained.known.facts.space.kind == "open":  # what proposes lies in the blocks
         assert isinstance(old, BlockedSampler)
         routed = BlockedSampler(sampler, old.members, old.router).requires_grad_(False)
-        parts = trained.model.parts._replace(sampler=routed.to(next(trained.model.parameters()).device))
+        parts = trained.model.parts._replace(sampler=routed.to(trained.model.device))
         model = Model(parts, trained.model.tones)
         return trained._replace(config=replace(trained.config, sampler=scaled), model=model.eval())
     state, own = old.state_dict(), sampler.state_dict()
@@ -141,6 +141,6 @@ def _resampled(trained: "Trained", samples: float) -> "Trained":
         raise UsageError("samples: this run's sampler has learnt for its own number of samples; leave --samples at 1")
     sampler.load_state_dict(state)
     sampler.requires_grad_(False)
-    parts = trained.model.parts._replace(sampler=sampler.to(next(trained.model.parameters()).device))
+    parts = trained.model.parts._replace(sampler=sampler.to(trained.model.device))
     model = Model(parts, trained.model.tones)
     return trained._replace(config=replace(trained.config, sampler=scaled), model=model.eval())

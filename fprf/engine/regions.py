@@ -105,7 +105,7 @@ def shrunk(cameras: Cameras, view: int, size: int) -> Cameras:
 
 def _membership(regions: Regions, cameras: Cameras, view: int, pixel: Tensor) -> tuple[Tensor, Tensor]:
     model, config = regions.trained.model, regions.trained.config.render
-    weight = RegionWeight(regions.scene, torch.eye(len(regions.scene.share))).to(next(model.parameters()).device)
+    weight = RegionWeight(regions.scene, torch.eye(len(regions.scene.share))).to(model.device)
     return paint_pixels(model, cameras, view, pixel, config, weight, semantic=weight.divided)
 
 

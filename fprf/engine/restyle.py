@@ -91,7 +91,7 @@ def encoders_of(trained: Trained, scene: SceneStyle, basis: Basis | None) -> Enc
                 f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
                 "use the same weights, or train the scene again"
             )
-    device = next(trained.model.parameters()).device
+    device = trained.model.device
     return Encoders(content.to(device), None if semantic is None else semantic.to(device), basis, scene, device)
 
 
@@ -132,7 +132,7 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
     stylizer = regional(dictionary, scene, orders.allowed, chosen)
     partly = bool((orders.strength != 1).any())
     check_stylizer(chosen, stylizer, dictionary, scene)
-    device = next(trained.model.parameters()).device
+    device = trained.model.device
     stylizer = stylizer.to(device)
     colours = colour_maps(stylizer, dictionary, scene, trained.model.decoder, features=chosen.features, share=chosen.colours)
     mine = Restyle(

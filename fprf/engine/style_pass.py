@@ -45,7 +45,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
     `cameras` are the capture's; the model's own poses, if it has any, are taken into account here.
     """
     cameras = refined(model.poses, cameras)
-    device = next(model.parameters()).device
+    device = model.device
     view, pixel = lattice(cameras, views, config.statistics.rays)
     whole = None
 

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..interfaces import Stylizer
-from ..memory import at_once, in_parts
-from ..ops.precision import wide_device
+from ..memory import chunk_size, in_parts
+from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.pixel_rays import grid_rays
 from ..rendering.renderer import Restyle, composite, march, render_rays
@@ -38,8 +38,8 @@ def view_rays(
 
     The latter are float64: on the CPU where the device has none.
     """
-    device = next(model.parameters()).device
-    wide = wide_device(device)
+    device = model.device
+    wide = float64_device(device)
     if pixel is None:
         origin, direction = grid_rays(cameras, view, wide)
     else:
@@ -66,7 +66,7 @@ def render_view(
     restyle: Restyle | None = None,
     factor: Annotated[Tensor, "3"] | None = None,
 ) -> View:
-    """Colour and depth of one view, in chunks of rays (see `memory.at_once`) and in one copy to the host.
+    """Colour and depth of one view, in chunks of rays (see `memory.chunk_size`) and in one copy to the host.
 
     Below `config.resolution` 1 fewer rays are rendered, and what lies between is interpolated.
 
@@ -101,7 +101,7 @@ def _rendered(
         part = Rays(*(x[here] for x in rays))
         return render_rays(part, model.parts, want=Want.COLOUR, budget=config.budget, background=background, restyle=restyle)
 
-    for out in in_parts(len(rays.near), at_once(config.chunk, rays.near.device), render):
+    for out in in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), render):
         assert out.rgb is not None
         rgb.append(out.rgb)
         depth.append(out.depth)
@@ -161,6 +161,6 @@ def paint_pixels(
         mass = composite(kept, torch.ones_like(kept.weight)[:, None], len(chunk.near))
         return composite(kept, found, len(chunk.near)) / mass.clamp_min(1e-10), marched.opacity
 
-    painted, opacity = zip(*in_parts(len(rays.near), at_once(config.chunk, rays.near.device), paint), strict=True)
+    painted, opacity = zip(*in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), paint), strict=True)
     shown, seen = on_host(torch.cat(painted), torch.cat(opacity))
     return shown, seen

@@ -78,7 +78,7 @@ def align_view(
 ) -> Annotated[Tensor, "6"]:
     """Turn and shift (world units), float64, that bring the render of a view nearest to its image, `where` that counts."""
     model, facts = trained.model, trained.known.facts
-    device = next(model.parameters()).device
+    device = model.device
     through, background = PixelRays(cameras.select(torch.tensor([view]))), background_of(facts, device)
     tones = model.tones
     factor = torch.ones(3) if tones is None else tones(torch.tensor([view]))[0].detach().cpu()

@@ -9,7 +9,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..engine.model import Facts, Model, background_of
 from ..engine.views import on_host
-from ..memory import at_once, in_parts
+from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import composite, march
 from ..style.look import Restyle
@@ -25,7 +25,7 @@ def render_looks(
     """A picture for each look (None: unstylised), in [0, 1], and the depth in world units: what `render_view` gives."""
     pixel = pixel_grid(cameras, view)
     origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
-    device = next(model.parameters()).device
+    device = model.device
     rays = Rays(*(x.to(device) for x in model.space.rays(origin, direction)))
     background = background_of(facts, device)
     asks = any(look is not None and Want.SEMANTIC in look.needs for look in looks.values())
@@ -42,7 +42,7 @@ def render_looks(
             pictures[name] = rgb if background is None else rgb + marched.through[:, None] * background
         return pictures, marched.depth
 
-    found = list(in_parts(len(pixel), at_once(config.chunk, device), shown))
+    found = list(in_parts(len(pixel), chunk_size(config.chunk, device), shown))
     width, height = (int(side) for side in cameras.size[view])
     *colours, depth = on_host(
         *(torch.cat([part[name] for part, _ in found]) for name in looks), torch.cat([d for _, d in found])

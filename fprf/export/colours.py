@@ -13,7 +13,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..engine.model import Facts, Model, background_of
 from ..engine.views import on_host
-from ..memory import at_once
+from ..memory import chunk_size
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Parts, Restyle, composite, march
 from ..types import Rays, Want
@@ -67,7 +67,7 @@ def seen_colours(
     light, share = torch.zeros(len(points)), torch.zeros(len(points))
     total = int((seen.weight > 0).sum())
     done = 0
-    size = at_once(config.chunk, next(model.parameters()).device)
+    size = chunk_size(config.chunk, model.device)
     for rank in range(seen.view.shape[1]):
         for part in torch.split((seen.weight[:, rank] > 0).nonzero()[:, 0], size):
             report(done, total)
@@ -99,7 +99,7 @@ def _looked(
     tolerance: float | None,
 ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
     """Composited colours of all styles side by side, and opacities, of rays from views to points."""
-    device = next(model.parameters()).device
+    device = model.device
     origin = cameras.pose[view, :, 3]
     distance = torch.linalg.vector_norm(points - origin, dim=-1)
     direction = (points - origin) / distance[:, None]

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..engine.model import Model
 from ..engine.views import on_host
-from ..memory import at_once, in_parts
+from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import march
 from ..rendering.space import Space
@@ -81,7 +81,7 @@ def half_way(
 
 
 def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reach: float) -> Annotated[Tensor, "H W"]:
-    device = next(model.parameters()).device
+    device = model.device
     pixel = pixel_grid(cameras, view)
     origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
     rays = model.space.rays(origin, direction)
@@ -90,7 +90,7 @@ def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reac
         marched = march(Rays(*(x[here].to(device) for x in rays)), model.parts, budget=config.budget)
         return half_way(marched.weights, marched.sampled.t, 0.5 * marched.opacity), marched.opacity
 
-    parts = zip(*in_parts(len(pixel), at_once(config.chunk, device), met), strict=True)
+    parts = zip(*in_parts(len(pixel), chunk_size(config.chunk, device), met), strict=True)
     t, opacity = on_host(*(torch.cat(part) for part in parts))
     depth = model.space.metric(origin, direction, t).float()
     seen = (opacity > _SOLID) & (depth < reach) & (depth > 0)

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..engine.model import Model
 from ..engine.style_pass import lattice
-from ..memory import at_once
+from ..memory import chunk_size
 from ..output.atomic import write_text
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import Restyle, composite, march
@@ -50,12 +50,12 @@ def look_pairs(
     rays: int = RAYS,
 ) -> Pairs:
     """Pixels spread evenly over the views, without any background."""
-    device = next(model.parameters()).device
+    device = model.device
     weight = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
     view, pixel = lattice(cameras, torch.tensor(list(views)), rays)
     every = model.space.rays(*rays_through(cameras, view, pixel))
     found = []
-    size = at_once(config.chunk, device)
+    size = chunk_size(config.chunk, device)
     for start in range(0, len(view), size):
         part = Rays(*(x[start : start + size].to(device) for x in every))
         kept = march(part, model.parts, budget=config.budget).kept

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ..checks import at_least
 from ..errors import DataError
-from .precision import full_precision, wide_device
+from .precision import float64_device, full_precision
 
 __all__ = ["Packed", "apply", "apply_packed", "coefficients", "upsample"]
 
@@ -73,7 +73,7 @@ def coefficients(
     y = _axis(height, features.shape[1], radius, stride, fineness)
     x = _axis(width, features.shape[2], radius, stride, fineness)
 
-    wide = wide_device(features.device)
+    wide = float64_device(features.device)
     y, x = (_Axis(*(operator.to(wide) for operator in axis)) for axis in (y, x))
     pixels = guide.detach().to(device=wide, dtype=torch.float64).permute(2, 0, 1)
     colour = pixels.mean((1, 2), keepdim=True)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-__all__ = ["double", "full_precision", "tf32", "wide_device"]
+__all__ = ["double", "float64_device", "full_precision", "tf32"]
 
 
 def full_precision(x: Tensor) -> torch.autocast:
@@ -30,9 +30,9 @@ def tf32(enabled: bool) -> Iterator[None]:
 
 def double(x: Tensor) -> Tensor:
     """The tensor in float64; on a device that has none (MPS), on the CPU."""
-    return x.to(device=wide_device(x.device), dtype=torch.float64)
+    return x.to(device=float64_device(x.device), dtype=torch.float64)
 
 
-def wide_device(device: torch.device) -> torch.device:
+def float64_device(device: torch.device) -> torch.device:
     """The device, or the CPU where that one has no float64."""
     return torch.device("cpu") if device.type == "mps" else device

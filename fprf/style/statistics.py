@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import NumericsError
-from ..ops.precision import double, wide_device
+from ..ops.precision import double, float64_device
 
 __all__ = ["Moments", "covariance", "dead_channels", "deviation", "double", "empty", "group_moments", "merge", "mix", "moments"]
 
@@ -44,7 +44,7 @@ def moments(features: Annotated[Tensor, "N C"], weights: Annotated[Tensor, "N"])
 
     Raises NumericsError where a row that counts, or a weight, is not finite.
     """
-    total = empty(features.shape[1], device=wide_device(features.device))
+    total = empty(features.shape[1], device=float64_device(features.device))
     for rows, mass in _chunks(features, weights):
         weight = mass.sum()
         mean = mass @ rows / weight

@@ -114,7 +114,7 @@ class Studio:
         width, height = cameras.size[0].tolist()
         if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
             raise UsageError(f"pixel {pixel[0]:.0f},{pixel[1]:.0f}: outside of the view of {width}x{height}")
-        weight = RegionWeight(self.encoders.scene, torch.eye(self.regions)).to(next(self.trained.model.parameters()).device)
+        weight = RegionWeight(self.encoders.scene, torch.eye(self.regions)).to(self.trained.model.device)
         place = torch.tensor([pixel], dtype=torch.float64)
         config = self.trained.config.render
         share, opacity = paint_pixels(self.trained.model, cameras, 0, place, config, weight, semantic=weight.divided)
@@ -125,7 +125,7 @@ class Studio:
         scene, styled = self.encoders.scene, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:
-            device = next(self.trained.model.parameters()).device
+            device = self.trained.model.device
             attention = styled.restyle.match(scene.keys[region : region + 1].to(device))[0].cpu()
             shares = torch.zeros(len(styled.codes.names)).index_add_(0, styled.codes.reference, attention.float())
             taken = sorted(zip(names_of(look), shares.tolist(), strict=True), key=lambda row: -row[1])

@@ -23,7 +23,7 @@ from fprf.engine.quality import QualityConfig, at_quality
 from fprf.engine.restyle import Encoders, dress, encode_photograph, open_encoders
 from fprf.engine.tones import Tones
 from fprf.engine.views import render_view
-from fprf.memory import at_once, free_memory
+from fprf.memory import chunk_size, free_memory
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import (
     AdainConfig,
@@ -157,12 +157,12 @@ def test_learnt_poses_and_tones(world: World) -> None:
 
 
 def test_chunks_follow_the_memory_of_an_accelerator_alone() -> None:
-    assert at_once(8192, torch.device("cpu")) == 8192 and free_memory(torch.device("cpu")) is None
+    assert chunk_size(8192, torch.device("cpu")) == 8192 and free_memory(torch.device("cpu")) is None
     with pretend_cuda(memory=24 << 30):
         assert free_memory(CUDA) == 24 << 30
-        assert at_once(8192, CUDA) == (12 << 30) // (192 << 10)
+        assert chunk_size(8192, CUDA) == (12 << 30) // (192 << 10)
     with pretend_cuda(memory=1 << 20):
-        assert at_once(8192, CUDA) == 8192, "what does not fit is halved when it is met"
+        assert chunk_size(8192, CUDA) == 8192, "what does not fit is halved when it is met"
 
 
 def test_rays_are_made_on_the_device(world: World) -> None:
