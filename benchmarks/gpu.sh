@@ -47,7 +47,7 @@ if [ "$dry" = 1 ]; then
         --datamanager.parser.height 36)
     time=(--steps 20) again=(--steps 40)
     size=(--rays 500 --repeats 2) points=(--points 2000)
-    tests+=(-k "pretended and views" "$root/tests/device")
+    tests+=(-k "pretended and views" "$root/tests/test_gpu.py")
     [ "$long" = 0 ] || long=40
     export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 else
@@ -60,7 +60,7 @@ else
     data=(--data "$scene" --datamanager.parser llff --datamanager.parser.images "$images")
     time=(--minutes "$minutes") again=(--steps "$long")
     size=(--rays 762048 --repeats 5) points=(--points 262144)
-    tests+=(-k "not pretended" "$root/tests/device" "$root/tests/ops/test_triplane_triton.py")
+    tests+=(-k "not pretended" "$root/tests/test_gpu.py" "$root/tests/ops/test_triplane_triton.py")
     case " $* " in *" --semantic.encoder "*) ;; *) set -- --semantic.encoder bundled-semantic "$@" ;; esac
 fi
 

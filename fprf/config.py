@@ -16,6 +16,7 @@ from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
 
 __all__ = [
+    "RESUMABLE",
     "ContentConfig",
     "IncompleteConfig",
     "LossConfig",
@@ -246,6 +247,10 @@ class TrainConfig:
         positive("checkpoint_minutes", self.checkpoint_minutes)
         between("device_memory", self.device_memory, 0.0, 1.0)
         between("poses", self.poses, 0.0, 1.0)
+
+
+RESUMABLE = ("steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes")
+"""Fields of a `TrainConfig` that may differ when a run is resumed."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,10 +6,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_cuda import pretend_cuda
 
 from fprf import cli
 from fprf.errors import OutOfMemoryError
-from fprf.memory import LEAST, in_parts, out_of_memory, shortage, wanted
+from fprf.memory import LEAST, chunk_size, free_memory, in_parts, out_of_memory, shortage, wanted
 
 TORCH = "[enforce fail at alloc_cpu.cpp:127] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 4096 bytes."
 CUDA = "CUDA out of memory. Tried to allocate 1.50 GiB. GPU 0 has a total capacity of 79 GiB of which 1 GiB is free."
@@ -114,3 +115,13 @@ def test_the_command_line_ends_with_one_line_and_2(
     assert cli.main(["plugins"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: fprf: not enough memory")
+
+
+def test_chunks_follow_the_memory_of_an_accelerator_alone() -> None:
+    cpu, cuda = torch.device("cpu"), torch.device("cuda:0")
+    assert chunk_size(8192, cpu) == 8192 and free_memory(cpu) is None
+    with pretend_cuda(memory=24 << 30):
+        assert free_memory(cuda) == 24 << 30
+        assert chunk_size(8192, cuda) == (12 << 30) // (192 << 10)
+    with pretend_cuda(memory=1 << 20):
+        assert chunk_size(8192, cuda) == 8192, "too large a chunk is halved when memory is short"

@@ -1,8 +1,10 @@
 """A town of ten pictures of 32 x 24 pixels and a model of a few thousand numbers, trained for 15 steps: made once a session."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +25,22 @@ from fprf.rendering.pixel_rays import PixelRays
 from fprf.town.write import write_town
 from fprf.types import Batch, Rays
 
-__all__ = ["Altered", "World", "flags", "make_world", "parameters", "rays_of", "trained_for"]
+__all__ = [
+    "Altered",
+    "Change",
+    "World",
+    "events",
+    "flags",
+    "make_world",
+    "parameters",
+    "rays_of",
+    "spoilt",
+    "stopping",
+    "trained_for",
+]
+
+Change = Callable[[int, Batch], Batch]
+"""Step and batch to the batch that is trained on."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +59,36 @@ class World:
 
 
 class Altered(DataManager):
-    """A data manager whose batches somebody meddles with."""
+    """A data manager with changed batches."""
 
-    def __init__(self, inner: DataManager, change: Callable[[int, Batch], Batch]) -> None:
+    def __init__(self, inner: DataManager, change: Change) -> None:
         self.inner, self.change = inner, change
         self.content_store, self.semantic_store = inner.content_store, inner.semantic_store
 
     def batch(self, step: int) -> Batch:
         return self.change(step, self.inner.batch(step))
 
+    def to(self, device: torch.device, *, room: int) -> DataManager:
+        return Altered(self.inner.to(device, room=room), self.change)
+
     def image(self, view: int) -> torch.Tensor:
         return self.inner.image(view)
+
+
+def spoilt(value: float, *steps: int) -> Change:
+    """Colours of some steps are all this value."""
+    return lambda step, batch: batch._replace(rgb=torch.full_like(batch.rgb, value)) if step in steps else batch
+
+
+def stopping(at: int) -> Change:
+    """An interrupt in a step."""
+
+    def change(step: int, batch: Batch) -> Batch:
+        if step == at:
+            raise KeyboardInterrupt
+        return batch
+
+    return change
 
 
 def tiny(data: Path, output: Path) -> TrainConfig:
@@ -102,7 +138,7 @@ def trained_for(
     folder: Path,
     config: TrainConfig,
     *,
-    change: Callable[[int, Batch], Batch] | None = None,
+    change: Change | None = None,
     report: Callable[[Report], None] = lambda event: None,
 ) -> Run:
     """Train in a folder without preparing anything anew."""
@@ -122,6 +158,12 @@ def parameters(run: Run, step: int) -> dict[str, torch.Tensor]:
     saved = load(run.checkpoints, step)
     named = {**{f"model.{k}": v for k, v in saved.model.items()}, **{f"adam.{k}": v for k, v in saved.optimizer.items()}}
     return {name: tensor.clone() for name, tensor in named.items()}  # else they are maps of files that tests spoil
+
+
+def events(run: Run, key: str) -> list[dict[str, Any]]:
+    """The logged events that have a key."""
+    lines = (run.root / "events.jsonl").read_text().splitlines()
+    return [event for event in map(json.loads, lines) if key in event]
 
 
 def rays_of(world: World, trained: Trained, batch: Batch) -> Rays:

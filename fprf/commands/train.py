@@ -165,10 +165,11 @@ def _check_same(folder: "Run", config: "TrainConfig") -> None:
     """
     if not folder.exists:
         return
+    from ..config import RESUMABLE
+    from ..engine.lay_out import FREE
+
     old, _ = folder.load_config()
-    free = {"steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes"}
-    if old.blocks.cuts and config.blocks.cuts:
-        free |= {"blocks", "executor", "statistics", "render"}
+    free = FREE if old.blocks.cuts and config.blocks.cuts else RESUMABLE
     mine, theirs = vars(old), vars(config)  # another method may have other fields
     changed = [name for name in mine | theirs if name not in free and mine.get(name) != theirs.get(name)]
     if changed:

@@ -35,12 +35,14 @@ DECODE = 16
 WHITE = (1.0, 1.0, 1.0)
 
 
-def generator_of(seed: int, step: int, device: torch.device | None = None) -> torch.Generator:
-    """The generator of a step's pixels, the CPU's unless a device is named."""
-    name = f"fprf pixels {seed} {step}".encode()
-    return torch.Generator(device or "cpu").manual_seed(
-        int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1
-    )
+def generator_of(seed: int, step: int, device: torch.device | None = None, *, purpose: str = "pixels") -> torch.Generator:
+    """The generator of one step's draws, on the CPU unless a device is given.
+
+    Its seed is a hash of purpose, seed and step, since the CPU's generator looks at 32 bits of its seed alone.
+    """
+    name = f"fprf {purpose} {seed} {step}".encode()
+    number = int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1
+    return torch.Generator(device or "cpu").manual_seed(number)
 
 
 class _Marks(NamedTuple):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..blocks.charts import chart_of, surroundings_of
 from ..blocks.plan import Plan, boxes_from, boxes_to, make_plan
-from ..config import TrainConfig
+from ..config import RESUMABLE, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.features import extract
 from ..datamanagers.images import load_image
@@ -37,20 +37,7 @@ from .run import Run
 
 __all__ = ["FREE", "RAYS", "Laid", "asked_of", "lay_out", "load_boxes", "plan_scene", "write_down"]
 
-FREE = (
-    "steps",
-    "minutes",
-    "output",
-    "data",
-    "device",
-    "device_memory",
-    "precision",
-    "checkpoint_minutes",
-    "blocks",
-    "executor",
-    "statistics",
-    "render",
-)
+FREE = (*RESUMABLE, "blocks", "executor", "statistics", "render")
 """Fields of a config that do not decide what a block of given bounds and rays learns."""
 
 

@@ -4,7 +4,6 @@ On CUDA the host waits for the device at reports alone, twice a second: losses a
 are drawn there where they fit, else copied one step ahead.
 """
 
-import hashlib
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,6 +14,7 @@ from torch import Tensor
 from torch.profiler import record_function
 
 from ..config import TrainConfig
+from ..datamanagers.batches import generator_of
 from ..errors import NumericsError
 from ..interfaces import DataManager
 from ..memory import free_memory, out_of_memory, shortage
@@ -33,7 +33,7 @@ from .run import Run
 from .schedule import progress, rate
 from .tones import toned
 
-__all__ = ["Loop", "Report", "optimizer_of", "step_generator", "train"]
+__all__ = ["Loop", "Report", "optimizer_of", "train"]
 
 REPORT_SECONDS = 0.5
 """Time between reports."""
@@ -54,12 +54,6 @@ class Report(NamedTuple):
     losses: dict[str, float]
     skipped: int
     """Steps skipped because their loss or a gradient was not finite."""
-
-
-def step_generator(seed: int, step: int, device: torch.device) -> torch.Generator:
-    """Draws of one step: a hash of seed and step, since the CPU's generator looks at 32 bits of its seed alone."""
-    name = f"fprf draws {seed} {step}".encode()
-    return torch.Generator(device).manual_seed(int.from_bytes(hashlib.blake2b(name, digest_size=8).digest(), "little") >> 1)
 
 
 def optimizer_of(config: TrainConfig, model: Model) -> torch.optim.Optimizer:
@@ -212,7 +206,7 @@ class Loop:
             rays = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
-        draws = step_generator(self.config.seed, step, self.device)
+        draws = generator_of(self.config.seed, step, self.device, purpose="draws")
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.half):
             rendered = render_rays(
                 rays,

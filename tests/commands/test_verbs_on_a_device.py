@@ -106,7 +106,7 @@ VERBS: dict[str, Callable[[World, Path], list[str]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", VERBS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name == "export" else name for name in VERBS])
 def test_a_verb_writes_what_the_cpu_writes(world: World, tmp_path: Path, name: str) -> None:
     outputs = [tmp_path / device for device in ("cpu", "cuda")]
     for output, device in zip(outputs, ("cpu", DEVICE), strict=True):
@@ -138,6 +138,7 @@ def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatc
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_the_demo(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fprf.methods, "fprf_lite", lambda: replace(world.config, output=None, steps=2))
     made = TownConfig.__init__

@@ -1,15 +1,12 @@
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
-from tiny_world import Altered, World, parameters, trained_for
+from tiny_world import Altered, World, events, parameters, spoilt, trained_for
 from torch import nn
 
 from fprf.config import TrainConfig
@@ -23,7 +20,6 @@ from fprf.types import Batch
 
 NAN, INF = float("nan"), float("inf")
 TINY = torch.finfo(torch.float32).tiny
-Change = Callable[[int, Batch], Batch]
 
 
 def bad_gradients(world: World, folder: Path, config: TrainConfig, value: float, *bad: int, stop: int = -1) -> Run:
@@ -51,17 +47,8 @@ def bad_gradients(world: World, folder: Path, config: TrainConfig, value: float,
     return Run(folder)
 
 
-def spoilt(value: float, *steps: int) -> Change:
-    return lambda step, batch: batch._replace(rgb=torch.full_like(batch.rgb, value)) if step in steps else batch
-
-
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
-
-
-def events(run: Run, key: str) -> list[dict[str, Any]]:
-    lines = (run.root / "events.jsonl").read_text().splitlines()
-    return [event for event in map(json.loads, lines) if key in event]
 
 
 def test_terms_that_are_not_finite_are_named() -> None:

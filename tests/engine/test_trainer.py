@@ -1,38 +1,19 @@
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from tiny_world import World, parameters, trained_for
+from tiny_world import World, parameters, spoilt, stopping, trained_for
 
+from fprf.datamanagers.batches import generator_of
 from fprf.engine import checkpoint
 from fprf.engine.run import Run
-from fprf.engine.trainer import Report, step_generator
+from fprf.engine.trainer import Report
 from fprf.errors import CheckpointError
 from fprf.types import Batch
 
 NAN, INF = float("nan"), float("inf")
-
-
-Change = Callable[[int, Batch], Batch]
-
-
-def spoilt(value: float, *steps: int) -> Change:
-    def change(step: int, batch: Batch) -> Batch:
-        return batch._replace(rgb=torch.full_like(batch.rgb, value)) if step in steps else batch
-
-    return change
-
-
-def stopping(at: int) -> Change:
-    def change(step: int, batch: Batch) -> Batch:
-        if step == at:
-            raise KeyboardInterrupt
-        return batch
-
-    return change
 
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
@@ -150,7 +131,7 @@ def test_training_learns(world: World, tmp_path: Path) -> None:
 
 def test_draws_of_a_step_depend_on_seed_and_step_alone() -> None:
     def draw(seed: int, step: int) -> float:
-        return float(torch.rand((), generator=step_generator(seed, step, torch.device("cpu"))))
+        return float(torch.rand((), generator=generator_of(seed, step, purpose="draws")))
 
     assert draw(3, 7) == draw(3, 7)
     assert len({draw(seed, step) for seed in (0, 1, 2**31 - 1) for step in range(50)}) == 150

@@ -27,7 +27,7 @@ def vgg(folder: Path) -> str:
     return str(folder / "vgg.safetensors")
 
 
-@pytest.mark.parametrize("kind", ["decoder", "content", "semantic"])
+@pytest.mark.parametrize("kind", ["decoder", "content", pytest.param("semantic", marks=pytest.mark.slow)])
 def test_the_same_weights_and_report(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images = str(photo_folder(tmp_path / "photos", 4))
     own = {

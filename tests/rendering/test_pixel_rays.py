@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
@@ -106,3 +107,12 @@ def test_a_lens_that_differs_in_anything_is_another() -> None:
         _, found = grid_rays(other, 0)
         assert (found - rays_through(other, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1]).abs().max() <= 1e-14
         assert found.shape != known.shape or (found - known).abs().max() > 1e-4
+
+
+def test_rays_of_a_view_are_made_on_the_device() -> None:
+    cameras = rig(*MIXED)
+    expected = grid_rays(cameras, 1)
+    with pretend_cuda():
+        found = grid_rays(cameras, 1, CUDA)
+        assert all(x.device == CUDA for x in found)
+        assert all(torch.equal(a, b.cpu()) for a, b in zip(expected, found, strict=True))

@@ -1,8 +1,7 @@
 """Renders, restyles, match maps and blocks on the pretended device: the CPU's, bit for bit, where both take plain torch."""
 
 import copy
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from fprf.engine.quality import QualityConfig, at_quality
 from fprf.engine.restyle import Encoders, dress, encode_photograph, open_encoders
 from fprf.engine.tones import Tones
 from fprf.engine.views import render_view
-from fprf.memory import chunk_size, free_memory
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import (
     AdainConfig,
@@ -34,7 +32,6 @@ from fprf.plugins.stylizers.config import (
     RegionToneConfig,
     StylizerConfig,
 )
-from fprf.rendering.pixel_rays import grid_rays
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary, build_dictionary
 from fprf.style.files import StyleFile
@@ -50,13 +47,7 @@ STYLIZERS = (
 )
 
 
-@contextmanager
-def plain() -> Iterator[None]:
-    with backend.plain():
-        yield
-
-
-PLACES: tuple[tuple[str, Callable[[], Any]], ...] = (("cpu", plain), (str(CUDA), pretend_cuda))
+PLACES: tuple[tuple[str, Callable[[], Any]], ...] = (("cpu", backend.plain), (str(CUDA), pretend_cuda))
 
 
 class Here:
@@ -154,24 +145,6 @@ def test_learnt_poses_and_tones(world: World) -> None:
     with pretend_cuda():
         found = [copy.deepcopy(poses).to(CUDA).refined(cameras).pose, copy.deepcopy(tones).to(CUDA).mixed(*mixed).cpu()]
     assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
-
-
-def test_chunks_follow_the_memory_of_an_accelerator_alone() -> None:
-    assert chunk_size(8192, torch.device("cpu")) == 8192 and free_memory(torch.device("cpu")) is None
-    with pretend_cuda(memory=24 << 30):
-        assert free_memory(CUDA) == 24 << 30
-        assert chunk_size(8192, CUDA) == (12 << 30) // (192 << 10)
-    with pretend_cuda(memory=1 << 20):
-        assert chunk_size(8192, CUDA) == 8192, "what does not fit is halved when it is met"
-
-
-def test_rays_are_made_on_the_device(world: World) -> None:
-    cameras = world.prepared.scene.cameras
-    expected = grid_rays(cameras, 4)
-    with pretend_cuda():
-        found = grid_rays(cameras, 4, CUDA)
-        assert all(x.device == CUDA for x in found)
-        assert all(torch.equal(a, b.cpu()) for a, b in zip(expected, found, strict=True))
 
 
 def test_the_api_and_presets(world: World) -> None:

@@ -1,7 +1,7 @@
-"""What must hold on a CUDA device: on a pretended one in every run of the tests, on a real one with `pytest -m gpu`.
+"""Training, views and styles on a CUDA device: a pretended one in every run of the tests, a real one with `pytest -m gpu`.
 
-Tolerances are those of a card, where sums have another order and a kept sample more or less may decide: the pretended device
-is held to closer ones by the tests of training and rendering.
+Tolerances are those of a real device, where sums have another order and more or fewer samples may be kept. Other tests hold
+the pretended device to tighter ones.
 """
 
 from collections.abc import Iterator
@@ -149,7 +149,11 @@ def test_the_scenes_own_style_is_that_of_the_cpu(world: World, device: Device) -
         for at in ("cpu", str(device.at))
     )
     for name, value in here.items():
-        assert (there[name].cpu() - value).norm() <= 1e-3 * (1e-6 + value.norm()), name
+        assert there[name].device.type == "cpu", name
+        if device.real:
+            assert (there[name] - value).norm() <= 1e-3 * (1e-6 + value.norm()), name
+        else:
+            assert (there[name] - value).abs().max() <= 1e-5 * (1 + value.abs().max()), name
 
 
 @pytest.mark.gpu
