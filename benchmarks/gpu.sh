@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# What a machine with a GPU says, in about ten minutes: the tests of devices, a scene trained for a given time, restyled frames
+# Measure a machine with a GPU in about ten minutes: the tests of devices, a scene trained for a given time, restyled frames
 # a second, a new style to its first frame, Triton's tri-planes against plain torch. Writes one JSON with rows and goals.
 #
 #   benchmarks/gpu.sh --scene DIR [--images images_4] [--minutes 3] [--method fprf] [--long STEPS] [--output FILE]
@@ -64,7 +64,7 @@ else
     case " $* " in *" --semantic.encoder "*) ;; *) set -- --semantic.encoder bundled-semantic "$@" ;; esac
 fi
 
-# step NAME SECONDS COMMAND...: run it, note how it ended, say the end of what it said where it failed.
+# step NAME SECONDS COMMAND...: run it, note its exit status, print the end of its log where it failed.
 step() {
     local name=$1 seconds=$2 begun=$SECONDS status=0
     shift 2

@@ -1,4 +1,4 @@
-"""Whether `gpu.sh` can run here: packages that cannot be imported are named, and nothing is installed.
+"""Check that `gpu.sh` can run here: name packages that cannot be imported; install nothing.
 
     python benchmarks/gpu_check.py FOLDER
 

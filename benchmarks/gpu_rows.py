@@ -23,11 +23,11 @@ from fprf.output.atomic import write_json
 FRAME = 1008 * 756
 STYLES = ("stylised, region-tone", "stylised, region-ot", "stylised, local-adain")
 SAID = 3000
-"""Characters of what a failed step said last that are kept."""
+"""Characters that are kept of the end of a failed step's log."""
 
 
 def steps(work: Path) -> list[dict[str, Any]]:
-    """Every step with its seconds; of those that failed the last that they said."""
+    """Every step with its seconds; of those that failed the end of the log."""
     found = [json.loads(line) for line in (work / "steps.jsonl").read_text().splitlines()]
     for each in found:
         each["passed"] = each["status"] == 0

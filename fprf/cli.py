@@ -1,6 +1,7 @@
 """The command line: `fprf VERB ...`. A verb's module is imported when it is used; `--help` imports nothing heavy.
 
-Packages add verbs in the entry-point group `fprf.commands` (`commands/config.py`); where the names clash, ours win.
+Packages add verbs in the entry-point group `fprf.commands` (`commands/config.py`); a built-in verb takes precedence over one
+of the same name.
 
 Exit codes: 0 done, 1 our fault, 2 the user's mistake (one line on standard error), 130 interrupted.
 """
@@ -99,7 +100,7 @@ def _dispatch(args: list[str]) -> int:
 
 
 def packaged() -> dict[str, str]:
-    """Verbs that packages add, by name, with those that provide them. Imports nothing."""
+    """Verbs of packages: name to the packages that provide it. Imports nothing."""
     return {
         name: " and ".join(each.package for each in entries) for name, entries in installed(_GROUP).items() if name not in VERBS
     }

@@ -75,7 +75,7 @@ class LossConfig:
     proposal_variation: float = 1e-4
     """Total variation of the proposal planes."""
     penalties: tuple[tuple[str, float], ...] = ()
-    """Names and weights of other penalties of fields and samplers; those that are not named weigh 1."""
+    """Names and weights of other penalties of fields and samplers; those that are not named have weight 1."""
     penalty_every: int = 1
     """Steps between penalties, which then weigh as many times more."""
     interlevel: float = 1.0
@@ -87,7 +87,7 @@ class LossConfig:
     sky: float = 0.1
     """Rays into the sky should meet nothing before it (where the capture has masks of its sky)."""
     extra: LossTermConfig | None = None
-    """A term of a package."""
+    """A loss term of an installed package, by name."""
 
     def __post_init__(self) -> None:
         for name in (
@@ -107,7 +107,7 @@ class LossConfig:
             if name in ("variation", "proposal_variation"):
                 raise ConfigError(f"loss.penalties: {name} has a field of its own; set loss.{name}")
             if names.count(name) > 1:
-                raise ConfigError(f"loss.penalties: {name} stands there twice; name it once")
+                raise ConfigError(f"loss.penalties: {name} is named twice; name it once")
             at_least(f"loss.penalties: {name}", weight, 0.0)
         at_least("loss.penalty_every", self.penalty_every, 1)
         if self.rgb == self.content == self.semantic == 0:

@@ -71,8 +71,8 @@ class ContentField(nn.Module, ABC):
     def penalties(self) -> dict[str, Tensor]:
         """Regularisers by name, each a scalar, the same names at each call.
 
-        'variation' and 'proposal_variation' weigh what `loss.variation` and `loss.proposal_variation` say; any other name
-        weighs 1, so its own weight belongs into the scalar, unless `loss.penalties` says otherwise. One name in several parts
+        The weights of 'variation' and 'proposal_variation' are `loss.variation` and `loss.proposal_variation`; any other name
+        has weight 1 unless `loss.penalties` names it, so the scalar should include its own weight. One name in several parts
         is added up.
         """
 
@@ -230,14 +230,14 @@ class DataManager(ABC):
     def batch(self, step: int) -> Batch:
         """The pixels of a step: a pure function of (seed, step), so that a resumed run sees the same ones.
 
-        In host memory, or on the device of `to`. Those in host memory are asked for by a thread of their own, one step ahead
-        of the device that they are copied to.
+        In host memory, or on the device of `to`. For an accelerator those in host memory are drawn by another thread, one step
+        ahead.
         """
 
     def to(self, device: torch.device, *, room: int) -> "DataManager":
         """A data manager of the same batches that draws them on a device, from at most `room` bytes held there.
 
-        Itself, which draws in host memory, unless it says otherwise.
+        By default itself, which draws in host memory.
         """
         return self
 

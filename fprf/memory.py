@@ -74,13 +74,13 @@ def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator
 
 
 def chunk_size(size: int, device: "torch.device") -> int:
-    """Rays to render at a time: `size` on the CPU; on an accelerator as many as its memory has room for, but no fewer."""
+    """Rays to render at a time: `size` on the CPU; on an accelerator what half of its free memory holds, at least `size`."""
     free = free_memory(device)
     return size if free is None else max(size, int(_SHARE * free) // _RAY)
 
 
 def free_memory(device: "torch.device") -> int | None:
-    """Bytes of an accelerator that can be had; None for the CPU, and for a device that does not tell."""
+    """Free bytes of an accelerator; None for the CPU, and for other kinds of device."""
     if device.type == "cuda":
         from torch import cuda
 

@@ -46,7 +46,7 @@ class Chart:
         return {}
 
     def _placed(self, points: Tensor) -> "_Placed":
-        """The chart's numbers where points lie, copied there once: not again in each training step."""
+        """The chart's tensors with the dtype and device of points, copied once, not in each training step."""
         key = (points.dtype, points.device)
         if key not in self._numbers:
             with torch.inference_mode(False):

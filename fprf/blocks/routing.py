@@ -42,7 +42,7 @@ class Router(ABC):
         """The groups of points of the space."""
 
     def whole(self, points: Annotated[Tensor, "N 3"]) -> Group | None:
-        """The one group that all points are in; None where that cannot be told without looking at them."""
+        """The only group, where all points are in one; None where that depends on the points."""
         return None
 
 
@@ -54,15 +54,15 @@ class Everywhere(Router):
         return [self.whole(points)]
 
     def whole(self, points: Annotated[Tensor, "N 3"]) -> Group:
-        """All points."""
+        """The group of all points."""
         return Group((0,), _all(points), None)
 
 
 class Inset(Router):
     """Member 0 inside of a chart's box, member 1 outside.
 
-    On an accelerator both look at all points, one of them with weight 0: how many lie inside only the device knows, and the
-    host would wait for it.
+    On an accelerator both members are evaluated at all points, one of them with weight 0: the host would have to wait for the
+    number of points inside.
     """
 
     def __init__(self, chart: Chart) -> None:

@@ -17,7 +17,7 @@ __all__ = ["aligned", "local", "shares", "window"]
 
 
 def aligned(turn: Annotated[Tensor, "3 3"]) -> bool:
-    """Whether axes are those of the space."""
+    """Return whether axes are those of the space."""
     return bool((turn == torch.eye(3, dtype=turn.dtype, device=turn.device)).all())
 
 

@@ -30,7 +30,7 @@ On many machines:
 
   1. on every machine          pip install "fprf[cluster]"
   2. one folder for all        SCENE, the run folder and XDG_CACHE_HOME lie on storage that every machine mounts alike
-                               with `--device cuda` (or auto, where there is one) each task takes a GPU: --executor.gpus
+                               with `--device cuda` (or auto on a machine with a GPU) each task takes one GPU: --executor.gpus
   3. on {head:<22}         export RAY_USAGE_STATS_ENABLED=0 RAY_AUTH_MODE=token
                                ray get-auth-token --generate
                                ray start --head --port {port}

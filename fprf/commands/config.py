@@ -12,8 +12,8 @@ __all__ = ["CommandConfig"]
 class CommandConfig(PluginConfig):
     """A verb: `fprf NAME` parses its fields as flags and calls `run`. Its docstring is the first text of `--help`.
 
-    Fields may be slots. The built-in verbs stand in `fprf.cli.VERBS`: help shows their usage without importing them, which
-    the metadata of an entry point cannot hold.
+    Fields may be slots. The built-in verbs are listed in `fprf.cli.VERBS` with their usage, which help shows without
+    importing them and an entry point cannot hold.
     """
 
     group: ClassVar[str] = "fprf.commands"
@@ -21,5 +21,5 @@ class CommandConfig(PluginConfig):
     """Fields that are given without a flag, in this order, and must be given."""
 
     def run(self) -> int:
-        """Do what the verb is for; return the exit code, 0 = done. Raise FprfError for a mistake of the user."""
+        """Run the verb; return the exit code, 0 = done. Raise FprfError for a mistake of the user."""
         raise NotImplementedError

@@ -47,7 +47,7 @@ class DoctorConfig:
     target: Path | None = None
     """A run or a scene folder; none = this machine."""
     device: str = "auto"
-    """cpu, cuda, mps, or auto: what of this machine is tested."""
+    """Device of this machine that is tested: cpu, cuda, mps, or auto."""
 
 
 def run(args: list[str]) -> int:
@@ -92,7 +92,7 @@ def machine() -> Iterator[Finding]:
 
 
 def self_test(name: str) -> Iterator[Finding]:
-    """What a device is fast by, and whether a tiny training step, render and restyle on it are the CPU's; a few seconds.
+    """Report a device's kernels and precision, and compare a tiny training step, render and restyle on it with the CPU's.
 
     Raises PluginError for a device that is not here.
     """
@@ -112,7 +112,7 @@ def self_test(name: str) -> Iterator[Finding]:
         return
     wrong = [f"{each.what} is off by {each.error:.2g}, {each.allowed:g} is allowed" for each in outcomes if not each.right]
     if wrong:
-        yield Finding("self-test", f"{device} computes something else than the CPU: {'; '.join(wrong)}", remedy)
+        yield Finding("self-test", f"{device} differs from the CPU: {'; '.join(wrong)}", remedy)
         return
     worst = max(outcomes, key=lambda each: each.error / each.allowed)
     figure = f"at worst the {worst.what} is off by {worst.error:.1g}, {worst.allowed:g} is allowed"

@@ -35,7 +35,7 @@ class Basis(NamedTuple):
         return y @ self.matrix.to(y).T + self.mean.to(y)
 
     def origin(self) -> Annotated[Tensor, "D"]:
-        """Where the encoder's zero lies in the basis."""
+        """The encoder's zero, projected."""
         return -(self.mean @ self.matrix)
 
     def tensors(self) -> dict[str, Tensor]:

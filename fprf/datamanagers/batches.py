@@ -58,7 +58,7 @@ class _Marks(NamedTuple):
 
 
 class _Source(NamedTuple):
-    """What a batch is drawn from, on one device."""
+    """Pixels, masks and points that batches are drawn from, on one device."""
 
     pixels: Annotated[Tensor, "P 3"]
     """uint8, all training views one after the other."""

@@ -70,7 +70,7 @@ class FeatureStore:
         return self.std if self.std > 1e-6 * self._magnitude else 1.0
 
     def to(self, device: torch.device) -> "FeatureStore":
-        """The same targets, with the coefficients on a device as well: what is asked there is answered there."""
+        """The same targets, with the coefficients on a device as well: `at` of tensors there computes there."""
         entries = list(self._entries.values())
         coefs = [entry.coefs.flatten(0, 1) for entry in entries]
         ends = torch.tensor([len(part) for part in coefs]).cumsum(0)
@@ -95,8 +95,8 @@ class FeatureStore:
         self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"], rgb: Annotated[Tensor, "R 3"]
     ) -> Annotated[Tensor, "R C"]:
         """Features, float32, raw. `view` counts in the scene; pixel is x, y with centres at +0.5; rgb in [0, 1] is the
-        image's own colour there. Raises DataError for a view that is not in the store; on the device of `to`, where the host
-        would wait for the answer, it must not be asked for one.
+        image's own colour there. Raises DataError for a view that is not in the store; on the device of `to` views are not
+        checked, since the host would wait.
         """
         if self._packed is not None and view.device == self._numbers.device:
             return guided.apply_packed(self._packed, self._numbers[view], pixel, rgb, grey=store_files.GREY)

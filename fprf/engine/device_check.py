@@ -1,6 +1,6 @@
-"""Does a device compute what the CPU computes? A tiny scene of seeded numbers: no files, no network, a few seconds.
+"""Compare a device with the CPU on a tiny scene of seeded numbers: no files, no network, a few seconds.
 
-The CPU's values are those of plain torch, so that on the CPU its compiled kernels are what is looked at.
+The expected values are computed by plain torch on the CPU, so on the CPU its compiled kernels are compared with them.
 """
 
 import math
@@ -41,16 +41,16 @@ of an 8-bit step, of a style a whole one.
 
 
 class Outcome(NamedTuple):
-    """One thing that was computed on both."""
+    """One result that was computed on both."""
 
     what: str
     error: float
-    """Largest difference of colours in [0, 1]; of features and gradients the length of the difference relative to theirs."""
+    """Largest absolute difference of colours in [0, 1]; of features and gradients the relative L2 error."""
     allowed: float
 
     @property
     def right(self) -> bool:
-        """The device computes the same, but for rounding."""
+        """Whether the error is within the tolerance."""
         return self.error <= self.allowed
 
 
@@ -68,7 +68,7 @@ def compare(device: torch.device) -> list[Outcome]:
 
 
 def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
-    """What runs faster than plain torch on a device, and how much memory is free: names and plain words."""
+    """Name and description of the kernels and the precision that a device uses, and of its free memory."""
     probe = torch.zeros(1, 3, device=device)
     if march.fit(probe):
         yield "kernels", "numba's: tri-planes, networks, marching, matching, guided filter"
@@ -86,7 +86,7 @@ def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
 
 
 def _computed(device: torch.device) -> dict[str, Tensor]:
-    """All that is compared, by name, on the device."""
+    """The results to compare, by name, computed on the device."""
     encoder = BundledContentConfig().build()
     config, facts = _tiny(encoder.identity, encoder.channels)
     model, cameras = build_model(config, facts).to(device), _camera()
@@ -132,7 +132,7 @@ def _camera() -> Cameras:
 
 
 def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]) -> Annotated[Tensor, "P"]:
-    """Of everything that is learnt, by all terms, after a step along the first of them."""
+    """Flat gradients of colour, content and semantic terms after one step of gradient descent."""
     rays, _, _ = view_rays(model, cameras, 0)
     learned = model.learned()
     gradients: list[Tensor] = []
@@ -150,7 +150,7 @@ def _gradients(model: Model, cameras: Cameras, image: Annotated[Tensor, "3 H W"]
 
 @torch.no_grad()
 def _restyle(model: Model, features: Annotated[Tensor, "N C"], image: Annotated[Tensor, "3 H W"]) -> Restyle:
-    """The picture's style on points that are what it shows, in other light; both fall into a few clear kinds."""
+    """The style of the picture for points with its features, scaled and shifted; both have a few distinct classes."""
     kinds = torch.arange(len(features), device=features.device) % _KINDS
     semantic = torch.nn.functional.one_hot(kinds, _DIM).float() + 0.05 * _uniform(len(features), _DIM).to(features)
     colour = torch.nn.functional.interpolate(image[None], (24, 32), mode="area")[0].flatten(1).T

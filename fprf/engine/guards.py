@@ -8,8 +8,8 @@ Moments of what is no longer seen decay into denormal numbers and, rounded, stay
 They are cleared by step number, not by the processor's own mode: that is set a thread, so that results would depend on which
 thread computed what.
 
-On CUDA nobody looks before the optimiser steps: the host would wait for the answer. `unfit_step` stays on the device, fused
-Adam reads it there and leaves everything as it is, and `StepStatistics` counts; what it counted is read with the reports.
+On CUDA the host does not check before the optimiser steps, since it would wait. `unfit_step` stays on the device, fused Adam
+reads it there and skips the step, and `StepStatistics` counts; the host reads the counts with the reports.
 """
 
 from collections.abc import Iterable, Mapping
@@ -64,13 +64,13 @@ def unfit_gradients(parameters: Iterable[tuple[str, nn.Parameter]]) -> str | Non
 
 @torch.no_grad()
 def unfit_step(loss: Tensor, parameters: Iterable[nn.Parameter]) -> Tensor:
-    """1 where the loss or a gradient is not finite, or too large to be squared, else 0: float32, where the loss lies."""
+    """1 where the loss or a gradient is not finite, or too large to be squared, else 0: float32, on the loss's device."""
     norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
     return (~(torch.isfinite(loss) & (norm < LARGEST))).float()
 
 
 class StepStatistics:
-    """Running means of named numbers, and counts of those that were not finite, kept where they lie until they are read."""
+    """Running means of named scalars, and counts of those that were not finite, kept on their device until they are read."""
 
     def __init__(self, device: torch.device) -> None:
         self.names: list[str] = []
@@ -100,7 +100,7 @@ class StepStatistics:
         self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
 
     def count_skipped(self, unfit: Tensor) -> None:
-        """Whether this step was skipped, 1 or 0."""
+        """Count a step: `unfit` is 1 where it was skipped, else 0."""
         self.skipped, self.failed = self.skipped + unfit, (self.failed + 1) * unfit
 
     def means(self) -> dict[str, float]:

@@ -29,12 +29,12 @@ NEARBY = 0.1
 
 
 def extra_term(config: LossConfig) -> LossTerm | None:
-    """The term of a package that `loss.extra` chooses; None where there is none, or where it weighs nothing."""
+    """Build the term of `loss.extra`; None where there is none, or where its weight is 0."""
     return config.extra.build() if config.extra is not None and config.extra.weight > 0 else None
 
 
 def check_penalties(config: LossConfig, model: Model) -> None:
-    """Raise ConfigError where a weight is given to a penalty that is not there, PluginError where one has a term's name."""
+    """Raise ConfigError where a weight is given to an unknown penalty, PluginError where a penalty has the name of a term."""
     names = model.penalty_names
     for name, _ in config.penalties:
         if name not in names:
@@ -44,7 +44,7 @@ def check_penalties(config: LossConfig, model: Model) -> None:
                 f"(penalties that can be named: {', '.join(known) or 'none'})"
             )
     for name in sorted(names & _weights(config, 1.0).keys()):
-        raise PluginError(f"a penalty of a field or a sampler is called {name!r}, as a term of its own is; rename it there")
+        raise PluginError(f"a penalty of a field or a sampler is called {name!r}, the name of a loss term; rename it there")
 
 
 def wanted(config: LossConfig, batch: Batch, extra: LossTerm | None = None) -> Want:
@@ -72,8 +72,8 @@ def terms(
 ) -> dict[str, Tensor]:
     """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits any encoder.
 
-    Penalties walk over every parameter of the planes, whatever the batch: they come every `penalty_every` steps. `extra` is
-    what `extra_term` gave; it draws from the generator.
+    Penalties run over every parameter of the planes, whatever the batch: they are computed every `penalty_every` steps.
+    `extra` is the term of `extra_term`; it draws from the generator.
     """
     result: dict[str, Tensor] = {}
     if rendered.rgb is not None and config.rgb > 0:
@@ -112,8 +112,8 @@ def terms(
 def ending(t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], distance: Annotated[Tensor, "R"]) -> Tensor | None:
     """How far rays of known distance (space units, NaN = unknown) are from ending there; None where none is known.
 
-    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. Elsewhere
-    than on the CPU it is 0 where none is known: the host would have to wait to tell.
+    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. On an
+    accelerator it is 0 where none is known: the host would have to wait to find out.
     """
     known = torch.isfinite(distance)
     if t.device.type == "cpu":
@@ -135,7 +135,7 @@ def emptiness(
 ) -> Tensor | None:
     """How much rays into the sky meet before `within` (space units); None where there are none.
 
-    Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell. Elsewhere than on the CPU
+    Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell. On an accelerator
     it is 0 where there are none.
     """
     if t.device.type == "cpu":
@@ -163,7 +163,7 @@ def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
 
 
 def _weights(config: LossConfig, colour: float) -> dict[str, float]:
-    """Weights of the terms that are no penalties."""
+    """Weights of the terms other than penalties."""
     return {
         "rgb": colour,
         "unaided": colour,

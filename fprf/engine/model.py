@@ -75,7 +75,7 @@ class Model(nn.Module):
         return [p for p in self.parameters() if p.requires_grad]
 
     def penalties(self) -> dict[str, Tensor]:
-        """Regularisers of all parts by name; what several parts call the same is added up."""
+        """Regularisers of all parts by name; those of one name are added up."""
         terms = self.field.penalties()
         for part in (self.sampler, self.semantic):
             for name, value in (part.penalties() if part is not None else {}).items():
@@ -84,7 +84,7 @@ class Model(nn.Module):
 
     @cached_property
     def penalty_names(self) -> frozenset[str]:
-        """Names of `penalties`, which takes one look at them."""
+        """Names of `penalties`, which are computed once to find them."""
         with torch.no_grad():
             return frozenset(self.penalties())
 

@@ -104,7 +104,7 @@ def refined(poses: Poses | None, cameras: Cameras) -> Cameras:
 
 
 def _like(moves: Tensor, other: Tensor) -> Tensor:
-    """Moves where another tensor lies, in its type: one after the other, since MPS has no float64."""
+    """Moves with the device and dtype of another tensor: device first, since MPS has no float64."""
     return moves.to(other.device).to(other.dtype)
 
 

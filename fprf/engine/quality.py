@@ -52,7 +52,7 @@ class QualityConfig:
     """Share of an image's width and height that is rendered, in (0, 1]; the rest is interpolated; none = what the quality
     says."""
     chunk: int | None = None
-    """Rays rendered at a time on the CPU, and the least on an accelerator; none = as the run's own config says."""
+    """Rays rendered at a time on the CPU, and at least so many on an accelerator; none = as the run's own config says."""
     max_memory: float | None = None
     """MiB that blocks of a large scene may take together; the least recently used make room. none = all stay."""
 

@@ -51,7 +51,7 @@ class Encoders(NamedTuple):
     basis: Basis | None
     scene: SceneStyle
     device: torch.device = torch.device("cpu")
-    """Where the encoders lie."""
+    """Device of the encoders."""
 
 
 class Codes(NamedTuple):

@@ -1,7 +1,7 @@
 """The training loop. Batches and draws are functions of (seed, step), so a resumed run goes on as if never stopped.
 
-On CUDA the host waits for the device at reports alone, twice a second: losses and faults stay on the device until then, batches
-are drawn there where they fit, else copied one step ahead.
+On CUDA the host waits for the device only at reports, twice a second: losses and faults stay on the device until then.
+Batches are drawn there where their data fit, otherwise copied one step ahead.
 """
 
 import time
@@ -76,9 +76,9 @@ def train(
 
     `model` is one at its start, where it is not simply that of the config: a block in its surroundings, whose sampler was
     trained for `lead` steps before. An interrupt saves first, then goes on upwards. Steps that are not finite change nothing
-    and are logged; several in a row lead back to the last checkpoint: on CUDA with the next report, where they still go on.
-    Raises NumericsError where there is none, or where that was of no use, OutOfMemoryError where a step finds too little
-    memory.
+    and are logged; several in a row lead back to the last checkpoint: on CUDA with the next report, where the last steps
+    before it failed. Raises NumericsError where there is none, or where that was of no use, OutOfMemoryError where a step
+    finds too little memory.
     """
     device = device_of(config.device)
     model = (build_model(config, prepared.facts) if model is None else model).to(device)
@@ -172,7 +172,7 @@ class Loop:
         self.config, self.model, self.optimizer, self.device = config, model, optimizer, device
         self.facts: Facts = prepared.facts
         self.deferred = device.type == "cuda"
-        """Whether faults are looked for with the reports alone."""
+        """Whether the host reads faults only with the reports."""
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
         self.half = config.precision == "bfloat16" and device.type != "cpu"
         check_penalties(config.loss, model)
@@ -252,13 +252,13 @@ class Loop:
             self.skipped, self.failed = self.skipped + 1, self.failed + 1
 
     def _step_deferred(self, loss: Tensor) -> None:
-        """Step, unless the device finds that nothing may change."""
+        """Step, unless the device finds a loss or gradient that is not finite."""
         self.fault = None
         with record_function("fprf.backward"):
             loss.backward()  # type: ignore[no-untyped-call]
         flag = unfit_step(loss, self.model.parameters())
         with record_function("fprf.optimizer"):
-            # What a gradient scaler tells an optimiser, which then leaves parameters, moments and its count of steps alone.
+            # As torch's GradScaler does: the optimiser then changes neither parameters, moments nor its count of steps.
             self.optimizer.found_inf = flag  # type: ignore[attr-defined]
             self.optimizer.step()
         self.statistics.count_skipped(flag)
@@ -294,7 +294,7 @@ class Loop:
 
 
 class Batches:
-    """A data manager's batches. Those of host memory are drawn a step ahead of an accelerator, by a thread of their own."""
+    """Batches of a data manager. For an accelerator those in host memory are drawn one step ahead by a thread."""
 
     def __init__(self, manager: DataManager, device: torch.device) -> None:
         self.manager, self.device = manager, device

@@ -48,7 +48,7 @@ def view_rays(
 
 
 def on_host(*tensors: Tensor) -> list[Tensor]:
-    """Tensors of one type on the CPU: from an accelerator all of them in one copy, since the host waits for each."""
+    """Copy tensors of one dtype to the CPU, from an accelerator in a single copy, since the host waits for each."""
     if all(each.device.type == "cpu" for each in tensors):
         return list(tensors)
     flat = torch.cat([each.reshape(-1) for each in tensors]).cpu()

@@ -1,4 +1,4 @@
-"""What autocast must not lower, and TF32 for a while."""
+"""Full precision within autocast, TF32 within a block, and float64 where a device has it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

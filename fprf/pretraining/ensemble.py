@@ -25,7 +25,7 @@ Ensemble = Sequence[tuple[MobileNetTeacher, Basis]]
 
 @torch.no_grad()
 def look(teacher: MobileNetTeacher, images: Annotated[Tensor, "B 3 H W"], stride: int) -> Annotated[Tensor, "B F h w"]:
-    """Mean of a teacher's features over scales and mirror images, one per `stride` pixels, rounded up; where it looks."""
+    """Mean of a teacher's features over scales and mirror images, one per `stride` pixels, rounded up, on its device."""
     images = images.to(teacher.device)
     cells = [-(-n // stride) for n in images.shape[-2:]]
     total: Tensor | float = 0.0

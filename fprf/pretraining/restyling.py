@@ -62,7 +62,7 @@ def prepare_crops(
 ) -> Crops:
     """One square of each photograph that is large enough on both sides (else as large as it gets). Draws by `seed`.
 
-    `measure` sets the network's units from these crops. Encoder and network lie on `device`; None = the CPU.
+    `measure` sets the network's units from these crops. Encoder and network must be on `device`; None = the CPU.
     """
     loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))

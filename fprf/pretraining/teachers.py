@@ -26,13 +26,13 @@ class MobileNetTeacher:
         self.name, self._network = name, network
 
     def to(self, device: torch.device) -> "MobileNetTeacher":
-        """Look there from now on."""
+        """Move the network to a device."""
         self._network.to(device)
         return self
 
     @property
     def device(self) -> torch.device:
-        """Where images are looked at."""
+        """Device of the network."""
         return next(chain(self._network.parameters(), self._network.buffers())).device
 
     @torch.no_grad()

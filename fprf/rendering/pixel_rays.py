@@ -36,11 +36,11 @@ class PixelRays:
 
     @property
     def device(self) -> torch.device:
-        """Where rays are made, and views and pixels are expected."""
+        """Device on which rays are made; views and pixels must be on it."""
         return self.start.device
 
     def to(self, device: torch.device) -> "PixelRays":
-        """Make rays there from now on."""
+        """Move to a device."""
         self.cameras, self.kind, self.start = self.cameras.to(device), self.kind.to(device), self.start.to(device)
         self.table = None if self.table is None else self.table.to(device)
         return self

@@ -6,8 +6,8 @@
 Only the kept samples meet the content network, the semantic field, the stylizer and the decoder; what is left out weighs at
 most `budget` a ray, which bounds the colour error (colours lie in [0, 1]).
 
-In training on an accelerator every sample is kept and what is left out has weight 0: how many are left only the device knows,
-and the host would wait for it in each step. Geometry stays in full precision under autocast: a density is an exponential.
+In training on an accelerator every sample is kept and what is left out has weight 0: the host would have to wait for the
+number of samples in each step. Geometry stays in full precision under autocast: a density is an exponential.
 """
 
 from typing import Annotated, NamedTuple

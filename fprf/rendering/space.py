@@ -148,7 +148,7 @@ class Space:
         return {}
 
     def _constant(self, name: str, like: Tensor) -> Tensor:
-        """A field as a tensor where another one lies, copied there once: not again in each training step."""
+        """A field as a tensor with the dtype and device of another one, copied once, not in each training step."""
         key = (name, like.dtype, like.device)
         if key not in self._tensors:
             with torch.inference_mode(False):

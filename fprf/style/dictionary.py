@@ -80,7 +80,7 @@ class StyleDictionary(NamedTuple):
     allowed: Annotated[Tensor, "K references"] | None = None
     """On one scene: which references each of its regions may take from, bool; None = all. See `style.regional`. Not saved."""
     origin: Annotated[Tensor, "D"] | None = None
-    """Where the encoder's zero lies in the scene's semantic basis; None = at 0. Not saved: it follows from the basis."""
+    """The encoder's zero, projected on the scene's semantic basis; None = 0. Not saved: it follows from the basis."""
 
 
 def build_dictionary(
@@ -94,8 +94,8 @@ def build_dictionary(
     """Cluster each reference by its semantics; a code is the mean and covariance of the content inside, float32.
 
     A code takes `blend` of its whole image's statistics, and more the further its members fall short of `min_members`. The
-    order of the references plays no part: they are sorted by what they hold. Statistics are taken where the samples lie;
-    their tables, a few kB of which stylizers are built, lie on the CPU. Raises DataError for no references, one
+    order of the references plays no part: they are sorted by what they hold. Statistics are computed on the samples' device;
+    the tables, a few kB, are on the CPU, where stylizers are built. Raises DataError for no references, one
     without pixels, sizes that differ, or values that are not finite.
     """
     at_least("clusters", clusters, 1)

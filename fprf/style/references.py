@@ -61,7 +61,7 @@ def read_reference(
 
     `basis` projects the semantics as the scene's were; without encoder or basis D is 0. `guided` is the scene's. Of a
     photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of it.
-    `name` is the file's by default. Encoders lie on `device`, and so will the samples; None = the CPU. Raises DataError
+    `name` is the file's by default. Encoders must be on `device`, and the samples will be; None = the CPU. Raises DataError
     where a file is no readable image, or a mask does not fit.
     """
     at_least("longest", longest, _SHORTEST)

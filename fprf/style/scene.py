@@ -54,8 +54,8 @@ def scene_style(
     """The scene's style from weighted points, float32.
 
     Regions are k-means clusters of the semantics; their statistics are taken over the same soft `membership` by which the
-    region stylizers assign points. Its tables, a few kB of which stylizers are built, lie on the CPU, wherever the points
-    do. `moments` are those of the whole scene, where a longer pass has them already. Raises
+    region stylizers assign points. Its tables, a few kB, are on the CPU, where stylizers are built, whatever the device of
+    the points. `moments` are those of the whole scene, where a longer pass has them already. Raises
     DataError for no weight, NumericsError for values that are not finite.
     """
     if not bool(weights.any()):

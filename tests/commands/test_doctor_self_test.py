@@ -63,7 +63,7 @@ def test_a_wrong_kernel_of_the_cpu_is_found(monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.setattr(march, "composite", lambda *args, real=march.composite: real(*args) * 1.05)
     assert cli.main(["doctor", "--device", "cpu"]) == 1
     said = [line for line in capsys.readouterr().out.splitlines() if "self-test" in line]
-    assert len(said) == 1 and "computes something else than the CPU" in said[0] and "render is off by" in said[0]
+    assert len(said) == 1 and "differs from the CPU" in said[0] and "render is off by" in said[0]
 
 
 def test_a_device_that_fails_or_is_absent_is_one_line(

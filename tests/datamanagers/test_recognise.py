@@ -139,7 +139,7 @@ def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
         ("from fprf.fields.layouts import SingleConfig as ScanConfig", "not a DataParserConfig"),
     ],
 )
-def test_a_broken_parser_is_named_and_passed_over(
+def test_a_broken_parser_is_named_and_skipped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, told: str
 ) -> None:
     folder, site = tmp_path / "scene", tmp_path / "site"
@@ -150,8 +150,7 @@ def test_a_broken_parser_is_named_and_passed_over(
         assert recognise(folder) == ColmapConfig()
         (line,) = capsys.readouterr().err.splitlines()
         assert (
-            line.startswith("warning: data parser 'bad' (acme_bad4:ScanConfig from acme-bad 1) is passed over: ")
-            and told in line
+            line.startswith("warning: data parser 'bad' (acme_bad4:ScanConfig from acme-bad 1) is skipped: ") and told in line
         )
         (folder / "sparse").rename(folder / "elsewhere")
         with pytest.raises(DataError, match=r"choose a parser with --datamanager\.parser NAME \(bad, blocknerf"):

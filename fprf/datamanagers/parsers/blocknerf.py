@@ -36,7 +36,7 @@ def record_files(data: Path) -> list[Path]:
 
 
 def is_record(name: str) -> bool:
-    """Whether a file's name is that of a TFRecord file, whole or a part."""
+    """Return whether a file name is that of a TFRecord file or of one of its shards."""
     return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
 
 

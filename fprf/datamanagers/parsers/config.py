@@ -33,12 +33,12 @@ __all__ = [
 
 
 class Recognised(NamedTuple):
-    """How sure a parser is that it reads a folder."""
+    """A parser's confidence that it reads a folder."""
 
     confidence: float
-    """In (0, 1]: the surest parser reads the folder; two that are equally sure are an error."""
+    """In (0, 1]: the parser with the highest one reads the folder; a tie is an error."""
     reason: str
-    """What in the folder says so, for example `transforms.json`."""
+    """The file or folder that it was recognised by, for example `transforms.json`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +48,9 @@ class DataParserConfig(PluginConfig):
     group: ClassVar[str] = "fprf.dataparsers"
 
     def recognises(self, data: Path) -> Recognised | None:
-        """Whether `data`, which may be absent or a file, is of this format, from the names that lie there; None = it is not.
+        """The confidence that `data`, which may be absent or a file, is of this format, by file names alone; None = not.
 
-        A parser that does not say is used only where it is chosen by name.
+        By default None: such a parser is used only where it is chosen by name.
         """
         return None
 
@@ -86,7 +86,7 @@ class TransformsConfig(DataParserConfig):
     only transforms*.json."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By `transforms.json` or `transforms_train.json`, less surely by the only other transforms*.json."""
+        """By `transforms.json` or `transforms_train.json`, with less confidence by the only other transforms*.json."""
         names = sorted(path.name for path in data.glob("transforms*.json"))
         known = [name for name in names if name in ("transforms.json", "transforms_train.json")]
         if known:

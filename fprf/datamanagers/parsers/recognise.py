@@ -1,4 +1,4 @@
-"""Which parser a scene folder wants: every installed one is asked, built-in or not."""
+"""Find the parser of a scene folder among all that are installed."""
 
 import sys
 from pathlib import Path
@@ -13,10 +13,10 @@ __all__ = ["parse_scene", "recognise"]
 
 
 def recognise(data: Path) -> DataParserConfig:
-    """The parser that is surest of a folder, with its defaults; `town`, where no such folder exists, is the embedded scene.
+    """The parser with the highest confidence, with its defaults; `town`, where no such folder exists, is the embedded scene.
 
-    A parser that fails to load or to answer is named in a line on standard error and passed over. Raises DataError where no
-    parser recognises the folder, or where several are equally sure.
+    A parser that raises is skipped, with a warning on standard error. Raises DataError where no parser recognises the folder,
+    or where several have the same confidence.
     """
     group, best = DataParserConfig.group, 0.0
     surest: dict[str, tuple[DataParserConfig, str]] = {}
@@ -28,7 +28,7 @@ def recognise(data: Path) -> DataParserConfig:
             between("confidence", confidence, 0.0, 1.0)
         except (Exception, SystemExit) as fault:  # a stranger's
             origin = ", ".join(each.origin for each in entries)
-            print(f"warning: data parser {name!r} ({origin}) is passed over: {_line(fault)}", file=sys.stderr)
+            print(f"warning: data parser {name!r} ({origin}) is skipped: {_line(fault)}", file=sys.stderr)
             continue
         if answer and confidence >= best:
             surest = {name: (config, reason)} if confidence > best else {**surest, name: (config, reason)}

@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 
 
 def resources(config: RayConfig) -> dict[str, float]:
-    """What Ray is asked for on behalf of each task."""
+    """Options of `ray.remote` for each task."""
     return {"num_cpus": config.processors, "num_gpus": config.gpus or 0.0, "max_retries": config.retries}
 
 

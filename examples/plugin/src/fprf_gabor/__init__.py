@@ -46,7 +46,7 @@ class GaborConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OpacityConfig(LossTermConfig):
-    """Rays should meet something or nothing: for objects before an empty background, against half-transparent haze."""
+    """Push the opacity of rays to 0 or 1: for objects before an empty background, against half-transparent haze."""
 
     weight: float = 0.01
     """Weight of the term, which is 1 for rays of opacity 0.5 and 0 for those of opacity 0 or 1."""
