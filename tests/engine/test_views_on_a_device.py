@@ -167,4 +167,6 @@ def test_blocks_of_a_large_scene(block_world: BlockWorld) -> None:
             trained = load_run(block_world.root, device, max_memory=1.0)
             view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render)
             found.append(view[:3])
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+    # Off the CPU points are turned into a block without a matrix product: sums of three, in another order.
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
