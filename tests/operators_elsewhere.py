@@ -45,7 +45,7 @@ ELSEWHERE = {
     "precision.double": "a conversion",
     "precision.full_precision": "a switch",
     "precision.tf32": "a switch, in test_precision",
-    "precision.wide_device": "a choice of device",
+    "precision.float64_device": "a choice of device",
     "references": "photographs, in test_references",
     "regional": "makes a stylizer, in test_regional",
     "scene.scene_style": "puts others together, in test_scene_style",
