@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["DecoderConfig", "MlpDecoderConfig", "Objective", "ResidualDecoderConfig"]
 
 Objective = Literal["identity", "paper"]
-"""What a decoder was trained for: to return photographs, or with the paper's content and style losses as well."""
+"""Training objective of a decoder: returning photographs alone, or the paper's content and style losses as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class MlpDecoderConfig(DecoderConfig):
     weights: Path | None = None
     """A decoder made by `fprf pretrain decoder`. By default one that ships for the chosen encoder."""
     objective: Objective = "identity"
-    """Which of the shipped decoders: trained to return photographs alone, or with the paper's content and style losses
+    """Objective that the shipped decoder was trained with: returning photographs alone, or the paper's content and style losses
     (L_c + lambda L_s) as well. Not used where `weights` names a file."""
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
