@@ -32,7 +32,7 @@ from .rendering.cameras import Cameras
 from .rendering.motions import make_path, upwards
 from .rendering.paths import look_at, pinhole
 from .style.config import StyleConfig
-from .style.files import StyleFile, check_photographs, read_style, write_style
+from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
 
 __all__ = ["Shot", "TrainedScene", "open_scene"]
@@ -143,25 +143,24 @@ class TrainedScene:
         forbid: Sequence[str] = (),
         keep: Sequence[str] = (),
     ) -> "TrainedScene":
-        """The scene in the style of photographs, feed-forward; every argument is a field of `StyleConfig`.
+        """The scene in the style of photographs, or of all in a folder; every argument is a field of `StyleConfig`.
 
         Raises UsageError for no references or wishes that the scene does not know, DataError for unreadable photographs,
         WeightsError where the encoders at hand are not the scene's.
         """
-        return self.apply(
-            StyleConfig(
-                references=tuple(Path(path) for path in references),
-                weights=tuple(weights),
-                strength=strength,
-                luminance=luminance,
-                clusters=clusters,
-                blend=blend,
-                stylizer=RegionToneConfig() if stylizer is None else stylizer,
-                pin=tuple(pin),
-                forbid=tuple(forbid),
-                keep=tuple(keep),
-            )
+        style = StyleConfig(
+            references=tuple(Path(path) for path in references),
+            weights=tuple(weights),
+            strength=strength,
+            luminance=luminance,
+            clusters=clusters,
+            blend=blend,
+            stylizer=RegionToneConfig() if stylizer is None else stylizer,
+            pin=tuple(pin),
+            forbid=tuple(forbid),
+            keep=tuple(keep),
         )
+        return self.apply(with_folders(style))
 
     def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
         """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as `stylize`."""

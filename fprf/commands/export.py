@@ -10,7 +10,7 @@ from ..export.config import ExportConfig
 from ..export.looks import Look, Named, make_looks, named_styles, style_name
 from ..export.plan import KINDS, Plan, look_file, plan
 from .progress import Display
-from .style_flags import read_flags
+from .style_flags import read_flags, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -35,7 +35,7 @@ def run(args: list[str]) -> int:
         ExportConfig(), _kinds_as_flag(args), prog="fprf export", description=_DESCRIPTION, positional=("run",)
     )
     what = plan(config.kinds, config.output or config.run / "exports")
-    styles = named_styles(config.styles, file)
+    styles = named_styles(config.styles, file, say)
     if config.references:
         styles.insert(0, Named(style_name(config.references, config.style), file))
     if config.kinds and "lut" in what.kinds and not styles:

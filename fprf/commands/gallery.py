@@ -16,6 +16,7 @@ from .parsing import parse
 from .progress import Display
 from .render import RenderVerbConfig, camera_path, frames_of
 from .showcase import restyled, write_page
+from .style_flags import say
 
 if TYPE_CHECKING:
     from ..engine.loading import Trained
@@ -79,11 +80,12 @@ def run(args: list[str]) -> int:
     output = config.output if config.output is not None else config.run / "gallery.html"
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
-    photographs = _photographs(config.references)
+    from ..datamanagers.images import photographs as find_photographs
     from ..engine.loading import load_run
     from ..engine.views import render_view
     from ..output.video import write_video
 
+    photographs = find_photographs(config.references, say)
     trained = at_quality(load_run(config.run, config.device), config)
     views, known = _views(trained, config), trained.known
     chosen = _chosen(config, photographs)
@@ -119,21 +121,6 @@ def run(args: list[str]) -> int:
     )
     print(f"{len(views)} views in {len(shown)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
     return 0
-
-
-def _photographs(paths: Sequence[Path]) -> list[Path]:
-    """The files among the paths and the images in the folders, each once. Raises UsageError for an empty folder."""
-    from ..datamanagers.image_header import IMAGE_SUFFIXES
-
-    found: list[Path] = []
-    for path in paths:
-        inside = [path]
-        if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-            if not inside:
-                raise UsageError(f"--references {path}: holds no images ({' '.join(sorted(IMAGE_SUFFIXES))})")
-        found += [each for each in inside if each not in found]
-    return found
 
 
 def _chosen(config: GalleryConfig, photographs: list[Path]) -> list[tuple[str, StyleFile]]:

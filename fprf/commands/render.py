@@ -14,7 +14,7 @@ from ..errors import ConfigError, UsageError
 from ..style.config import StyleConfig
 from .keyframes import keyed_looks, read_keyframes
 from .progress import Display
-from .style_flags import read_flags
+from .style_flags import read_flags, say
 
 if TYPE_CHECKING:
     from ..engine.footage import Take
@@ -185,7 +185,7 @@ def _takes(trained: "Trained", config: RenderVerbConfig, file: "StyleFile") -> "
         if text == "plain":
             takes.append(Take("plain", lambda frame: None))
         else:
-            ((name, named),) = named_styles([text], file)
+            ((name, named),) = named_styles([text], file, say)
             takes.append(_styled_take(trained, name, named))
     takes = takes or [Take("plain", lambda frame: None)]
     if "match" in config.show and not any(take.styled is not None for take in takes):

@@ -108,7 +108,7 @@ def write_page(
         scene=facts,
         view_names=[trained.known.names[view] for view in views],
         originals=[to_uint8(view.rgb) for view in originals],
-        references=[Reference(name, load_image(path)) for name, path in references.items()],
+        references=[Reference(name, load_image(path, upright=True)) for name, path in references.items()],
         styles=[
             Style(
                 each.name,

@@ -1,15 +1,16 @@
 """Flags of the verbs that restyle: a style file first, where one is named, then every flag over it."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..style.config import StyleConfig
-from ..style.files import StyleFile, check_photographs, read_style
+from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from .parsing import parse
 
-__all__ = ["read_flags"]
+__all__ = ["read_flags", "say"]
 
 C = TypeVar("C", bound=StyleConfig)
 
@@ -19,19 +20,25 @@ def read_flags(
 ) -> tuple[C, StyleFile]:
     """The verb's config and the style that it asks for; `--style FILE` gives the values that no flag gives.
 
-    A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg 5=b.jpg`. Raises what
-    `parse` and `read_style` raise, and DataError where a photograph of the file is no longer the one it was.
+    A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg 5=b.jpg`. Folders among
+    the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
+    where a photograph of the file is no longer the one it was.
     """
     path, args = _style_flag(args), _joined(args, default)
     file = read_style(path) if path is not None else StyleFile(StyleConfig())
     if path is not None:
         default = replace(default, **_styles(file.style))
-    config = parse(default, args, prog=prog, description=description, positional=positional)
+    config = with_folders(parse(default, args, prog=prog, description=description, positional=positional), say)
     file = file._replace(style=StyleConfig(**_styles(config)))
     given = {arg.partition("=")[0] for arg in args}
     if path is not None and not given & {"--references", "--masks"}:
         check_photographs(path, file)
     return config, file
+
+
+def say(text: str) -> None:
+    """A line on standard error."""
+    print(text, file=sys.stderr)
 
 
 def _styles(config: StyleConfig) -> dict[str, Any]:

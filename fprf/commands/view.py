@@ -3,14 +3,16 @@
 import importlib.util
 import os
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
 from ..engine.quality import QualityConfig, at_quality
-from ..errors import UsageError
+from ..errors import CheckpointError, UsageError
 from .parsing import parse
+from .style_flags import say
 
 if TYPE_CHECKING:
     from ..engine.loading import Trained
@@ -28,7 +30,7 @@ class ViewConfig(QualityConfig):
     run: Path = Path()
     """Run folder."""
     references: tuple[Path, ...] = ()
-    """Photographs to begin with: on the shelf, and all in the mix."""
+    """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"
     """Address to listen on; any but this machine's own needs a token."""
     port: int = 8080
@@ -59,8 +61,11 @@ def run(args: list[str]) -> int:
 
     access = make_access(config.host, config.token)
     with Host(access, config.port) as host:
+        if not (config.run / "config.json").is_file():
+            raise CheckpointError(f"{config.run}: no config.json here, so it is no run folder; `fprf train` makes one")
+        references = _photographs(config.references)
         print(host.address, flush=True)
-        host.open(lambda: _load(config), config.references, config.pixels)
+        host.open(lambda: _load(config), references, config.pixels)
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
@@ -70,6 +75,15 @@ def run(args: list[str]) -> int:
             last.start()
             raise
     return 0
+
+
+def _photographs(references: Sequence[Path]) -> Sequence[Path]:
+    """The images of folders in the folders' place. Raises DataError where there are none."""
+    if not any(path.is_dir() for path in references):  # decoding needs a library that the page does not wait for
+        return references
+    from ..datamanagers.images import photographs
+
+    return photographs(references, say)
 
 
 def _load(config: ViewConfig) -> "Trained":

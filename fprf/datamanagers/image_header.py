@@ -1,9 +1,10 @@
 """Size and transparency of an image file, from its first bytes: nothing is decoded, so a bomb costs nothing.
 
-PNG, JPEG, WebP, BMP and TIFF, told by their content and not by the file's name.
+PNG, JPEG, WebP, BMP, TIFF, HEIC and AVIF, told by their content and not by the file's name.
 """
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,23 +12,31 @@ from ..errors import DataError
 
 __all__ = ["IMAGE_SUFFIXES", "ImageHeader", "header_of", "read_header"]
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"})
 """What is taken for an image when a folder is listed, in lower case."""
 
 _HEAD = 1 << 18
 """Bytes read at first: more than any camera's EXIF block with its thumbnail."""
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
+_AVIF = frozenset({b"avif", b"avis"})
+_HEIF = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
+"""Brands of the ISO base media format that mark still images."""
+_ALPHA = (b"auxiliary:alpha", b"hevc:2015:auxid:1")
+"""Types of an auxiliary image that is the alpha channel."""
 
 
 class ImageHeader(NamedTuple):
-    """What a file says of its image, as stored: EXIF orientation is not applied."""
+    """What a file says of its image, as stored: EXIF orientation is not applied.
+
+    HEIC and AVIF store rotation in the image itself (`irot`), which decoders apply: width and height are those after it.
+    """
 
     width: int
     height: int
     alpha: bool
     kind: str
-    """png, jpeg, webp, bmp or tiff."""
+    """png, jpeg, webp, bmp, tiff, heic or avif."""
 
 
 def read_header(path: Path) -> ImageHeader:
@@ -43,7 +52,9 @@ def read_header(path: Path) -> ImageHeader:
     if not head:
         raise DataError(f"{path}: the file is empty; restore the image or remove it from the scene")
     if header is None:
-        raise DataError(f"{path}: no PNG, JPEG, WebP, BMP or TIFF header; replace the file or convert the image to PNG")
+        raise DataError(
+            f"{path}: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF header; replace the file or convert the image to PNG"
+        )
     if header.width < 1 or header.height < 1:
         raise DataError(f"{path}: the header says {header.width}x{header.height} pixels; replace the file")
     return header
@@ -62,7 +73,9 @@ def header_of(data: bytes) -> ImageHeader | None:
             return _bmp(data)
         if data[:4] in (b"II*\0", b"MM\0*"):
             return _tiff(data)
-    except (struct.error, IndexError):
+        if data[4:8] == b"ftyp":
+            return _heif(data)
+    except (struct.error, IndexError, KeyError):
         return None
     return None
 
@@ -126,3 +139,56 @@ def _tiff(data: bytes) -> ImageHeader | None:
     if 256 not in tags or 257 not in tags:
         return None
     return ImageHeader(tags[256], tags[257], tags.get(277, 1) in (2, 4), "tiff")
+
+
+def _heif(data: bytes) -> ImageHeader | None:
+    """The primary image of a HEIC or AVIF file (ISO/IEC 23008-12), cropped and rotated by its own properties."""
+    brands = {data[at : at + 4] for at in range(8, min(struct.unpack_from(">I", data)[0], 256), 4)}
+    if not brands & (_AVIF | _HEIF):
+        return None
+    whole = {kind: (start, end) for kind, start, end in _boxes(data, 0, len(data))}
+    meta = {kind: (start, end) for kind, start, end in _boxes(data, whole[b"meta"][0] + 4, whole[b"meta"][1])}
+    parts = {kind: (start, end) for kind, start, end in _boxes(data, *meta[b"iprp"])}
+    properties = list(_boxes(data, *parts[b"ipco"]))
+    at = meta[b"pitm"][0]
+    (primary,) = struct.unpack_from(">H" if data[at] == 0 else ">I", data, at + 4)
+    width, height, turned = 0, 0, False
+    for index in _properties_of(data, parts[b"ipma"][0], primary):
+        kind, start, _ = properties[index - 1]
+        if kind == b"ispe":
+            width, height = struct.unpack_from(">II", data, start + 4)
+        elif kind == b"clap":
+            across, by, down, by_too = struct.unpack_from(">4I", data, start)
+            width, height = across // max(by, 1), down // max(by_too, 1)
+        elif kind == b"irot":
+            turned = bool(data[start] & 1)
+    alpha = any(kind == b"auxC" and any(name in data[start:end] for name in _ALPHA) for kind, start, end in properties)
+    if turned:
+        width, height = height, width
+    return ImageHeader(width, height, alpha, "avif" if brands & _AVIF else "heic")
+
+
+def _properties_of(data: bytes, at: int, item: int) -> list[int]:
+    """Numbers, from 1, of the properties of an item, by the content of an `ipma` box at `at`."""
+    version, long = data[at], data[at + 3] & 1
+    (count,) = struct.unpack_from(">I", data, at + 4)
+    at += 8
+    for _ in range(count):
+        (number,) = struct.unpack_from(">I" if version else ">H", data, at)
+        at += 4 if version else 2
+        size, at = data[at], at + 1
+        end = at + size * (1 + long)
+        if number == item:
+            return [n & (0x7FFF if long else 0x7F) for n in struct.unpack_from(f">{size}{'H' if long else 'B'}", data, at)]
+        at = end
+    return []
+
+
+def _boxes(data: bytes, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, start and end of the content of each box in a part of an ISO base media file."""
+    while at + 8 <= end:
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if length < 8:  # 0: up to the end of the file, 1: longer than 4 GiB; neither holds what describes an image
+            return
+        yield kind, at + 8, at + length
+        at += length

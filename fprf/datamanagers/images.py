@@ -1,11 +1,12 @@
 """Image files to 8-bit arrays [H W 3], sRGB, at the size that a scene's cameras have.
 
-Pixels are taken as stored: EXIF orientation is ignored, as COLMAP does, because the cameras were calibrated so.
+Pixels of captures are taken as stored: EXIF orientation is ignored, as COLMAP does, because the cameras were calibrated so.
+Photographs without a camera, such as references, are turned upright.
 Transparency is straight (not premultiplied) and composited before any reduction, which averages areas.
 """
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -16,12 +17,12 @@ from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..memory import out_of_memory
-from .image_header import ImageHeader, header_of, read_header
+from .image_header import IMAGE_SUFFIXES, ImageHeader, header_of, read_header
 
 if TYPE_CHECKING:  # else reading a picture would need torch
     from .scene import Scene
 
-__all__ = ["MAX_PIXELS", "Image", "load_image", "load_images", "load_mask"]
+__all__ = ["MAX_PIXELS", "Image", "load_image", "load_images", "load_mask", "photographs"]
 
 MAX_PIXELS = 100_000_000
 """Files that claim more are refused before they are decoded."""
@@ -30,16 +31,23 @@ Image: TypeAlias = NDArray[np.uint8]
 _WHITE = (1.0, 1.0, 1.0)
 
 
-def load_image(path: Path, size: tuple[int, int] | None = None, background: Sequence[float] | None = None) -> Image:
+def load_image(
+    path: Path,
+    size: tuple[int, int] | None = None,
+    background: Sequence[float] | None = None,
+    *,
+    upright: bool = False,
+) -> Image:
     """An image [H W 3] in sRGB, 0 to 255, resized to `size` (width, height), or as delivered without one.
 
     16-bit files are rounded to 8 bits, grey ones repeated. Transparent pixels show `background` (RGB in [0, 1]; white
-    by default). Raises DataError where the file is absent, truncated, damaged, of no known format or over 1e8 pixels.
+    by default). `upright` obeys EXIF orientation, except in files with transparency. Raises DataError where the file is
+    absent, truncated, damaged, of no known format or over 1e8 pixels.
     """
     header = read_header(path)
     if header.width * header.height > MAX_PIXELS:
         raise DataError(f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the image")
-    pixels = _to_rgb(path, _decode(path, header), _WHITE if background is None else background)
+    pixels = _to_rgb(path, _decode(path, header, upright), _WHITE if background is None else background)
     if size is None or size == (pixels.shape[1], pixels.shape[0]):
         return pixels
     smaller = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
@@ -84,7 +92,42 @@ def load_images(scene: "Scene", background: Sequence[float] | None = None) -> li
         return list(pool.map(load, range(len(sizes))))
 
 
-def _decode(path: Path, header: ImageHeader) -> NDArray[np.generic]:
+def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Path]:
+    """The files among the paths and the images in the folders, each once; those of a folder in the order of their names.
+
+    An image in a folder that cannot be read is left out, and `report` is given the reason. Raises DataError for a folder
+    without a readable image.
+    """
+    found: dict[Path, None] = {}
+    for path in paths:
+        found |= dict.fromkeys(_readable(path, report) if path.is_dir() else [path])
+    return list(found)
+
+
+def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
+    """The images of a folder that can be decoded."""
+    images = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    if not images:
+        raise DataError(f"{folder}: holds no images ({' '.join(sorted(IMAGE_SUFFIXES))}); name a folder that does")
+
+    def fault(path: Path) -> str:
+        try:
+            load_image(path)
+        except DataError as error:
+            return str(error)
+        return ""
+
+    with ThreadPoolExecutor() as pool:
+        faults = dict(zip(images, pool.map(fault, images), strict=True))
+    for reason in filter(None, faults.values()):
+        report(f"left out: {reason}")
+    if all(faults.values()):
+        raise DataError(f"{folder}: none of its {len(images)} images can be read; the first one: {faults[images[0]]}")
+    return [path for path in images if not faults[path]]
+
+
+def _decode(path: Path, header: ImageHeader, upright: bool = False) -> NDArray[np.generic]:
+    """Pixels as OpenCV orders them, BGR; EXIF orientation is obeyed on request, and not where there is transparency."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -92,16 +135,37 @@ def _decode(path: Path, header: ImageHeader) -> NDArray[np.generic]:
     damage = _damage(data, header)
     if damage:
         raise DataError(f"{path}: {damage}; copy or export the image again")
+    if header.kind == "heic":
+        return _decode_heic(path, data)
+    # OpenCV obeys the orientation only where it may also drop the alpha channel.
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
+    if header.alpha or not upright:
+        flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    again = "convert the image to PNG or JPEG" if header.kind == "avif" else "copy or export the image again"
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error as error:
         if out_of_memory(error):
             raise
-        raise DataError(f"{path}: the {header.kind} data cannot be decoded; copy or export the image again") from error
+        raise DataError(f"{path}: the {header.kind} data cannot be decoded; {again}") from error
     if pixels is None:
         np.empty(8 * header.width * header.height, np.uint8)  # raises MemoryError where that is what the decoder lacked
-        raise DataError(f"{path}: the {header.kind} data cannot be decoded; copy or export the image again")
+        raise DataError(f"{path}: the {header.kind} data cannot be decoded; {again}")
     return np.asarray(pixels)
+
+
+def _decode_heic(path: Path, data: bytes) -> NDArray[np.generic]:
+    """The image of a HEIC file. Its rotation is part of the format, so it comes upright."""
+    try:
+        import pillow_heif
+    except ImportError:
+        raise DataError(
+            f"{path}: is HEIC, which needs the package pillow-heif: pip install 'fprf[heic]', or convert the image to JPEG"
+        ) from None
+    try:
+        return np.asarray(pillow_heif.open_heif(data, bgr_mode=True))
+    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError) as error:
+        raise DataError(f"{path}: the heic data cannot be decoded; copy or export the image again") from error
 
 
 def _damage(data: bytes, header: ImageHeader) -> str:

@@ -111,7 +111,7 @@ def styled_by_photographs(trained: Trained, encoders: Encoders, config: PaperCon
     shown = [render_looks(trained.model, known.facts, known.cameras, view, render, looks)[0] for view in views]
     plain = [pictures[PLAIN] for pictures in shown]
     side = max(plain[0].shape[:2])
-    images = [torch.from_numpy(shrink(load_image(path), side)).float() / 255 for path in paths]
+    images = [torch.from_numpy(shrink(load_image(path, upright=True), side)).float() / 255 for path in paths]
     observer = encoders.semantic if encoders.semantic is not None else encoders.content
     here, there = matched_regions(observer.cpu(), plain, images, regions=_REGIONS, seed=0)
     styled = {name: [pictures[name] for pictures in shown] for name in stylizers}

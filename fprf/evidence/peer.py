@@ -100,7 +100,7 @@ def _nearness(frames: Frames, truth: Sequence[Tensor]) -> dict[str, float]:
 
 def _style(config: PeerConfig, styled: Sequence[Tensor], plain: Sequence[Tensor]) -> dict[str, float | None]:
     """Distance to the references (1 = no change) and what is left of the frames' structure (1 = all of it)."""
-    references = [torch.from_numpy(load_image(path)).float() / 255 for path in config.references]
+    references = [torch.from_numpy(load_image(path, upright=True)).float() / 255 for path in config.references]
     references = [_reduced(image) for image in references]
     here, there = matched_regions(BundledSemanticConfig().build(), plain, references, regions=REGIONS, seed=0)
     judge = {"bundled-content": BundledContentConfig().build()}

@@ -1,13 +1,14 @@
 """The looks that a scene is exported in: as it is, and each style with its name."""
 
 import re
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import UsageError
 from ..style.config import StyleConfig
-from ..style.files import StyleFile, check_photographs, read_style
+from ..style.files import StyleFile, check_photographs, read_style, with_folders
 
 if TYPE_CHECKING:
     from ..engine.loading import Trained
@@ -42,10 +43,11 @@ def style_name(references: Sequence[Path], style: Path | None) -> str:
     return _tidy(own) or "style"
 
 
-def named_styles(texts: Sequence[str], base: StyleFile) -> list[Named]:
+def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], None] = warnings.warn) -> list[Named]:
     """Styles from NAME=STYLE.json or NAME=PHOTO[,PHOTO ...]; photographs go with the other settings of `base`.
 
-    Raises UsageError for another form or a name that comes twice, and what reading a style file raises.
+    Folders stand for the images in them, and `report` is told which of these cannot be read. Raises UsageError for another
+    form or a name that comes twice, and what reading a style file raises.
     """
     found = []
     for text in texts:
@@ -58,7 +60,7 @@ def named_styles(texts: Sequence[str], base: StyleFile) -> list[Named]:
             file = read_style(Path(what))
             check_photographs(Path(what), file)
         else:
-            file = StyleFile(_with(base.style, tuple(Path(part) for part in what.split(","))))
+            file = StyleFile(with_folders(_with(base.style, tuple(Path(part) for part in what.split(","))), report))
         found.append(Named(name, file))
     return found
 

@@ -1,10 +1,11 @@
-"""What a photograph says of its camera: model and focal length, from the EXIF block of a JPEG. Nothing else is read."""
+"""What a photograph says of its camera: model and focal length, from the EXIF block of a JPEG, which HEIC files also have."""
 
 import struct
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Lens", "lens_of", "read_lens"]
+__all__ = ["Lens", "heic_exif", "lens_of", "read_lens"]
 
 _HEAD = 1 << 17
 """EXIF lies within the first 64 KiB of a JPEG."""
@@ -30,6 +31,23 @@ def read_lens(path: Path) -> Lens:
             return lens_of(file.read(_HEAD))
     except OSError:
         return Lens()
+
+
+def heic_exif(path: Path) -> bytes:
+    """The EXIF block of a HEIC file that can be decoded, for a JPEG of its pixels: without orientation, which these have had.
+
+    Empty where there is none, it is longer than a JPEG takes, or the file is none.
+    """
+    if not find_spec("pillow_heif"):
+        return b""
+    import pillow_heif
+
+    if not pillow_heif.is_supported(path):
+        return b""
+    info = pillow_heif.open_heif(path).info
+    pillow_heif.set_orientation(info)
+    block: bytes = info.get("exif") or b""
+    return block if len(block) < (1 << 16) - 2 else b""
 
 
 def lens_of(data: bytes) -> Lens:

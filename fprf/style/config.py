@@ -19,7 +19,7 @@ class StyleConfig:
     """How photographs become the style of a scene. REGION and REFERENCE are explained in `style.wishes`."""
 
     references: tuple[Path, ...] = ()
-    """Photographs whose style the scene takes."""
+    """Photographs whose style the scene takes, or folders of them."""
     weights: tuple[float, ...] = ()
     """How much each reference counts, in their order, above 0; none = all alike."""
     masks: tuple[Path, ...] = ()

@@ -9,10 +9,11 @@ on another scene by its key, since numbers mean something on one scene alone.
 
 import hashlib
 import os
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from .. import __version__
 from ..errors import ConfigError, DataError
@@ -21,12 +22,13 @@ from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig
 
-__all__ = ["Key", "StyleFile", "check_photographs", "read_style", "write_style"]
+__all__ = ["Key", "StyleFile", "check_photographs", "read_style", "with_folders", "write_style"]
 
 _FORMAT = 1
 _KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
 
 Key = tuple[float, ...]
+S = TypeVar("S", bound=StyleConfig)
 
 
 class StyleFile(NamedTuple):
@@ -103,6 +105,28 @@ def check_photographs(path: Path, file: StyleFile) -> None:
                 f"{path}: {photo} has changed since the style was saved (sha256 {then[:12]}…, now {now[:12]}…); "
                 "restore it, or name all photographs with --references to take them as they are"
             )
+
+
+def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
+    """The style with the images of each folder in the folder's place, all with its weight.
+
+    Images of folders that cannot be read are left out, and `report` is given the reason. Raises DataError for a folder
+    without a readable image, ConfigError for a mask over a folder.
+    """
+    if not any(path.is_dir() for path in style.references):
+        return style
+    from ..datamanagers.images import photographs
+
+    count = len(style.references)
+    rows: dict[Path, tuple[float, Path]] = {}
+    for path, weight, mask in zip(
+        style.references, style.weights or (1.0,) * count, style.masks or (NO_MASK,) * count, strict=True
+    ):
+        if path.is_dir() and mask != NO_MASK:
+            raise ConfigError(f"masks: {mask} is for one photograph, {path} is a folder; write none, or name the photographs")
+        rows |= {file: (weight, mask) for file in photographs([path], report) if file not in rows}
+    weights, masks = zip(*rows.values(), strict=True)
+    return replace(style, references=tuple(rows), weights=weights if style.weights else (), masks=masks if style.masks else ())
 
 
 def _found(file: Path, path: Path) -> Path:

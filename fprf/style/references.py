@@ -65,7 +65,7 @@ def read_reference(
     where a file is no readable image, or a mask does not fit.
     """
     at_least("longest", longest, _SHORTEST)
-    photo = load_image(path)
+    photo = load_image(path, upright=True)
     image = torch.from_numpy(_reduced(photo, longest)).to(device).float() / 255
     height, width = image.shape[:2]
     pixel = _grid(height, width) if mask is None else _inside(_mask(mask, path, photo, (width, height)))
@@ -120,7 +120,7 @@ def _inside(mask: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "N 2"]:
 
 def _mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
     """What a mask selects at that size (width, height), bool: at least half covered, else whatever is covered at all."""
-    picture = load_image(path)
+    picture = load_image(path, upright=True)
     (height, width), (own_height, own_width) = picture.shape[:2], photo.shape[:2]
     if abs(width * own_height - height * own_width) > 0.5 * (width + height + own_width + own_height):
         raise DataError(

@@ -50,7 +50,7 @@ def _decode(source: Path, target: Path, side: int) -> None:
 
     from ..datamanagers.images import load_image
 
-    photo = load_image(source)
+    photo = load_image(source, upright=True)
     height, width = photo.shape[:2]
     scale = min(1.0, side / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))

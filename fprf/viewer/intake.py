@@ -35,7 +35,7 @@ def check_photograph(data: bytes) -> None:
         raise DataError(f"photograph: {len(data)} bytes; at most {LARGEST} are taken: make it smaller")
     header = header_of(data)
     if header is None:
-        raise DataError("photograph: no PNG, JPEG, WebP, BMP or TIFF; convert it to one of these")
+        raise DataError("photograph: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF; convert it to one of these")
     if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
         raise DataError(f"photograph: {header.width}x{header.height} pixels; 1 to {MAX_PIXELS:.0e} are taken: make it smaller")
 

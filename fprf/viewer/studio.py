@@ -87,7 +87,7 @@ class Studio:
         """Encode a photograph. Raises DataError for an unreadable one."""
         reference = encode_photograph(self.trained, path, self.encoders, name=name)
         self._cards += 1
-        return Card(self._cards, name, path, shrink(load_image(path), _THUMBNAIL), reference)
+        return Card(self._cards, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference)
 
     def styled(self, look: Look) -> Styled | None:
         """The look on the scene; None for the scene as it is. Raises UsageError for wishes that contradict each other."""

@@ -2,6 +2,7 @@
 
 import re
 import struct
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +13,10 @@ import pytest
 from capture_files import Capture, write_image, write_transforms
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from photo_files import HEIC, turned_jpeg
 
 from fprf.datamanagers.image_header import header_of, read_header
-from fprf.datamanagers.images import load_image, load_images
+from fprf.datamanagers.images import load_image, load_images, photographs
 from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.errors import DataError
 
@@ -105,14 +107,59 @@ def test_16_bits_are_rounded_to_8(tmp_path: Path) -> None:
     assert load_image(tmp_path / "a.png")[0, :, ::-1].tolist() == [[0, 7, 255], [0, 1, 200]]
 
 
-def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
-    plain = encoded(".jpg", NOISE)
-    exif = b"Exif\0\0II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)
-    turned = plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:]
-    (tmp_path / "a.jpg").write_bytes(turned)
-    (tmp_path / "b.jpg").write_bytes(plain)
-    assert cv2.imread(str(tmp_path / "a.jpg")).shape[:2] == (18, 12)
-    assert np.array_equal(load_image(tmp_path / "a.jpg"), load_image(tmp_path / "b.jpg"))
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_ignored_unless_a_photograph_is_wanted_upright(tmp_path: Path, orientation: int) -> None:
+    shown = turned_jpeg(tmp_path / "a.jpg", NOISE, orientation)
+    stored = turned_jpeg(tmp_path / "b.jpg", NOISE, 1)
+    assert np.array_equal(load_image(tmp_path / "a.jpg"), stored)
+    assert np.array_equal(load_image(tmp_path / "a.jpg", upright=True), shown)
+    assert np.array_equal(load_image(tmp_path / "b.jpg", upright=True), stored)
+
+
+def test_heic_comes_upright_and_needs_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.heic").write_bytes(HEIC)
+    assert read_header(tmp_path / "a.heic") == (48, 64, False, "heic")
+    for length in range(len(HEIC)):
+        header_of(HEIC[:length])  # whatever is cut off, it is an answer and no fault
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pillow_heif", None)
+        with pytest.raises(DataError, match=r"is HEIC.*pip install 'fprf\[heic\]', or convert"):
+            load_image(tmp_path / "a.heic")
+    pytest.importorskip("pillow_heif")
+    for upright in (False, True):
+        loaded = load_image(tmp_path / "a.heic", upright=upright).astype(int)
+        assert loaded.shape == (64, 48, 3)
+        for (y, x), colour in {(15, 24): (200, 40, 30), (50, 12): (20, 60, 220), (50, 36): (30, 180, 60)}.items():
+            assert abs(loaded[y, x] - colour).max() < 8
+    (tmp_path / "a.heic").write_bytes(HEIC[:-40])
+    with pytest.raises(DataError, match="cannot be decoded"):
+        load_image(tmp_path / "a.heic")
+
+
+@pytest.mark.skipif(not cv2.haveImageWriter("x.avif"), reason="this OpenCV has no AVIF")
+def test_avif(tmp_path: Path) -> None:
+    flat = np.full((12, 18, 4), (200, 40, 30, 128), dtype=np.uint8)
+    (tmp_path / "a.avif").write_bytes(encoded(".avif", flat[:, :, :3]))
+    (tmp_path / "b.avif").write_bytes(encoded(".avif", flat))
+    assert read_header(tmp_path / "a.avif") == (18, 12, False, "avif") and read_header(tmp_path / "b.avif").alpha
+    assert abs(load_image(tmp_path / "a.avif").astype(int) - (30, 40, 200)).max() < 8
+
+
+def test_folders_of_photographs_are_listed_without_what_cannot_be_read(tmp_path: Path) -> None:
+    for name in ("b.png", "a.jpg", "notes.txt", ".hidden.png", "broken.jpg", "empty.webp"):
+        (tmp_path / name).write_bytes(encoded(".png" if "png" in name else ".jpg", NOISE))
+    (tmp_path / "broken.jpg").write_bytes(b"not a photograph")
+    (tmp_path / "empty.webp").write_bytes(b"")
+    (tmp_path / "deeper").mkdir()
+    told: list[str] = []
+    found = photographs([tmp_path / "b.png", tmp_path, tmp_path / "broken.jpg"], told.append)
+    assert [path.name for path in found] == ["b.png", "a.jpg", "broken.jpg"], "what is named by itself is taken as it is"
+    assert len(told) == 2 and "broken.jpg" in told[0] and "empty.webp: the file is empty" in told[1]
+    with pytest.raises(DataError, match="deeper: holds no images"):
+        photographs([tmp_path / "deeper"], told.append)
+    (tmp_path / "deeper" / "x.png").write_bytes(b"")
+    with pytest.raises(DataError, match=r"none of its 1 images can be read.*x\.png"):
+        photographs([tmp_path / "deeper"], told.append)
 
 
 def test_reduction_averages_areas(tmp_path: Path) -> None:

@@ -1,11 +1,14 @@
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from photo_files import HEIC
 
+from fprf.datamanagers.images import load_image
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.output.video import write_video
 from fprf.sfm.config import SfmConfig
@@ -61,6 +64,37 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(photos: Path, tmp_path: 
     assert len(state.images) == 3
     assert state.dropped.keys() == {"empty.jpg", "text.png", "half.jpg"}
     assert state.dropped["half.jpg"] == "the JPEG is truncated (no end-of-image marker)"
+
+
+def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = tmp_path / "in"
+    source.mkdir()
+    for k in range(3):
+        (source / f"IMG {k}.HEIC").write_bytes(HEIC)
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pillow_heif", None)
+        with pytest.raises(DataError, match=r"0 usable images.*IMG 0\.HEIC: is HEIC.*pip install 'fprf\[heic\]'"):
+            gathered(source, Place(tmp_path / "without"))
+    pytest.importorskip("pillow_heif")
+    place = Place(tmp_path / "scene")
+    state = gathered(source, place)
+    assert names(place) == list(state.images) == [f"IMG_{k}.HEIC.jpg" for k in range(3)]
+    assert state.images["IMG_0.HEIC.jpg"] | {"sha256": ""} == {
+        "sha256": "",
+        "width": 48,
+        "height": 64,
+        "lens": ["Phone 9", 0.0, 0],
+    }
+    jpeg = place.images / "IMG_0.HEIC.jpg"
+    assert np.array_equal(load_image(jpeg), load_image(jpeg, upright=True)), "it is upright already"
+    assert abs(load_image(jpeg).astype(int) - load_image(source / "IMG 0.HEIC")).mean() < 3
+
+
+def test_a_folder_of_other_files_is_told_by_what_it_holds(tmp_path: Path) -> None:
+    for name in ("a.dng", "b.DNG", "c.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(DataError, match=r"0 usable images.*holds \.dng \.txt files.*convert"):
+        gathered(tmp_path, Place(tmp_path / "scene"))
 
 
 def test_folders_below_and_blanks_in_names(photos: Path, tmp_path: Path) -> None:
@@ -121,7 +155,7 @@ def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
     (tmp_path / "few").mkdir()
     photo(tmp_path / "few" / "a.jpg")
     (tmp_path / "few" / "b.jpg").write_bytes(b"")
-    with pytest.raises(DataError, match=r"1 usable images, at least 3 are needed \(the file is empty\)"):
+    with pytest.raises(DataError, match=r"1 usable images, at least 3 are needed; b\.jpg: the file is empty"):
         gathered(tmp_path / "few", place)
     gathered(photos, place)
     (tmp_path / "other").mkdir()

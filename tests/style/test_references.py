@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from photo_files import turned_jpeg
 
 from fprf.datamanagers.basis import Basis
 from fprf.datamanagers.config import GuidedConfig
@@ -41,6 +42,28 @@ def test_samples_have_the_statistics_of_the_whole_filtered_image(tmp_path: Path)
         assert 10_000 < len(samples) < 40_000
         assert float(((samples.mean(0) - full.mean(0)).abs() / sigma).max()) < 0.03
         assert float((samples.std(0) / sigma - 1).abs().max()) < 0.05
+
+
+def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path) -> None:
+    stored, mask = cv2.imread(str(photo(tmp_path, 96, 128))), np.zeros((96, 128, 3), np.uint8)
+    mask[:40, :90] = 255
+    for name, pixels in (("photo", stored), ("mask", mask)):
+        upright = turned_jpeg(tmp_path / f"{name}.jpg", pixels, 6)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), upright[:, :, ::-1])
+    for masked in (False, True):
+        turned, plain = (
+            read_reference(
+                tmp_path / f"photo.{kind}",
+                content=CONTENT,
+                semantic=SEMANTIC,
+                basis=BASIS,
+                mask=tmp_path / f"mask.{kind}" if masked else None,
+            )
+            for kind in ("jpg", "png")
+        )
+        for a, b in zip(turned[1:3], plain[1:3], strict=True):
+            assert isinstance(a, torch.Tensor) and torch.equal(a, b)
+        assert turned.colour is not None and plain.colour is not None and torch.equal(turned.colour, plain.colour)
 
 
 def test_without_semantics_there_are_none(tmp_path: Path) -> None:

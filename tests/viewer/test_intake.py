@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from photo_files import HEIC, turned_jpeg
 
 from fprf.errors import DataError
 from fprf.viewer import decode
@@ -41,6 +42,13 @@ def test_a_photograph_becomes_a_png_of_ours(intake: Intake) -> None:
     large = intake.take(png(SIDE * 2, 100))
     assert cv2.imread(str(large)).shape == (50, SIDE, 3)
     assert sorted(intake.folder.glob("*.part")) == []
+
+
+def test_photographs_of_phones_come_upright(intake: Intake, tmp_path: Path) -> None:
+    shown = turned_jpeg(tmp_path / "a.jpg", cv2.imdecode(np.frombuffer(png(60, 40), np.uint8), cv2.IMREAD_COLOR), 6)
+    assert np.array_equal(cv2.imread(str(intake.take((tmp_path / "a.jpg").read_bytes())))[:, :, ::-1], shown)
+    pytest.importorskip("pillow_heif")
+    assert cv2.imread(str(intake.take(HEIC))).shape == (64, 48, 3)
 
 
 @pytest.mark.parametrize(

@@ -105,7 +105,9 @@ def image_names(folder: Path) -> list[str]:
         raise DataError(f"{folder}: no such image folder ({error.strerror}); name it or put the images there") from error
     names = sorted(n for n in entries if Path(n).suffix.lower() in IMAGE_SUFFIXES and not n.startswith("."))
     if not names:
-        raise DataError(f"{folder}: no image among {len(entries)} files; put PNG, JPEG, WebP, BMP or TIFF images there")
+        raise DataError(
+            f"{folder}: no image among {len(entries)} files; put PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF images there"
+        )
     return names
 
 
