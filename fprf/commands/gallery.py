@@ -48,8 +48,8 @@ class GalleryConfig(QualityConfig):
     """Local styles per photograph, at least 1."""
     stylizer: StylizerConfig = StyleConfig().stylizer
     """What moves the scene's features; of photographs."""
-    split: Literal["test", "train", "all"] = "test"
-    """Views to choose from."""
+    split: Literal["covered", "test", "train", "all"] = "covered"
+    """Views to choose from. covered: at most 8, those that training views surround; test: those held out from training."""
     most: int = 6
     """Views that are shown, evenly taken from the split."""
     views: tuple[str, ...] = ()

@@ -29,6 +29,7 @@ from ..errors import CheckpointError
 from ..output.atomic import write_json
 from ..plugins.codec import load_config, save_config
 from ..rendering.cameras import Cameras
+from ..rendering.coverage import well_covered
 from ..rendering.space import Space
 from . import tensorfiles
 from .model import Facts
@@ -36,6 +37,8 @@ from .model import Facts
 __all__ = ["Known", "Run", "view_names"]
 
 FORMAT = 1
+_SHOWN = 8
+"""Views of the split `covered`, at most."""
 _CAMERA = ("pose", "focal", "centre", "size", "distortion", "lens")
 
 
@@ -54,7 +57,9 @@ class Known:
     facts: Facts
 
     def split(self, name: str) -> tuple[int, ...]:
-        """Views of `train`, `test` or `all`."""
+        """Views of `train`, `test` or `all`; `covered`: at most 8 that are well covered by the training views."""
+        if name == "covered":
+            return tuple(well_covered(self.cameras, self.train, self.facts.space, _SHOWN))
         return {"train": self.train, "test": self.test, "all": tuple(range(len(self.names)))}[name]
 
 

@@ -27,13 +27,16 @@ def gallery(run: Path, *words: str) -> str:
 
 def test_a_folder_of_photographs_becomes_a_page(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "metrics.json").write_text(json.dumps({"psnr": 17.25, "per_view": {"0000": {"psnr": 3.125}}}))
-    page = gallery(run, "--references", str(run.parent / "photos"))
+    (run.parent / "photos" / "broken.jpg").write_bytes(b"not a photograph")
+    page = gallery(run, "--references", str(run.parent / "photos"), "--split", "test")
     assert re.findall(r'data-style="\d".*?<span>([^<]*)</span></button>', page) == ["dusk", "snow", "dusk + snow"]
     assert re.findall(r'data-shot="(\d-\d)"', page) == [f"{style}-{view}" for style in range(3) for view in range(2)]
     assert set(re.findall(r'data-match="(\d-\d)"', page)) == {"2-0", "2-1"}, "match maps where there is a choice"
     assert page.count('data-go="') == 8 and "17.25" in page and "3.125" not in page
     assert page.count("Match score") == 3 and "<video" not in page and "http" not in page.replace("http-equiv", "")
-    assert f"2 views in 3 styles: {run / 'gallery.html'}" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert f"2 views in 3 styles: {run / 'gallery.html'}" in told.out
+    assert "broken.jpg: no PNG, JPEG" in told.err, "it is named, and the others are shown"
 
 
 def test_views_are_chosen_evenly_or_by_name(run: Path, world: World) -> None:
@@ -66,7 +69,7 @@ def test_photographs_of_one_name_are_told_apart() -> None:
     ("words", "told"),
     [
         ([], "name photographs with --references, or style files with --styles"),
-        (["--references", "EMPTY"], "holds no images (.bmp"),
+        (["--references", "EMPTY"], "holds no images (.avif"),
         (["--references", "absent.jpg"], "absent.jpg"),
         (["--references", "PHOTO", "--output", "page.pdf"], "--output page.pdf: the page is an .html file"),
         (["--references", "PHOTO", "--views", "0099"], "--views 0099: no such view in the run"),

@@ -21,7 +21,7 @@ def run(world: World, tmp_path: Path) -> Path:
 
 
 def stylize(run: Path, world: World, *args: str) -> int:
-    return cli.main(["stylize", str(run), "--references", *map(str, world.references), *args])
+    return cli.main(["stylize", str(run), "--split", "test", "--references", *map(str, world.references), *args])
 
 
 def test_pictures_pair_up_by_stem(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
@@ -35,6 +35,26 @@ def test_pictures_pair_up_by_stem(run: Path, world: World, capsys: pytest.Captur
     assert {name.removesuffix(".png") for name in names if name.endswith(".png") and "match" not in name} <= stems
     assert all(cv2.imread(str(folder / name)).shape == (24, 32, 3) for name in ("0000.png", "0008.png"))
     assert capsys.readouterr().out.startswith(f"2 views in {folder}  (")
+
+
+def test_folders_stand_for_their_photographs_and_views_are_the_covered_ones(
+    run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos, out = tmp_path / "photos", tmp_path / "s"
+    photos.mkdir()
+    for path in world.references:
+        shutil.copy(path, photos)
+    (photos / "broken.jpg").write_bytes(b"not a photograph")
+    args = ["stylize", str(run), "--references", str(photos), "--weights", "2", "--no-matches", "--output", str(out)]
+    assert cli.main(args) == 0
+    assert "broken.jpg: no PNG, JPEG" in capsys.readouterr().err
+    style = json.loads((out / "style.json").read_text())["style"]
+    assert [Path(path).name for path in style["references"]] == ["dusk.png", "snow.png"] and style["weights"] == [2, 2]
+    known = world.load().known
+    assert {p.stem for p in out.glob("*.png")} == {known.names[view] for view in known.split("covered")}
+    assert len(known.split("covered")) == 8
+    assert cli.main([*args, "--masks", str(world.references[0])]) == 2
+    assert "is for one photograph" in capsys.readouterr().err
 
 
 def test_style_json_and_the_dictionary(run: Path, world: World, tmp_path: Path) -> None:
@@ -55,8 +75,9 @@ def test_a_style_file_is_the_same_style_again_and_flags_come_over_it(run: Path, 
     wishes = ["--clusters", "3", "--pin", "0002:15,20=snow", "--keep", "1", "--luminance", "0.5", "--stylizer", "region-adain"]
     assert stylize(run, world, *wishes, "--output", str(tmp_path / "a")) == 0
     file = ["--style", str(tmp_path / "a" / "style.json")]
-    assert cli.main(["stylize", str(run), *file, "--output", str(tmp_path / "b")]) == 0
-    assert cli.main(["stylize", str(run), *file, "--output", str(tmp_path / "c"), "--strength", "0.5"]) == 0
+    again = ["stylize", str(run), "--split", "test", *file, "--output"]
+    assert cli.main([*again, str(tmp_path / "b")]) == 0
+    assert cli.main([*again, str(tmp_path / "c"), "--strength", "0.5"]) == 0
     for name in ("0000.png", "0000-match.png", "0008.png"):
         a, b, c = (cv2.imread(str(tmp_path / folder / name)) for folder in "abc")
         assert np.array_equal(a, b) and np.array_equal(a, c) == ("match" in name)
