@@ -51,7 +51,7 @@ VERBS = {
     "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
     "completion": Verb("bash|zsh|fish", "a script by which a shell completes verbs and flags"),
-    "doctor": Verb("[RUN|DIR]", "look over this machine, a run or a scene folder"),
+    "doctor": Verb("[RUN|DIR|METHOD]", "look over this machine, a run, a scene folder, a method's needs"),
 }
 
 

@@ -189,12 +189,13 @@ class StatisticsConfig:
 class TrainConfig:
     """Everything that decides a run."""
 
-    data: Path = Path("town")
-    """Scene folder; `town` is the embedded one."""
+    data: Path | None = None
+    """Scene folder, which must be named; `town` is the embedded one."""
     output: Path | None = None
     """Run folder; by default runs/SCENE-METHOD. A folder with a run in it is resumed."""
-    downscale: int = 1
-    """Images are reduced by this factor."""
+    downscale: int | None = None
+    """Factor by which the delivered images are reduced; none = found from their size and number, the rays of the training and
+    the device (docs/formats.md), and saved with the run."""
     steps: int = 30_000
     """Optimiser steps."""
     minutes: float | None = None
@@ -239,7 +240,8 @@ class TrainConfig:
     """Scene statistics for styling."""
 
     def __post_init__(self) -> None:
-        at_least("downscale", self.downscale, 1)
+        if self.downscale is not None:
+            at_least("downscale", self.downscale, 1)
         at_least("steps", self.steps, 0)
         between("seed", self.seed, 0, 2**31 - 1)
         if self.minutes is not None:

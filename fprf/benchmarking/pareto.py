@@ -10,8 +10,8 @@ from rich.table import Table
 from torch import Tensor
 
 from ..datamanagers.images import load_image
-from ..datamanagers.parsers.recognise import parse_scene
 from ..engine.loading import Trained, load_run
+from ..engine.prepare import scene_of
 from ..engine.restyle import restyle
 from ..engine.run import view_names
 from ..errors import FprfError, UsageError
@@ -77,7 +77,7 @@ def _photographs(subject: Subject, views: Sequence[int], cameras: Sequence[Camer
     """What the views really look like, at the size that they are rendered at; or why that is not known."""
     config, known = subject.trained.config, subject.trained.known
     try:
-        scene = parse_scene(subject.data, config.downscale, config.datamanager.parser)
+        scene = scene_of(replace(config, data=subject.data))
         if tuple(view_names(scene.paths)) != known.names:
             raise UsageError(f"{subject.data}: its images are not those of the run; name the folder with --data")
         images = []

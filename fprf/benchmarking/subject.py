@@ -55,7 +55,7 @@ class Subject(NamedTuple):
 def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
     """The run in `root`; `folder` takes what is made on the way."""
     trained = load_run(root, config.device)
-    data = config.data or trained.config.data
+    data = config.data or trained.config.data or Path(trained.known.data)
 
     def prepared(chosen: TrainConfig) -> Prepared:
         made = prepare(replace(chosen, data=data))

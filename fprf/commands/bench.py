@@ -73,7 +73,7 @@ def run(args: list[str]) -> int:
 
 def _train(config: BenchConfig, output: Path) -> Path:
     method, name = load_method(config.method)
-    data = config.data or method.data
+    data = config.data or method.data or Path("town")
     return train_scene(replace(method, data=data, output=output, steps=config.steps, minutes=None, device=config.device), name)
 
 

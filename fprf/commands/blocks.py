@@ -51,7 +51,8 @@ def train_blocks(
     display.say(f"{scene.name}: {len(scene.train)} + {len(scene.test)} views, {count} blocks and their surroundings")
     executor = config.executor.on(device_of(config.device).type).build()
     around, each = block_minutes(config, count, time.perf_counter() - start)
-    root, data = str(folder.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
+    scene_folder = config.data or Path()
+    root, data = str(folder.root.resolve()), str(scene_folder.resolve() if scene_folder.exists() else scene_folder)
 
     def task(block: int, minutes: float | None) -> BlockTask:
         return BlockTask(root=root, data=data, block=block, minutes=minutes, quiet=display.quiet)

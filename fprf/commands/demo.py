@@ -58,9 +58,11 @@ def run(args: list[str]) -> int:
     method = fprf_lite()
     manager, field = method.datamanager, method.content.field
     assert isinstance(manager, RayBatchesConfig) and isinstance(field, PlanesConfig)  # this very method, not somebody's
+    data = Path("town")
     training = replace(
         method,
-        data=Path("town"),
+        data=data,
+        downscale=1,
         output=config.output / "run",
         minutes=config.minutes,
         device=config.device,
@@ -70,7 +72,7 @@ def run(args: list[str]) -> int:
     )
     root = train_scene(training, "fprf-lite")
     trained = load_run(root, config.device)
-    scene = parse_scene(training.data, 1, TownConfig())
+    scene = parse_scene(data, 1, TownConfig())
     references = _references(config.output / "references")
     with Display() as display:
         metrics, renders = judge(trained, scene, trained.known.test, display.count)

@@ -1,4 +1,7 @@
-"""`fprf doctor`: what this machine offers, what a scene folder holds, how a run stands. Each problem names its remedy."""
+"""`fprf doctor`: what this machine offers, what a method needs, what a scene folder holds, how a run stands.
+
+Each problem names its remedy.
+"""
 
 import os
 import platform
@@ -22,7 +25,7 @@ from ..plugins.codec import Missing
 from ..plugins.slots import slots
 from .parsing import parse
 
-__all__ = ["Finding", "machine", "run", "run_folder", "scene_folder", "self_test", "speed"]
+__all__ = ["Finding", "cleaned", "machine", "method_needs", "run", "run_folder", "scene_folder", "self_test", "speed"]
 
 _MIB = 1 << 20
 _LEAST_DISK = 1 << 30
@@ -45,24 +48,31 @@ class DoctorConfig:
     """What to look over."""
 
     target: Path | None = None
-    """A run or a scene folder; none = this machine."""
+    """A run, a scene folder or a method; none = this machine."""
     device: str = "auto"
     """Device of this machine that is tested: cpu, cuda, mps, or auto."""
+    clean: bool = False
+    """Delete the cached feature targets of all scenes; they are made again when needed."""
 
 
 def run(args: list[str]) -> int:
     """Print the findings; 1 if something that is needed is wrong."""
-    if len(args) == 1 and not args[0].startswith("-"):  # tyro has no positional argument that may be absent
-        args = ["--target", args[0]]
+    if args and not args[0].startswith("-"):  # tyro has no positional argument that may be absent
+        args = ["--target", *args]
     about = (
-        "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene folder."
+        "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene\n"
+        "folder, `fprf doctor METHOD` what a method needs here."
     )
     config = parse(DoctorConfig(), args, prog="fprf doctor", description=about)
     target = config.target
-    if target is None:
-        findings: Iterator[Finding] = chain(machine(), self_test(config.device))
+    if config.clean:
+        findings: Iterator[Finding] = cleaned(feature_folder())
+    elif target is None:
+        findings = chain(machine(), self_test(config.device))
     elif (target / "config.json").is_file():
         findings = run_folder(target)
+    elif str(target) in registry.installed("fprf.methods"):
+        findings = method_needs(str(target))
     else:
         findings = scene_folder(target)
     console = Console(highlight=False)
@@ -83,6 +93,7 @@ def machine() -> Iterator[Finding]:
     yield from _guarded("torch", _torch)
     yield from speed(os.environ)
     yield _disk(shutil.disk_usage(Path.cwd()).free)
+    yield _cache(feature_folder())
     yield from _weights()
     count = sum(len(registry.installed(group)) for group in registry.groups())
     bad = registry.unreadable()
@@ -136,8 +147,50 @@ def speed(environment: Mapping[str, str]) -> Iterator[Finding]:
         yield Finding("cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True)
 
 
+def method_needs(name: str) -> Iterator[Finding]:
+    """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be loaded."""
+    from ..engine.needs import decoder_needs, plugin_needs
+    from ..plugins.codec import method_config
+
+    config = method_config(name)
+    needs = plugin_needs(config)
+    if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in needs):
+        needs += decoder_needs(config)
+    for need in needs:
+        later = ", is downloaded when it is needed" if need.downloaded else " is missing"
+        yield Finding("needs", need.what + later, need.remedy, optional=need.downloaded)
+    filled = (f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}" for slot in slots(config) if slot.value)
+    yield Finding("method", f"{name}: {', '.join(filled)}")
+    yield Finding("next", f"fprf train {name} --data FOLDER")
+
+
+def cleaned(folder: Path) -> Iterator[Finding]:
+    """Delete the cached feature targets."""
+    size = _size(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    yield Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")
+
+
+def feature_folder() -> Path:
+    """Where feature targets are cached."""
+    from ..engine.prepare import cache_folder
+
+    return cache_folder() / "features"
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _cache(folder: Path) -> Finding:
+    from ..datamanagers.features import CACHED_BYTES
+
+    most = 2 * CACHED_BYTES / _MIB  # content and semantics
+    return Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
+
+
 def _disk(free: int) -> Finding:
-    remedy = 'rm -r "${XDG_CACHE_HOME:-$HOME/.cache}/fprf/features"    # they are made again when needed'
+    remedy = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
     return Finding("disk", f"{free / 1024**3:.1f} GiB free here", remedy if free < _LEAST_DISK else "")
 
 
@@ -198,8 +251,7 @@ def run_folder(folder: Path) -> Iterator[Finding]:
     measured = (folder / "metrics.json").is_file()
     yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else measure, True)
     yield from _trouble(folder)
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-    yield Finding("size", f"{size / _MIB:.1f} MiB")
+    yield Finding("size", f"{_size(folder) / _MIB:.1f} MiB")
 
 
 def _trouble(folder: Path) -> Iterator[Finding]:

@@ -1,6 +1,6 @@
 """`fprf eval RUN`: measure a run on views it has not seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -38,8 +38,8 @@ def run(args: list[str]) -> int:
     """Render the split, write metrics.json, print a table."""
     description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
-    from ..datamanagers.parsers.recognise import parse_scene
     from ..engine.loading import load_run
+    from ..engine.prepare import scene_of
     from ..engine.run import view_names
     from ..evaluation.alignment import align, described
     from ..evaluation.judge import judge
@@ -49,7 +49,7 @@ def run(args: list[str]) -> int:
 
     trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
     data = config.data or trained.config.data
-    scene = parse_scene(data, trained.config.downscale, trained.config.datamanager.parser)
+    scene = scene_of(replace(trained.config, data=data))
     if tuple(view_names(scene.paths)) != trained.known.names:
         raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
     views = trained.known.split(config.split)

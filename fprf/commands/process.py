@@ -1,6 +1,7 @@
 """`fprf process IMAGES|VIDEO --output SCENE`: poses for images that have none, by COLMAP's Python package."""
 
-from dataclasses import asdict, dataclass
+import shlex
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,15 @@ from rich.table import Table
 
 from .. import __version__
 from ..errors import UsageError
+from ..plugins.codec import method_config
 from ..sfm.config import SfmConfig
 from .parsing import parse
 from .progress import Display
 
 __all__ = ["ProcessConfig", "run"]
+
+METHOD, MINUTES = "fprf-lite", 8
+"""What the command that is printed trains with: on two cores, together with poses, in less than twelve minutes."""
 
 _DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
 
@@ -84,11 +89,16 @@ def _print(content: dict[str, Any], root: Path) -> None:
 
 
 def _check(root: Path) -> None:
-    """The scene as training will see it. Raises DataError where it cannot be read."""
-    import shlex
-
-    from ..datamanagers.parsers.config import ColmapConfig
+    """Read the scene as training will, and print the commands that come next. Raises DataError where it cannot be read."""
     from ..datamanagers.parsers.recognise import parse_scene
+    from ..engine.prepare import with_downscale
+    from .train import default_output
 
-    scene = parse_scene(root, 1, ColmapConfig())
-    print(f"{len(scene.train)} + {len(scene.test)} views: fprf train fprf-lite --data {shlex.quote(str(root))}")
+    config = replace(method_config(METHOD), data=root, minutes=MINUTES)
+    delivered = parse_scene(root, 1, None)
+    size = with_downscale(config).downscale or 1
+    width, height = delivered.cameras.scaled(size).size[0].tolist()
+    run = default_output(config, METHOD)
+    print(f"{len(delivered.train)} + {len(delivered.test)} views, trained at {width}x{height}")
+    print(f"fprf train {METHOD} --data {shlex.quote(str(root))} --minutes {MINUTES}")
+    print(f"fprf stylize {shlex.quote(str(run))} --references PHOTO.jpg")

@@ -1,5 +1,6 @@
 """`fprf train METHOD|CONFIG.json`: train a scene, or go on where a run stopped."""
 
+import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,8 @@ from .event_log import EventLog
 from .parsing import LIST_FLAGS, load_method, methods, parse
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ..config import TrainConfig
     from ..datamanagers.scene import Scene
     from ..engine.model import Model
@@ -19,11 +22,18 @@ if TYPE_CHECKING:
     from ..engine.run import Run
     from ..engine.trainer import Report
     from ..viewer.aside import Aside
+    from .progress import Display
 
 __all__ = ["default_output", "run", "train_scene"]
 
 PLAN = "--plan"
 CHANGED = "--changed-images"
+_TIMED_VIEWS = 2
+"""Views after which the time of all features is estimated."""
+_SMALL = 96
+"""Pixels of an image's shorter side below which a `--downscale` that was asked for is probably a mistake."""
+_SHOWN = 4
+"""Differences of a run's config that a message names."""
 
 
 def run(args: list[str]) -> int:
@@ -61,7 +71,8 @@ def run(args: list[str]) -> int:
 
 def default_output(config: "TrainConfig", method: str) -> Path:
     """runs/SCENE-METHOD."""
-    return Path("runs") / f"{config.data.resolve().name or 'scene'}-{method}"
+    name = "" if config.data is None else config.data.resolve().name
+    return Path("runs") / f"{name or 'scene'}-{method}"
 
 
 def train_scene(
@@ -72,9 +83,10 @@ def train_scene(
 
     `view` shows how it goes; where there is a terminal, and somebody looks at the end, it stays until they leave.
 
-    Raises DataError where another process is training there.
+    Raises UsageError where packages, weights or the scene are missing, DataError where another process is training there.
     """
     from ..engine import originals, prepare, style_pass, trainer
+    from ..engine.budget import Forecast
     from ..engine.lay_out import plan_scene
     from ..engine.lock import held
     from ..engine.model import build_model
@@ -87,10 +99,13 @@ def train_scene(
     output = config.output or default_output(config, method)
     config = replace(config, output=output)
     folder = Run(output)
+    with Display(quiet=quiet) as display:
+        _check_needs(config, method, display)  # before there is a folder
     with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
         if view is not None:
             display.say(f"live at {view.address}")
+        config = _sized(folder, config, display)
         _check_same(folder, config)
         for place in (output, *output.glob("blocks/*")):
             remove_unfinished(place)
@@ -107,10 +122,10 @@ def train_scene(
                 look(scene)
                 originals.keep(output, marks)
                 train_blocks(config, method, folder, scene, plan, display, start, view)
-                display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
+                _say_outcome(folder, config, scene, display, time.perf_counter() - start)
                 linger(view, display)
                 return output
-        prepared = prepare.prepare(config, display.features, look)
+        prepared = prepare.prepare(config, _told_features(config, display), look)
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
         originals.keep(output, marks)
@@ -118,11 +133,13 @@ def train_scene(
         if prepared.basis is not None:
             folder.save_tensors("basis", prepared.basis.tensors())
         display.say(_described(prepared))
-        log = EventLog(folder)
+        log, forecast = EventLog(folder), Forecast(config, method, prepare.device_of(config.device).type)
 
         def report(event: "Report") -> None:
             display.training(event)
             log(event)
+            if line := forecast(event):
+                display.say(line)
             if view is not None:
                 view(event)
 
@@ -143,7 +160,7 @@ def train_scene(
         style = style_pass.measure_style(config, model, prepared.scene.cameras, prepared.scene.train)
         folder.save_tensors("style", to_tensors(style))
         folder.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
-        display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
+        _say_outcome(folder, config, prepared.scene, display, time.perf_counter() - start)
     linger(view, display)
     return output
 
@@ -158,6 +175,78 @@ def _described(prepared: "Prepared") -> str:
     )
 
 
+def _check_needs(config: "TrainConfig", method: str, display: "Display") -> None:
+    """Raise UsageError where something is missing that nothing downloads, after showing all that is missing."""
+    from ..engine.needs import decoder_needs, plugin_needs, scene_needs
+
+    needs = plugin_needs(config)
+    if config.data is not None and all(need.downloaded for need in needs):
+        return  # where the scene cannot be read its parser says so
+    needs = [*scene_needs(config), *needs]
+    if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in needs):
+        needs += decoder_needs(config)
+    if len(needs) > 1:
+        for need in needs:
+            display.say(f"missing: {need.what}: {need.remedy}")
+        raise UsageError(f"fprf train {method}: {len(needs)} things are missing; `fprf doctor {method}` looks again")
+    raise UsageError(f"fprf train {method}: {needs[0].what}: {needs[0].remedy}")
+
+
+def _sized(folder: "Run", config: "TrainConfig", display: "Display") -> "TrainConfig":
+    """The config with the size of its images, which an existing run has decided already."""
+    from ..engine.prepare import scene_of, with_downscale
+
+    if config.downscale is not None:
+        if config.downscale > 1 and not folder.exists:
+            width, height = scene_of(config).cameras.size[0].tolist()
+            if min(width, height) < _SMALL:
+                display.say(
+                    f"warning: {width}x{height} pixels are few: --downscale {config.downscale} counts from the images as they "
+                    "are delivered, also in a folder images_N; leave it out"
+                )
+        return config
+    old = folder.load_config()[0].downscale if folder.exists else None
+    if old is not None:
+        return replace(config, downscale=old)
+    config = with_downscale(config)
+    if config.downscale != 1:
+        width, height = scene_of(config).cameras.size[0].tolist()
+        display.say(
+            f"images are reduced to 1/{config.downscale}, {width}x{height}, for this device and time: --downscale 1 keeps them"
+        )
+    return config
+
+
+def _told_features(config: "TrainConfig", display: "Display") -> "Callable[[int, int, str], None]":
+    """Progress of the feature store, with a line where it will take most of a time limit."""
+    begun: dict[str, float] = {}
+
+    def progress(done: int, total: int, what: str) -> None:
+        display.features(done, total, what)
+        now = time.perf_counter()
+        seconds = (now - begun.setdefault(what, now)) / max(done, 1) * total
+        if done == _TIMED_VIEWS and config.minutes is not None and seconds > 30 * config.minutes:
+            display.say(
+                f"warning: {what} will take {seconds:.0f} s of the {60 * config.minutes:.0f} s of --minutes; "
+                f"--downscale {2 * (config.downscale or 1)} and another --output take a quarter"
+            )
+
+    return progress
+
+
+def _say_outcome(folder: "Run", config: "TrainConfig", scene: "Scene", display: "Display", seconds: float) -> None:
+    """What training came to, and what comes next."""
+    from ..engine.budget import outcome
+
+    quoted = shlex.quote(str(folder.root))
+    found = outcome(folder.root, config, scene)
+    short = found is not None and found.too_short
+    if found is not None:
+        display.say(found.told(config))
+    ended = "ended" if short else "done"
+    display.say(f"{ended} after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
+
+
 def _check_same(folder: "Run", config: "TrainConfig") -> None:
     """A run goes on with its own config; only how long, how often saved and where may change.
 
@@ -167,15 +256,19 @@ def _check_same(folder: "Run", config: "TrainConfig") -> None:
         return
     from ..config import RESUMABLE
     from ..engine.lay_out import FREE
+    from ..plugins.typed_json import leaves
 
     old, _ = folder.load_config()
     free = FREE if old.blocks.cuts and config.blocks.cuts else RESUMABLE
-    mine, theirs = vars(old), vars(config)  # another method may have other fields
-    changed = [name for name in mine | theirs if name not in free and mine.get(name) != theirs.get(name)]
+    mine, theirs = leaves(config), leaves(old)
+    changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]
     if changed:
+        shown = [f"{name} {theirs.get(name, '-')} ({mine.get(name, '-')} is asked)" for name in changed[:_SHOWN]]
+        more = f" and {len(changed) - _SHOWN} others" if len(changed) > _SHOWN else ""
+        other = next(path for k in range(2, 1000) if not (path := folder.root.with_name(f"{folder.root.name}-{k}")).exists())
         raise UsageError(
-            f"{folder.root}: holds a run with another {', '.join(changed)}; resume it with "
-            f"`fprf train {folder.root / 'config.json'}`, or choose another --output"
+            f"{folder.root}: holds a run with {', '.join(shown)}{more}; go on with it by its own values, or begin another with "
+            f"--output {shlex.quote(str(other))}"
         )
 
 

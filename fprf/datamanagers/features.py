@@ -38,6 +38,8 @@ BASIS_CELLS = 32_768
 # Features met while fitting the basis are remembered up to this, so that small scenes are encoded once, not twice.
 REMEMBER_BYTES = 1 << 28
 MOMENT_PIXELS = 2048
+CACHED_BYTES = 1 << 30
+"""What the files in a folder may take together; those of the views at hand stay whatever they take."""
 # A and b move within a window's fifth: measured on photographs, a coarser grid costs more than 1.5 % of the features' spread.
 CELLS_PER_WINDOW = 5
 _COMPILED = importlib.util.find_spec("numba") is not None
@@ -166,6 +168,7 @@ def extract(
             entry = store_files.read(folder, key) or made
         remembered.pop(view, None)
         entries[view] = entry
+    store_files.keep_within(folder, CACHED_BYTES, set(keys.values()))
     if progress is not None:
         progress(len(views), len(views), f"features of {encoder.identity}")
     store = FeatureStore(entries, basis)

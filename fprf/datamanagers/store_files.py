@@ -8,10 +8,12 @@ Half precision keeps 11 bits of each number, so numbers are made small first: b 
 [-0.5, 0.5]) and relative to its mean, and each channel is divided by its largest coefficient.
 """
 
+import contextlib
 import hashlib
+import os
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -24,7 +26,19 @@ from torch import Tensor
 
 from ..output.atomic import atomic_path
 
-__all__ = ["GREY", "LANES", "Entry", "digest", "pack", "read", "read_tensors", "remove_stale", "write", "write_tensors"]
+__all__ = [
+    "GREY",
+    "LANES",
+    "Entry",
+    "digest",
+    "keep_within",
+    "pack",
+    "read",
+    "read_tensors",
+    "remove_stale",
+    "write",
+    "write_tensors",
+]
 
 GREY = 0.5
 LANES = 8
@@ -104,8 +118,29 @@ def read_tensors(folder: Path, key: str) -> dict[str, Tensor] | None:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError):
         return None
+    with contextlib.suppress(OSError):  # a cache that is only read; its order of use is then not known
+        os.utime(path)
     right = metadata.get("key") == key and metadata.get("crc32") == str(_checksum(tensors))
     return tensors if right else None
+
+
+def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
+    """Delete the files that were used longest ago until at most `size` bytes are left, but none whose key is in `used`.
+
+    Whoever has one mapped keeps it on POSIX; on Windows it stays.
+    """
+    files = []
+    for path in folder.glob("[!.]*.safetensors"):
+        with contextlib.suppress(OSError):  # another process was first
+            files.append((path.stat().st_mtime, path.stat().st_size, path))
+    total = sum(bytes_of for _, bytes_of, _ in files)
+    for _, bytes_of, path in sorted(files):
+        if total <= size:
+            return
+        if path.stem not in used:
+            with contextlib.suppress(OSError):
+                path.unlink()
+                total -= bytes_of
 
 
 def remove_stale(folder: Path, hours: float = 1.0) -> None:

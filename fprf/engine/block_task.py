@@ -11,7 +11,6 @@ from torch import Tensor
 from ..blocks.visibility import pixel_mask
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
-from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import ConfigError
 from ..interfaces import DataManager
@@ -23,7 +22,7 @@ from .checkpoint import reached
 from .lay_out import RAYS, asked_of, load_boxes
 from .lock import held
 from .model import Facts, Model
-from .prepare import Prepared, build_encoders, cache_folder
+from .prepare import Prepared, build_encoders, cache_folder, scene_of
 from .run import Run
 from .trainer import Report, train
 
@@ -66,7 +65,7 @@ def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callab
     config, _ = run.load_config()
     facts, boxes = run.load_known().facts, load_boxes(root)
     folder = folder_of(root, task.block)
-    scene = parse_scene(Path(task.data), config.downscale, config.datamanager.parser)
+    scene = scene_of(replace(config, data=Path(task.data)))
     own = _scene_of(scene, folder)
     asked = asked_of(config, facts, scene, boxes, task.block, tensorfiles.read(folder / RAYS))
     done = read_done(folder)

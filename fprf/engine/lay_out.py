@@ -21,7 +21,6 @@ from ..config import RESUMABLE, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.features import extract
 from ..datamanagers.images import load_image
-from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
 from ..output.atomic import write_json
@@ -31,7 +30,7 @@ from . import tensorfiles
 from .blocks import SURROUNDINGS, folder_of
 from .decoder import build_decoder
 from .model import Facts
-from .prepare import behind, build_encoders, cache_folder, facts_of
+from .prepare import behind, build_encoders, cache_folder, facts_of, scene_of
 from .renumber import renumber, trained_tasks
 from .run import Run
 
@@ -56,7 +55,7 @@ class Laid(NamedTuple):
 
 def plan_scene(config: TrainConfig) -> tuple[Scene, Plan]:
     """The scene and how it is cut."""
-    scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
+    scene = scene_of(config)
     return scene, make_plan(scene, config.blocks)
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,15 +15,27 @@ from ..datamanagers.features import FeatureStore
 from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
 from ..datamanagers.sightings import find_sightings
-from ..errors import PluginError
+from ..errors import PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..rendering.bounds import find_space
 from ..rendering.space import Space
+from .budget import find_downscale
 from .decoder import build_decoder
 from .model import Facts
 from .tones import relative
 
-__all__ = ["Prepared", "behind", "build_encoders", "cache_folder", "device_of", "facts_of", "prepare", "reach_of"]
+__all__ = [
+    "Prepared",
+    "behind",
+    "build_encoders",
+    "cache_folder",
+    "device_of",
+    "facts_of",
+    "prepare",
+    "reach_of",
+    "scene_of",
+    "with_downscale",
+]
 
 
 class Prepared(NamedTuple):
@@ -52,13 +65,30 @@ def device_of(name: str) -> torch.device:
         raise PluginError(f"device: {name!r} is not available here; use cpu or auto") from e
 
 
+def with_downscale(config: TrainConfig) -> TrainConfig:
+    """The config with the size of its images decided: unchanged where `downscale` is a number. Raises as `scene_of`."""
+    if config.downscale is not None:
+        return config
+    delivered = scene_of(replace(config, downscale=1))
+    sizes = delivered.cameras.size[delivered.train]
+    return replace(config, downscale=find_downscale(config, sizes, device_of(config.device).type) if len(sizes) else 1)
+
+
+def scene_of(config: TrainConfig) -> Scene:
+    """The scene of a config, at its size. Raises UsageError where it names none, DataError where that cannot be read."""
+    if config.data is None:
+        raise UsageError("no scene is named: give --data FOLDER, or --data town for the embedded one")
+    size = with_downscale(config).downscale
+    return parse_scene(config.data, size or 1, config.datamanager.parser)
+
+
 def prepare(
     config: TrainConfig,
     progress: Callable[[int, int, str], None] | None = None,
     look: Callable[[Scene], None] = lambda scene: None,
 ) -> Prepared:
     """Everything but the model. `progress(done, total, what)` is told of the features; `look` may refuse the scene before."""
-    scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
+    scene = scene_of(config)
     look(scene)
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
@@ -78,10 +108,25 @@ def prepare(
 
 
 def build_encoders(config: TrainConfig) -> tuple[Encoder, Encoder | None]:
-    """The content encoder and the semantic one, if there is one, on the device of the config."""
+    """The content encoder and the semantic one, if there is one, on the device of the config.
+
+    Raises WeightsError with what both of them lack.
+    """
     device = device_of(config.device)
-    semantic = config.semantic.encoder
-    return config.content.encoder.build().to(device), None if semantic is None else semantic.build().to(device)
+    built: list[Encoder | None] = []
+    faults: list[WeightsError] = []
+    for encoder in (config.content.encoder, config.semantic.encoder):
+        try:
+            built.append(None if encoder is None else encoder.build().to(device))
+        except WeightsError as fault:
+            faults.append(fault)
+    if len(faults) > 1:
+        raise WeightsError("; ".join(map(str, faults))) from faults[0]
+    if faults:
+        raise faults[0]
+    content, semantic = built
+    assert content is not None
+    return content, semantic
 
 
 def facts_of(

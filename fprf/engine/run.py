@@ -89,12 +89,12 @@ class Run:
             raise CheckpointError(f"{self.root}: no config.json here, so it is no run folder; `fprf train` makes one")
         return load_config(self.root / "config.json")
 
-    def save_known(self, scene: Scene, data: Path, facts: Facts) -> None:
+    def save_known(self, scene: Scene, data: Path | None, facts: Facts) -> None:
         """Write scene.json."""
         document = {
             "format": FORMAT,
             "name": scene.name,
-            "data": str(data),
+            "data": str(data or ""),
             "names": view_names(scene.paths),
             "cameras": {key: getattr(scene.cameras, key).tolist() for key in _CAMERA},
             "train": scene.train.tolist(),

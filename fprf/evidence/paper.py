@@ -15,9 +15,8 @@ import torch
 
 from ..config import TrainConfig
 from ..datamanagers.images import load_image
-from ..datamanagers.parsers.recognise import parse_scene
 from ..engine.loading import Trained, load_run
-from ..engine.prepare import prepare
+from ..engine.prepare import prepare, scene_of
 from ..engine.restyle import Encoders, encoders_of, open_encoders
 from ..engine.run import Run
 from ..engine.style_pass import measure_style
@@ -170,7 +169,7 @@ def _finished(root: Path, device: str) -> Short:
 
 def _held_out(trained: Trained, views: int) -> Row:
     known, config = trained.known, trained.config
-    scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
+    scene = scene_of(config)
     chosen = (known.test or known.train)[:views]
     found = []
     for view in chosen:

@@ -14,9 +14,9 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from ..datamanagers.parsers.recognise import parse_scene
 from ..engine.cached_view import CachedView, cache_view
 from ..engine.loading import Trained
+from ..engine.prepare import scene_of
 from ..errors import DataError, UsageError
 from ..rendering.cameras import Cameras
 from ..town.layout import Town, build_town
@@ -88,8 +88,7 @@ def set_stage(trained: Trained, *, views: int, frames: int, longest: int, stride
 
 def town_folder(trained: Trained) -> Path | None:
     """Where the town lies that a run was trained on; None where it was another scene."""
-    config = trained.config
-    scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
+    scene = scene_of(trained.config)
     folder = scene.paths[0].parents[1]
     return folder if is_town(folder) else None
 

@@ -1,9 +1,21 @@
 """The root of every config that is chosen by name."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from pathlib import Path
+from typing import ClassVar, NamedTuple
 
-__all__ = ["PluginConfig"]
+__all__ = ["Need", "PluginConfig", "absent_file"]
+
+
+class Need(NamedTuple):
+    """Something that a plug-in lacks on this machine."""
+
+    what: str
+    """What is missing, for example `the package transformers`."""
+    remedy: str
+    """The command that installs it, or what else to do."""
+    downloaded: bool = False
+    """`build` downloads it where there is a network."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,3 +27,16 @@ class PluginConfig:
     """
 
     group: ClassVar[str]
+
+    def needs(self) -> tuple[Need, ...]:
+        """Packages and files that `build` wants and that are not here, found without building or downloading anything.
+
+        `fprf train` shows the needs of all plug-ins at once, before any work, and `fprf doctor METHOD` beforehand. By default
+        none. A slot's own plug-in is asked for itself.
+        """
+        return ()
+
+
+def absent_file(path: Path | None, what: str = "weights file") -> tuple[Need, ...]:
+    """The need for a file that is named and not there; none where no file is named."""
+    return () if path is None or path.is_file() else (Need(f"{path}: no such {what}", "name one that exists"),)

@@ -14,10 +14,10 @@ from typing import Any, Literal, NoReturn, TypeVar, get_args, get_origin
 
 from ..errors import ConfigError, PluginError
 from . import registry
-from .config import PluginConfig
+from .config import Need, PluginConfig
 from .slots import hints_of, is_slot, members
 
-__all__ = ["Missing", "from_json", "to_json"]
+__all__ = ["Missing", "from_json", "leaves", "to_json"]
 
 T = TypeVar("T")
 
@@ -39,6 +39,11 @@ class Missing(PluginConfig):
     reason: str
     """Why it cannot be loaded."""
 
+    def needs(self) -> tuple[Need, ...]:
+        """The package that provides it."""
+        package = self.package or "the package that provides it"
+        return (Need(self.reason, f"install {package}, or choose another with --{self.slot} NAME"),)
+
     def build(self, *args: object, **kwargs: object) -> NoReturn:
         """Raise PluginError: takes what any kind's `build` takes."""
         raise PluginError(
@@ -50,6 +55,21 @@ class Missing(PluginConfig):
 def to_json(config: object) -> Any:
     """A config as dicts, lists, strings and numbers; a plug-in carries its name as `type`."""
     return _encode(config, type(config), "config")
+
+
+def leaves(config: object) -> dict[str, Any]:
+    """Every field of a config tree as JSON by its dotted path. A plug-in's path gives its name; without one there, null."""
+    found: dict[str, Any] = {}
+
+    def walk(tree: Any, path: str) -> None:
+        if not isinstance(tree, dict):
+            found[path] = tree
+            return
+        for name, value in tree.items():
+            walk(value, path if name == "type" else f"{path}.{name}".lstrip("."))
+
+    walk(to_json(config), "")
+    return found
 
 
 def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None) -> T:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from ...checks import at_least, positive
-from ..config import PluginConfig
+from ..config import Need, PluginConfig, absent_file
 
 if TYPE_CHECKING:
     from ...interfaces import Decoder
@@ -42,6 +42,10 @@ class MlpDecoderConfig(DecoderConfig):
     """Objective that the shipped decoder was trained with: returning photographs alone, or the paper's content and style losses
     (L_c + lambda L_s) as well. Not used where `weights` names a file."""
 
+    def needs(self) -> tuple[Need, ...]:
+        """The file, where one is named; whether it fits the encoder is found when it is read."""
+        return absent_file(self.weights)
+
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         """The decoder whose file names this encoder."""
         from .mlp import load_decoder
@@ -63,6 +67,10 @@ class ResidualDecoderConfig(DecoderConfig):
     def __post_init__(self) -> None:
         at_least("hidden", self.hidden, 1)
         positive("fade", self.fade)
+
+    def needs(self) -> tuple[Need, ...]:
+        """The file, where one is named; whether it fits the encoder is found when it is read."""
+        return absent_file(self.weights)
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         """The decoder whose file names this encoder, with a head that changes nothing yet."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...checks import at_least
 from ...errors import ConfigError
-from ..config import PluginConfig
+from ..config import Need, PluginConfig, absent_file
 
 if TYPE_CHECKING:
     from ...interfaces import Encoder
@@ -45,6 +47,10 @@ class BundledContentConfig(EncoderConfig):
     weights: Path | None = None
     """A file made by `fprf pretrain content`. By default the one that ships."""
 
+    def needs(self) -> tuple[Need, ...]:
+        """The file, where one is named."""
+        return absent_file(self.weights)
+
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where the file is absent or no content encoder."""
         from .bundled import load_content_encoder
@@ -58,6 +64,10 @@ class BundledSemanticConfig(EncoderConfig):
 
     weights: Path | None = None
     """A file made by `fprf pretrain semantic`. By default the one that ships."""
+
+    def needs(self) -> tuple[Need, ...]:
+        """The file, where one is named."""
+        return absent_file(self.weights)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where the file is absent or no semantic encoder."""
@@ -81,6 +91,13 @@ class Vgg16Config(EncoderConfig):
     def __post_init__(self) -> None:
         if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-3])", self.layer):
             raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-16; allowed are conv1_1, relu1_1 ... relu5_3")
+
+    def needs(self) -> tuple[Need, ...]:
+        """The weights."""
+        from .vgg_weights import SOURCES
+        from .weight_sources import weights_needed
+
+        return weights_needed(SOURCES["vgg16"], self.weights)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or end before the layer."""
@@ -106,6 +123,14 @@ class Vgg19Config(EncoderConfig):
         if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-4])", self.layer):
             raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-19; allowed are conv1_1, relu1_1 ... relu5_4")
 
+    def needs(self) -> tuple[Need, ...]:
+        """The weights, beyond the layers that ship."""
+        from .vgg_weights import BUNDLED_LAYERS, SOURCES
+        from .weight_sources import weights_needed
+
+        ships = self.weights is None and self.layer[4:] in BUNDLED_LAYERS
+        return () if ships else weights_needed(SOURCES["vgg19"], self.weights)
+
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or end before the layer."""
         from .vgg_weights import build_vgg19
@@ -126,6 +151,10 @@ class DinoConfig(EncoderConfig):
 
     def __post_init__(self) -> None:
         _check_transformer(self.layer, self.stride)
+
+    def needs(self) -> tuple[Need, ...]:
+        """The package transformers, and the model."""
+        return _transformer_needs(self.model)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where transformers or the model is absent."""
@@ -148,6 +177,10 @@ class Dinov2Config(EncoderConfig):
     def __post_init__(self) -> None:
         _check_transformer(self.layer, self.stride)
 
+    def needs(self) -> tuple[Need, ...]:
+        """The package transformers, and the model."""
+        return _transformer_needs(self.model)
+
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where transformers or the model is absent."""
         from .vit import build_vit
@@ -168,6 +201,10 @@ class Dinov3Config(EncoderConfig):
 
     def __post_init__(self) -> None:
         _check_transformer(self.layer, self.stride)
+
+    def needs(self) -> tuple[Need, ...]:
+        """The package transformers, and the model."""
+        return _transformer_needs(self.model)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where transformers or the model is absent."""
@@ -203,3 +240,15 @@ def _check_transformer(layer: int, stride: int) -> None:
     if layer == 0:
         raise ConfigError("layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last")
     at_least("stride", stride, 1)
+
+
+def _transformer_needs(model: str) -> tuple[Need, ...]:
+    found = []
+    if importlib.util.find_spec("transformers") is None:
+        ships = "or choose an encoder that ships: --semantic.encoder bundled-semantic"
+        found.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
+    hub = os.environ.get("HF_HUB_CACHE") or Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface") / "hub"
+    cached = any(Path(hub).glob(f"models--{model.replace('/', '--')}/snapshots/*/config.json"))
+    if not cached and not (Path(model) / "config.json").is_file():
+        found.append(Need(f"the model {model}", f"hf download {model}", downloaded=True))
+    return tuple(found)

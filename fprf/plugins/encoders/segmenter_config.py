@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ...errors import ConfigError
+from ..config import Need
 from .config import EncoderConfig
 
 if TYPE_CHECKING:
@@ -29,6 +30,13 @@ class MobileNetV2Config(EncoderConfig):
     def __post_init__(self) -> None:
         if not re.fullmatch(r"features\.(\d|1[0-8])", self.layer):
             raise ConfigError(f"layer: {self.layer!r} is no layer of MobileNetV2; allowed are features.0 ... features.18")
+
+    def needs(self) -> tuple[Need, ...]:
+        """The weights."""
+        from .mobilenet import SOURCE
+        from .weight_sources import weights_needed
+
+        return weights_needed(SOURCE, self.weights)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or end before the layer."""
@@ -52,6 +60,13 @@ class DeepLabConfig(EncoderConfig):
                 f"layer: {self.layer!r} is no layer of DeepLabv3; allowed are backbone.0 ... backbone.17 and logits"
             )
 
+    def needs(self) -> tuple[Need, ...]:
+        """The weights."""
+        from .deeplab import SOURCE
+        from .weight_sources import weights_needed
+
+        return weights_needed(SOURCE, self.weights)
+
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or lack the layer."""
         from .deeplab import build_deeplab
@@ -68,6 +83,13 @@ class EspNetConfig(EncoderConfig):
     weights: Path | None = None
     """EdgeNets' espnetv2_s_2.0_city_1024x512.pth or espnetv2_s_2.0_pascal_384x384.pth, or a safetensors file with their keys.
     By default the second, in the weights cache."""
+
+    def needs(self) -> tuple[Need, ...]:
+        """The weights."""
+        from .espnet import SOURCE
+        from .weight_sources import weights_needed
+
+        return weights_needed(SOURCE, self.weights)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or lack the layer."""

@@ -13,9 +13,19 @@ import torch
 from torch import Tensor
 
 from ...errors import WeightsError
+from ..config import Need, absent_file
 from ..weightfiles import read_weights
 
-__all__ = ["IMAGENET_MEAN", "IMAGENET_STD", "WeightSource", "find_weights", "read_tensors", "stated_triple", "torchvision_file"]
+__all__ = [
+    "IMAGENET_MEAN",
+    "IMAGENET_STD",
+    "WeightSource",
+    "find_weights",
+    "read_tensors",
+    "stated_triple",
+    "torchvision_file",
+    "weights_needed",
+]
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CHUNK = 1 << 20
@@ -42,18 +52,35 @@ def torchvision_file(network: str, file: str, flag: str) -> WeightSource:
     return WeightSource(network, file, f"https://download.pytorch.org/models/{file}", flag, pinned=True)
 
 
+def weights_needed(source: WeightSource, path: Path | None) -> tuple[Need, ...]:
+    """What `find_weights` would not find without a network."""
+    if path is not None or _cached(source) is not None:
+        return absent_file(path)
+    target = _cache_folder() / source.file
+    command = f"curl --create-dirs --output {target} {source.origin}" if source.pinned else f"put it there: {source.origin}"
+    named = f"{command}, or name a file with {source.flag} FILE"
+    return (Need(f"{source.network}'s weights {target}", named, downloaded=source.pinned),)
+
+
+def _cached(source: WeightSource) -> Path | None:
+    return next((folder / source.file for folder in _folders() if (folder / source.file).is_file()), None)
+
+
+def _folders() -> tuple[Path, Path]:
+    return _cache_folder(), Path.home() / ".cache/torch/hub/checkpoints"
+
+
 def find_weights(source: WeightSource, path: Path | None) -> Path:
     """The named file, else the cached one, else the download. Raises WeightsError where none of them is to be had."""
     if path is not None:
         return path
-    folders = (_cache_folder(), Path.home() / ".cache/torch/hub/checkpoints")
-    for folder in folders:
-        if (folder / source.file).is_file():
-            return folder / source.file
+    cached = _cached(source)
+    if cached is not None:
+        return cached
     if source.pinned:
         return _download(source)
     raise WeightsError(
-        f"{source.network}: {source.file} is not in {folders[0]} nor in {folders[1]}; put it there ({source.origin}), "
+        f"{source.network}: {source.file} is not in {' nor in '.join(map(str, _folders()))}; put it there ({source.origin}), "
         f"or name a file with {source.flag} FILE"
     )
 

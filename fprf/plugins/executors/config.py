@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from ...checks import at_least, positive
-from ..config import PluginConfig
+from ..config import Need, PluginConfig
 
 if TYPE_CHECKING:
     from ...interfaces import Executor
@@ -61,6 +62,12 @@ class RayConfig(ExecutorConfig):
         at_least("executor.retries", self.retries, 0)
         if self.gpus is not None:
             at_least("executor.gpus", self.gpus, 0.0)
+
+    def needs(self) -> tuple[Need, ...]:
+        """The package ray."""
+        if importlib.util.find_spec("ray") is not None:
+            return ()
+        return (Need("the package ray", "pip install 'fprf[cluster]', or choose --executor serial"),)
 
     def on(self, device: str) -> RayConfig:
         """With the GPUs that tasks on this device take."""
