@@ -18,9 +18,8 @@ SMALL = ["--steps", "2", "--views", "1", "--palettes", "night", "--device", "cpu
 
 
 def table(world: World, name: str, output: Path, *more: str) -> dict[str, Any]:
-    method = str(world.run / "config.json")
-    args = ["bench", "paper", "--table", name, "--data", str(world.town), "--method", method, *SMALL, "--output", str(output), *more]
-    assert cli.main(args) == 0
+    scene = ["--data", str(world.town), "--method", str(world.run / "config.json")]
+    assert cli.main(["bench", "paper", "--table", name, *scene, *SMALL, "--output", str(output), *more]) == 0
     document: dict[str, Any] = json.loads(output.read_text())
     assert document["table"] == name
     return document
