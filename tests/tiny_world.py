@@ -97,6 +97,7 @@ def tiny(data: Path, output: Path) -> TrainConfig:
         lite,
         data=data,
         output=output,
+        downscale=1,
         steps=15,
         device="cpu",
         datamanager=RayBatchesConfig(rays=256, semantic_share=0.5),

@@ -31,7 +31,7 @@ from ..interfaces import (
     SemanticField,
     Stylizer,
 )
-from ..plugins.config import PluginConfig
+from ..plugins.config import Need, PluginConfig
 from ..plugins.decoders.config import DecoderConfig
 from ..plugins.encoders.config import EncoderConfig, RandomConfig
 from ..plugins.executors.config import ExecutorConfig
@@ -68,8 +68,11 @@ def check_config(config: PluginConfig) -> None:
     require(kind() == kind(), f"{kind.__name__}: two with the same values must be equal")
     require(from_json(to_json(config), kind) == config, f"{kind.__name__}: must survive JSON unchanged")
     for field in dataclasses.fields(kind):
-        require(field.name not in ("type", "build"), f"{kind.__name__}: a field must not be called {field.name!r}")
+        require(field.name not in ("type", "build", "needs"), f"{kind.__name__}: a field must not be called {field.name!r}")
         require(field.kw_only is True, f"{kind.__name__}.{field.name}: fields must be keyword-only")
+    require(
+        all(type(need) is Need for need in config.needs()), f"{kind.__name__}: needs() must give Need, as often as it is asked"
+    )
 
 
 def check_encoder(config: EncoderConfig) -> None:

@@ -6,7 +6,7 @@ import pytest
 from fake_packages import packages_in
 
 from fprf.commands import doctor
-from fprf.commands.doctor import Finding, machine, run, run_folder, scene_folder, speed
+from fprf.commands.doctor import Finding, machine, method_needs, run, run_folder, scene_folder, speed
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
@@ -153,7 +153,32 @@ def test_what_is_slow_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) 
 def test_a_full_disk_is_a_problem() -> None:
     assert doctor._disk(50 << 30) == Finding("disk", "50.0 GiB free here")
     full = doctor._disk(100 << 20)
-    assert full.remedy.startswith("rm -r ") and "fprf" in full.remedy and not full.optional
+    assert full.remedy.startswith("fprf doctor --clean") and not full.optional
+
+
+def test_a_method_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert run(["fprf-lite"]) == 0 and run(["fprf"]) == 1
+    package, model = (finding for finding in method_needs("fprf") if finding.what == "needs")
+    assert "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
+    assert model.remedy == "hf download facebook/dino-vits8" and model.optional, "it is downloaded where there is a network"
+    (tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1").mkdir(parents=True)
+    (tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1" / "config.json").touch()
+    assert [finding for finding in method_needs("fprf") if finding.what == "needs"] == [package]
+
+
+def test_the_feature_cache_is_told_and_cleaned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    files = tmp_path / "fprf" / "features" / "content"
+    files.mkdir(parents=True)
+    (files / "a.safetensors").write_bytes(bytes(3 << 20))
+    (tmp_path / "fprf" / "weights").mkdir()
+    assert _by_name(machine())["features"].found.startswith("3 MiB of at most 2048")
+    assert run(["--clean"]) == 0 and "3 MiB deleted" in capsys.readouterr().out
+    assert not files.exists() and (tmp_path / "fprf" / "weights").is_dir()
 
 
 def test_what_training_noted_is_told(trained: Path) -> None:

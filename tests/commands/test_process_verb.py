@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from fprf import cli
+from fprf.commands.parsing import load_method, parse
+from fprf.commands.train import default_output
 from fprf.datamanagers.parsers.recognise import parse_scene
 
 FAKE = Path(__file__).parents[1] / "sfm" / "fake"
@@ -58,7 +61,10 @@ def test_images_become_a_scene(photos: Path, capsys: pytest.CaptureFixture[str])
     assert calls(photos) == ["features SIMPLE_RADIAL 1600 0.png 1.png 2.png 3.png 4.png", "matches 10", "mapping"]
     out = capsys.readouterr().out
     assert "5 of 5 images have a pose; 50 points, 0.50 pixels off; exhaustive matching" in out
-    assert f"fprf train fprf-lite --data {photos.parent / 'scene'}" in out
+    train, stylize = (shlex.split(line)[1:] for line in out.splitlines()[-2:])
+    assert train == ["train", "fprf-lite", "--data", str(photos.parent / "scene"), "--minutes", "8"]
+    config = parse(load_method("fprf-lite")[0], train[2:], prog="fprf train fprf-lite", description="")
+    assert stylize[:2] == ["stylize", str(default_output(config, "fprf-lite"))] and stylize[2:] == ["--references", "PHOTO.jpg"]
     assert report(photos)["images"] == {"given": 5, "used": 5, "posed": 5}
 
 

@@ -1,6 +1,6 @@
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,10 @@ from fprf.engine import checkpoint
 from fprf.engine.run import Run
 from fprf.errors import UsageError
 from fprf.methods import fprf_lite
+from fprf.plugins import registry
+from fprf.plugins.config import Need
+from fprf.plugins.decoders.config import MlpDecoderConfig
+from fprf.plugins.encoders.config import EncoderConfig
 from fprf.plugins.executors.config import SerialConfig
 
 
@@ -57,7 +61,8 @@ def test_another_config_in_an_existing_run_is_refused_before_any_work(
     monkeypatch.setattr("fprf.engine.prepare.prepare", None)
     before = (world.run / "config.json").read_bytes()
     line = mistake(capsys, "train", "fprf-lite", *flags(world, world.run), "--render.chunk", "77", "--seed", "5")
-    assert f"{world.run}: holds a run with another seed, render; resume it with `fprf train {world.run}/config.json`" in line
+    assert f"{world.run}: holds a run with seed 0 (5 is asked), render.chunk 8192 (77 is asked)" in line
+    assert f"--output {world.run}-2" in line
     assert (world.run / "config.json").read_bytes() == before
 
 
@@ -73,6 +78,7 @@ def test_another_config_in_an_existing_run_is_refused_before_any_work(
         (["fprf-lite", "--loss.rgb", "0", "--loss.content", "0", "--loss.semantic", "0"], "nothing would be learnt"),
         (["fprf-lite", "--content.encoder", "vgg99"], "no plug-in 'vgg99'"),
         (["absent/config.json"], "absent/config.json: cannot be read"),
+        (["fprf-lite"], "no scene is named: give --data FOLDER, or --data town"),
     ],
 )
 def test_mistakes_on_the_command_line(
@@ -136,5 +142,40 @@ def test_a_quiet_run_says_nothing(
     assert train_scene(replace(world.config, output=tmp_path / "run", steps=1), "fprf-lite", quiet=True) == tmp_path / "run"
     assert asked == ["cpu"], "executors are told where a scene is trained: Ray hides GPUs that nobody asks for"
     assert capsys.readouterr() == ("", "")
-    with pytest.raises(UsageError, match="holds a run with another seed"):
+    with pytest.raises(UsageError, match="holds a run with seed"):
         train_scene(replace(world.config, output=tmp_path / "run", seed=3), "fprf-lite", quiet=True)
+
+
+def test_everything_that_is_missing_is_listed_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The plug-ins' own, the scene, and nothing is made. A stranger's encoder says its needs as ours do."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Strange(EncoderConfig):
+        def needs(self) -> tuple[Need, ...]:
+            return (Need("the model odd-1", "odd fetch odd-1"), Need("the file of labels", "odd labels", downloaded=True))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "name_of", lambda group, kind: "strange")
+    semantic = replace(fprf_lite().semantic, encoder=Strange())
+    decoder = MlpDecoderConfig(weights=tmp_path / "none.safetensors")
+    config = replace(fprf_lite(), semantic=semantic, content=replace(fprf_lite().content, decoder=decoder))
+    with pytest.raises(UsageError, match="4 things are missing; `fprf doctor m` looks again"):
+        train_scene(config, "m")
+    told = capsys.readouterr().err
+    for part in ("odd fetch odd-1", "odd labels", "none.safetensors: no such weights file", "no scene is named"):
+        assert part in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_size_that_is_found_stays_with_the_run(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a number in config.json; the same command goes on with it, whatever would be found today."""
+    found = iter((2, 3))
+    monkeypatch.setattr("fprf.engine.prepare.find_downscale", lambda config, sizes, device: next(found))
+    for steps in ("2", "3"):
+        args = [*flags(world, tmp_path / "run"), "--steps", steps]
+        assert cli.main(["train", "fprf-lite", *args[:4], *args[6:]]) == 0
+    run = Run(tmp_path / "run")
+    assert run.load_config()[0].downscale == 2 and run.load_known().cameras.size[0].tolist() == [16, 12]
+    assert checkpoint.steps(run.checkpoints) == [2, 3]

@@ -96,3 +96,16 @@ def test_only_old_unfinished_files_are_removed(tmp_path: Path) -> None:
         os.utime(path, (time.time() - 7200,) * 2)
     store_files.remove_stale(tmp_path)
     assert not old.exists() and young.exists() and kept.exists()
+
+
+def test_what_was_used_longest_ago_goes_first_and_what_is_in_use_stays(tmp_path: Path) -> None:
+    keys = [store_files.digest(str(k)) for k in range(5)]
+    for age, key in enumerate(keys):
+        store_files.write_tensors(tmp_path, key, {"x": torch.zeros(1000)})
+        os.utime(tmp_path / f"{key}.safetensors", (1e9 - age, 1e9 - age))
+    size = (tmp_path / f"{keys[0]}.safetensors").stat().st_size
+    assert store_files.read_tensors(tmp_path, keys[4]) is not None, "which makes it the youngest"
+    store_files.keep_within(tmp_path, 3 * size, {keys[3]})
+    assert {path.stem for path in tmp_path.iterdir()} == {keys[0], keys[3], keys[4]}
+    store_files.keep_within(tmp_path, 0, {keys[3], keys[4]})
+    assert {path.stem for path in tmp_path.iterdir()} == {keys[3], keys[4]}
