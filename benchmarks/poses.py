@@ -29,6 +29,7 @@ from fprf.config import TrainConfig
 from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.engine.loading import load_run
 from fprf.engine.poses import rotated
+from fprf.engine.prepare import with_downscale
 from fprf.evaluation.alignment import align
 from fprf.evaluation.judge import judge
 from fprf.process import keep_memory
@@ -124,7 +125,8 @@ def main() -> None:
     keep_memory()
     method, _ = load_method("fprf-lite")
     flags = ["--data", str(options.scene), "--steps", str(options.steps), "--device", "cpu", *sys.argv[len(own) + 2 :]]
-    base = parse(method, flags, prog="poses", description="")
+    base = with_downscale(parse(method, flags, prog="poses", description=""))
+    assert base.downscale is not None
     source = parse_scene(base.data, 1, base.datamanager.parser).paths[0].parents[1]
     scratch = options.scratch.resolve() / source.name
     true = None if options.as_given else parse_scene(source, base.downscale, None).cameras

@@ -112,9 +112,9 @@ class Outcome(NamedTuple):
         """One line: what was reached, and what would raise it."""
         reached = f"{self.steps:,} steps, {self.passes:.2g} rays for each pixel, {self.psnr:.1f} dB on the training views"
         timed = config.minutes is not None and self.steps < config.steps
-        longer = f"--minutes {2 * (config.minutes or 0):g}" if timed else f"--steps {2 * config.steps}"
+        longer = f"--minutes {2 * (config.minutes or 0):g}" if timed else f"--steps {max(2 * config.steps, _FEW_STEPS)}"
         if self.too_short:
-            return f"warning: trained too short for any judgement: {reached}; go on with {longer} or more"
+            return f"warning: too few steps to judge the scene by: {reached}; go on with {longer} or more"
         size = config.downscale or 1
         finer = f", --downscale {size - 1} and another --output its detail" if size > 1 and self.passes > _PASSES else ""
         return f"{reached}; {longer} would raise it{finer}"

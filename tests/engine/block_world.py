@@ -47,6 +47,7 @@ def small(town: Path, output: Path, blocks: LayoutConfig = BLOCKS, steps: int = 
         lite,
         data=town,
         output=output,
+        downscale=1,
         steps=steps,
         device="cpu",
         blocks=blocks,
