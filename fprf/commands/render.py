@@ -27,6 +27,12 @@ if TYPE_CHECKING:
 __all__ = ["RenderVerbConfig", "camera_path", "frames_of", "run"]
 
 
+_NO_FOLDERS = frozenset(
+    [".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpeg", ".mpg", ".png", ".tif", ".tiff", ".webm", ".wmv"]
+)
+"""Endings that nobody gives a folder."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RenderVerbConfig(StyleConfig, QualityConfig):
     """What to film, and how."""
@@ -34,7 +40,8 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
     run: Path = Path()
     """Run folder."""
     output: Path = Path("render.mp4")
-    """A film (.mp4) or a folder for numbered frames. Frames that an interrupted render left are not made again."""
+    """A film (.mp4), an animated picture (.gif .webp .apng), or a folder for numbered frames. Frames that an interrupted
+    render left are not made again."""
     path: str = "interpolate"
     """spiral, orbit, interpolate, dataset, or a camera-path JSON file of Nerfstudio."""
     split: Literal["test", "train", "all"] = "all"
@@ -86,14 +93,16 @@ def run(args: list[str]) -> int:
     from ..datamanagers.images import load_image
     from ..engine.loading import load_run
     from ..output.resumed import missing
-    from ..output.video import write_video
+    from ..output.video import FILMS, write_video
 
+    if config.output.suffix.lower() in _NO_FOLDERS:
+        raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
     trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
     cameras, names = camera_path(trained, config)
     if config.lens != "own":
         cameras = _all_round(trained, config, cameras)
     takes = _takes(trained, config, file)
-    film = config.output.suffix.lower() == ".mp4"
+    film = config.output.suffix.lower() in FILMS
     folder = config.output.with_suffix(".frames") if film else config.output
     paths = [folder / f"{name}.{'png' if film else config.format}" for name in names]
     key = _key(trained, config, cameras)

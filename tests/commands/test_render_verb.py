@@ -42,6 +42,15 @@ def test_paths_have_about_the_frames_asked_for(world: World, path: str) -> None:
     assert first.shape == (24, 32, 3) and first.dtype == np.uint8
 
 
+def test_a_gif_is_a_file_and_other_films_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["render", str(run), "--path", "spiral", "--frames", "2", "--output"]
+    assert cli.main([*args, str(tmp_path / "a.gif")]) == 0
+    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
+    capsys.readouterr()
+    assert cli.main([*args, str(tmp_path / "a.mov")]) == 2
+    assert "films end in .mp4 .gif .webp .apng" in capsys.readouterr().err and not (tmp_path / "a.mov").exists()
+
+
 def test_frames_in_a_folder_and_depth(run: Path, tmp_path: Path) -> None:
     common = ["render", str(run), "--path", "spiral", "--frames", "3"]
     assert cli.main([*common, "--output", str(tmp_path / "plain")]) == 0

@@ -40,6 +40,18 @@ def test_a_film_reads_back(tmp_path: Path, h264: bool, size: tuple[int, int]) ->
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize(("ending", "far"), [(".gif", 12), (".webp", 8), (".apng", 0)])
+def test_animated_pictures_read_back(tmp_path: Path, ending: str, far: int) -> None:
+    path = tmp_path / f"film{ending}"
+    assert write_video(path, flat(48, 64), 24) == ending[1:]
+    read, found = cv2.imdecodeanimation(np.frombuffer(path.read_bytes(), np.uint8))
+    assert read and len(found.frames) == len(COLOURS) and found.loop_count == 0
+    assert sum(found.durations) == pytest.approx(5 / 24 * 1000, abs=5), "roundings do not add up"
+    for frame, colour in zip(found.frames, COLOURS, strict=True):
+        assert np.abs(frame[:, :, 2::-1].mean((0, 1)) - colour).max() <= far, "GIF dithers"
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_film_plays_while_it_loads_and_says_its_colours(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     path = tmp_path / "film.mp4"
