@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["RenderVerbConfig", "camera_path", "frames_of", "run"]
 
 
-_NO_FOLDERS = frozenset(
-    [".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpeg", ".mpg", ".png", ".tif", ".tiff", ".webm", ".wmv"]
-)
+_NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
 """Endings that nobody gives a folder."""
 
 
