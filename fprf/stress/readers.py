@@ -3,6 +3,7 @@
 import json
 import struct
 import zipfile
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from ..datamanagers.parsers.tfrecord import read_examples
 from ..engine import checkpoint, tensorfiles
 from ..plugins.codec import load_config
 from ..rendering.camera_path import read_camera_path
+from ..splats.files import read_capture, write_gaussians
+from ..splats.gaussians import Gaussians
 from ..style.dictionary import load_dictionary, save_dictionary
 from ..style.files import read_style
 from ..testing import cases
@@ -46,7 +49,8 @@ def targets(folder: Path) -> list[Target]:
     found += [_camera_path(folder / "paths"), _style(folder / "styles"), _config(folder / "configs")]
     found += _tensors(folder / "tensors")
     found += [_checkpoint(folder / "checkpoints"), *_tables(folder / "tables"), _meganerf(folder / "meganerf")]
-    return [*found, _polycam(folder / "polycam"), _record3d(folder / "record3d"), *_odm(folder / "odm")]
+    found += [_polycam(folder / "polycam"), _record3d(folder / "record3d"), *_odm(folder / "odm")]
+    return [*found, *_gaussians(folder / "gaussians")]
 
 
 def _pictures(folder: Path, count: int) -> list[str]:
@@ -283,3 +287,12 @@ def _odm(folder: Path) -> list[Target]:
         Target("shots of ODM", part, lambda: parser.parse(folder / "report", 1)),
         Target("cameras of ODM", folder / "report" / "cameras.json", lambda: parser.parse(folder / "report", 1)),
     ]
+
+
+def _gaussians(folder: Path) -> list[Target]:
+    """Every format, with view dependence where it has some; the folder's own meta.json last."""
+    parts = (cases.normal(12, 3), cases.normal(12, 4), cases.normal(12, 3), cases.normal(12), 0.1 * cases.normal(12, 4, 3))
+    made, names = Gaussians(*parts), ("x.ply", "x.compressed.ply", "x.splat", "x.spz", "x.sog", "meta.json")
+    for name in names:
+        write_gaussians(folder / name, made)
+    return [Target(f"Gaussians, {name}", folder / name, partial(read_capture, folder / name)) for name in names]

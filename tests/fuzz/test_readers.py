@@ -33,6 +33,7 @@ NAMES = [
     "camera of Polycam",
     "metadata of Record3D",
     *(f"{kind} of ODM" for kind in ("reconstruction", "shots", "cameras")),
+    *(f"Gaussians, {name}" for name in ("x.ply", "x.compressed.ply", "x.splat", "x.spz", "x.sog", "meta.json")),
 ]
 
 

@@ -1,0 +1,94 @@
+"""Files of 3D Gaussians, read and written: .ply, .compressed.ply, .splat, .spz, .sog and SOG folders (meta.json)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from ...errors import DataError
+from ...output.atomic import write_bytes
+from ..gaussians import Gaussians
+from .base import Capture
+from .ply import compressed_bytes, is_compressed, ply_bytes, read_ply
+from .sog import read_sog, sog_bytes, unbundle
+from .splat import read_splat, splat_bytes
+from .spz import read_spz, spz_bytes
+
+__all__ = ["ENDINGS", "Capture", "read_capture", "write_capture", "write_gaussians"]
+
+
+class _Format(NamedTuple):
+    read: Callable[[Path, bytes], Capture]
+    pack: Callable[[Gaussians, bool], bytes]
+
+
+_FORMATS = {
+    ".compressed.ply": _Format(read_ply, compressed_bytes),
+    ".ply": _Format(read_ply, ply_bytes),
+    ".splat": _Format(read_splat, splat_bytes),
+    ".spz": _Format(read_spz, spz_bytes),
+    ".sog": _Format(read_sog, sog_bytes),
+    "meta.json": _Format(read_sog, sog_bytes),
+}
+ENDINGS = tuple(_FORMATS)
+
+
+def read_capture(path: Path) -> Capture:
+    """Read a file of Gaussians, or a SOG folder. Raises DataError for another ending, or a file that is not what it says."""
+    if path.is_dir():
+        path = path / "meta.json"
+    reader = _FORMATS[_ending(path)].read
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    capture = reader(path, data)
+    if not len(capture.gaussians):
+        raise DataError(f"{path}: holds no Gaussian")
+    return capture
+
+
+def write_gaussians(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
+    """Write a file in the format that its name ends with, whole or not at all. Raises DataError for another ending.
+
+    .ply is exact; the others lose what their bits cannot hold, and .splat has no view dependence. .compressed.ply and SOG
+    have an order of their own.
+    """
+    _write(path, _FORMATS[_ending(path)].pack(gaussians, antialiased))
+
+
+def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"]) -> None:
+    """Write a capture with new harmonics, in the format that the name ends with.
+
+    In the format that it was read from everything else stays as it was, bit for bit; where no harmonic differs from those
+    read, that is the whole file.
+    """
+    ending, here = _ending(path), _ending(capture.path)
+    # A compressed file may be called .ply; under the same ending it stays what it is.
+    plain = ending == ".ply" and here == ".compressed.ply"
+    packed = ending == ".compressed.ply" and not is_compressed(capture.data)
+    if _FORMATS[ending].read is not _FORMATS[here].read or plain or packed:
+        before = capture.gaussians
+        gaussians = Gaussians(before.means, before.quaternions, before.log_scales, before.logits, harmonics)
+        write_gaussians(path, gaussians, antialiased=capture.antialiased)
+        return
+    changed = (harmonics != capture.gaussians.harmonics).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
+    data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))
+    _write(path, data)
+
+
+def _ending(path: Path) -> str:
+    for ending in ENDINGS:
+        if path.name.lower().endswith(ending):
+            return ending
+    raise DataError(f"{path}: no file of Gaussians by its name; known endings are {', '.join(ENDINGS)}")
+
+
+def _write(path: Path, data: bytes) -> None:
+    if _ending(path) != "meta.json":
+        write_bytes(path, data)
+        return
+    for name, content in unbundle(path, data).items():
+        write_bytes(path.with_name(name), content)

@@ -1,0 +1,364 @@
+"""SOG (PlayCanvas): a meta.json and lossless WebP images, a pixel a Gaussian, in a folder or bundled in a .sog archive.
+
+means     two images, 16 bits between mins and maxs of sign(x) ln(1 + |x|)
+quats     the three smaller components times sqrt 2 as bytes; alpha - 252 says which one is missing (w x y z)
+scales    ln-scales, sh0 constants (alpha: opacity): indices into codebooks of 256 numbers
+shN       labels of 16 bits into a palette of harmonics, 64 entries a row, which are indices into a codebook
+Version 1 has ranges (mins, maxs) in the place of codebooks, and logits in sh0's alpha.
+
+Recoloured, a file keeps its labels: each entry of the palette becomes the mean of what its Gaussians became.
+"""
+
+import io
+import json
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...datamanagers.image_header import header_of
+from ...errors import DataError
+from ..gaussians import COUNTS, Gaussians
+from .base import Bools, Capture, Floats, assembled, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
+
+__all__ = ["bundle", "read_sog", "sog_bytes", "unbundle"]
+
+_Bytes: TypeAlias = NDArray[np.uint8]
+_LEVELS = 256
+_ROW = 64
+"""Entries of the palette a row."""
+_PALETTE = 1 << 16
+_DENSE = 8
+"""Pixels a byte of the low image of positions at most: captures have far fewer, and it bounds what is decoded."""
+_SLACK = 1 << 16
+_MEMBERS = 64
+_LLOYD = 12
+_FIRST = (1980, 1, 1, 0, 0, 0)
+"""Time of archived files: the same capture gives the same bytes."""
+
+
+def read_sog(path: Path, data: bytes) -> Capture:
+    """A .sog archive, or the meta.json of a folder. Raises DataError for what is neither."""
+    if not data.startswith(b"PK"):
+        data = bundle(_folder(path, data))
+    parts = unbundle(path, data)
+    meta = _json(path, parts.get("meta.json", b""))
+    version = meta.get("version", 1)
+    if version not in (1, 2):
+        raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
+    pictures = _Pictures(path, parts, meta)
+    count = pictures.count
+    low, high = (pictures.rows("means", i)[:, :3].astype(np.int64) for i in (0, 1))
+    least, most = pictures.numbers("means", "mins", 3), pictures.numbers("means", "maxs", 3)
+    bent = least + (high << 8 | low) / 65535 * (most - least)
+    turn, scale, base = pictures.rows("quats", 0), pictures.rows("scales", 0), pictures.rows("sh0", 0)
+    tag = turn[:, 3].astype(np.int64) - 252
+    quaternions = three_to_four(np.clip(tag, 0, 3), turn[:, :3] / 255 * 2 - 1)
+    quaternions[tag < 0] = (1, 0, 0, 0)
+    labels, rest = pictures.palette()
+    alpha = base[:, 3:] if version == 2 else pictures.decoded("sh0", base, 4)[:, 3:]
+    constants = pictures.decoded("sh0", base[:, :3] if version == 2 else base, 3 if version == 2 else 4)[:, :3]
+    gaussians = assembled(
+        np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)),
+        quaternions,
+        pictures.decoded("scales", scale[:, :3], 3),
+        logit(alpha[:, 0] / 255) if version == 2 else alpha[:, 0],
+        np.concatenate([constants[:, None], rest[labels]], 1) if len(rest) else constants[:, None],
+    )
+
+    def recolour(harmonics: Floats, changed: Bools) -> bytes:
+        new, said = dict(parts), json.loads(parts["meta.json"])
+        names = said["sh0"]["files"][0]
+        index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
+        picture = pictures.picture(names)
+        picture.reshape(-1, 4)[:count, :3] = index
+        new[names] = _webp(picture)
+        if len(rest):
+            mixed = _means(harmonics[:, 1:].reshape(count, -1), labels, len(rest)).reshape(rest.shape)
+            seen = np.bincount(labels, minlength=len(rest)) > 0
+            entries = np.where(seen[:, None, None], mixed, rest)
+            name = said["shN"]["files"][0]
+            index, said["shN"] = _quantized(entries, said["shN"])
+            new[name] = _webp(_palette_picture(index, pictures.picture(name, _PALETTE * max(COUNTS))))
+        new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
+        return bundle(new, like=data)
+
+    return Capture(path, gaussians, meta.get("antialias") is True, data, recolour)
+
+
+def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
+    """A bundled file of version 2. Gaussians are put in spatial order, by which the images shrink."""
+    gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
+    count = len(gaussians)
+    width = -(-int(np.ceil(count**0.5)) // 4) * 4
+    shape = (-(-count // max(width, 1)), width)
+    means = np.nan_to_num(gaussians.means.numpy().astype(np.float64))
+    bent = np.sign(means) * np.log1p(np.abs(means))
+    least, most = bent.min(0), bent.max(0)
+    at = steps((bent - least) / np.where(most > least, most - least, 1.0), 65535)
+    largest, three = smallest_three(gaussians.quaternions.numpy())
+    harmonics = gaussians.harmonics.numpy()
+    opacity = steps(sigmoid(gaussians.logits.numpy()), 255)
+    scale, scales = _quantized(np.nan_to_num(gaussians.log_scales.numpy()), {"files": ["scales.webp"], "codebook": []})
+    base, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
+    pictures = {
+        "means_l.webp": _picture(at & 255, shape),
+        "means_u.webp": _picture(at >> 8, shape),
+        "quats.webp": _picture(np.concatenate([steps(three / 2 + 0.5, 255), largest[:, None] + 252], 1), shape),
+        "scales.webp": _picture(scale, shape),
+        "sh0.webp": _picture(np.concatenate([base, opacity[:, None]], 1), shape),
+    }
+    meta: dict[str, Any] = {
+        "version": 2,
+        "count": count,
+        **({"antialias": True} if antialiased else {}),
+        "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
+        "scales": scales,
+        "quats": {"files": ["quats.webp"]},
+        "sh0": sh0,
+    }
+    if gaussians.degree > 0:
+        labels = _labels(harmonics[:, 1:].reshape(count, -1))
+        used = int(labels.max()) + 1
+        entries = _means(harmonics[:, 1:].reshape(count, -1), labels, used).reshape(used, -1, 3)
+        index, meta["shN"] = _quantized(
+            entries,
+            {"count": used, "bands": gaussians.degree, "codebook": [], "files": ["shN_centroids.webp", "shN_labels.webp"]},
+        )
+        rows = np.zeros((-(-used // _ROW), _ROW * entries.shape[1], 4), np.uint8)
+        pictures["shN_centroids.webp"] = _palette_picture(index, rows)
+        pictures["shN_labels.webp"] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
+    files = {name: _webp(picture) for name, picture in pictures.items()}
+    return bundle({**files, "meta.json": json.dumps(meta, separators=(",", ":")).encode()})
+
+
+def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
+    """The files of an archive, in their order. Raises DataError where it is damaged, or claims more than it holds."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+            # WebP does not shrink: what claims more than the archive is long is damaged, but for texts.
+            if len(entries) > _MEMBERS or sum(entry.file_size for entry in entries) > 2 * len(data) + (1 << 22):
+                raise DataError(f"{path}: {len(entries)} files that claim more than the archive holds; copy it again")
+            return {entry.filename: archive.read(entry) for entry in entries}
+    except (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise DataError(f"{path}: no readable .sog archive ({error}); copy it again") from error
+
+
+def bundle(parts: Mapping[str, bytes], like: bytes | None = None) -> bytes:
+    """Files as an archive, stored as they are; times are those of the archive `like`, where it has such a file."""
+    times = {}
+    if like is not None:
+        with zipfile.ZipFile(io.BytesIO(like)) as archive:
+            times = {entry.filename: entry.date_time for entry in archive.infolist()}
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in parts.items():
+            archive.writestr(zipfile.ZipInfo(name, times.get(name, _FIRST)), content)
+    return out.getvalue()
+
+
+class _Pictures:
+    """The decoded images of a capture, and the numbers that its meta.json gives them."""
+
+    def __init__(self, path: Path, parts: Mapping[str, bytes], meta: Mapping[str, Any]) -> None:
+        self.path, self.parts, self.meta = path, parts, meta
+        shape = meta["means"].get("shape") if isinstance(meta.get("means"), dict) else None
+        count = meta.get("count", shape[0] if isinstance(shape, list) and shape else None)
+        name = self._name("means", 0)
+        if not isinstance(count, int) or isinstance(count, bool) or not 0 < count <= _DENSE * len(parts[name]) + _SLACK:
+            raise self._wrong(f"{count!r} Gaussians with {len(parts[name])} bytes of positions")
+        self.count: int = count
+
+    def numbers(self, group: str, name: str, length: int) -> Floats:
+        """A list of so many finite numbers."""
+        value = self.meta[group].get(name) if isinstance(self.meta.get(group), dict) else None
+        if not isinstance(value, list) or len(value) != length:
+            raise self._wrong(f"{group}.{name} is no list of {length} numbers")
+        # Exporters write null in the place of the first number of a codebook that is not finite.
+        if name == "codebook" and value and value[0] is None:
+            value = [value[1], *value[1:]]
+        try:
+            found = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            found = np.array([np.nan])
+        if found.shape != (length,) or not np.isfinite(found).all():
+            raise self._wrong(f"{group}.{name} is no list of {length} numbers")
+        return found
+
+    def picture(self, name: str, most: int | None = None) -> _Bytes:
+        """An image [H W 4], RGBA, of at most so many pixels."""
+        header = header_of(self.parts[name])
+        most = 2 * self.count + _SLACK if most is None else most
+        if header is None or header.kind not in ("webp", "png") or not 0 < header.width * header.height <= most:
+            raise self._wrong(f"{name} is no image of at most {most} pixels")
+        try:
+            found = cv2.imdecode(np.frombuffer(self.parts[name], np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            found = None
+        if found is None or found.dtype != np.uint8 or found.ndim != 3 or found.shape[2] not in (3, 4):
+            raise self._wrong(f"{name} cannot be decoded")
+        return np.asarray(cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGBA), np.uint8)
+
+    def rows(self, group: str, which: int) -> _Bytes:
+        """The pixels [N 4] of an image, one a Gaussian."""
+        name = self._name(group, which)
+        pixels = self.picture(name).reshape(-1, 4)
+        if len(pixels) < self.count:
+            raise self._wrong(f"{name} has {len(pixels)} pixels for {self.count} Gaussians")
+        return pixels[: self.count]
+
+    def decoded(self, group: str, index: NDArray[np.integer[Any]], channels: int) -> Floats:
+        """Bytes as the numbers that they stand for: by the codebook, or between mins and maxs."""
+        if isinstance(self.meta[group], dict) and "codebook" in self.meta[group]:
+            return np.asarray(self.numbers(group, "codebook", _LEVELS)[index])
+        low, high = (self.numbers(group, name, channels) for name in ("mins", "maxs"))
+        return np.asarray(low + index / 255 * (high - low))
+
+    def palette(self) -> tuple[NDArray[np.int64], Floats]:
+        """The label of each Gaussian, and the harmonics that labels mean [entries K-1 3]; no entries where it has none."""
+        about = self.meta.get("shN")
+        if about is None:
+            return np.zeros(self.count, np.int64), np.zeros((0, 0, 3))
+        name = self._name("shN", 0)
+        picture = self.picture(name, _PALETTE * max(COUNTS))
+        coefficients = picture.shape[1] // _ROW
+        entries = picture.shape[0] * _ROW
+        if picture.shape[1] % _ROW or coefficients + 1 not in COUNTS or coefficients == 0:
+            raise self._wrong(f"{name} is {picture.shape[1]} pixels wide; {_ROW} entries of 3, 8 or 15 harmonics are a row")
+        index = picture[..., :3].reshape(entries, coefficients, 3)
+        if "codebook" in about:
+            rest = self.numbers("shN", "codebook", _LEVELS)[index]
+        else:
+            low, high = about.get("mins"), about.get("maxs")
+            if not all(isinstance(v, (int, float)) and abs(v) < 1e6 for v in (low, high)):
+                raise self._wrong("shN.mins and shN.maxs are no numbers")
+            rest = low + index / 255 * (high - low)
+        pixels = self.rows("shN", 1).astype(np.int64)
+        labels = pixels[:, 0] | pixels[:, 1] << 8
+        if int(labels.max(initial=0)) >= entries:
+            raise self._wrong(f"label {int(labels.max())} in a palette of {entries} entries")
+        return labels, rest
+
+    def _name(self, group: str, which: int) -> str:
+        about = self.meta.get(group)
+        files = about.get("files") if isinstance(about, dict) else None
+        if not isinstance(files, list) or len(files) <= which or files[which] not in self.parts:
+            raise self._wrong(f"no image {which + 1} of {group}")
+        return str(files[which])
+
+    def _wrong(self, what: str) -> DataError:
+        return DataError(f"{self.path}: {what}; not a SOG file, or it is damaged")
+
+
+def _folder(path: Path, data: bytes) -> dict[str, bytes]:
+    """The images that a meta.json names, from its own folder alone, and itself."""
+    meta = _json(path, data)
+    groups = [value for value in meta.values() if isinstance(value, dict)]
+    names = [name for group in groups for name in group.get("files", []) if isinstance(group.get("files"), list)]
+    parts: dict[str, bytes] = {}
+    for name in names:
+        if not isinstance(name, str) or Path(name).name != name or len(parts) > _MEMBERS:
+            raise DataError(f"{path}: {name!r} is no file beside it; not a SOG folder")
+        try:
+            parts[name] = (path.parent / name).read_bytes()
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: {name} beside it cannot be read; copy the whole folder") from error
+    return {**parts, path.name: data} if path.name == "meta.json" else {**parts, "meta.json": data}
+
+
+def _json(path: Path, data: bytes) -> dict[str, Any]:
+    try:
+        meta = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: no valid meta.json ({error}); not a SOG file, or it is damaged") from error
+    if not isinstance(meta, dict) or not isinstance(meta.get("means"), dict):
+        raise DataError(f"{path}: a meta.json without `means`; not a SOG file")
+    return meta
+
+
+def _webp(picture: _Bytes) -> bytes:
+    """Lossless, colours of transparent pixels among it where OpenCV can."""
+    options = [cv2.IMWRITE_WEBP_QUALITY, 101]
+    mode = getattr(cv2, "IMWRITE_WEBP_LOSSLESS_MODE", None)
+    if mode is not None:
+        options = [mode, cv2.IMWRITE_WEBP_LOSSLESS_PRESERVE_COLOR]
+    done, data = cv2.imencode(".webp", cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA), options)
+    assert done
+    return bytes(data.tobytes())
+
+
+def _picture(rows: NDArray[np.integer[Any]], shape: tuple[int, int]) -> _Bytes:
+    """Rows [N C] as RGBA pixels, opaque where C = 3."""
+    pixels = np.full((shape[0] * shape[1], 4), 255, np.uint8)
+    pixels[: len(rows), : rows.shape[1]] = rows
+    return pixels.reshape(*shape, 4)
+
+
+def _palette_picture(index: NDArray[np.integer[Any]], like: _Bytes) -> _Bytes:
+    """Entries [E K-1 3] in rows of 64."""
+    out = np.full_like(like, 255)
+    flat = out.reshape(-1, 4)
+    flat[: index.shape[0] * index.shape[1], :3] = index.reshape(-1, 3)
+    return out
+
+
+def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    """Values [... 3] as bytes, and what meta.json says of them: a new codebook, or new ranges (version 1)."""
+    said, values = dict(about), np.nan_to_num(values.astype(np.float64))
+    if "codebook" in said:
+        book = _codebook(values.ravel())
+        said["codebook"] = book.tolist()
+        return np.searchsorted((book[1:] + book[:-1]) / 2, values), said
+    whole = isinstance(said["mins"], (int, float))
+    axes = tuple(range(values.ndim)) if whole else tuple(range(values.ndim - 1))
+    low, high = values.min(axes), values.max(axes)
+    index = steps((values - low) / np.where(high > low, high - low, 1.0), 255)
+    if whole:
+        return index, said | {"mins": float(low), "maxs": float(high)}
+    return index, said | {"mins": [*low.tolist(), *said["mins"][3:]], "maxs": [*high.tolist(), *said["maxs"][3:]]}
+
+
+def _codebook(values: Floats) -> Floats:
+    """256 increasing numbers near to all values (Lloyd's algorithm on a line), float32 in float64."""
+    ordered = np.sort(values)
+    total = np.concatenate([[0.0], np.cumsum(ordered)])
+    at = np.linspace(0, 1, _LEVELS)
+    # Half by rank and half by distance: rare far values are not left out.
+    book = (np.quantile(ordered, at) + ordered[0] + (ordered[-1] - ordered[0]) * at) / 2
+    for _ in range(_LLOYD):
+        edges = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2), [len(ordered)]])
+        inside = np.diff(edges)
+        book = np.where(inside > 0, np.diff(total[edges]) / np.maximum(inside, 1), book)
+    return np.maximum.accumulate(book.astype(np.float32)).astype(np.float64)
+
+
+def _labels(rows: Floats) -> NDArray[np.int64]:
+    """At most 65536 groups of like rows [N C]: each its own where there are no more, else halves of halves.
+
+    A group is cut at the median of the column that varies most in it.
+    """
+    if len(rows) <= _PALETTE:
+        return np.arange(len(rows))
+    labels = np.zeros(len(rows), np.int64)
+    for level in range(16):
+        groups = 1 << level
+        spread = _means(rows**2, labels, groups) - _means(rows, labels, groups) ** 2
+        order = np.lexsort((rows[np.arange(len(rows)), spread.argmax(1)[labels]], labels))
+        starts = np.searchsorted(labels[order], np.arange(groups))
+        sizes = np.diff([*starts, len(rows)])
+        rank = np.arange(len(rows)) - starts[labels[order]]
+        labels[order] = 2 * labels[order] + (2 * rank >= sizes[labels[order]])
+    return np.unique(labels, return_inverse=True)[1]
+
+
+def _means(rows: Floats, labels: NDArray[np.int64], count: int) -> Floats:
+    """Mean row of each label; 0 where there is none."""
+    inside = np.maximum(np.bincount(labels, minlength=count), 1)
+    return np.stack([np.bincount(labels, column, count) for column in rows.T], 1) / inside[:, None]

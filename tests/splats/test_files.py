@@ -1,0 +1,295 @@
+"""Files of Gaussians: byte for byte back where nothing changed, within each format's steps where it is written anew."""
+
+import gzip
+import io
+import json
+import struct
+import zipfile
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from fprf.errors import DataError
+from fprf.splats.files import ENDINGS, Capture, read_capture, write_capture, write_gaussians
+from fprf.splats.files.base import spatial_order
+from fprf.splats.gaussians import Gaussians
+
+SHAPE = ("means", "quaternions", "log_scales", "logits")
+COUNT = 600
+STEP = {  # half a step of positions (of their range), ln-scales (of theirs), opacities, mean colours and harmonics
+    ".ply": (0.0, 0.0, 1e-7, 0.0, 0.0),
+    ".compressed.ply": (0.5 / 1023, 0.5 / 1023, 0.5 / 255, 0.5 / 255, 0.5 * 8 / 256),
+    ".splat": (0.0, 1e-7, 0.5 / 255, 0.5 / 255, None),
+    ".spz": (2**-22, 0.5 / 16, 0.5 / 255, 0.5 / 255 * 0.282 / 0.15, 0.5 / 128),
+    ".sog": (4e-5, None, 0.5 / 255, None, None),
+}
+
+
+def cloud(degree: int, count: int = COUNT, seed: int = 0) -> Gaussians:
+    draw = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, generator=draw)
+
+    harmonics = 0.2 * (random(count, (degree + 1) ** 2, 3) - 0.5)
+    harmonics[:, 0] *= 15
+    turns = torch.nn.functional.normalize(random(count, 4) - 0.5, dim=1)
+    return Gaussians(4 * random(count, 3) - 2, turns, -6 + 4 * random(count, 3), 8 * random(count) - 4, harmonics)
+
+
+def names(ending: str) -> str:
+    return ending if ending == "meta.json" else f"x{ending}"
+
+
+@pytest.fixture(params=[(e, d) for e in ENDINGS for d in (0, 2) if e != ".splat" or d == 0], ids=lambda p: f"{p[0]}-{p[1]}")
+def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Capture:
+    ending, degree = request.param
+    write_gaussians(tmp_path / names(ending), cloud(degree), antialiased=ending != ".splat")
+    return read_capture(tmp_path / names(ending))
+
+
+def test_unchanged_colours_give_the_file_back(capture: Capture, tmp_path: Path) -> None:
+    there = tmp_path / "there" / capture.path.name
+    write_capture(there, capture, capture.gaussians.harmonics.clone())
+    for path in [capture.path] if there.name != "meta.json" else capture.path.parent.glob("*.*"):
+        assert (there.parent / path.name).read_bytes() == path.read_bytes()
+    assert capture.antialiased == (there.suffix != ".splat")
+
+
+def test_new_colours_change_nothing_else(capture: Capture, tmp_path: Path) -> None:
+    before = capture.gaussians
+    new = before.harmonics.clone()
+    new[::2] = 0.7 * new[::2] + 0.1
+    there = tmp_path / "there" / capture.path.name
+    write_capture(there, capture, new)
+    after = read_capture(there).gaussians
+    assert all(torch.equal(getattr(after, name), getattr(before, name)) for name in SHAPE)
+    tolerance = 0.03 if capture.path.suffix != ".ply" or ".compressed" in capture.path.name else 0.0
+    assert (after.harmonics - new).abs().max() <= tolerance
+    assert (after.harmonics - new).square().mean().sqrt() <= 0.1 * (before.harmonics - new).square().mean().sqrt()
+
+
+@pytest.mark.parametrize("ending", STEP)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_written_gaussians_come_back_within_a_step(ending: str, degree: int, tmp_path: Path) -> None:
+    made = cloud(degree)
+    write_gaussians(tmp_path / f"x{ending}", made)
+    found = read_capture(tmp_path / f"x{ending}").gaussians
+    if ending in (".compressed.ply", ".sog"):
+        made = made.select(torch.from_numpy(spatial_order(made.means.numpy())))
+    assert found.degree == (0 if ending == ".splat" else degree)
+    at, scale, opacity, tint, rest = STEP[ending]
+
+    def off(name: str) -> float:
+        return float((getattr(found, name) - getattr(made, name)).abs().max())
+
+    slack = 1e-6
+    assert off("means") <= at * 4 + slack
+    assert off("log_scales") <= (0.5 / 16 if scale is None else scale * (1 if ending == ".spz" else 4)) + slack
+    assert off("opacities") <= opacity + slack
+    assert off("colours") <= (0.02 if tint is None else tint * (1.3 if ending == ".compressed.ply" else 1)) + slack
+    if degree and ending != ".splat":
+        error = (found.harmonics[:, 1:] - made.harmonics[:, 1:]).abs().max()
+        assert error <= (0.01 if rest is None else rest) + slack
+    turned = (torch.nn.functional.normalize(found.quaternions, dim=1) * made.quaternions).sum(1).abs()
+    # Half a step of 8 bits in each of four components, at most.
+    assert turned.min() >= 1 - 0.5 * 4 * (0.5 / 127) ** 2 - slack
+
+
+def test_captures_change_their_format_with_the_ending(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "x.ply", cloud(1), antialiased=True)
+    capture = read_capture(tmp_path / "x.ply")
+    new = capture.gaussians.harmonics * 0.5
+    for ending in (".spz", ".compressed.ply", ".sog", ".ply"):
+        write_capture(tmp_path / f"y{ending}", capture, new)
+        found = read_capture(tmp_path / f"y{ending}")
+        assert found.antialiased
+        assert float(found.gaussians.colours.mean()) == pytest.approx(
+            0.25 + 0.5 * float(capture.gaussians.colours.mean()), abs=0.01
+        )
+    packed = read_capture(tmp_path / "y.compressed.ply")
+    (tmp_path / "z.ply").write_bytes(packed.data)
+    renamed = read_capture(tmp_path / "z.ply")
+    write_capture(tmp_path / "w.ply", renamed, renamed.gaussians.harmonics)
+    assert (tmp_path / "w.ply").read_bytes() == packed.data, "a compressed file under the plain ending stays one"
+    write_capture(tmp_path / "v.ply", packed, packed.gaussians.harmonics)
+    assert torch.equal(read_capture(tmp_path / "v.ply").gaussians.means, packed.gaussians.means)
+
+
+def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> None:
+    kinds = [("f_dc_2", "double"), ("label", "int"), *((f"rot_{i}", "float") for i in range(4)), ("z", "float"), ("y", "float")]
+    kinds += [("x", "float"), ("opacity", "float"), ("f_dc_0", "float"), ("f_dc_1", "float"), ("confidence", "uchar")]
+    kinds += [(f"scale_{i}", "float") for i in range(3)]
+    codes = {"double": "<f8", "int": "<i4", "float": "<f4", "uchar": "u1"}
+    table = np.zeros(5, [(name, codes[kind]) for name, kind in kinds])
+    for k, (name, _) in enumerate(kinds):
+        table[name] = np.arange(5) + 0.1 * k + 1
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment by hand",
+        "element sensor 1",
+        "property double t",
+        "element vertex 5",
+    ]
+    lines += [f"property {kind} {name}" for name, kind in kinds]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+    data = "\r\n".join(lines).encode() + struct.pack("<d", 3.5) + table.tobytes() + b"\3" + struct.pack("<3i", 0, 1, 2)
+    path = tmp_path / "x.ply"
+    path.write_bytes(data)
+    capture = read_capture(path)
+    assert torch.equal(capture.gaussians.means[:, 0], torch.from_numpy(table["x"].copy()))
+    new = capture.gaussians.harmonics.clone()
+    new[3] = 0.25
+    write_capture(tmp_path / "y.ply", capture, new)
+    expected = table.copy()
+    for name in ("f_dc_0", "f_dc_1", "f_dc_2"):
+        expected[name][3] = 0.25
+    assert (tmp_path / "y.ply").read_bytes() == data.replace(table.tobytes(), expected.tobytes())
+
+
+def older_spz(version: int) -> bytes:
+    """Two Gaussians, by hand: axes right up back."""
+    at = np.array([[1.0, 2.0, -3.0], [0.5, 0.0, 0.25]])
+    if version == 1:
+        positions = at.astype("<f2").tobytes()
+    else:
+        whole = np.rint(at * 4096).astype(np.int64) & 0xFFFFFF
+        positions = np.stack([whole & 255, whole >> 8 & 255, whole >> 16], -1).astype(np.uint8).tobytes()
+    streams = [positions, bytes([255, 51]), bytes([128, 0, 255] * 2), bytes([160, 144, 128] * 2)]
+    streams += [bytes([255, 128, 128, 128, 255, 128]) if version < 3 else struct.pack("<2I", 3 << 30, 0)]
+    streams += [bytes(range(120, 129)) * 2]
+    if version < 4:
+        return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, version, 2, 1, 12, 1, 0) + b"".join(streams) + b"more")
+    zstandard = pytest.importorskip("zstandard")
+    packed = [zstandard.ZstdCompressor().compress(each) for each in streams]
+    head = struct.pack("<IIIBBBBI12x", 0x5053474E, 4, 2, 1, 12, 1, 6, 40) + b"extended"
+    return head + b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True)) + b"".join(packed)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
+def test_every_version_of_spz(version: int, tmp_path: Path) -> None:
+    (tmp_path / "x.spz").write_bytes(older_spz(version))
+    capture = read_capture(tmp_path / "x.spz")
+    found = capture.gaussians
+    assert capture.antialiased and found.degree == 1
+    assert torch.equal(found.means, torch.tensor([[1.0, -2.0, 3.0], [0.5, 0.0, -0.25]])), "axes become those of a PLY"
+    assert torch.equal(found.log_scales[0], torch.tensor([0.0, -1.0, -2.0]))
+    assert found.opacities[1] == pytest.approx(0.2, abs=1e-6) and found.opacities[0] > 0.99999
+    turn = [[0, 1, 0, 0], [0, 0, -1, 0]] if version < 3 else [[1, 0, 0, 0], [0, 1, 0, 0]]
+    assert torch.allclose(found.quaternions, torch.tensor(turn).float(), atol=0.1)
+    assert torch.equal(found.harmonics[0, 1:, 0] * 128, torch.tensor([8.0, 5.0, -2.0]))
+    new = found.harmonics.clone()
+    new[1] = 0.25
+    write_capture(tmp_path / "y.spz", capture, new)
+    again = read_capture(tmp_path / "y.spz")
+    assert torch.equal(again.gaussians.harmonics[0], found.harmonics[0])
+    assert (again.gaussians.harmonics - new).abs().max() < 0.5 / 255 / 0.15
+    assert (b"extended" in again.data) if version == 4 else gzip.decompress(again.data).endswith(b"more")
+
+
+def test_sog_of_version_1(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "x.sog", cloud(1, 40))
+    with zipfile.ZipFile(tmp_path / "x.sog") as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    meta = json.loads(parts["meta.json"])
+    old = {"means": meta["means"] | {"shape": [40, 3]}, "quats": meta["quats"]}
+    old["scales"] = {"mins": [-6, -6, -6], "maxs": [0, 0, 0], "files": ["scales.webp"]}
+    old["sh0"] = {"mins": [-1, -1, -1, -5], "maxs": [1, 1, 1, 5], "files": ["sh0.webp"]}
+    old["shN"] = {"mins": -2.0, "maxs": 2.0, "quantization": 8, "files": meta["shN"]["files"]}
+    for name, content in parts.items():
+        (tmp_path / name).write_bytes(content if name != "meta.json" else json.dumps(old).encode())
+    capture = read_capture(tmp_path)
+    pixels = cv2.cvtColor(cv2.imread(str(tmp_path / "sh0.webp"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA).reshape(-1, 4)[:40]
+    assert np.allclose(capture.gaussians.harmonics[:, 0], pixels[:, :3] / 255 * 2 - 1, atol=1e-6)
+    assert np.allclose(capture.gaussians.logits, pixels[:, 3] / 255 * 10 - 5, atol=1e-6)
+    new = capture.gaussians.harmonics * 0.5
+    write_capture(tmp_path / "there" / "meta.json", capture, new)
+    again = read_capture(tmp_path / "there").gaussians
+    assert (again.harmonics - new).abs().max() < 2 / 255 and torch.equal(again.logits, capture.gaussians.logits)
+
+
+def test_a_palette_takes_the_mean_of_what_its_gaussians_became(tmp_path: Path) -> None:
+    first = cloud(1, 50)
+    harmonics = torch.cat([first.harmonics, first.harmonics])
+    twice = Gaussians(*(torch.cat([getattr(first, f.name)] * 2) for f in fields(first)))
+    write_gaussians(tmp_path / "x.sog", replace(twice, harmonics=harmonics))
+    capture = read_capture(tmp_path / "x.sog")
+    parts = {}
+    with zipfile.ZipFile(io.BytesIO(capture.data)) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    labels = cv2.imdecode(np.frombuffer(parts["shN_labels.webp"], np.uint8), cv2.IMREAD_UNCHANGED)
+    labels[...] = 0  # all take the first entry
+    parts["shN_labels.webp"] = cv2.imencode(".webp", labels, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+    with zipfile.ZipFile(tmp_path / "y.sog", "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    capture = read_capture(tmp_path / "y.sog")
+    new = capture.gaussians.harmonics.clone()
+    new[:30, 1:] = 0.3
+    new[30:, 1:] = -0.2
+    write_capture(tmp_path / "z.sog", capture, new)
+    rest = read_capture(tmp_path / "z.sog").gaussians.harmonics[:, 1:]
+    assert torch.allclose(rest, torch.tensor(0.3 * 0.3 - 0.7 * 0.2).expand_as(rest), atol=1e-3)
+
+
+def test_gaussians_that_are_not_finite_are_read_and_told(tmp_path: Path) -> None:
+    made = cloud(0, 6)
+    made.means[1, 0], made.logits[2], made.logits[3] = torch.nan, torch.inf, torch.nan
+    write_gaussians(tmp_path / "x.ply", made)
+    capture = read_capture(tmp_path / "x.ply")
+    assert capture.gaussians.finite.tolist() == [True, False, True, False, True, True]
+    for ending in (".compressed.ply", ".splat", ".spz", ".sog"):
+        write_gaussians(tmp_path / f"x{ending}", made)
+        assert len(read_capture(tmp_path / f"x{ending}").gaussians) == 6
+
+
+def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:
+    write_gaussians(tmp_path / "x.ply", cloud(1, 4))
+    data = (tmp_path / "x.ply").read_bytes()
+    for what, changed in {
+        "2D Gaussians": data.replace(b"scale_2", b"scale_9"),
+        "2dgs": data.replace(b"format", b"comment SplatRenderMode: 2dgs\nformat", 1),
+        "little-endian": data.replace(b"binary_little_endian", b"ascii"),
+        "cut off": data[:-1],
+        "no property opacity": data.replace(b"opacity", b"opaque_"),
+        "f_rest": data.replace(b"f_rest_8", b"g_rest_8"),
+    }.items():
+        (tmp_path / "y.ply").write_bytes(changed)
+        with pytest.raises(DataError, match=what) as told:
+            read_capture(tmp_path / "y.ply")
+        assert "\n" not in str(told.value)
+    for name in ("x.obj", "none.ply", "x.splat"):
+        (tmp_path / "x.splat").write_bytes(b"abc")
+        with pytest.raises(DataError):
+            read_capture(tmp_path / name)
+    with pytest.raises(DataError, match="degrees"):
+        replace(cloud(0, 3), harmonics=torch.zeros(3, 2, 3))
+
+
+@pytest.mark.parametrize("ending", [".spz", ".sog"])
+def test_a_small_file_that_claims_much_takes_no_memory(ending: str, tmp_path: Path) -> None:
+    import tracemalloc
+
+    path = tmp_path / f"x{ending}"
+    if ending == ".spz":
+        path.write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 2**30, 3, 12, 0, 0) + bytes(1 << 20)))
+    else:
+        write_gaussians(path, cloud(0, 40))
+        wide = cv2.imencode(".webp", np.zeros((4000, 4000, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+        with zipfile.ZipFile(path) as archive:
+            parts = {name: archive.read(name) for name in archive.namelist()}
+        parts["means_l.webp"] = wide
+        parts["meta.json"] = parts["meta.json"].replace(b'"count":40', b'"count":16000000')
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in parts.items():
+                archive.writestr(name, content)
+    tracemalloc.start()
+    with pytest.raises(DataError):
+        read_capture(path)
+    assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    tracemalloc.stop()
