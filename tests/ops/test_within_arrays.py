@@ -8,7 +8,18 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-KERNELS = ("dense", "exponential", "guided", "march", "march_gradients", "mixture", "point_slopes", "triplane", "variation")
+KERNELS = (
+    "dense",
+    "exponential",
+    "guided",
+    "march",
+    "march_gradients",
+    "mixture",
+    "point_slopes",
+    "rasterise",
+    "triplane",
+    "variation",
+)
 
 
 @pytest.mark.slow

@@ -1,0 +1,215 @@
+"""3D Gaussians to pixels and back: the compiled kernels against the plain form in float64, and what is promised of both."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from fprf.errors import FprfError
+from fprf.ops import backend, rasterise
+
+ROUGH = 1.1e-4
+"""Relative error of the kernels' exponential."""
+STOP = 1e-3
+"""Share of the light below which they go no deeper."""
+Tensors = list[Tensor]
+
+
+def camera(width: int = 40, height: int = 30, near: float = 0.01) -> rasterise.Pinhole:
+    """At (-1.3, 0.2, -3.8), turned by 0.3 about y; different focal lengths, centre off the middle."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 0] = pose[2, 2] = math.cos(0.3)
+    pose[0, 2], pose[2, 0] = math.sin(0.3), -math.sin(0.3)
+    pose[:3, 3] = torch.tensor([0.1, -0.2, 4.0])
+    intrinsics = torch.tensor(
+        [[0.95 * width, 0, 0.48 * width], [0, 1.37 * height, 0.53 * height], [0, 0, 1]], dtype=torch.float64
+    )
+    return rasterise.Pinhole(intrinsics, pose, width, height, near)
+
+
+def cloud(count: int = 60, bands: int = 16, channels: int = 0, size: float = -1.5, seed: int = 0) -> Tensors:
+    """Means, quaternions, log scales, logits, harmonics, features, background."""
+    draw = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=draw)
+
+    means = normal(count, 3) * torch.tensor([1.2, 0.9, 0.5])
+    shape = [normal(count, 4), 0.5 * normal(count, 3) + size, normal(count), 0.3 * normal(count, bands, 3)]
+    return [means, *shape, torch.rand(count, channels, generator=draw), torch.tensor([0.2, 0.5, 0.1])]
+
+
+def render(given: Tensors, view: rasterise.Pinhole, antialiased: bool = False) -> rasterise.Rasterised:
+    return rasterise.rasterise(*given[:5], view, features=given[5], background=given[6], antialiased=antialiased)
+
+
+def exact(given: Tensors) -> Tensors:
+    return [x.double() for x in given]
+
+
+@pytest.mark.parametrize(("bands", "channels", "antialiased"), [(16, 9, False), (9, 0, True), (4, 8, True), (1, 1, False)])
+def test_images_and_gradients_are_those_of_float64(bands: int, channels: int, antialiased: bool) -> None:
+    """A weight is a product over what lies before; each factor errs by at most ROUGH alpha / (1 - alpha), which stays below
+    ROUGH for the alphas here, and tens of Gaussians lie on a pixel: 2 ROUGH of the largest value, on average; gradients have
+    twice as many factors. A pixel of thousands may lie where one alpha is cut at 1/255."""
+    given, view = cloud(bands=bands, channels=channels), camera()
+    pulls, results = torch.Generator().manual_seed(1), []
+    weights = [torch.randn(shape, generator=pulls) for shape in ((30, 40, 3), (30, 40), (30, 40), (30, 40, channels))]
+    for inputs in (given, exact(given)):
+        learnt = [x.detach().clone().requires_grad_() for x in inputs]
+        found = render(learnt, view, antialiased)
+        torch.stack([(x * w).sum() for x, w in zip(found[:4], weights, strict=True)]).sum().backward()
+        results.append((found, [x.grad for x in learnt]))
+    (ours, slopes), (theirs, wanted) = results
+    for a, b in zip(ours[:4], theirs[:4], strict=True):
+        assert a.dtype == torch.float32 and a.shape == b.shape
+        if b.numel():
+            off = (a.double() - b).abs().flatten().sort(descending=True).values / b.abs().max()
+            assert off[2:].max() < 2 * ROUGH and off.max() < 1 / 255
+    for one, other in zip(slopes, wanted, strict=True):
+        assert one is not None and other is not None and bool(torch.isfinite(one).all())
+        if other.numel():
+            assert (one.double() - other).norm() < 4 * ROUGH * other.norm()
+
+
+def test_gradients_of_the_plain_form_are_finite_differences() -> None:
+    given = exact(cloud(count=7, bands=16, channels=2, size=-0.7))
+    view = camera(12, 9)
+    # Far from the cut at 1/255: everything covers everything.
+    given[2], given[3] = given[2] + 1.5, given[3].abs() + 1
+
+    def value(*x: Tensor) -> Tensor:
+        found = render(list(x), view, antialiased=True)
+        return torch.cat([found.image.flatten(), found.depth.flatten(), found.opacity.flatten(), found.features.flatten()])
+
+    assert torch.autograd.gradcheck(value, [x.requires_grad_() for x in given], eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
+
+
+def test_what_is_skipped_is_counted_and_leaves_no_more_than_promised() -> None:
+    given, view = cloud(count=3000, bands=4, size=-1.0), camera(70, 50)
+    given[3][:1500] += 3  # opaque: tiles saturate
+    given[3][1500:1600] = -9.0
+    given[0][1600:1700, 2] -= 20
+    given[0][1700:1800, 1] += 50
+    given[0][1800] = math.nan
+    given[4][1801, 2, 1] = math.inf
+    given[2][1802] = math.nan
+    ours, theirs = render(given, view), render(exact(given), view)
+    counts = ours.counts
+    assert counts["faint"] >= 100 and counts["behind"] >= 100 and counts["outside"] >= 100 and counts["invalid"] == 3
+    assert counts["saturated"] > 0.2 * counts["entries"]
+    apart = (ours.image.double() - theirs.image).abs().flatten().sort(descending=True).values
+    bound = STOP * float(theirs.image.max()) + 3 * ROUGH * float(theirs.image.max())
+    assert apart[len(apart) // 500 :].max() < bound and apart.max() < 1 / 255 + bound
+    assert (ours.opacity - theirs.opacity).abs().max() < STOP + 3 * ROUGH
+
+
+def test_lifting_is_the_transpose_of_rendering_features() -> None:
+    given, view = cloud(count=200, bands=1, channels=11), camera(50, 37)
+    pixels = torch.randn(37, 50, 11, generator=torch.Generator().manual_seed(2))
+    ours = rasterise.lift(*given[:4], view, pixels)
+    theirs = rasterise.lift(*(x.double() for x in given[:4]), view, pixels.double())
+    for a, b in zip(ours, theirs, strict=True):
+        assert (a.double() - b).norm() < 4 * ROUGH * b.norm()
+    # <render(v), p> = <v, lift(p)>, and the weights of all Gaussians are all the opacity.
+    found = render(given, view)
+    assert float((found.features * pixels).sum()) == pytest.approx(float((given[5] * ours.features).sum()), rel=1e-3)
+    assert float(found.opacity.sum()) == pytest.approx(float(ours.weights.sum()), rel=1e-4)
+
+
+def test_one_gaussian_is_the_formula() -> None:
+    """An isotropic one on the axis: alpha = o exp(-d^2 / 2 sigma^2), sigma^2 = (f s / z)^2 + 0.3."""
+    intrinsics = torch.tensor([[50.0, 0, 16], [0, 50.0, 16], [0, 0, 1]])
+    view = rasterise.Pinhole(intrinsics, torch.eye(4), 32, 32)
+    given = [torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), math.log(0.1)), torch.zeros(1)]
+    found = rasterise.rasterise(*given, torch.zeros(1, 1, 3), view)
+    x = torch.arange(32) + 0.5 - 16
+    variance = (50 * 0.1 / 2) ** 2 + 0.3
+    alpha = 0.5 * torch.exp(-(x[:, None] ** 2 + x**2) / (2 * variance))
+    alpha = torch.where(alpha > 1 / 255, alpha, 0)
+    assert (found.opacity - alpha).abs().max() < ROUGH and (found.image - 0.5 * alpha[..., None]).abs().max() < ROUGH
+    assert (found.depth - 2 * (alpha > 0)).abs().max() < 1e-4
+    smooth = rasterise.rasterise(*given, torch.zeros(1, 1, 3), view, antialiased=True)
+    assert float(smooth.opacity.max() / found.opacity.max()) == pytest.approx((variance - 0.3) / variance, abs=1e-3)
+
+
+def _behind(given: Tensors) -> None:
+    given[0][:, 2] -= 30
+
+
+def _points(given: Tensors) -> None:
+    given[2][:] = -math.inf
+
+
+def _vast(given: Tensors) -> None:
+    given[2][:20] = 80.0
+    given[2][20:40, 0] = 9.0
+    given[2][40:60] = 16.0
+
+
+def _no_rotation(given: Tensors) -> None:
+    given[1].zero_()
+
+
+def _at_the_camera(given: Tensors) -> None:
+    pose = camera().world_to_camera
+    given[0][:] = (-pose[:3, :3].T @ pose[:3, 3]).float()
+
+
+def _infinite_opacity(given: Tensors) -> None:
+    given[3][:] = math.inf
+
+
+def _not_numbers(given: Tensors) -> None:
+    given[0][::2], given[1][::3], given[2][::5], given[3][::7], given[4][::11] = (math.nan,) * 5
+
+
+def _far_away(given: Tensors) -> None:
+    given[0][:] = torch.tensor([3e38, -3e38, 3e38])
+
+
+def _none(given: Tensors) -> None:
+    for k in range(6):
+        given[k] = given[k][:0]
+
+
+SPOILT = [_behind, _points, _vast, _no_rotation, _at_the_camera, _infinite_opacity, _not_numbers, _far_away, _none]
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("spoil", SPOILT)
+def test_no_input_leaves_the_image_or_a_gradient_without_a_number(spoil: Callable[[Tensors], Any], antialiased: bool) -> None:
+    given, view = cloud(bands=4, channels=2), camera()
+    spoil(given)
+    images = []
+    for inputs in (given, exact(given)):
+        learnt = [x.detach().clone().requires_grad_() for x in inputs]
+        found = render(learnt, view, antialiased)
+        assert all(bool(torch.isfinite(x).all()) for x in found[:4])
+        torch.stack([x.sum() for x in found[:4]]).sum().backward()
+        assert all(x.grad is not None and bool(torch.isfinite(x.grad).all()) for x in learnt)
+        images.append(found.image.double().detach())
+    # Alphas of 0.99 let factors of 1 - alpha err by 99 ROUGH.
+    assert (images[0] - images[1]).abs().median() < 100 * ROUGH
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    given = cloud()
+    for spoilt in (given[0][:-1], given[0][:, :2]):
+        with pytest.raises(FprfError, match="Gaussians of shapes"):
+            rasterise.rasterise(spoilt, *given[1:5], camera())
+    with pytest.raises(FprfError, match="Gaussians of shapes"):
+        rasterise.rasterise(*given[:4], given[4][:, :5], camera())
+    with pytest.raises(FprfError, match="pixels"):
+        rasterise.lift(*given[:4], camera(), torch.zeros(40, 30, 2))
+
+
+def test_threads_and_the_plain_form_on_request() -> None:
+    given, view = cloud(channels=3), camera()
+    with backend.plain():
+        plain = render(given, view)
+    assert plain.image.dtype == torch.float32 and not plain.counts
+    assert (plain.image - render(given, view).image).abs().mean() < ROUGH
