@@ -34,6 +34,8 @@ class Matching(NamedTuple):
     """In [0, 1]; 0 = semantics as they are."""
     recentred: int = 0
     """Times that the codes' mean is taken again; 0 = the mean of all of them."""
+    centred: bool = True
+    """Cosines are taken from the mean of each side; False = from the encoder's own origin, without whitening."""
 
 
 class Keys(NamedTuple):
@@ -43,8 +45,17 @@ class Keys(NamedTuple):
     share: Annotated[Tensor, "T"]
 
 
-def match_keys(here: Keys, there: Keys, matching: Matching, prior: Annotated[Tensor, "T"]) -> Annotated[Tensor, "K T"]:
+def match_keys(
+    here: Keys,
+    there: Keys,
+    matching: Matching,
+    prior: Annotated[Tensor, "T"],
+    origin: Annotated[Tensor, "D"] | None = None,
+) -> Annotated[Tensor, "K T"]:
     """Share of each code in each region, float64; rows sum to 1. `prior` > 0 multiplies the odds of each code.
+
+    `origin` is the encoder's, in the keys' own basis; None = 0. It counts where cosines are not centred: a single thing has
+    no sky, so its mean says nothing about that of a landscape.
 
     With cosines, moving one side or rotating both changes nothing. Dot products are the paper's, and know no frame.
     """
@@ -52,6 +63,10 @@ def match_keys(here: Keys, there: Keys, matching: Matching, prior: Annotated[Ten
     if matching.similarity == "dot":
         centres = share_mean(*here), share_mean(*there)
         queries, keys = compared(here.keys, there.keys, "dot", queries_centre=centres[0], keys_centre=centres[1])
+        return attention(queries, keys, matching.temperature * score_spread(queries, keys), double(prior))
+    if not matching.centred:
+        zero = torch.zeros_like(here.keys[0]) if origin is None else double(origin)
+        queries, keys = unit(here.keys, zero), unit(there.keys, zero)
         return attention(queries, keys, matching.temperature * score_spread(queries, keys), double(prior))
     queries = _directions(here.keys, share_mean(*here), whitener(here, matching.whitening))
     white, weight = whitener(there, matching.whitening), there.share

@@ -130,6 +130,9 @@ class _RegionConfig(StylizerConfig):
     """How far both sides' semantics are whitened before they are scored as cosines, in [0, 1]; 0 = not at all."""
     recentred: int = 5
     """How often the references' centre is taken again from the codes that the scene takes; 0 = the mean of all codes."""
+    centred: bool = True
+    """Cosines are taken from the mean of each side; False = from the encoder's own origin, without whitening: for single
+    objects, whose mean says nothing about that of a landscape."""
     gain: float = 8.0
     """Largest amplification of any channel or direction, at least 1, so that the noise of flat regions stays small."""
 
@@ -145,7 +148,7 @@ class _RegionConfig(StylizerConfig):
         from ...style.alignment import Matching
         from .region import TwoSidedStylizer, plan_regions
 
-        matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred)
+        matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred, self.centred)
         plan = plan_regions(dictionary, scene, matching)
         return TwoSidedStylizer(plan, scene, self._maps(plan, scene))
 

@@ -60,7 +60,7 @@ class RegionPlan(NamedTuple):
 def plan_regions(dictionary: StyleDictionary, scene: SceneStyle, matching: Matching) -> RegionPlan:
     """Match the regions with the codes. The scene's statistics are blended as the dictionary's are."""
     check_fit(dictionary, scene)
-    own = own_style(scene, dictionary.blend)
+    own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
     same = _mixed(own, region_table(scene, own, matching))
     table = region_table(scene, dictionary, matching)
     if len(table) > 1:
@@ -171,7 +171,8 @@ def _matched(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching)
     odds = code_odds(dictionary)
     if len(scene.keys) == 1 or scene.keys.shape[1] == 0:
         return odds.expand(len(scene.keys), -1)
-    return match_keys(Keys(scene.keys, scene.share), Keys(dictionary.keys, odds), matching, dictionary.weight)
+    here, there = Keys(scene.keys, scene.share), Keys(dictionary.keys, odds)
+    return match_keys(here, there, matching, dictionary.weight, dictionary.origin)
 
 
 def _mixed(d: StyleDictionary, table: Tensor) -> Side:
