@@ -119,7 +119,7 @@ def main() -> None:
         row("new photograph to first restyled view, in a process", opening + first_style + first_view, "seconds", 2.0),
         row("from nothing to first restyled view", start + loading + opening + first_style + first_view, "seconds", 2.0),
         row("match map of a view", median(lambda: match_map(trained, plain, len(known.names) // 3)), "seconds", 1.0),
-        row("regions explained", median(lambda: explain(trained, plain.orders.regions, plain)), "seconds"),
+        row("regions explained", median(lambda: explain(plain.orders.regions, plain)), "seconds"),
     ]
     seconds: dict[str, float] = {}
     for name, (peer, look) in looks(trained, encoders, base, plain).items():

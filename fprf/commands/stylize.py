@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..engine.regions import Regions
     from ..engine.restyle import Styled
 
-__all__ = ["StylizeConfig", "run"]
+__all__ = ["StylizeConfig", "print_explained", "run"]
 
 _LONGEST = 80
 """Characters of a style's default name."""
@@ -69,7 +69,7 @@ def run(args: list[str]) -> int:
     """Build the style; explain it, map it, or render the views; write style.json."""
     config, file = read_flags(StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",))
     from ..engine.loading import load_run, load_style
-    from ..engine.regions import Regions
+    from ..engine.regions import Regions, TrainedViews
     from ..engine.restyle import apply_style
     from ..style.dictionary import save_dictionary
     from ..style.statistics import dead_channels
@@ -77,7 +77,7 @@ def run(args: list[str]) -> int:
     trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
     views, output = _views(trained, config), config.output or config.run / "styles" / _name(config)
     if config.explain and not config.references:
-        _explain(trained, output, Regions(trained, *load_style(trained.run)), None)
+        print_explained(output, Regions(TrainedViews(trained), *load_style(trained.run)), None)
         return 0
     start = time.perf_counter()
     styled = apply_style(trained, file)
@@ -90,7 +90,7 @@ def run(args: list[str]) -> int:
     for note in styled.orders.notes:
         print(note)
     if config.explain:
-        _explain(trained, output, styled.orders.regions, styled)
+        print_explained(output, styled.orders.regions, styled)
     if config.match_only or not config.explain:
         made |= _make(trained, output, styled, views, config)
     save_dictionary(output / "dictionary.safetensors", styled.dictionary)
@@ -138,14 +138,14 @@ def _make(trained: "Trained", output: Path, styled: "Styled", views: list[int], 
     return made
 
 
-def _explain(trained: "Trained", output: Path, regions: "Regions", styled: "Styled | None") -> None:
-    """The table on standard output, explain.json and explain.png."""
+def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -> None:
+    """Show a scene's regions with what they take: a table on standard output, explain.json and explain.png in `output`."""
     from ..engine.explain import explain, region_row, region_tile
     from ..output.atomic import write_json
     from ..output.images import write_image
     from ..output.sheet import sheet
 
-    found = explain(trained, regions, styled)
+    found = explain(regions, styled)
     names = styled.dictionary.names if styled is not None else ()
     _print_table([_HEAD if styled else _HEAD[:3], *(_cells(region) for region in found)])
     write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in found]})

@@ -8,12 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..output.images import Picture, to_uint8
+from ..output.images import Picture
 from ..output.sheet import Tile, highlight
-from .loading import Trained
 from .regions import Regions, membership_view, shrunk
 from .restyle import Styled
-from .views import render_view
 
 __all__ = ["Region", "Taken", "explain", "region_row", "region_tile"]
 
@@ -57,23 +55,22 @@ class Region(NamedTuple):
 
 
 @torch.inference_mode()
-def explain(trained: Trained, regions: Regions, styled: Styled | None = None) -> list[Region]:
+def explain(regions: Regions, styled: Styled | None = None) -> list[Region]:
     """All regions in their order, with what they take where there is a style."""
-    names, count = trained.known.names, len(regions.scene.share)
+    names, count = regions.views.names, len(regions.scene.share)
     looked = sorted({round(i * (len(names) - 1) / max(1, _VIEWS - 1)) for i in range(_VIEWS)})
     mass = torch.stack([_mass(regions, view) for view in looked])
     best = [looked[int(mass[:, k].argmax())] for k in range(count)]
-    seen = {view: _seen(trained, regions, view) for view in sorted(set(best))}
+    seen = {view: _seen(regions, view) for view in sorted(set(best))}
     found = []
     for k, view in enumerate(best):
         colour, share = seen[view]
-        width, height = trained.known.cameras.size[view].tolist()
+        width, height = regions.views.cameras.size[view].tolist()
         pixel = _middle(share[..., k], (width, height))
         found.append(Region(k, float(regions.scene.share[k]), names[view], pixel, highlight(colour, share[..., k])))
     if styled is None:
         return found
-    device = trained.model.device
-    attention = styled.restyle.stylizer.match(regions.scene.keys.to(device)).cpu().double()
+    attention = styled.restyle.stylizer.match(regions.scene.keys.to(regions.views.device)).cpu().double()
     return [_matched(region, styled, attention[region.number]) for region in found]
 
 
@@ -108,12 +105,10 @@ def _mass(regions: Regions, view: int) -> Annotated[Tensor, "K"]:
     return (share * opacity[..., None]).mean((0, 1))
 
 
-def _seen(trained: Trained, regions: Regions, view: int) -> tuple[Picture, Annotated[Tensor, "H W K"]]:
+def _seen(regions: Regions, view: int) -> tuple[Picture, Annotated[Tensor, "H W K"]]:
     """A view as it is, small, and where its regions are."""
-    camera = shrunk(trained.known.cameras, view, _FINE)
-    picture = render_view(trained.model, trained.known.facts, camera, 0, trained.config.render)
     share, opacity = membership_view(regions, view, _FINE)
-    return to_uint8(picture.rgb), share * opacity[..., None]
+    return regions.views.picture(shrunk(regions.views.cameras, view, _FINE), 0), share * opacity[..., None]
 
 
 def _middle(share: Annotated[Tensor, "H W"], size: tuple[int, int]) -> tuple[int, int]:

@@ -77,7 +77,7 @@ def take_orders(regions: Regions, dictionary: StyleDictionary, style: StyleConfi
         keep=tuple(book.name(f) for f in kept),
         region_strength=tuple(f"{book.name(f)}={value:g}" for f, value in strengths),
     )
-    file = StyleFile(saved, book.keys, regions.trained.known.facts.semantic_encoder)
+    file = StyleFile(saved, book.keys, regions.views.semantic_encoder)
     return Orders(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)))
 
 

@@ -24,7 +24,7 @@ from ..style.wishes import labels
 from .first_use import check_stylizer
 from .loading import Trained, load_style
 from .orders import Orders, take_orders
-from .regions import Regions
+from .regions import Regions, TrainedViews
 
 __all__ = [
     "Codes",
@@ -126,7 +126,7 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
     style, scene, basis = file.style, encoders.scene, encoders.basis
     if basis is not None:
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
-    regions = Regions(trained, scene, basis, file.regions, file.semantic_encoder)
+    regions = Regions(TrainedViews(trained), scene, basis, file.regions, file.semantic_encoder)
     orders = take_orders(regions, dictionary, style)
     chosen = style.stylizer
     stylizer = regional(dictionary, scene, orders.allowed, chosen)

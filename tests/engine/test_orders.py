@@ -35,7 +35,7 @@ def style_of(references: Sequence[Path]) -> StyleConfig:
 def orders_of(world: World, styled: Styled, file: StyleFile | None = None, **wishes: object) -> Orders:
     style = replace(style_of(world.references), **wishes)  # type: ignore[arg-type]
     old = styled.orders.regions
-    regions = Regions(old.trained, old.scene, old.basis, {} if file is None else file.regions)
+    regions = Regions(old.views, old.scene, old.basis, {} if file is None else file.regions)
     return take_orders(regions, styled.dictionary, style)
 
 
@@ -112,7 +112,7 @@ def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: St
     saved = orders.saved
     assert all(text.partition("=")[0] in saved.regions for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep))
     old = styled.orders.regions
-    again = take_orders(Regions(old.trained, old.scene, old.basis, saved.regions), styled.dictionary, saved.style)
+    again = take_orders(Regions(old.views, old.scene, old.basis, saved.regions), styled.dictionary, saved.style)
     assert torch.equal(again.allowed, orders.allowed) and torch.equal(again.strength, orders.strength)
     assert again.saved == saved, "names and keys stay as they are, however often it is saved"
     named = {text.partition("=")[0] for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep)}

@@ -8,15 +8,20 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.engine.loading import load_style
-from fprf.engine.regions import ALIKE, Found, Regions, find_regions, key_of, membership_view
+from fprf.engine.loading import Trained, load_style
+from fprf.engine.regions import ALIKE, Found, Regions, TrainedViews, find_regions, key_of, membership_view
 from fprf.errors import DataError, UsageError
 from fprf.style.files import Key
 
 
 def regions_of(world: World, keys: dict[str, Key] | None = None) -> Regions:
     trained = world.load()
-    return Regions(trained, *load_style(trained.run), keys or {})
+    return Regions(TrainedViews(trained), *load_style(trained.run), keys or {})
+
+
+def trained_of(regions: Regions) -> Trained:
+    assert isinstance(regions.views, TrainedViews)
+    return regions.views.trained
 
 
 def test_numbers_are_the_scenes(world: World) -> None:
@@ -53,7 +58,7 @@ def test_pixels_outside_are_refused(world: World, place: str) -> None:
 def test_a_pixel_that_sees_nothing_is_refused(world: World) -> None:
     regions = regions_of(world)
     with torch.no_grad():
-        regions.trained.model.get_parameter("field.to_density.weight").fill_(-1e6)
+        trained_of(regions).model.get_parameter("field.to_density.weight").fill_(-1e6)
     with pytest.raises(UsageError, match="there is nothing at that pixel"):
         find_regions(regions, "0002:5,5")
 
@@ -142,15 +147,16 @@ def test_keys_of_another_encoder_are_refused(world: World) -> None:
     fitting = regions._replace(keys={"sky": key_of(regions, 0)})
     with pytest.raises(UsageError, match=said):
         find_regions(fitting._replace(encoder="dino:small"), "sky")
-    assert find_regions(fitting._replace(encoder=regions.trained.known.facts.semantic_encoder), "sky")
+    assert find_regions(fitting._replace(encoder=regions.views.semantic_encoder), "sky")
 
 
 def test_names_of_views_may_be_parts_of_each_other(world: World) -> None:
     from dataclasses import replace
 
     regions = regions_of(world)
-    known = regions.trained.known
+    trained = trained_of(regions)
+    known = trained.known
     names = ("a", "a:1", *known.names[2:])
-    renamed = regions._replace(trained=regions.trained._replace(known=replace(known, names=names)))
+    renamed = regions._replace(views=TrainedViews(trained._replace(known=replace(known, names=names))))
     share, _ = membership_view(regions, 1, 32)
     assert find_regions(renamed, "a:1:5,6")[0].number == int(share[6, 5].argmax())
