@@ -41,6 +41,7 @@ VERBS = {
     "train": Verb("METHOD|CONFIG.json --data DIR", "train a scene, or go on where a run stopped"),
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
+    "restyle": Verb("CAPTURE.ply --references A.jpg ...", "restyle a finished capture of 3D Gaussians, from its file alone"),
     "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("RUN", "in the browser: drop a photograph on the scene to restyle it"),

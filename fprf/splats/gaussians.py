@@ -5,7 +5,7 @@ the real spherical harmonics Y of `fields.harmonics`.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Annotated
 
 import torch
@@ -66,6 +66,10 @@ class Gaussians:
         """Gaussians that can be drawn: every number finite, but for infinite logits, which are opacities 0 and 1; bool."""
         parts = (self.means, self.quaternions, self.log_scales, self.harmonics.flatten(1))
         return torch.stack([part.isfinite().all(1) for part in parts]).all(0) & ~self.logits.isnan()
+
+    def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "Gaussians":
+        """The same Gaussians with other harmonics."""
+        return replace(self, harmonics=harmonics)
 
     def select(self, index: Annotated[Tensor, "M"]) -> "Gaussians":
         """Some of the Gaussians, in the order of `index` (int64, or a mask of all)."""

@@ -25,7 +25,7 @@ from .scene import SceneStyle, membership, region_units
 from .statistics import double, mix
 from .transport import monge, symmetric_root
 
-__all__ = ["ColourMaps", "colour_maps", "decoded_colours"]
+__all__ = ["ColourMaps", "carried_colours", "colour_maps", "decoded_colours"]
 
 _DRAWS = 512
 """Points drawn of each region: means of colours are known to a fiftieth of their deviation."""
@@ -102,6 +102,20 @@ def colour_maps(
     at = mean.new_full((len(mean),), dictionary.blend)
     mean, covariances = blend_codes(mean, covariances, *whole, at)
     table = double(stylizer.match(scene.keys.to(_device(stylizer, scene)))).to(mean)
+    return ColourMaps(scene, *carried_colours(mean, covariances, table, dictionary), share)
+
+
+def carried_colours(
+    mean: Annotated[Tensor, "K 3"],
+    covariances: Annotated[Tensor, "K 3 3"],
+    table: Annotated[Tensor, "K T"],
+    dictionary: StyleDictionary,
+) -> tuple[Annotated[Tensor, "K 3 3"], Annotated[Tensor, "K 3"]]:
+    """A and b of each region, float64, c' = c A + b: from the colours that it has to those of the codes that it takes.
+
+    `table` holds the shares of the codes, and the dictionary the colours of its photographs.
+    """
+    assert dictionary.colour_mean is not None and dictionary.colour_covariance is not None
     there, spread = double(dictionary.colour_mean).to(mean), double(dictionary.colour_covariance).to(mean)
     if len(mean) == 1:  # an undivided scene takes its codes together, with what lies between them
         target, wide = (part[None] for part in mix(there, spread, table[0]))
@@ -109,8 +123,7 @@ def colour_maps(
         target, wide = table @ there, torch.einsum("kt,tij->kij", table, spread)
     floor = _QUIET * torch.eye(3).to(mean)
     matrix = monge(covariances + floor, wide + floor, gain=_GAIN)
-    bias = target - torch.einsum("kc,kcd->kd", mean, matrix)
-    return ColourMaps(scene, matrix, bias, share)
+    return matrix, target - torch.einsum("kc,kcd->kd", mean, matrix)
 
 
 @torch.no_grad()

@@ -70,9 +70,7 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
     plain = ending == ".ply" and here == ".compressed.ply"
     packed = ending == ".compressed.ply" and not is_compressed(capture.data)
     if _FORMATS[ending].read is not _FORMATS[here].read or plain or packed:
-        before = capture.gaussians
-        gaussians = Gaussians(before.means, before.quaternions, before.log_scales, before.logits, harmonics)
-        write_gaussians(path, gaussians, antialiased=capture.antialiased)
+        write_gaussians(path, capture.gaussians.recoloured(harmonics), antialiased=capture.antialiased)
         return
     changed = (harmonics != capture.gaussians.harmonics).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
     data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))

@@ -1,0 +1,177 @@
+"""Cameras for a capture that came without any: around an object, or inside what surrounds them (rooms, streets, gardens).
+
+Objects are seen from rings at several heights and distances. Where most directions from free places within the capture end on
+something, cameras stand in these places instead and look around. Either way the better views are kept: filled, and with
+nothing close before the camera.
+"""
+
+import math
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..errors import DataError
+from ..ops.rasterise import Pinhole, Rasterised, rasterise
+from ..rendering.cameras import Cameras
+from ..rendering.paths import look_at, pinhole
+from .gaussians import Gaussians
+
+__all__ = ["camera_of", "draw", "find_views"]
+
+_LIFTS = (-8.0, 12.0, 32.0, 55.0)
+"""Heights of the rings, in degrees above the middle."""
+_DISTANCES = (1.2, 1.7)
+"""Of the rings; at 1 the object just fits into the view."""
+_FOV, _WIDE = 45.0, 70.0
+"""Vertical angles of views around and inside, in degrees."""
+_PROBE = 8
+"""Candidates are judged on pictures reduced by this."""
+_CELLS = 24
+"""Cells a side of the grid in which free places are looked for."""
+_FREE, _PLACES, _TURNS = 0.02, 12, 8
+"""Opacity of a free cell, as a share of that of all occupied ones in the mean; places tried; directions looked in at each."""
+_PROBED = 30_000
+"""Gaussians, those of most opacity times area, of which candidates are drawn."""
+_ENCLOSED = 0.8
+"""Opacity of the surroundings, seen from the better places, from which on a capture is looked at from within."""
+_NEAR = 3.0
+"""What a pixel with something close before the camera costs, in filled ones."""
+
+
+def camera_of(cameras: Cameras, view: int) -> Pinhole:
+    """A view as the rasteriser takes it: OpenCV's axes, world to camera."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = cameras.pose[view]
+    pose[:3, 1:3] *= -1
+    (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
+    intrinsics = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    width, height = (int(v) for v in cameras.size[view])
+    return Pinhole(intrinsics, torch.linalg.inv(pose), width, height)
+
+
+def draw(
+    gaussians: Gaussians,
+    camera: Pinhole,
+    *,
+    antialiased: bool = False,
+    features: Annotated[Tensor, "N C"] | None = None,
+    background: float = 0.0,
+) -> Rasterised:
+    """A view of Gaussians; harmonics above degree 3, which files may hold, are not drawn."""
+    parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits, gaussians.harmonics[:, :16])
+    behind = torch.full((3,), background) if background else None
+    return rasterise(*parts, camera, features=features, background=behind, antialiased=antialiased)
+
+
+@torch.inference_mode()
+def find_views(
+    gaussians: Gaussians, *, count: int, size: tuple[int, int], up: Annotated[Tensor, "3"], antialiased: bool = False
+) -> Cameras:
+    """At most `count` views of `size` (width, height). Raises DataError where nothing can be seen from anywhere."""
+    up = up.double() / up.double().norm()
+    opacity = gaussians.opacities
+    ends = torch.stack([_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]).double()
+    coarse = gaussians
+    if len(gaussians) > _PROBED:
+        area = gaussians.log_scales.topk(2, dim=1).values.sum(1) + opacity.log()
+        coarse = gaussians.select(area.topk(_PROBED).indices)
+    cameras, worth = _inside(coarse, _free_places(gaussians, ends, up), up, size, antialiased)
+    if not len(cameras):
+        cameras, near = _rings(gaussians, ends, up, size, count)
+        worth = _probed(coarse, cameras, near, antialiased)[0]
+    best = worth.topk(min(count, len(worth))).indices.sort().values
+    chosen = cameras.select(best[worth[best] > 0])
+    if not len(chosen):
+        raise DataError("no view shows anything of the capture; give the axis that points up (--up), or clean the file")
+    return chosen
+
+
+def _rings(
+    gaussians: Gaussians, ends: Tensor, up: Tensor, size: tuple[int, int], count: int
+) -> tuple[Cameras, Annotated[Tensor, "V"]]:
+    """Candidates around the middle, more than are needed, and what is close to each."""
+    centre = ends.mean(1)
+    away = torch.linalg.vector_norm(gaussians.means.double() - centre, dim=1)
+    reach = float(_quantiles(away.float(), gaussians.opacities, (0.95,))[0]) / math.sin(math.radians(_FOV / 2))
+    rings = [(lift, far) for far in _DISTANCES for lift in _LIFTS]
+    each = max(4, round(1.6 * count / len(rings)))
+    side, front = _level(up)
+    eyes = []
+    for ring, (lift, far) in enumerate(rings):
+        turn = (torch.arange(each, dtype=torch.float64) + 0.38 * ring) * (2 * math.pi / each)
+        flat = turn.cos()[:, None] * side + turn.sin()[:, None] * front
+        eyes.append(centre + (math.cos(math.radians(lift)) * flat + math.sin(math.radians(lift)) * up) * far * reach)
+    eye = torch.cat(eyes)
+    cameras = pinhole(look_at(eye, centre.expand_as(eye), up), width=size[0], height=size[1], fov=_FOV)
+    return cameras, 0.3 * torch.linalg.vector_norm(eye - centre, dim=1)
+
+
+def _free_places(gaussians: Gaussians, ends: Tensor, up: Tensor) -> Annotated[Tensor, "P 3"]:
+    """Middles of cells of the capture's box that hold next to nothing, nor do their neighbours; spread over all such."""
+    low, span = ends[:, 0], (ends[:, 1] - ends[:, 0]).clamp_min(1e-9)
+    at = ((gaussians.means.double() - low) / span * _CELLS).floor().long()
+    kept = ((at >= 0) & (at < _CELLS)).all(1)
+    flat = at[kept] @ torch.tensor([_CELLS * _CELLS, _CELLS, 1])
+    mass = torch.zeros(_CELLS**3).index_add_(0, flat, gaussians.opacities[kept])
+    full = (mass > _FREE * mass[mass > 0].mean()).float().view(1, 1, _CELLS, _CELLS, _CELLS)
+    clear = torch.nn.functional.max_pool3d(full, 3, 1, 1)[0, 0] == 0
+    # Not at the box's faces, and not in the upper third, where nobody holds a camera.
+    clear[[0, 1, -2, -1]] = clear[:, [0, 1, -2, -1]] = clear[:, :, [0, 1, -2, -1]] = False
+    places = low + (clear.nonzero().double() + 0.5) / _CELLS * span
+    if not len(places):
+        return places
+    height = places @ up
+    bottom, top = (ends * up[:, None]).amin(1).sum(), (ends * up[:, None]).amax(1).sum()
+    places = places[height <= bottom + 0.67 * (top - bottom)]
+    picked, apart = [], torch.full((len(places),), math.inf, dtype=torch.float64)
+    for _ in range(min(_PLACES, len(places))):
+        nearest = int(apart.argmax()) if picked else int((places - ends.mean(1)).norm(dim=1).argmin())
+        picked.append(nearest)
+        apart = apart.minimum((places - places[nearest]).norm(dim=1))
+    return places[picked]
+
+
+def _inside(
+    gaussians: Gaussians, places: Annotated[Tensor, "P 3"], up: Tensor, size: tuple[int, int], antialiased: bool
+) -> tuple[Cameras, Annotated[Tensor, "V"]]:
+    """Views in all directions from those places that are enclosed, with their worth; none where few are."""
+    side, front = _level(up)
+    turn = torch.arange(_TURNS, dtype=torch.float64) * (2 * math.pi / _TURNS)
+    ahead = turn.cos()[:, None] * side + turn.sin()[:, None] * front - 0.1 * up
+    eye = places.repeat_interleave(_TURNS, 0)
+    cameras = pinhole(look_at(eye, eye + ahead.repeat(len(places), 1), up), width=size[0], height=size[1], fov=_WIDE)
+    every = torch.arange(0, len(cameras), 2)  # half of them overlap enough to tell
+    near = 0.05 * float(gaussians.means.double().var(0).sum().sqrt())
+    _, filled = _probed(gaussians, cameras.select(every), torch.full((len(every),), near), antialiased)
+    share = filled.view(len(places), _TURNS // 2).mean(1)
+    if not len(places) or float(share.quantile(0.75)) < _ENCLOSED:
+        return cameras.select(every[:0]), torch.zeros(0)
+    cameras = cameras.select((share >= _ENCLOSED).repeat_interleave(_TURNS))
+    return cameras, _probed(gaussians, cameras, torch.full((len(cameras),), near), antialiased)[0]
+
+
+def _probed(
+    gaussians: Gaussians, cameras: Cameras, near: Annotated[Tensor, "V"], antialiased: bool
+) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "V"]]:
+    """Worth of views, how much of a small picture is filled less what lies in the way, and the former alone."""
+    small, worth, filled = cameras.scaled(_PROBE), torch.zeros(len(cameras)), torch.zeros(len(cameras))
+    for view in range(len(small)):
+        drawn = draw(gaussians, camera_of(small, view), antialiased=antialiased)
+        close = (drawn.opacity > 0.5) & (drawn.depth < float(near[view]))
+        filled[view] = drawn.opacity.mean()
+        worth[view] = filled[view] - _NEAR * close.float().mean()
+    return worth, filled
+
+
+def _level(up: Tensor) -> tuple[Tensor, Tensor]:
+    """Two directions across `up`, and across each other."""
+    basis = torch.linalg.qr(torch.cat([up[:, None], torch.eye(3, dtype=up.dtype)[:, up.abs().argsort()[:2]]], 1))[0]
+    return basis[:, 1], basis[:, 2]
+
+
+def _quantiles(values: Tensor, weights: Tensor, shares: tuple[float, ...]) -> Tensor:
+    ordered, at = values.sort()
+    mass = weights[at].double().cumsum(0)
+    wanted = torch.tensor(shares, dtype=torch.float64) * mass[-1]
+    return ordered[torch.searchsorted(mass, wanted).clamp_max(len(mass) - 1)]
