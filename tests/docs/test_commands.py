@@ -15,17 +15,19 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
+from splat_ball import ball
 from tiny_world import World, flags
 
 from fprf import cli
 from fprf.cli import VERBS
 from fprf.output.atomic import write_json
 from fprf.output.video import write_video
+from fprf.splats.files import write_gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-RUN = ("eval", "stylize", "render", "gallery", "report", "export", "cluster", "plugins", "doctor", "completion")
+RUN = ("eval", "stylize", "restyle", "render", "gallery", "report", "export", "cluster", "plugins", "doctor", "completion")
 """Verbs whose commands are run here."""
 PARSED = {
     "demo": "minutes; tests/commands/test_demo_verb.py runs it small",
@@ -50,10 +52,12 @@ SMALL = {
 }  # fmt: skip
 """What is named by its place in a larger scene."""
 FEWER = {"render": ["--frames", "2"], "export": ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--lut-size", "5"]}
+FEWER["restyle"] = ["--views", "3", "--size", "64", "48", "--regions", "3"]
 """The tiny model renders few frames, and has barely begun to agree with itself."""
 SCENES = ("my_scene", "SCENE", "DIR", "FOLDER", "scenes/yard", "fox")
 RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite")
 PHOTOGRAPHS = ("autumn.jpg", "night.jpg", "dusk.jpg", "snow.jpg", "a.jpg", "A.jpg", "photos/one.jpg", "my_photos/one.jpg")
+CAPTURES = ("capture.ply", "plant.splat", "my_scan.spz")
 WEIGHTS = ("vgg19.safetensors", "F")
 
 
@@ -106,6 +110,8 @@ def place(world: World, tmp_path: Path) -> Path:
     pose = [float(x) for x in np.eye(4).ravel()]
     frames = [{"camera_to_world": pose, "fov": 50, "aspect": 1.3}] * 2
     write_json(folder / "camera_path.json", {"camera_path": frames, "render_width": 32, "render_height": 24, "fps": 2})
+    for name in CAPTURES:
+        write_gaussians(folder / name, ball(300))
     (folder / "night").mkdir()
     write_json(folder / "night" / "style.json", {"format": 1, "style": {"references": [str(folder / "night.jpg")]}})
     write_video(folder / "clip.mp4", [np.full((24, 32, 3), 90, np.uint8)] * 2, 2)
