@@ -228,9 +228,9 @@ class TrainConfig:
     """Weights of the training terms."""
     optimizer: OptimizerConfig = OptimizerConfig()
     """How parameters move."""
-    tones: bool = False
-    """Learn how bright and how coloured each view was taken, from its exposure where the capture says; the scene is what they
-    have in common."""
+    tones: bool | None = None
+    """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what they have in common.
+    none = where exposures differ, as the capture says or as its sparse points show."""
     poses: float = 0.0
     """Refine the cameras' poses with the scene, at this share of the learning rate (in radians, and in distances that views
     commonly see); 0 = they are as the capture says, 0.02 suits poses that are off by some pixels."""

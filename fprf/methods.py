@@ -11,9 +11,14 @@ __all__ = ["fprf", "fprf_lite"]
 
 
 def fprf() -> TrainConfig:
-    """The paper's sizes: VGG-19 relu2_1 content, DINO semantics, tri-planes 64 to 512, 256 + 128 + 48 samples."""
+    """The paper's sizes: VGG-19 relu2_1 content, DINO semantics, tri-planes 64 to 512, 256 + 128 + 48 samples.
+
+    As in the paper it learns from pixels alone. Where exposures differ, `--tones none` learns them; with few photographs,
+    `--datamanager.depth-share 0.25` asks a quarter of the rays to end at sparse points, as `fprf-lite` does with its rays.
+    """
     content = ContentConfig(decoder=MlpDecoderConfig(objective="paper"))
-    return TrainConfig(content=content, render=RenderConfig(train_budget=0.0))
+    manager = RayBatchesConfig(depth_share=0.0)
+    return TrainConfig(content=content, datamanager=manager, tones=False, render=RenderConfig(train_budget=0.0))
 
 
 def fprf_lite() -> TrainConfig:

@@ -44,7 +44,7 @@ SECOND: dict[str, tuple[Any, str]] = {
     "checkpoint_minutes": (1e-9, "saving"),
     "datamanager.rays": (128, "training"),
     "datamanager.semantic_share": (0.75, "training"),
-    "datamanager.depth_share": (0.25, "training"),
+    "datamanager.depth_share": (0.5, "points"),
     "datamanager.masks": (False, "masks"),
     "datamanager.guided.radius": (0.3, "targets"),
     "datamanager.guided.eps": (0.1, "targets"),
@@ -253,15 +253,17 @@ def test_tones_and_poses_are_facts_of_the_scene(world: World) -> None:
     assert first.centres == second.centres == () and len(third.centres) == 10 and len(third.held) == 2 and third.reach > 0
 
 
-def test_a_loss_on_points_changes_the_training(world: World, tmp_path: Path) -> None:
-    """It counts where rays are drawn through points of the reconstruction."""
-    base = changed(replace(world.config, steps=5), "datamanager.depth_share", 0.25)
-    there = replace(world, prepared=prepare(base))
-    first, second = (
-        checkpoint.load(trained_for(there, tmp_path / name, config).checkpoints, 5).model
-        for name, config in (("a", base), ("b", changed(base, "loss.depth", SECOND["loss.depth"][0])))
-    )
-    assert differ(first, second) and shown("points") == ["loss.depth"]
+def test_points_count_where_several_views_see_them(world: World, tmp_path: Path) -> None:
+    """Rays that are drawn through them, and the loss on those."""
+    scene, base, found = replace(world.prepared.scene, seen=None), replace(world.config, steps=5), []
+    for name in ("", *shown("points")):
+        config = changed(base, name, SECOND[name][0]) if name else base
+        manager = config.datamanager.build(
+            scene=scene, content=None, semantic=None, dim=8, cache=tmp_path / "cache", seed=config.seed
+        )
+        there = replace(world, prepared=world.prepared._replace(scene=scene, manager=manager))
+        found.append(checkpoint.load(trained_for(there, tmp_path / f"run{name}", config).checkpoints, 5).model)
+    assert len(found) == 3 and all(differ(found[0], other) for other in found[1:])
 
 
 def test_penalties_are_looked_up_in_the_parts(world: World, tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
     data = config.data or trained.config.data or Path(trained.known.data)
 
     def prepared(chosen: TrainConfig) -> Prepared:
-        made = prepare(replace(chosen, data=data))
+        made = prepare(replace(chosen, data=data), saved=trained.known.facts)
         if tuple(view_names(made.scene.paths)) != trained.known.names:
             raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
         for kind in ("content_encoder", "semantic_encoder"):

@@ -45,7 +45,7 @@ def train_blocks(
     from ..engine.style_pass import measure_style
     from ..style.scene import to_tensors
 
-    laid = lay_out(config, scene, plan, display.features)
+    laid = lay_out(config, scene, plan, display.features, folder.saved_facts())
     write_down(folder, config, method, laid)
     count = len(plan.boxes.low)
     display.say(f"{scene.name}: {len(scene.train)} + {len(scene.test)} views, {count} blocks and their surroundings")

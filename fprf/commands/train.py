@@ -125,7 +125,7 @@ def train_scene(
                 _say_outcome(folder, config, scene, display, time.perf_counter() - start)
                 linger(view, display)
                 return output
-        prepared = prepare.prepare(config, _told_features(config, display), look)
+        prepared = prepare.prepare(config, _told_features(config, display), look, folder.saved_facts())
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
         originals.keep(output, marks)
@@ -169,9 +169,10 @@ def _described(prepared: "Prepared") -> str:
     scene, facts = prepared.scene, prepared.facts
     width, height = (int(v) for v in scene.cameras.size[0])
     semantics = f", {facts.dim} semantic" if facts.dim else ", no semantic"
+    light = ", tones" if facts.exposure else ""
     return (
         f"{scene.name}: {len(scene.train)} + {len(scene.test)} views of {width}x{height}, space {facts.space.kind}, "
-        f"{facts.channels} content{semantics} channels"
+        f"{facts.channels} content{semantics} channels{light}"
     )
 
 

@@ -218,8 +218,15 @@ class RayBatches(DataManager):
             yield int(self._ends[slot]) - width * height, mask(view, width, height).reshape(-1)
 
     def _marked(self) -> _Marks | None:
-        """Where sparse points are seen in the training views, among the pixels that are learnt from."""
-        sightings = find_sightings(self._scene)
+        """Where sparse points are seen in the training views, among the pixels that are learnt from.
+
+        Of a reconstruction that says who saw what, points count that two of these views saw: one alone says nothing of depth.
+        """
+        seen = self._scene.seen
+        if seen is not None:
+            seen = seen[torch.isin(seen[:, 0], self._scene.train)]
+            seen = seen[torch.bincount(seen[:, 1])[seen[:, 1]] >= 2]
+        sightings = find_sightings(replace(self._scene, seen=seen))
         if sightings is None:
             return None
         slots = torch.full((len(self._scene.cameras),), -1, dtype=torch.int64)

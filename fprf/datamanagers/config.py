@@ -87,7 +87,7 @@ class RayBatchesConfig(DataManagerConfig):
     """Rays per step."""
     semantic_share: float = 1.0
     """Share of the rays that also carry a semantic target."""
-    depth_share: float = 0.0
+    depth_share: float = 0.25
     """Share of the rays that are drawn through sparse points of the reconstruction, where there are any, for `loss.depth`."""
 
     def __post_init__(self) -> None:

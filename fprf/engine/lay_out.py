@@ -30,7 +30,7 @@ from . import tensorfiles
 from .blocks import SURROUNDINGS, folder_of
 from .decoder import build_decoder
 from .model import Facts
-from .prepare import behind, build_encoders, cache_folder, facts_of, scene_of
+from .prepare import behind, build_encoders, cache_folder, exposure_of, facts_of, scene_of
 from .renumber import renumber, trained_tasks
 from .run import Run
 
@@ -59,8 +59,17 @@ def plan_scene(config: TrainConfig) -> tuple[Scene, Plan]:
     return scene, make_plan(scene, config.blocks)
 
 
-def lay_out(config: TrainConfig, scene: Scene, plan: Plan, progress: Callable[[int, int, str], None] | None = None) -> Laid:
-    """Extract the features of all training views. `progress(done, total, what)` is told of them."""
+def lay_out(
+    config: TrainConfig,
+    scene: Scene,
+    plan: Plan,
+    progress: Callable[[int, int, str], None] | None = None,
+    saved: Facts | None = None,
+) -> Laid:
+    """Extract the features of all training views. `progress(done, total, what)` is told of them.
+
+    `saved` are the facts of a run that goes on: its exposures are not measured again.
+    """
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
     background, cache, views = behind(config, scene), cache_folder() / "features", scene.train.tolist()
@@ -75,7 +84,8 @@ def lay_out(config: TrainConfig, scene: Scene, plan: Plan, progress: Callable[[i
     if semantic is not None:
         dim = config.semantic.dim
         semantic_store = extract(cache / "semantic", views, image, semantic, guided, dim=dim, progress=progress)
-    facts = facts_of(config, scene, plan.space, content, semantic, content_store, semantic_store)
+    exposure = exposure_of(config, scene, lambda view: image(view).float() / 255, saved)
+    facts = facts_of(config, scene, plan.space, exposure, content, semantic, content_store, semantic_store)
     return Laid(scene, plan, facts, semantic_store.basis if semantic_store is not None else None)
 
 

@@ -19,12 +19,14 @@ from ..types import Batch, Rendered, Want
 from .first_use import check_term
 from .model import Facts, Model
 
-__all__ = ["NEARBY", "SHELL", "check_penalties", "emptiness", "ending", "extra_term", "terms", "total", "wanted"]
+__all__ = ["FADE", "NEARBY", "SHELL", "check_penalties", "emptiness", "ending", "extra_term", "terms", "total", "wanted"]
 
 
+FADE = 0.01
+"""Share of `loss.depth` that is left at the end: points say where things are, pixels what they look like in detail."""
 SHELL = 4.0
 """Sky lies at least so many space units away: times what views commonly see, or the scene's inner radius."""
-NEARBY = 0.1
+NEARBY = 0.04
 """Share of its distance by which a ray's end may miss a point: what a reconstruction is uncertain by, and samples are apart."""
 
 
@@ -67,13 +69,15 @@ def terms(
     model: Model,
     *,
     step: int,
+    ends: Annotated[Tensor, "R"] | None = None,
     extra: LossTerm | None = None,
     generator: torch.Generator | None = None,
 ) -> dict[str, Tensor]:
     """Each term by name, unweighted. Feature terms are in units of the targets' spread, so one weight fits any encoder.
 
-    Penalties run over every parameter of the planes, whatever the batch: they are computed every `penalty_every` steps.
-    `extra` is the term of `extra_term`; it draws from the generator.
+    `ends` are the ray parameters at `batch.distance` (`Space.parameter`). Penalties run over every parameter of the planes,
+    whatever the batch: they are computed every `penalty_every` steps. `extra` is the term of `extra_term`; it draws from the
+    generator.
     """
     result: dict[str, Tensor] = {}
     if rendered.rgb is not None and config.rgb > 0:
@@ -92,9 +96,8 @@ def terms(
         result["interlevel"] = torch.stack(parts).sum()
     if config.distortion > 0:
         result["distortion"] = distortion(sampled.s, weights)
-    if config.depth > 0 and batch.distance is not None and facts.space.kind != "ndc":
-        # NDC's ray parameter is no distance; captures that face one way are not short of parallax either.
-        found = ending(sampled.t, weights, batch.distance * facts.space.scale)
+    if config.depth > 0 and ends is not None:
+        found = ending(sampled.t, weights, ends, ndc=facts.space.kind == "ndc")
         if found is not None:
             result["depth"] = found
     if config.sky > 0 and batch.sky is not None:
@@ -109,23 +112,26 @@ def terms(
     return result
 
 
-def ending(t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], distance: Annotated[Tensor, "R"]) -> Tensor | None:
-    """How far rays of known distance (space units, NaN = unknown) are from ending there; None where none is known.
+def ending(
+    t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], ends: Annotated[Tensor, "R"], *, ndc: bool = False
+) -> Tensor | None:
+    """How far rays are from ending at their known ray parameters (NaN = unknown); None where none is known.
 
     (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. On an
     accelerator it is 0 where none is known: the host would have to wait to find out.
     """
-    known = torch.isfinite(distance)
+    known = torch.isfinite(ends)
     if t.device.type == "cpu":
         index = known.nonzero()[:, 0]
         if not len(index):
             return None
-        return _missed(*(x.index_select(0, index) for x in (t, weights, distance))).mean()
-    return _mean_of(_missed(t, weights, torch.where(known, distance, 1.0)), known)
+        return _missed(*(x.index_select(0, index) for x in (t, weights, ends)), ndc=ndc).mean()
+    return _mean_of(_missed(t, weights, torch.where(known, ends, 0.5), ndc=ndc), known)
 
 
-def _missed(t: Tensor, weights: Tensor, distance: Tensor) -> Annotated[Tensor, "R"]:
-    middle = midpoints(t) / distance[:, None]
+def _missed(t: Tensor, weights: Tensor, ends: Tensor, *, ndc: bool) -> Annotated[Tensor, "R"]:
+    # In NDC 1 - t is in proportion to 1 / depth.
+    middle = (1 - ends)[:, None] / (1 - midpoints(t)) if ndc else midpoints(t) / ends[:, None]
     there, before = (middle - 1).abs() <= NEARBY, middle < 1 - NEARBY
     return (1 - (weights * there).sum(-1)).square() + (weights * before).sum(-1).square()
 
@@ -152,10 +158,11 @@ def _mean_of(values: Annotated[Tensor, "R"], mask: Annotated[Tensor, "R"]) -> Te
     return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
 
 
-def total(config: LossConfig, parts: dict[str, Tensor]) -> Tensor:
-    """Weighted sum."""
+def total(config: LossConfig, parts: dict[str, Tensor], share: float = 0.0) -> Tensor:
+    """Weighted sum, when a share of the training is over."""
     # Both colours of a decoder with a part of the scene's own share one weight: the regularisers keep theirs.
     weights = _weights(config, config.rgb / 2 if "unaided" in parts else config.rgb)
+    weights["depth"] *= FADE**share
     every = config.penalty_every
     return torch.stack(
         [(weights[name] if name in weights else _penalty_weight(config, name) * every) * value for name, value in parts.items()]

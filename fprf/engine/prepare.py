@@ -4,13 +4,15 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
+from torch import Tensor
 
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.batches import WHITE
+from ..datamanagers.exposure import differ, with_exposure
 from ..datamanagers.features import FeatureStore
 from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
@@ -30,6 +32,7 @@ __all__ = [
     "build_encoders",
     "cache_folder",
     "device_of",
+    "exposure_of",
     "facts_of",
     "prepare",
     "reach_of",
@@ -86,8 +89,12 @@ def prepare(
     config: TrainConfig,
     progress: Callable[[int, int, str], None] | None = None,
     look: Callable[[Scene], None] = lambda scene: None,
+    saved: Facts | None = None,
 ) -> Prepared:
-    """Everything but the model. `progress(done, total, what)` is told of the features; `look` may refuse the scene before."""
+    """Everything but the model. `progress(done, total, what)` is told of the features; `look` may refuse the scene before.
+
+    `saved` are the facts of a run that goes on: its exposures are not measured again.
+    """
     scene = scene_of(config)
     look(scene)
     content, semantic = build_encoders(config)
@@ -103,7 +110,8 @@ def prepare(
         background=behind(config, scene),
     )
     semantic_store = manager.semantic_store
-    facts = facts_of(config, scene, find_space(scene), content, semantic, manager.content_store, semantic_store)
+    exposure = exposure_of(config, scene, manager.image, saved)
+    facts = facts_of(config, scene, find_space(scene), exposure, content, semantic, manager.content_store, semantic_store)
     return Prepared(scene, manager, facts, semantic_store.basis if semantic_store is not None else None)
 
 
@@ -133,6 +141,7 @@ def facts_of(
     config: TrainConfig,
     scene: Scene,
     space: Space,
+    exposure: tuple[float, ...],
     content: Encoder,
     semantic: Encoder | None,
     content_store: FeatureStore | None,
@@ -148,11 +157,23 @@ def facts_of(
         content_scale=content_store.scale if content_store is not None else 1.0,
         semantic_scale=semantic_store.scale if semantic_store is not None else 1.0,
         background=behind(config, scene),
-        exposure=relative(scene.exposure, len(scene.paths)) if config.tones else (),
-        held=tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist()))) if config.tones or config.poses else (),
+        exposure=exposure,
+        held=tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist()))) if exposure or config.poses else (),
         centres=tuple((float(x), float(y), float(z)) for x, y, z in scene.cameras.pose[:, :, 3]) if config.poses else (),
         reach=reach_of(scene, space) if config.poses else 1.0,
     )
+
+
+def exposure_of(
+    config: TrainConfig, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
+) -> tuple[float, ...]:
+    """`relative` exposure of the views; empty where tones are not learnt. `image(view)` is a training view, in [0, 1]."""
+    if saved is not None:
+        return saved.exposure
+    if config.tones is False:
+        return ()
+    exposure = with_exposure(scene, image).exposure
+    return relative(exposure, len(scene.paths)) if config.tones or differ(exposure) else ()
 
 
 def reach_of(scene: Scene, space: Space) -> float:

@@ -130,6 +130,10 @@ class Run:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as e:
             raise CheckpointError(f"{path}: cannot be read ({e!r}); train the scene again") from e
 
+    def saved_facts(self) -> Facts | None:
+        """What a run found out about its scene; None before it wrote scene.json. Raises CheckpointError."""
+        return self.load_known().facts if (self.root / "scene.json").is_file() else None
+
     def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
         """Write NAME.safetensors, with a checksum for each tensor."""
         tensorfiles.save_sealed(self.root / f"{name}.safetensors", tensors)

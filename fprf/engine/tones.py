@@ -13,12 +13,10 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
+from ..datamanagers.exposure import GAMMA
 from ..types import Rendered
 
 __all__ = ["Tones", "relative", "toned"]
-
-GAMMA = 1 / 2.2
-"""Exponent at the start: light is in proportion to exposure, sRGB to about this power of light."""
 
 
 class Tones(nn.Module):

@@ -203,7 +203,7 @@ class Loop:
         with record_function("fprf.batch"):
             drawn = self.batches(step)
             batch = _moved(drawn, self.device)
-            rays = self._rays(drawn if self.through.device.type == "cpu" else batch)
+            rays, ends = self._rays(drawn if self.through.device.type == "cpu" else batch)
         for group in self.optimizer.param_groups:
             group["lr"] = rate(self.config.optimizer, step, share)
         draws = generator_of(self.config.seed, step, self.device, purpose="draws")
@@ -223,9 +223,17 @@ class Loop:
         rendered = toned(rendered, self.model.tones, batch.view)
         with record_function("fprf.losses"):
             parts = terms(
-                self.config.loss, self.facts, rendered, batch, self.model, step=step, extra=self.extra, generator=draws
+                self.config.loss,
+                self.facts,
+                rendered,
+                batch,
+                self.model,
+                step=step,
+                ends=ends,
+                extra=self.extra,
+                generator=draws,
             )
-            loss = total(self.config.loss, parts)
+            loss = total(self.config.loss, parts, share)
         self.optimizer.zero_grad(set_to_none=True)
         if self.deferred:
             self._step_deferred(loss)
@@ -283,14 +291,18 @@ class Loop:
         speed = self.rays / (time.perf_counter() - self.begun)
         return Report(step, share, seconds, float(-10 * rgb.log10()), speed, means.get("kept", 0.0), losses, self.skipped)
 
-    def _rays(self, batch: Batch) -> Rays:
-        there = self.through.device
+    def _rays(self, batch: Batch) -> tuple[Rays, Tensor | None]:
+        """The rays of a batch, and their parameters at its known distances."""
+        there, space = self.through.device, self.model.space
         origin, direction = self.through(batch.view.to(there), batch.pixel.to(there))
+        ends = None
+        if batch.distance is not None:
+            ends = space.parameter(origin, direction, batch.distance.to(there)).to(self.device)
         if self.model.poses is not None:
-            rays = moving(self.model.space.rays(*self.model.poses(batch.view, origin, direction)))
+            rays = moving(space.rays(*self.model.poses(batch.view, origin, direction)))
         else:
-            rays = self.model.space.rays(origin, direction)
-        return Rays(*(x.to(self.device) for x in rays))
+            rays = space.rays(origin, direction)
+        return Rays(*(x.to(self.device) for x in rays)), ends
 
 
 class Batches:

@@ -132,12 +132,10 @@ class Space:
         """The ray parameter t at a world distance along unit world rays: the inverse of `metric`."""
         if self.kind != "ndc":
             return distance * self.scale
-        low, high = torch.zeros_like(distance), torch.ones_like(distance)
-        for _ in range(40):  # `metric` rises with t
-            middle = (low + high) / 2
-            short = self.metric(origin, direction, middle) < distance
-            low, high = torch.where(short, middle, low), torch.where(short, high, middle)
-        return low
+        turn = self._constant("rotation", origin)
+        o, d = (origin - self._constant("centre", origin)) @ turn[2], direction @ turn[2]
+        z = (o + d * distance.to(o.dtype)).clamp(max=-self.near)
+        return (1 + self.near / z).to(distance.dtype)
 
     def __getstate__(self) -> dict[str, object]:
         """The fields alone: a copy in another process makes its tensors itself."""

@@ -14,8 +14,9 @@ from fprf.rendering.cameras import rays_through
 
 
 def manager(world: World, folder: Path, share: float, **fields: object) -> DataManager:
+    """Of the tiny town, whose points any view may see."""
     config = RayBatchesConfig(rays=64, depth_share=share)
-    scene = fields.pop("scene", world.prepared.scene)
+    scene = fields.pop("scene", replace(world.prepared.scene, seen=None))
     return config.build(scene=scene, content=None, semantic=None, dim=4, cache=folder, seed=3, **fields)  # type: ignore[arg-type]
 
 
@@ -55,6 +56,19 @@ def test_a_batch_stays_a_function_of_its_step(world: World, tmp_path: Path) -> N
 def test_without_points_there_are_no_marks(world: World, tmp_path: Path) -> None:
     bare = replace(world.prepared.scene, points=None, seen=None)
     assert manager(world, tmp_path, 0.25, scene=bare).batch(0).distance is None
+
+
+def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World, tmp_path: Path) -> None:
+    scene = world.prepared.scene
+    first, second = scene.train.tolist()[:2]
+    held = int(scene.test[0])
+    both = torch.tensor([[first, 0], [second, 0]])
+    alone = torch.tensor([[first, point] for point in range(1, 50)] + [[held, point] for point in range(1, 50)])
+    marks = manager(world, tmp_path, 0.5, scene=replace(scene, seen=torch.cat([both, alone]))).batch(0)
+    expected = manager(world, tmp_path, 0.5, scene=replace(scene, seen=both)).batch(0)
+    assert marks.distance is not None and expected.distance is not None
+    torch.testing.assert_close(marks.distance, expected.distance, equal_nan=True)
+    assert manager(world, tmp_path, 0.5, scene=replace(scene, seen=alone)).batch(0).distance is None
 
 
 def test_a_block_is_marked_where_it_learns(world: World, tmp_path: Path) -> None:

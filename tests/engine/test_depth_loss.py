@@ -26,7 +26,7 @@ def spike(*at: float) -> Tensor:
 
 
 def test_a_ray_that_ends_at_its_point_costs_nothing() -> None:
-    found = ending(rays(3), spike(1.0, 5.0, 9.5), torch.tensor([1.0, 5.0, 9.5]))
+    found = ending(rays(3), spike(3.0, 5.0, 9.5), torch.tensor([3.0, 5.0, 9.5]))
     assert found is not None and float(found) == 0.0
 
 
@@ -61,6 +61,16 @@ def test_only_known_rays_count_and_the_mean_is_theirs(distances: list[float], se
         return
     assert found is not None and 0 <= float(found) <= 2
     torch.testing.assert_close(found, torch.tensor(each).mean(), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("found", [3.0, 5.0, 8.0])
+def test_in_device_coordinates_it_is_about_depths_too(found: float) -> None:
+    """Straight ahead of a near plane at 1, depth z has the ray parameter 1 - 1/z."""
+    depths, end = rays(1)[:, 10:], torch.tensor([5.0])
+    weights = spike(found)[:, 10:]
+    expected = ending(depths, weights, end)
+    assert expected is not None
+    torch.testing.assert_close(ending(1 - 1 / depths, weights, 1 - 1 / end, ndc=True), expected)
 
 
 def test_it_does_not_depend_on_the_scale_of_space() -> None:

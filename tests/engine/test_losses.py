@@ -219,6 +219,12 @@ def test_the_total_is_the_weighted_sum() -> None:
     assert float(total(config, parts)) == pytest.approx(54321)
 
 
+def test_the_depth_of_points_fades() -> None:
+    config, parts = LossConfig(rgb=1.0, depth=10.0), {"rgb": torch.tensor(1.0), "depth": torch.tensor(1.0)}
+    found = [float(total(config, parts, share)) for share in (0.0, 0.5, 1.0)]
+    assert found == pytest.approx([11.0, 1.0 + 10.0 * losses.FADE**0.5, 1.0 + 10.0 * losses.FADE])
+
+
 @pytest.mark.parametrize("name", ["semantic", "content"])
 def test_features_never_move_density(world: World, name: str) -> None:
     """Paper: semantics are rendered with detached weights; a method may ask so for content too."""

@@ -6,7 +6,8 @@ import torch
 from tiny_world import World
 
 from fprf.datamanagers.batches import RayBatches
-from fprf.engine.prepare import cache_folder, device_of, prepare
+from fprf.datamanagers.scene import Scene
+from fprf.engine.prepare import cache_folder, device_of, exposure_of, prepare
 from fprf.errors import ConfigError, DataError, PluginError
 
 
@@ -77,3 +78,19 @@ def test_images_and_renders_show_the_same_background(world: World) -> None:
     for wrong in (1.5, -0.1, float("nan")):
         with pytest.raises(ConfigError, match=r"render\.background"):
             replace(world.config.render, background=(0.0, wrong, 0.0))
+
+
+def test_tones_are_learnt_where_exposures_differ(world: World) -> None:
+    """Unless the config decides; a run that goes on keeps what it began with."""
+    scene, image = world.prepared.scene, world.prepared.manager.image
+    evenly = replace(scene, exposure=torch.full((len(scene.paths),), 3.0, dtype=torch.float64))
+    unevenly = replace(scene, exposure=torch.linspace(1.0, 4.0, len(scene.paths), dtype=torch.float64))
+
+    def learnt(tones: bool | None, scene: Scene) -> bool:
+        return bool(exposure_of(replace(world.config, tones=tones), scene, image))
+
+    assert [learnt(None, each) for each in (scene, evenly, unevenly)] == [False, False, True]
+    assert [learnt(own, each) for own in (True, False) for each in (evenly, unevenly)] == [True, True, False, False]
+    saved = replace(world.prepared.facts, exposure=(0.0,) * len(scene.paths))
+    for facts in (saved, world.prepared.facts):
+        assert exposure_of(world.config, unevenly, image, facts) == facts.exposure

@@ -37,7 +37,8 @@ def test_scene_json_gives_the_scene_back(world: World) -> None:
         there, here = getattr(known.cameras, name), getattr(scene.cameras, name)
         assert there.dtype == here.dtype and torch.equal(there, here), name
     assert known.names == tuple(p.stem for p in scene.paths)
-    assert known.facts == world.prepared.facts
+    assert known.facts == Run(world.run).saved_facts() == world.prepared.facts
+    assert Run(world.folder / "none").saved_facts() is None
     assert (known.split("train"), known.split("test")) == (tuple(scene.train.tolist()), tuple(scene.test.tolist()))
     assert known.split("all") == tuple(range(10))
     assert sorted(known.train + known.test) == list(range(10))
