@@ -1,5 +1,6 @@
 """A phone-like folder, the town's views as JPEG without poses, through COLMAP itself and back to the truth."""
 
+import shlex
 import shutil
 import sys
 from importlib.util import find_spec
@@ -12,6 +13,8 @@ from alignment import align, misses
 
 from fprf import cli
 from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.engine.budget import outcome
+from fprf.engine.run import Run
 from fprf.output.video import write_video
 from fprf.town.write import write_town
 
@@ -84,3 +87,25 @@ def test_poses_of_the_town_are_within_a_percent_of_the_truth(tmp_path: Path, kin
     assert focal == pytest.approx(1, abs=0.01)
     shutil.rmtree(tmp_path / "scene" / "sfm")
     assert len(parse_scene(tmp_path / "scene", 1, None).paths) == len(stems), "what is only needed to go on may go"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed (extra sfm)")
+def test_the_printed_commands_lead_from_photographs_to_a_style(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `process` prints them, with less time and a photograph in place of PHOTO.jpg."""
+    monkeypatch.chdir(tmp_path)
+    write_town(tmp_path / "town", seed=0, palette="day", views=16, width=960, height=720)
+    photographed(tmp_path / "town", tmp_path / "phone")
+    shutil.copy(next((tmp_path / "phone").iterdir()), "PHOTO.jpg")
+    assert cli.main(["process", "phone", "--output", "my_scene"]) == 0
+    train, stylize = (shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines()[-2:])
+    train[train.index("--minutes") + 1] = "3"
+    assert cli.main(train) == 0 and cli.main(stylize) == 0
+    run = Run(Path(stylize[1]))
+    found = outcome(run.root, run.load_config()[0], parse_scene(Path("my_scene"), 2, None))
+    assert run.load_known().cameras.size[0].tolist() == [480, 360]
+    assert found is not None and not found.too_short and found.psnr > 17
+    assert list(run.root.glob("styles/PHOTO/*.png"))
