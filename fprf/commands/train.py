@@ -243,7 +243,7 @@ def _say_outcome(folder: "Run", config: "TrainConfig", scene: "Scene", display: 
     found = outcome(folder.root, config, scene)
     short = found is not None and found.too_short
     if found is not None:
-        display.say(found.told(config))
+        display.say(found.told(folder.root, config))
     ended = "ended" if short else "done"
     display.say(f"{ended} after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
 

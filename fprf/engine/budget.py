@@ -5,6 +5,7 @@ device always give the same size.
 """
 
 import math
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -108,16 +109,17 @@ class Outcome(NamedTuple):
         """Whether there is nothing to be judged by yet."""
         return self.steps < _FEW_STEPS
 
-    def told(self, config: TrainConfig) -> str:
-        """One line: what was reached, and what would raise it."""
+    def told(self, root: Path, config: TrainConfig) -> str:
+        """One line: what the run in a folder reached, and the command that would raise it."""
         reached = f"{self.steps:,} steps, {self.passes:.2g} rays for each pixel, {self.psnr:.1f} dB on the training views"
         timed = config.minutes is not None and self.steps < config.steps
+        again = f"fprf train {shlex.quote(str(root / 'config.json'))}"
         longer = f"--minutes {2 * (config.minutes or 0):g}" if timed else f"--steps {max(2 * config.steps, _FEW_STEPS)}"
         if self.too_short:
-            return f"warning: too few steps to judge the scene by: {reached}; go on with {longer} or more"
+            return f"warning: too few steps to judge the scene by: {reached}; go on: {again} {longer}"
         size = config.downscale or 1
-        finer = f", --downscale {size - 1} and another --output its detail" if size > 1 and self.passes > _PASSES else ""
-        return f"{reached}; {longer} would raise it{finer}"
+        finer = f"; for more detail: --downscale {size - 1} and another --output" if size > 1 and self.passes > _PASSES else ""
+        return f"{reached}; to raise it: {again} {longer}{finer}"
 
 
 def outcome(root: Path, config: TrainConfig, scene: Scene) -> Outcome | None:

@@ -1,16 +1,19 @@
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import sleep
 
 import pytest
 from tiny_world import World, flags, parameters
 
 from fprf import cli
 from fprf.commands.train import default_output, train_scene
+from fprf.config import TrainConfig
 from fprf.engine import checkpoint
 from fprf.engine.run import Run
-from fprf.errors import UsageError
+from fprf.errors import DataError, UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins import registry
 from fprf.plugins.config import Need
@@ -179,3 +182,21 @@ def test_a_size_that_is_found_stays_with_the_run(world: World, tmp_path: Path, m
     run = Run(tmp_path / "run")
     assert run.load_config()[0].downscale == 2 and run.load_known().cameras.size[0].tolist() == [16, 12]
     assert checkpoint.steps(run.checkpoints) == [2, 3]
+
+
+def test_few_pixels_and_slow_features_are_told_before_the_training(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def slow(config: TrainConfig, progress: Callable[[int, int, str], None], look: object) -> None:
+        progress(0, 100, "features of slow")
+        sleep(0.05)
+        progress(1, 100, "features of slow")
+        progress(2, 100, "features of slow")
+        raise DataError("no more")
+
+    monkeypatch.setattr("fprf.engine.prepare.prepare", slow)
+    for minutes in (0.01, 10.0):
+        with pytest.raises(DataError, match="no more"):
+            train_scene(replace(world.config, output=tmp_path / "run", downscale=2, minutes=minutes), "fprf-lite")
+    told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert len(told) == 3 and "16x12 pixels are few" in told[0] and "--downscale 4" in told[1] and "16x12" in told[2]
