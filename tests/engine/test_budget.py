@@ -92,16 +92,10 @@ def test_what_training_came_to(world: World, tmp_path: Path) -> None:
     config, scene = world.config, world.prepared.scene
     found = outcome(world.run, config, scene)
     assert found is not None and found.steps == 15 and found.passes == pytest.approx(15 * 256 / (8 * 32 * 24))
-    assert (
-        found.too_short
-        and found.told(world.run, config).startswith("warning: ")
-        and "--steps 300" in found.told(world.run, config)
-    )
+    told = found.told(world.run, config)
+    assert found.too_short and told.startswith("warning: ") and f"fprf train {world.run}/config.json --steps 300" in told
     long = Outcome(4000, 24.5, 9.0)
-    assert not long.too_short and f"fprf train {world.run}/config.json --minutes 16" in long.told(
-        world.run, replace(fprf_lite(), minutes=8.0)
-    )
-    assert "--downscale 4" in long.told(world.run, replace(fprf_lite(), downscale=5)) and "--downscale" not in long.told(
-        world.run, config
-    )
+    timed, reduced = (long.told(world.run, replace(fprf_lite(), **field)) for field in ({"minutes": 8.0}, {"downscale": 5}))
+    assert not long.too_short and "--minutes 16" in timed and "--downscale" not in timed
+    assert "--steps 24000" in reduced and "--downscale 4" in reduced
     assert outcome(tmp_path, config, scene) is None

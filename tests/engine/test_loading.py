@@ -94,7 +94,7 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
         config = replace(load_method("acme")[0], **vars(trained.config))
         trained.run.save_config(config, "acme")
         saved = (moved / "config.json").read_text()
-        with pytest.raises(UsageError, match="a run with another knob; resume it"):
+        with pytest.raises(UsageError, match=r"a run with knob 2 \(8 is asked\)"):
             train_scene(replace(config, knob=8, output=moved), "acme", quiet=True)  # type: ignore[call-arg]
     there = load_run(moved)
     assert isinstance(there.config, IncompleteConfig) and there.method == "acme"
