@@ -93,7 +93,7 @@ def test_what_training_came_to(world: World, tmp_path: Path) -> None:
     found = outcome(world.run, config, scene)
     assert found is not None and found.steps == 15 and found.passes == pytest.approx(15 * 256 / (8 * 32 * 24))
     told = found.told(world.run, config)
-    assert found.too_short and told.startswith("warning: ") and f"fprf train {world.run}/config.json --steps 300" in told
+    assert found.too_short and told.startswith("warning: ") and f"fprf train {world.run}/config.json --steps 600" in told
     long = Outcome(4000, 24.5, 9.0)
     timed, reduced = (long.told(world.run, replace(fprf_lite(), **field)) for field in ({"minutes": 8.0}, {"downscale": 5}))
     assert not long.too_short and "--minutes 16" in timed and "--downscale" not in timed

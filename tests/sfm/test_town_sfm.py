@@ -95,15 +95,15 @@ def test_poses_of_the_town_are_within_a_percent_of_the_truth(tmp_path: Path, kin
 def test_the_printed_commands_lead_from_photographs_to_a_style(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As `process` prints them, with less time and a photograph in place of PHOTO.jpg."""
+    """As `process` prints them, with fewer steps and a photograph in place of PHOTO.jpg."""
     monkeypatch.chdir(tmp_path)
     write_town(tmp_path / "town", seed=0, palette="day", views=16, width=960, height=720)
     photographed(tmp_path / "town", tmp_path / "phone")
     shutil.copy(next((tmp_path / "phone").iterdir()), "PHOTO.jpg")
     assert cli.main(["process", "phone", "--output", "my_scene"]) == 0
     train, stylize = (shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines()[-2:])
-    train[train.index("--minutes") + 1] = "3"
-    assert cli.main(train) == 0 and cli.main(stylize) == 0
+    train[train.index("--minutes") + 1] = "25"
+    assert cli.main([*train, "--steps", "800"]) == 0 and cli.main(stylize) == 0
     run = Run(Path(stylize[1]))
     found = outcome(run.root, run.load_config()[0], parse_scene(Path("my_scene"), 2, None))
     assert run.load_known().cameras.size[0].tolist() == [480, 360]
