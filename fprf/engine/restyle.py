@@ -134,7 +134,15 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
     check_stylizer(chosen, stylizer, dictionary, scene)
     device = trained.model.device
     stylizer = stylizer.to(device)
-    colours = colour_maps(stylizer, dictionary, scene, trained.model.decoder, features=chosen.features, share=chosen.colours)
+    colours = colour_maps(
+        stylizer,
+        dictionary,
+        scene,
+        trained.model.decoder,
+        features=chosen.features,
+        share=chosen.colours,
+        smoothing=chosen.smoothing(scene, orders.allowed),
+    )
     mine = Restyle(
         stylizer,
         style.strength,

@@ -1,4 +1,5 @@
 """One exact pass over the trained scene: the statistics and regions that every style builds on (design: statistics in kind).
+A second one over pairs of neighbouring pixels tells which regions meet without an edge of colour between them.
 
 Features are those of the very samples that the renderer keeps, weighted by their rendering weights, on a fixed lattice of
 pixels over all training views; moments are merged in float64, so neither order nor chunk size matters.
@@ -7,21 +8,27 @@ pixels over all training views; moments are merged in float64, so neither order 
 from typing import Annotated
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..config import TrainConfig
 from ..memory import in_parts
 from ..rendering.cameras import Cameras, rays_through
-from ..rendering.renderer import march
-from ..style.scene import SceneStyle, scene_style
+from ..rendering.renderer import composite, march
+from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.statistics import Moments, merge, moments
 from .model import Model
 from .poses import refined
 
-__all__ = ["POINTS", "lattice", "measure_style"]
+__all__ = ["POINTS", "lattice", "measure_style", "neighbours"]
 
 POINTS = 2**18
 """Points that regions are measured on, at most: 128 + 64 channels of them take 200 MB."""
+
+_PAIRS = 8
+"""Of the rays, one in so many has a neighbour, and the pairs are rendered again: a quarter of the pass."""
+_REACH = 24
+"""A neighbour lies so many-th of an image's shorter side away."""
 
 
 def lattice(cameras: Cameras, views: Annotated[Tensor, "V"], rays: int) -> tuple[Tensor, Tensor]:
@@ -36,6 +43,16 @@ def lattice(cameras: Cameras, views: Annotated[Tensor, "V"], rays: int) -> tuple
     view = views[which]
     width = cameras.size[view, 0]
     return view, torch.stack([within % width, within // width], -1) + 0.5
+
+
+def neighbours(cameras: Cameras, views: Annotated[Tensor, "V"], pairs: int) -> tuple[Tensor, Tensor]:
+    """View [P] and pixels [P 2 2] of about so many pairs on the lattice: one step to the right or down, inside of the image."""
+    view, pixel = lattice(cameras, views, pairs)
+    size = cameras.size[view]
+    step = (size.amin(1) // _REACH).clamp_min(1)[:, None] * F.one_hot(torch.arange(len(view)) % 2, 2)
+    there = pixel + step
+    there = torch.where(there < size, there, (pixel - step).clamp_min(0.5))
+    return view, torch.stack([pixel, there], 1)
 
 
 @torch.inference_mode()
@@ -67,7 +84,7 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
         weights.append(weight)
         if semantic is not None:
             semantics.append(semantic)
-    return scene_style(
+    scene = scene_style(
         torch.cat(contents),
         torch.cat(semantics) if semantics else None,
         torch.cat(weights),
@@ -75,3 +92,28 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
         config.statistics.regions,
         config.seed,
     )
+    if len(scene.share) == 1:
+        return scene
+    return scene._replace(contacts=_contacts(config, model, cameras, views, scene))
+
+
+def _contacts(
+    config: TrainConfig, model: Model, cameras: Cameras, views: Annotated[Tensor, "V"], scene: SceneStyle
+) -> Annotated[Tensor, "K K"]:
+    """Of rendered pixels: what is behind an edge in the picture is behind one here."""
+    view, pixel = neighbours(cameras, views, max(1, config.statistics.rays // _PAIRS))
+    view, pixel = view.repeat_interleave(2), pixel.flatten(0, 1)
+
+    def part_of(part: slice) -> Annotated[Tensor, "R 3+D"]:
+        rays = model.space.rays(*rays_through(cameras, view[part], pixel[part]))
+        rays = type(rays)(*(x.to(model.device) for x in rays))
+        kept = march(rays, model.parts, budget=config.render.budget).kept
+        assert model.semantic is not None  # else there is one region
+        shown = torch.cat([model.decoder(model.field.content(kept.latent, kept.view)), model.semantic(kept.point)], 1)
+        mass = composite(kept, torch.ones_like(kept.weight)[:, None], len(rays.near)).clamp_min(1e-10)
+        found: Tensor = composite(kept, shown, len(rays.near)) / mass
+        return found.cpu()
+
+    shown = torch.cat(list(in_parts(len(view), config.render.chunk, part_of)))
+    shown = shown.view(-1, 2, shown.shape[1])
+    return region_contacts(scene, shown[..., 3:], shown[..., :3])

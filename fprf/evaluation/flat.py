@@ -99,7 +99,10 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
     """What `fprf stylize` would do to the photograph."""
     device = flat.content.device
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
-    colours = colour_maps(stylizer, dictionary, flat.style, decoder, features=config.features, share=config.colours)
+    smoothing = config.smoothing(flat.style)
+    colours = colour_maps(
+        stylizer, dictionary, flat.style, decoder, features=config.features, share=config.colours, smoothing=smoothing
+    )
     return Restyle(stylizer, features=config.features, colours=None if colours is None else colours.to(device))
 
 

@@ -89,11 +89,13 @@ def colour_maps(
     *,
     features: float = 1.0,
     share: float = 1.0,
+    smoothing: Annotated[Tensor, "K K"] | None = None,
 ) -> ColourMaps | None:
     """The maps of a stylizer whose change of features counts `features`; None where nothing is to be carried over.
 
-    `share`, in [0, 1], is how much of the way colours go. Regions and codes are matched by the stylizer itself. A dictionary
-    without the colours of its photographs (that of the scene itself) carries nothing over.
+    `share`, in [0, 1], is how much of the way colours go. Regions and codes are matched by the stylizer itself; `smoothing`
+    (`region_smoothing`) is what it smooths its matches by. A dictionary without the colours of its photographs (that of the
+    scene itself) carries nothing over.
     """
     if share == 0 or dictionary.colour_mean is None or dictionary.colour_covariance is None:
         return None
@@ -101,6 +103,8 @@ def colour_maps(
     whole = mix(mean, covariances, scene.share)
     at = mean.new_full((len(mean),), dictionary.blend)
     mean, covariances = blend_codes(mean, covariances, *whole, at)
+    if smoothing is not None:
+        mean, covariances = smoothing.to(mean) @ mean, torch.einsum("kl,lij->kij", smoothing.to(mean), covariances)
     table = double(stylizer.match(scene.keys.to(_device(stylizer, scene)))).to(mean)
     return ColourMaps(scene, *carried_colours(mean, covariances, table, dictionary), share)
 

@@ -13,7 +13,18 @@ from .matching import point_shares, score_spread, unit
 from .statistics import Moments, covariance, double, group_moments
 from .statistics import moments as moments_of
 
-__all__ = ["SceneStyle", "check_fit", "from_tensors", "membership", "own_style", "region_units", "scene_style", "to_tensors"]
+__all__ = [
+    "SceneStyle",
+    "check_fit",
+    "from_tensors",
+    "membership",
+    "own_style",
+    "region_contacts",
+    "region_smoothing",
+    "region_units",
+    "scene_style",
+    "to_tensors",
+]
 
 _SOFTNESS = 0.3
 """Temperature of points belonging to regions, relative to the spread of the scores: fixed with the scene, since the
@@ -22,6 +33,10 @@ regions' statistics are taken with it."""
 _FAINT = 0.01
 """Memberships below this share of the largest are dropped: a point then belongs to two or three regions and the others
 cost nothing. What jumps there is below an 8-bit step."""
+
+
+_ALIKE = 0.05
+"""Difference of colours in [0, 1] at which two neighbouring pixels count 0.6 as one surface; at three times that, 0.01."""
 
 
 class SceneStyle(NamedTuple):
@@ -41,6 +56,8 @@ class SceneStyle(NamedTuple):
     """Share of the scene's weight in each region; sums to 1."""
     semantic_mean: Annotated[Tensor, "D"]
     """Mean semantic feature of the scene: the centre for cosine matching."""
+    contacts: Annotated[Tensor, "K K"]
+    """How much each two regions meet without an edge of colour between them (`region_contacts`); 0 where not measured."""
 
 
 def scene_style(
@@ -54,8 +71,8 @@ def scene_style(
     """The scene's style from weighted points, float32.
 
     Regions are k-means clusters of the semantics; their statistics are taken over the same soft `membership` by which the
-    region stylizers assign points. Its tables, a few kB, are on the CPU, where stylizers are built, whatever the device of
-    the points. `moments` are those of the whole scene, where a longer pass has them already. Raises
+    region stylizers assign points. Contacts are left at 0. Its tables, a few kB, are on the CPU, where stylizers are built,
+    whatever the device of the points. `moments` are those of the whole scene, where a longer pass has them already. Raises
     DataError for no weight, NumericsError for values that are not finite.
     """
     if not bool(weights.any()):
@@ -71,7 +88,8 @@ def scene_style(
     alive, belongs = _regions(semantic, keys, middle)
     keys, belongs = keys[alive], belongs * double(weights)[:, None]
     mean, covariances, share = group_moments(content, belongs)
-    found = (whole.mean, covariance(whole), keys, mean, covariances, share, middle)
+    contacts = share.new_zeros(len(share), len(share))
+    found = (whole.mean, covariance(whole), keys, mean, covariances, share, middle, contacts)
     return SceneStyle(*(table.float().cpu() for table in found))
 
 
@@ -88,6 +106,44 @@ def membership(
     if len(units) == 1:
         return semantic.new_ones(len(semantic), 1)
     return point_shares(semantic, units, temperature, centre=centre, faint=_FAINT)
+
+
+def region_contacts(
+    scene: SceneStyle, semantic: Annotated[Tensor, "P 2 D"], colour: Annotated[Tensor, "P 2 3"]
+) -> Annotated[Tensor, "K K"]:
+    """How much membership passes from one region to another between P pairs of neighbouring pixels without an edge of colour.
+
+    Mean over the pairs of -d_k d_l, with d the difference of both ends' memberships, where that is above 0; pairs whose colours
+    differ count less. Symmetric, at least 0, with 0 on the diagonal.
+    """
+    units, softness = region_units(scene.keys, scene.semantic_mean)
+    ends = [
+        double(membership(part.contiguous().to(units), scene.semantic_mean, units, softness)) for part in semantic.unbind(1)
+    ]
+    change = ends[0] - ends[1]
+    even = torch.exp(-double(colour[:, 0] - colour[:, 1]).abs().amax(1).square() / (2 * _ALIKE**2))
+    passed = -(change * even[:, None]).T @ change / max(1, len(change))
+    return passed.clamp_min(0).fill_diagonal_(0).float()
+
+
+def region_smoothing(
+    scene: SceneStyle, smoothness: float, allowed: Annotated[Tensor, "K references"] | None = None
+) -> Annotated[Tensor, "K K"]:
+    """What makes regions alike that meet without an edge of colour: H, float64, rows sum to 1; the identity for 0.
+
+    For values v of the regions, x = H v minimises sum_k s_k |x_k - v_k|^2 + smoothness sum_(k<l) c_kl |x_k - x_l|^2, with
+    shares s and contacts c: the second sum is what x changes by between neighbouring pixels of one colour. The mean over the
+    scene stays, s H = s. Regions that may not take from the same references (`allowed`) do not take from each other.
+    """
+    unity = torch.eye(len(scene.share), dtype=torch.float64)
+    if smoothness == 0:
+        return unity
+    contacts = double(scene.contacts).to(unity)
+    if allowed is not None:
+        contacts = contacts * (allowed[:, None] == allowed[None]).all(-1).to(unity)
+    share = torch.diag(double(scene.share).to(unity))
+    smooth: Tensor = torch.linalg.solve(share + smoothness * (torch.diag(contacts.sum(1)) - contacts), share)
+    return smooth
 
 
 def own_style(scene: SceneStyle, blend: float = BLEND) -> StyleDictionary:
@@ -124,12 +180,14 @@ def to_tensors(scene: SceneStyle) -> dict[str, Tensor]:
 
 def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:
     """A scene's style out of a checkpoint. Raises CheckpointError for missing or misshapen fields."""
+    if "contacts" not in tensors and "share" in tensors:  # a run from before they were measured
+        tensors = {**tensors, "contacts": tensors["share"].new_zeros(2 * tuple(tensors["share"].shape))}
     missing = [name for name in SceneStyle._fields if name not in tensors]
     if missing:
         raise CheckpointError(f"scene statistics: {', '.join(missing)} missing; compute the statistics again")
     scene = SceneStyle(**{name: tensors[name] for name in SceneStyle._fields})
     c, k, d = scene.mean.numel(), scene.share.numel(), scene.semantic_mean.numel()
-    shapes = ((c,), (c, c), (k, d), (k, c), (k, c, c), (k,), (d,))
+    shapes = ((c,), (c, c), (k, d), (k, c), (k, c, c), (k,), (d,), (k, k))
     for name, t, shape in zip(SceneStyle._fields, scene, shapes, strict=True):
         if tuple(t.shape) != shape:
             raise CheckpointError(f"scene statistics: {name} is {tuple(t.shape)}, expected {shape}; compute them again")

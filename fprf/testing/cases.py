@@ -126,6 +126,7 @@ def scene(regions: int, channels: int, dims: int) -> SceneStyle:
         region_covariance=covariances[:-1],
         share=torch.full((regions,), 1 / regions),
         semantic_mean=torch.zeros(dims),
+        contacts=torch.full((regions, regions), 1 / regions**2),
     )
 
 

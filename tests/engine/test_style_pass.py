@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.engine.style_pass import lattice, measure_style
+from fprf.engine.style_pass import lattice, measure_style, neighbours
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.renderer import march
 from fprf.style.scene import from_tensors
@@ -40,6 +40,17 @@ def test_the_lattice_covers_every_view_by_its_share(sizes: list[tuple[int, int]]
     assert len({(int(v), *p) for v, p in zip(view, pixel.tolist(), strict=True)}) == count, "no pixel twice"
     for one, pixels in zip(views.tolist(), area.tolist(), strict=True):
         assert abs(int((view == one).sum()) - count * pixels / int(area.sum())) <= 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(SIZES, st.integers(1, 100))
+def test_neighbours_lie_in_the_view(sizes: list[tuple[int, int]], pairs: int) -> None:
+    cameras = cameras_of([(24 * w, 24 * h) for w, h in sizes])
+    view, pixel = neighbours(cameras, torch.arange(len(sizes)), pairs)
+    size = cameras.size[view][:, None]
+    assert bool(((pixel > 0) & (pixel < size)).all())
+    step = (pixel[:, 1] - pixel[:, 0]).abs().sum(1)
+    assert torch.equal(step, cameras.size[view].amin(1).to(step) // 24)
 
 
 def test_all_pixels_where_there_are_fewer_than_rays() -> None:
@@ -82,6 +93,7 @@ def test_regions_share_out_the_scene(world: World) -> None:
     assert 1 <= len(style.share) <= world.config.statistics.regions
     assert float(style.share.sum()) == pytest.approx(1, abs=1e-5)
     assert all(torch.equal(a, b) for a, b in zip(style, from_tensors(trained.run.load_tensors("style")), strict=True))
+    assert torch.allclose(style.contacts, style.contacts.T) and 0 < float(style.contacts.sum()) < 1
     one = measure_style(
         replace(world.config, statistics=replace(world.config.statistics, regions=1)), trained.model, scene.cameras, scene.train
     )

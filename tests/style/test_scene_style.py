@@ -5,7 +5,17 @@ from hypothesis import strategies as st
 
 from fprf.errors import CheckpointError, DataError
 from fprf.style.dictionary import Reference, build_dictionary, whole_style
-from fprf.style.scene import check_fit, from_tensors, membership, own_style, region_units, scene_style, to_tensors
+from fprf.style.scene import (
+    check_fit,
+    from_tensors,
+    membership,
+    own_style,
+    region_contacts,
+    region_smoothing,
+    region_units,
+    scene_style,
+    to_tensors,
+)
 from fprf.style.statistics import covariance, mix, moments
 
 
@@ -135,3 +145,38 @@ def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None, said: 
     del tensors[name]
     with pytest.raises(CheckpointError, match=said):
         from_tensors(tensors if value is None else tensors | {name: value})
+
+
+def test_a_run_without_contacts_is_read() -> None:
+    tensors = to_tensors(scene_style(*points(), None, 3, 0))
+    del tensors["contacts"]
+    assert torch.equal(from_tensors(tensors).contacts, torch.zeros(3, 3))
+
+
+def test_contacts_are_where_regions_meet_without_an_edge_of_colour() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 3, 0)
+    share = membership(scene.keys, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean))
+    assert float((share - torch.eye(3)).abs().max()) < 1e-3, "keys lie in their own regions"
+    ends = scene.keys[torch.tensor([[0, 1], [1, 0], [1, 2], [2, 2]])]
+    colour = torch.full((4, 2, 3), 0.5)
+    colour[2, 1, 0] = 0.9
+    expected = torch.zeros(3, 3)
+    expected[0, 1] = expected[1, 0] = 0.5
+    torch.testing.assert_close(region_contacts(scene, ends, colour), expected, rtol=0.0, atol=1e-2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 6), st.floats(0, 1e4), st.integers(0, 99))
+def test_smoothing_mixes_and_keeps_the_mean_over_the_scene(regions: int, smoothness: float, seed: int) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    scene = scene_style(*points(), None, 8, 0)
+    contacts = torch.rand(regions, regions, generator=draw)
+    share = torch.rand(regions, generator=draw) + 0.01
+    scene = scene._replace(contacts=contacts + contacts.T, share=share / share.sum())
+    smooth = region_smoothing(scene, smoothness)
+    assert bool((smooth >= -1e-12).all())
+    torch.testing.assert_close(smooth.sum(1), torch.ones(regions, dtype=torch.float64))
+    torch.testing.assert_close(scene.share.double() @ smooth, scene.share.double())
+    far = region_smoothing(scene, 1e9)
+    torch.testing.assert_close(far, scene.share.double().expand(regions, -1), rtol=0.0, atol=1e-5)

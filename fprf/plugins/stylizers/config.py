@@ -7,12 +7,14 @@ references, so that one default serves every encoder. Small = each point takes o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from ...checks import at_least, between, positive
 from ..config import PluginConfig
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ...interfaces import Stylizer
     from ...style.dictionary import StyleDictionary
     from ...style.scene import SceneStyle
@@ -51,6 +53,12 @@ class StylizerConfig(PluginConfig):
     def reads_products(self) -> bool:
         """All that its stylizers read of semantics is a softmax of inner products with the keys of the dictionary."""
         return False
+
+    def smoothing(
+        self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
+    ) -> Annotated[Tensor, "K K"] | None:
+        """What its stylizers smooth the matches of regions by (`style.scene.region_smoothing`); None = nothing."""
+        return None
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The stylizer of these references on this scene."""
@@ -133,6 +141,9 @@ class _RegionConfig(StylizerConfig):
     centred: bool = True
     """Cosines are taken from the mean of each side; False = from the encoder's own origin, without whitening: for single
     objects, whose mean says nothing about that of a landscape."""
+    smoothness: float = 0.0
+    """How alike the styles of regions are made that meet without an edge of colour between them, at least 0; 0 = each by
+    itself. A run from before this was measured is left as it is."""
     gain: float = 8.0
     """Largest amplification of any channel or direction, at least 1, so that the noise of flat regions stays small."""
 
@@ -141,7 +152,16 @@ class _RegionConfig(StylizerConfig):
         positive("stylizer.temperature", self.temperature)
         between("stylizer.whitening", self.whitening, 0.0, 1.0)
         at_least("stylizer.recentred", self.recentred, 0)
+        at_least("stylizer.smoothness", self.smoothness, 0.0)
         at_least("stylizer.gain", self.gain, 1.0)
+
+    def smoothing(
+        self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
+    ) -> Annotated[Tensor, "K K"] | None:
+        """By `smoothness`."""
+        from ...style.scene import region_smoothing
+
+        return region_smoothing(scene, self.smoothness, allowed)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The two-sided stylizer towards these references, with this kind of maps."""
@@ -149,7 +169,7 @@ class _RegionConfig(StylizerConfig):
         from .region import TwoSidedStylizer, plan_regions
 
         matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred, self.centred)
-        plan = plan_regions(dictionary, scene, matching)
+        plan = plan_regions(dictionary, scene, matching, self.smoothing(scene, dictionary.allowed))
         return TwoSidedStylizer(plan, scene, self._maps(plan, scene))
 
     def _maps(self, plan: RegionPlan, scene: SceneStyle) -> RegionMaps:
@@ -185,3 +205,6 @@ class RegionToneConfig(_RegionConfig):
     """How far the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
     temperature: float = 0.2
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
+    smoothness: float = 16.0
+    """How alike the styles of regions are made that meet without an edge of colour between them, at least 0; 0 = each by
+    itself. A run from before this was measured is left as it is."""

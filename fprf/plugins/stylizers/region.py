@@ -57,18 +57,22 @@ class RegionPlan(NamedTuple):
     style: Side
 
 
-def plan_regions(dictionary: StyleDictionary, scene: SceneStyle, matching: Matching) -> RegionPlan:
-    """Match the regions with the codes. The scene's statistics are blended as the dictionary's are."""
+def plan_regions(
+    dictionary: StyleDictionary, scene: SceneStyle, matching: Matching, smoothing: Annotated[Tensor, "K K"] | None = None
+) -> RegionPlan:
+    """Match the regions with the codes. The scene's statistics are blended and smoothed as the dictionary's are."""
     check_fit(dictionary, scene)
     own = own_style(scene, dictionary.blend)._replace(origin=dictionary.origin)
-    same = _mixed(own, region_table(scene, own, matching))
-    table = region_table(scene, dictionary, matching)
+    same, table = region_table(scene, own, matching), region_table(scene, dictionary, matching)
+    if smoothing is not None:
+        same, table = smoothing @ same, smoothing @ table
+    before = _mixed(own, same)
     if len(table) > 1:
-        return RegionPlan(table, same, _mixed(dictionary, table))
+        return RegionPlan(table, before, _mixed(dictionary, table))
     # An undivided scene gets the global style: codes taken together, with what lies between them.
     left = dictionary if dictionary.allowed is None else choose(dictionary, dictionary.allowed[0])[0]
     mean, covariance = (part[None] for part in whole_style(left))
-    return RegionPlan(table, same, Side(mean, deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)), covariance))
+    return RegionPlan(table, before, Side(mean, deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)), covariance))
 
 
 class RegionMaps(nn.Module, ABC):

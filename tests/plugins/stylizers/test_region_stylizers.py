@@ -79,9 +79,11 @@ def test_the_scenes_own_style_is_the_identity(config: Config, regions: int, temp
     content[:, 1] *= 1e-3
     content[:, 2] = 4.0
     scene = scene_style(content, semantic, torch.ones(600), None, regions, 0)
-    made = config(temperature=temperature).build(dictionary=own_style(scene, blend), scene=scene)
-    out = made(content, semantic)
-    assert float((out - content).abs().max() / content.abs().max()) < 1e-5
+    scene = scene._replace(contacts=torch.full_like(scene.contacts, 0.1))
+    for smoothness in (0.0, 5.0):
+        made = config(temperature=temperature, smoothness=smoothness).build(dictionary=own_style(scene, blend), scene=scene)
+        out = made(content, semantic)
+        assert float((out - content).abs().max() / content.abs().max()) < 1e-5
 
 
 def test_one_region_that_meets_one_code_gets_its_statistics() -> None:
@@ -115,6 +117,21 @@ def test_high_temperatures_move_all_regions_alike(config: Config) -> None:
     lifted = torch.cat([content, torch.ones(600, 1)], 1).double()
     fit = lifted @ torch.linalg.lstsq(lifted, out.double()).solution
     assert float((fit - out).abs().max()) < 1e-3
+
+
+@pytest.mark.parametrize("config", BOTH)
+def test_smoothness_makes_regions_alike_that_meet(config: Config) -> None:
+    _, _, scene, d = setting()
+    contacts = torch.zeros(3, 3)
+    contacts[0, 1] = contacts[1, 0] = 0.1
+    scene = scene._replace(contacts=contacts)
+    tables = [config(smoothness=s).build(dictionary=d, scene=scene).get_buffer("table") for s in (0.0, 2.0, 1e6)]
+    apart = [float((table[0] - table[1]).abs().sum()) for table in tables]
+    assert apart[0] > 0.1 and apart[0] > apart[1] > apart[2] and apart[2] < 1e-4
+    torch.testing.assert_close(tables[2][2], tables[0][2], msg="region 2 meets none")
+    pinned = d._replace(allowed=torch.tensor([[True, False], [True, True], [True, True]]))
+    alone = [config(smoothness=s).build(dictionary=pinned, scene=scene).get_buffer("table")[0] for s in (0.0, 1e6)]
+    assert torch.equal(*alone), "what is pinned takes from no neighbour that is not"
 
 
 @pytest.mark.parametrize("similarity", ["cosine", "dot"])
