@@ -34,6 +34,7 @@ from .rendering.paths import look_at, pinhole
 from .style.config import StyleConfig
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
+from .style.presets import with_preset
 
 __all__ = ["Shot", "TrainedScene", "open_scene"]
 
@@ -142,11 +143,14 @@ class TrainedScene:
         pin: Sequence[str] = (),
         forbid: Sequence[str] = (),
         keep: Sequence[str] = (),
+        preset: str | None = None,
     ) -> "TrainedScene":
-        """The scene in the style of photographs, or of all in a folder; every argument is a field of `StyleConfig`.
+        """The scene in the style of photographs, or of all in a folder; all arguments but `preset` are fields of `StyleConfig`.
 
-        Raises UsageError for no references or wishes that the scene does not know, DataError for unreadable photographs,
-        WeightsError where the encoders at hand are not the scene's.
+        A preset, such as "gentle", replaces what it sets (`fprf.style.presets.PRESETS`).
+
+        Raises UsageError for no references, an unknown preset or wishes that the scene does not know, DataError for
+        unreadable photographs, WeightsError where the encoders at hand are not the scene's.
         """
         style = StyleConfig(
             references=tuple(Path(path) for path in references),
@@ -160,7 +164,7 @@ class TrainedScene:
             forbid=tuple(forbid),
             keep=tuple(keep),
         )
-        return self.apply(with_folders(style))
+        return self.apply(with_folders(style if preset is None else with_preset(style, preset)))
 
     def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
         """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as `stylize`."""

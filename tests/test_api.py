@@ -14,6 +14,7 @@ from fprf.api import TrainedScene
 from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
 from fprf.rendering.cameras import project
 from fprf.style.config import StyleConfig
+from fprf.style.presets import with_preset
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,12 @@ def test_views_go_by_number_and_name(scene: TrainedScene) -> None:
     assert len(scene.names) == len(scene.cameras) == 10
     by_name, by_number = scene.render("0003"), scene.render(3)
     assert torch.equal(by_name.rgb, by_number.rgb) and torch.equal(by_name.rgb, scene.render(scene.camera(3)).rgb)
+
+
+def test_a_preset_is_what_it_sets(scene: TrainedScene, world: World) -> None:
+    styled = scene.stylize(world.references[:1], luminance=1.0, preset="gentle").styled
+    assert styled is not None
+    assert styled.orders.saved.style == with_preset(StyleConfig(references=tuple(world.references[:1])), "gentle")
 
 
 def test_scenes_never_change(scene: TrainedScene, world: World) -> None:

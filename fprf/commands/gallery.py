@@ -16,7 +16,7 @@ from .parsing import parse
 from .progress import Display
 from .render import RenderVerbConfig, camera_path, frames_of
 from .showcase import restyled, write_page
-from .style_flags import say
+from .style_flags import read_preset, say, with_presets_named
 
 if TYPE_CHECKING:
     from ..engine.loading import Trained
@@ -46,6 +46,8 @@ class GalleryConfig(QualityConfig):
     """How much of the scene's own luminance is kept, in [0, 1]; of photographs."""
     clusters: int = StyleConfig().clusters
     """Local styles per photograph, at least 1."""
+    blend: float = StyleConfig().blend
+    """Share of the overall style in each local one, in [0, 1]; of photographs."""
     stylizer: StylizerConfig = StyleConfig().stylizer
     """What moves the scene's features; of photographs."""
     split: Literal["covered", "test", "train", "all"] = "covered"
@@ -70,13 +72,15 @@ class GalleryConfig(QualityConfig):
         between("strength", self.strength, 0.0, 1.0)
         between("luminance", self.luminance, 0.0, 1.0)
         at_least("clusters", self.clusters, 1)
+        between("blend", self.blend, 0.0, 1.0)
         at_least("most", self.most, 1)
         at_least("frames", self.frames, 0)
 
 
 def run(args: list[str]) -> int:
     """Render the views in every style, film, write the page."""
-    config = parse(GalleryConfig(), args, prog="fprf gallery", description=_DESCRIPTION, positional=("run",))
+    default, args = read_preset(GalleryConfig(), args)
+    config = parse(default, args, prog="fprf gallery", description=with_presets_named(_DESCRIPTION), positional=("run",))
     output = config.output if config.output is not None else config.run / "gallery.html"
     if output.suffix.lower() != ".html":
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
@@ -133,6 +137,7 @@ def _chosen(config: GalleryConfig, photographs: list[Path]) -> list[tuple[str, S
                 strength=config.strength,
                 luminance=config.luminance,
                 clusters=config.clusters,
+                blend=config.blend,
                 stylizer=config.stylizer,
             )
         )

@@ -1,4 +1,4 @@
-"""Flags of the verbs that restyle: a style file first, where one is named, then every flag over it."""
+"""Flags of the verbs that restyle: a style file first, where one is named, then a preset, then every flag over both."""
 
 import sys
 from collections.abc import Sequence
@@ -8,11 +8,13 @@ from typing import Any, TypeVar
 
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
+from ..style.presets import PRESETS, preset_flags, with_preset
 from .parsing import parse
 
-__all__ = ["read_flags", "say"]
+__all__ = ["read_flags", "read_preset", "say", "with_presets_named"]
 
 C = TypeVar("C", bound=StyleConfig)
+D = TypeVar("D")
 
 
 def read_flags(
@@ -20,15 +22,20 @@ def read_flags(
 ) -> tuple[C, StyleFile]:
     """The verb's config and the style that it asks for; `--style FILE` gives the values that no flag gives.
 
+    `--gentle`, or another name of `PRESETS`, sets what that preset sets, over the file and below every other flag.
     A flag of many values may stand several times: `--pin 3=a.jpg --pin 5=b.jpg` is `--pin 3=a.jpg 5=b.jpg`. Folders among
     the references stand for the images in them. Raises what `parse`, `with_folders` and `read_style` raise, and DataError
     where a photograph of the file is no longer the one it was.
     """
-    path, args = _style_flag(args), _joined(args, default)
+    path = _style_flag(args)
     file = read_style(path) if path is not None else StyleFile(StyleConfig())
     if path is not None:
         default = replace(default, **_styles(file.style))
-    config = with_folders(parse(default, args, prog=prog, description=description, positional=positional), say)
+    default, args = read_preset(default, args)
+    config = parse(
+        default, _joined(args, default), prog=prog, description=with_presets_named(description), positional=positional
+    )
+    config = with_folders(config, say)
     file = file._replace(style=StyleConfig(**_styles(config)))
     given = {arg.partition("=")[0] for arg in args}
     if path is not None and not given & {"--references", "--masks"}:
@@ -39,6 +46,22 @@ def read_flags(
 def say(text: str) -> None:
     """A line on standard error."""
     print(text, file=sys.stderr)
+
+
+def read_preset(default: D, args: Sequence[str]) -> tuple[D, list[str]]:
+    """The default with the preset whose flag is among the arguments, and the other arguments; says what the preset sets."""
+    flags = [f"--{name}" for name in PRESETS]
+    for flag in (arg for arg in args if arg in flags):
+        print(f"{flag}: {preset_flags(flag[2:])}")
+        default = with_preset(default, flag[2:])
+    return default, [arg for arg in args if arg not in flags]
+
+
+def with_presets_named(description: str) -> str:
+    """A verb's description, with the presets that it takes."""
+    return "\n\n".join(
+        [description, *(f"--{name} stands for {preset_flags(name)}; other flags come over it." for name in PRESETS)]
+    )
 
 
 def _styles(config: StyleConfig) -> dict[str, Any]:

@@ -7,15 +7,16 @@ lie at the end of a fade. `style_of` says a look in the terms of `style.json`.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from ..checks import at_least, between, positive
 from ..output.images import Picture
 from ..plugins.stylizers.config import RegionToneConfig
 from ..style.config import StyleConfig
 from ..style.dictionary import Reference
+from ..style.presets import PRESETS
 
-__all__ = ["Card", "Look", "Order", "Verb", "moved", "only", "ordered", "settled", "style_of", "weighed"]
+__all__ = ["Card", "Look", "Order", "Verb", "moved", "only", "ordered", "preset", "settled", "style_of", "weighed"]
 
 Verb: TypeAlias = Literal["pin", "forbid", "keep"]
 
@@ -53,6 +54,8 @@ class Look:
     clusters: int = 20
     blend: float = 0.1
     luminance: float = 0.0
+    smoothness: float = RegionToneConfig.smoothness
+    """How alike regions are styled that meet without an edge of colour, at least 0."""
     orders: frozenset[Order] = frozenset()
     towards: "Look | None" = None
     """Another look, and how far the scene is on the way to it, in [0, 1]; that look has none itself."""
@@ -63,6 +66,7 @@ class Look:
             between(name, getattr(self, name), 0.0, 1.0)
         at_least("clusters", self.clusters, 1)
         positive("temperature", self.temperature)
+        at_least("smoothness", self.smoothness, 0.0)
         for _, weight in self.mix:
             positive("weights", weight)
 
@@ -101,6 +105,12 @@ def ordered(look: Look, region: int, verb: Verb | None, card: Card | None = None
     return replace(look, orders=rest | new)
 
 
+def preset(look: Look, name: str) -> Look:
+    """The look with the values of a preset (`PRESETS`); what the preset does not set stays."""
+    values: dict[str, Any] = {path.rpartition(".")[2]: value for path, value in PRESETS[name].items()}
+    return replace(look, **values)
+
+
 def settled(look: Look) -> Look:
     """The same look, going towards another one only where both are styles and it lies between them.
 
@@ -133,7 +143,7 @@ def style_of(look: Look, stylizer: RegionToneConfig | None = None) -> StyleConfi
     return StyleConfig(
         references=tuple(card.path for card, _ in look.mix),
         weights=tuple(weight for _, weight in look.mix),
-        stylizer=replace(stylizer or RegionToneConfig(), temperature=look.temperature),
+        stylizer=replace(stylizer or RegionToneConfig(), temperature=look.temperature, smoothness=look.smoothness),
         clusters=look.clusters,
         blend=look.blend,
         strength=look.strength,

@@ -7,8 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
+from ..style.presets import PRESETS, preset_flags
 from .film import FilmPlan, Key, path_of
 from .keys import added, at_key, replaced
+from .looks import preset
 from .painter import MAPS, Map
 from .session import Session
 from .stage import Eye, fitted
@@ -44,7 +46,7 @@ class Panel:
 
     def follow(self, before: State, now: State) -> None:
         """Bring the controls to what the state says."""
-        for name in ("strength", "temperature", "clusters", "blend", "luminance", "at"):
+        for name in ("strength", "temperature", "clusters", "blend", "luminance", "smoothness", "at"):
             self._set(self._looks[name], getattr(now.look, name))
         self._set(self._landing, now.landing)
         self._set(self._map, now.map)
@@ -94,10 +96,14 @@ class Panel:
                 "clusters": add("clusters", 1, 40, 1, look.clusters, hint=_HINTS["clusters"]),
                 "blend": add("local ↔ global", 0.0, 1.0, 0.01, look.blend, hint=_HINTS["blend"]),
                 "luminance": add("keep light", 0.0, 1.0, 0.01, look.luminance, hint=_HINTS["luminance"]),
+                "smoothness": add("smoothness", 0, 256, 1, look.smoothness, hint=_HINTS["smoothness"]),
             }
+            presets = {name: self._gui.add_button(name, hint=preset_flags(name)) for name in PRESETS}
             self._landing = self._gui.add_dropdown("new photo", _LANDINGS, initial_value=state.landing, hint=_HINTS["landing"])
         for name, control in self._looks.items():
             self._on_look(name, control)
+        for name, button in presets.items():
+            self._pressed(button, self._preset(name))
         self._on(self._landing, lambda value: lambda state: replace(state, landing=_one(value, _LANDINGS)))
 
     def _show_controls(self, state: State) -> None:
@@ -208,6 +214,14 @@ class Panel:
 
         self._on(control, to)
 
+    def _preset(self, name: str) -> Callable[["viser.ClientHandle"], object]:
+        """The look with what a preset sets: the controls follow."""
+
+        def to(state: State) -> State:
+            return replace(state, look=preset(state.look, name))
+
+        return lambda client: self._session.change(to, client.client_id)
+
     def _pressed(self, button: Any, act: Callable[["viser.ClientHandle"], object]) -> None:
         button.on_click(lambda event: None if event.client is None else act(event.client))
 
@@ -220,6 +234,7 @@ _HINTS = {
     "temperature": "how softly regions are matched: low = each takes from what is most like it, high = all take from all",
     "clusters": "local styles of each photograph",
     "blend": "0 = each region takes a local style, 1 = all take that of the whole photograph",
+    "smoothness": "how alike regions are coloured that meet without an edge between them",
     "luminance": "how much of the scene's own light and dark stays",
     "landing": "what a photograph that is dropped becomes: the style alone, or one more in the mix",
     "map": "matches: which photograph each place takes its style from; regions: what can be picked",

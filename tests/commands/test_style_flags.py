@@ -1,6 +1,6 @@
 """A style file under the flags."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +10,7 @@ from fprf.errors import ConfigError, DataError, UsageError
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile, write_style
+from fprf.style.presets import PRESETS, preset_flags, with_preset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,3 +92,25 @@ def test_what_does_not_fit_together_is_named(file: Path) -> None:
         read("RUN", "--style")
     with pytest.raises(UsageError, match="RUN is missing"):
         read("--style", str(file))
+
+
+def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, found = read("--gentle", "RUN", "--references", "a.jpg", "--luminance", "0.9")
+    assert config.luminance == found.style.luminance == 0.9 and found.style.references == (Path("a.jpg"),)
+    assert replace(found.style, luminance=0.0) == replace(
+        with_preset(StyleConfig(references=(Path("a.jpg"),)), "gentle"), luminance=0.0
+    )
+    assert capsys.readouterr().out == f"--gentle: {preset_flags('gentle')}\n"
+    config, _ = read("RUN", "--style", str(file), "--gentle")
+    assert config.strength == PRESETS["gentle"]["strength"] and config.weights == (2.0,)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_what_its_flags_say(name: str) -> None:
+    assert read("RUN", f"--{name}")[1] == read("RUN", *preset_flags(name).split())[1]
+    assert with_preset(StyleConfig(), name) != StyleConfig()
+
+
+def test_an_unknown_preset_is_refused() -> None:
+    with pytest.raises(UsageError, match="'gentel': no such preset; did you mean 'gentle'"):
+        with_preset(StyleConfig(), "gentel")

@@ -3,6 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,11 @@ from test_session import Listener
 from tiny_world import World
 
 from fprf.engine.loading import load_run
+from fprf.plugins.stylizers.config import RegionToneConfig
+from fprf.style.config import StyleConfig
+from fprf.style.presets import with_preset
 from fprf.viewer import crew
+from fprf.viewer.looks import style_of
 from fprf.viewer.panel import Panel
 from fprf.viewer.session import Session
 from fprf.viewer.stage import Eye
@@ -97,12 +102,24 @@ def test_at_first_the_controls_say_what_the_state_is(room: Room) -> None:
         ("clusters", 5.0, "clusters", 5),
         ("local ↔ global", 0.3, "blend", 0.3),
         ("keep light", 1.0, "luminance", 1.0),
+        ("smoothness", 40.0, "smoothness", 40.0),
     ],
 )
 def test_sliders_of_the_look(room: Room, label: str, value: float, name: str, wanted: float) -> None:
     room.move(label, value)
     found = getattr(room.state.look, name)
     assert found == wanted and type(found) is type(wanted)
+
+
+def test_a_preset_moves_the_sliders(room: Room) -> None:
+    room.move("clusters", 5.0)
+    room.press("gentle")
+    wanted = with_preset(StyleConfig(), "gentle")
+    assert style_of(room.state.look) == replace(wanted, clusters=5)
+    shown = [room.gui[name].value for name in ("strength", "keep light", "local ↔ global", "smoothness", "temperature")]
+    kind = wanted.stylizer
+    assert isinstance(kind, RegionToneConfig)
+    assert shown == [wanted.strength, wanted.luminance, wanted.blend, kind.smoothness, kind.temperature]
 
 
 @pytest.mark.parametrize("value", [7.0, -1.0])
