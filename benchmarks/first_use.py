@@ -30,6 +30,7 @@ from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.engine.loading import load_run
 from fprf.evaluation.judge import judge
+from fprf.evidence.provenance import commit
 from fprf.output.images import to_uint8
 from fprf.output.video import write_frames
 from fprf.process import keep_memory
@@ -41,7 +42,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--side", type=int, default=240, help="longest side of the images at most, in pixels")
     parser.add_argument("--label", required=True, help="key of these figures in the file, for example before")
-    parser.add_argument("--commit", required=True, help="that is measured, noted with the figures")
     parser.add_argument("--renders", type=Path, help="folder that the held-out views are written to")
     parser.add_argument("--output", type=Path, required=True, help="JSON file that the figures are added to")
     own = sys.argv[1 : sys.argv.index("--")] if "--" in sys.argv else sys.argv[1:]
@@ -55,7 +55,7 @@ def main() -> None:
             data = thinned(Path(folder), Path(scratch) / Path(folder).name, int(count)) if count else Path(folder)
             renders = options.renders and options.renders / options.label / name.replace(", ", "-").replace(" ", "-")
             found = measured(data, Path(scratch) / "run", options.steps, options.side, flags, renders)
-        entry = {"commit": options.commit, "flags": flags, **found}
+        entry = {"commit": commit(Path(__file__).parent), "flags": flags, **found}
         known = json.loads(options.output.read_text()) if options.output.is_file() else {}
         known.setdefault(name, {})[options.label] = entry
         options.output.write_text(json.dumps(known, indent=1) + "\n")
