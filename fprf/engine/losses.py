@@ -117,16 +117,16 @@ def ending(
 ) -> Tensor | None:
     """How far rays are from ending at their known ray parameters (NaN = unknown); None where none is known.
 
-    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. On an
-    accelerator it is 0 where none is known: the host would have to wait to find out.
+    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, both within [0, 1], and 0 of other rays; the mean over all
+    rays. On an accelerator it is 0 where none is known: the host would have to wait to find out.
     """
     known = torch.isfinite(ends)
     if t.device.type == "cpu":
         index = known.nonzero()[:, 0]
         if not len(index):
             return None
-        return _missed(*(x.index_select(0, index) for x in (t, weights, ends)), ndc=ndc).mean()
-    return _mean_of(_missed(t, weights, torch.where(known, ends, 0.5), ndc=ndc), known)
+        return _missed(*(x.index_select(0, index) for x in (t, weights, ends)), ndc=ndc).sum() / len(ends)
+    return torch.where(known, _missed(t, weights, torch.where(known, ends, 0.5), ndc=ndc), 0.0).mean()
 
 
 def _missed(t: Tensor, weights: Tensor, ends: Tensor, *, ndc: bool) -> Annotated[Tensor, "R"]:
