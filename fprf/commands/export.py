@@ -23,10 +23,14 @@ if TYPE_CHECKING:
 
 __all__ = ["run"]
 
+_FEW = 0.5
+"""A smaller share of what there was is worth a warning."""
+
 _DESCRIPTION = f"""A scene as files that other programs open, in the capture's own frame.
 
-Kinds may follow the run, none = all of them: {", ".join(f"{name} = {what}" for name, what in KINDS.items())}. A look
-of the scene is a file: points.ply as it is, points.NAME.ply in a style, with the same points in the same order."""
+Kinds may follow the run; several share one geometry, none = all of them:
+{", ".join(f"{name} = {what}" for name, what in KINDS.items())}. A look of the scene is a file:
+points.ply as it is, points.NAME.ply in a style, with the same points in the same order."""
 
 
 def run(args: list[str]) -> int:
@@ -60,8 +64,26 @@ def run(args: list[str]) -> int:
     made["seconds"] = time.perf_counter() - start
     if what.single is None:
         write_json(what.folder / "export.json", made)
+    for line in _coverage(made):
+        print(line)
     print(f"{', '.join(what.kinds)} in {what.single or what.folder}  ({made['seconds']:.1f} s)")
     return 0
+
+
+def _coverage(made: dict[str, Any]) -> list[str]:
+    """Lines on how much of the scene the files hold, with what to do where that is little."""
+    lines: list[tuple[str, float, str]] = []
+    if "pixels" in made:
+        every, seen, agreed = (made["pixels"][name] for name in ("all", "seen", "agreed"))
+        text = f"depth maps of {made['views']} views: {seen / every:.0%} of the pixels see a surface within reach"
+        lines.append((f"{text}, other views agree on {agreed / seen:.0%} of these", agreed / seen, "raise --tolerance"))
+    if "points" in made:
+        kept, total = made["points"], made["points"] + made["floating"]
+        text = f"points: {kept} of {total} ({kept / total:.0%}) kept"
+        lines.append((f"{text}, {made['floating']} float where the field has no surface", kept / total, "lower --presence"))
+    if "vertices" in made:
+        lines.append((f"mesh: {made['vertices']} vertices, {made['triangles']} triangles", 1.0, ""))
+    return [text if share >= _FEW else f"warning: {text}: train longer, or {remedy}" for text, share, remedy in lines]
 
 
 class _Place(NamedTuple):
@@ -105,6 +127,7 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
     from ..export.points import origin_of
 
     sights = _sights(trained, config, display)
+    counts: dict[str, int] = {}
     cloud = fuse(
         sights,
         edge=config.edge,
@@ -112,9 +135,16 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
         tolerance=config.tolerance,
         agree=config.agree,
         report=lambda done, total: display.count(done, total, "fusing"),
+        counts=counts,
     )
     place = _Place(trained, what, looks, sights, origin_of(cloud), display)
-    made = {"origin": place.origin.tolist(), "views": len(sights.depth), "finest_edge": float(cloud.edge.amin())}
+    pixels = sum(depth.numel() for depth in sights.depth)
+    made: dict[str, Any] = {
+        "origin": place.origin.tolist(),
+        "views": len(sights.depth),
+        "pixels": {"all": pixels, **counts},
+        "finest_edge": float(cloud.edge.amin()),
+    }
     if {"ply", "splat"} & set(what.kinds):
         made |= _points(place, cloud, config)
     if "glb" in what.kinds:
@@ -145,13 +175,12 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     from ..export.points import write_points
     from ..export.sky import dome
     from ..export.splats import discs, write_gaussians, write_splat
-    from ..export.witness import alone, witnesses
+    from ..export.witness import alone, expected_presence, witnesses
 
     kinds = place.what.kinds
-    found = place.colours(
-        cloud.point, witnesses(place.sights, cloud.point, cloud.normal, cloud.edge, config.witnesses), config.tolerance
-    )
-    solid = found.presence >= config.presence
+    seen = witnesses(place.sights, cloud.point, cloud.normal, cloud.edge, config.witnesses)
+    found = place.colours(cloud.point, seen, config.tolerance)
+    solid = found.presence >= config.presence * expected_presence(place.sights, cloud.point, seen, config.tolerance)
     if not bool(solid.any()):
         raise DataError(f"export: no point is as present as {config.presence:g} in the field; lower --presence")
     cloud, colours = Cloud(*(column[solid] for column in cloud)), [colour[solid] for colour in found.colours]

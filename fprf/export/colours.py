@@ -14,6 +14,8 @@ from ..config import RenderConfig
 from ..engine.model import Facts, Model, background_of
 from ..engine.views import on_host
 from ..memory import chunk_size
+from ..plugins.samplers.config import UniformConfig
+from ..plugins.samplers.uniform import UniformSampler
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Parts, Restyle, composite, march
 from ..types import Rays, Want
@@ -21,6 +23,8 @@ from .witness import Witnesses, alone
 
 __all__ = ["Coloured", "paint", "seen_colours"]
 
+_CLOSE = UniformSampler(UniformConfig(samples=8))
+"""Steps along the piece of a ray that is close to a point."""
 _LOST = 1e-3
 """Where less light than this comes from a point, the colour of the whole ray is taken."""
 
@@ -31,8 +35,8 @@ class Coloured(NamedTuple):
     colours: list[Annotated[Tensor, "N 3"]]
     """sRGB in [0, 1], one set a look."""
     presence: Annotated[Tensor, "N"]
-    """How much of the light of the rays to a point comes from there, in [0, 1]: low where a point floats before or behind
-    the field's own surface."""
+    """How much light comes from close to a point, in [0, 1]: low where it floats before or behind the field's own surface,
+    and where that is thick (see `witness.expected_presence`)."""
 
 
 def paint(kept: Kept, parts: Parts, styles: Sequence[Restyle | None]) -> list[Annotated[Tensor, "M 3"]]:
@@ -108,7 +112,9 @@ def _looked(
         ends = (model.space.parameter(origin, direction, distance * (1 + side)).float() for side in (-tolerance, tolerance))
         near, far = (torch.maximum(torch.minimum(end, rays.far), rays.near) for end in ends)
         rays = rays._replace(near=near, far=far)
-    marched = march(Rays(*(x.to(device) for x in rays)), model.parts, budget=config.budget)
+    # Close to the point there is nothing to be found first: even steps are as good as proposals, and cost a third.
+    parts = model.parts if tolerance is None else model.parts._replace(sampler=_CLOSE)
+    marched = march(Rays(*(x.to(device) for x in rays)), parts, budget=config.budget)
     background = background_of(facts, device) if tolerance is None else None
     behind = 0.0 if background is None else marched.through[:, None] * background
     colours = [composite(marched.kept, colour, len(points)) + behind for colour in paint(marched.kept, model.parts, styles)]

@@ -38,7 +38,7 @@ class ExportConfig(StyleConfig):
     witnesses: int = 6
     """Views that give a point its colour, at most: those that see it best."""
     presence: float = 0.6
-    """Share of the light of the rays to a point that must come from there, in [0, 1]: less, and the point floats."""
+    """Share of the light that a surface there would send which must come from a point, in [0, 1]: less, and it floats."""
     reach: float | None = None
     """What is farther from its view, in world units, is sky; none = 20 times the scene's inner radius."""
     sky: bool = True

@@ -23,6 +23,9 @@ _SOLID = 0.5
 """Rays of a smaller opacity meet nothing."""
 
 
+_THICKEST = 2.0
+"""Surfaces are taken for no thicker than so many times their distance."""
+
 _REACH = 20.0
 """What is farther than so many inner radii of a contraction is sky, unless the user says otherwise."""
 _REACH_AHEAD = 50.0
@@ -62,7 +65,8 @@ def render_sights(
         report(view, len(some))
         maps.append(_depth(model, some, view, config, reach))
     report(len(some), len(some))
-    return Sights(some, tuple(maps))
+    depths, thicknesses = zip(*maps, strict=True)
+    return Sights(some, depths, thicknesses)
 
 
 def half_way(
@@ -80,7 +84,8 @@ def half_way(
     return (low + part * (high - low))[:, 0]
 
 
-def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reach: float) -> Annotated[Tensor, "H W"]:
+def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reach: float) -> tuple[Tensor, Tensor]:
+    """Depth and thickness [H W] of a view's surfaces."""
     device = model.device
     pixel = pixel_grid(cameras, view)
     origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
@@ -88,11 +93,13 @@ def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reac
 
     def met(here: slice) -> tuple[Tensor, Tensor]:
         marched = march(Rays(*(x[here].to(device) for x in rays)), model.parts, budget=config.budget)
-        return half_way(marched.weights, marched.sampled.t, 0.5 * marched.opacity), marched.opacity
+        parts = [half_way(marched.weights, marched.sampled.t, share * marched.opacity) for share in (0.1, 0.5, 0.9)]
+        return torch.stack(parts, 1), marched.opacity
 
     parts = zip(*in_parts(len(pixel), chunk_size(config.chunk, device), met), strict=True)
     t, opacity = on_host(*(torch.cat(part) for part in parts))
-    depth = model.space.metric(origin, direction, t).float()
+    first, depth, last = (model.space.metric(origin, direction, part).float() for part in t.unbind(1))
     seen = (opacity > _SOLID) & (depth < reach) & (depth > 0)
     width, height = (int(v) for v in cameras.size[view])
-    return torch.where(seen, depth, torch.inf).view(height, width)
+    thickness = ((last.clamp(max=reach) - first) / depth).clamp(0, _THICKEST)
+    return torch.where(seen, depth, torch.inf).view(height, width), torch.where(seen, thickness, 0.0).view(height, width)

@@ -47,12 +47,14 @@ def fuse(
     tolerance: float,
     agree: int,
     report: Callable[[int, int], None] = lambda done, total: None,
+    counts: dict[str, int] | None = None,
 ) -> Cloud:
     """The cloud of V >= 2 views.
 
     `edge` is the finest voxel's, in world units; None takes the median pixel's. It is doubled until at most `most` points
     are left. Points count as seen by a view that has a surface within `tolerance` of their distance; `agree` other views
-    must (fewer where fewer look there, but one at least). Raises DataError where nothing is left.
+    must (fewer where fewer look there, but one at least). `counts` is told the pixels that see a surface (`seen`) and
+    those of them that views agree on (`agreed`). Raises DataError where nothing is left.
     """
     found, views = [], []
     for index in range(len(sights.depth)):
@@ -62,6 +64,10 @@ def fuse(
         views.append(torch.full((len(seen.point),), index))
     report(len(sights.depth), len(sights.depth))
     every = Surface(*(torch.cat(column) for column in zip(*found, strict=True)))
+    del found, seen  # of many views, the largest thing in memory
+    if counts is not None:
+        counts["seen"] = sum(int(depth.isfinite().sum()) for depth in sights.depth)
+        counts["agreed"] = len(every.point)
     if len(every.point) == 0:
         raise DataError(
             "export: no surface that two views agree on; the scene may be trained too little (see `fprf eval`), "

@@ -17,6 +17,8 @@ KINDS = {
     "lut": "3D lookup tables of each style, for video editors",
 }
 """What can be exported."""
+_ALSO = {"points": "ply", "splats": "splat", "gaussians": "splat", "mesh": "glb", "transforms": "cameras", "luts": "lut"}
+"""Other words for the kinds."""
 
 _ENDINGS = {".ply": ("ply", "splat", "glb"), ".splat": ("splat",), ".glb": ("glb",), ".json": ("cameras",), ".cube": ("lut",)}
 """Kinds that a single file can hold, by its ending; the first one where none is named."""
@@ -32,10 +34,15 @@ class Plan(NamedTuple):
 
 
 def plan(kinds: Sequence[str], output: Path) -> Plan:
-    """From kinds (none = all) and an output, which is a file if it ends like one. Raises UsageError for what does not fit."""
+    """From kinds (none = all; also `points`, `splats`, `mesh`) and an output, which is a file if it ends like one.
+
+    Raises UsageError for what does not fit.
+    """
     for kind in kinds:
-        if kind not in KINDS:
-            raise UsageError(f"fprf export: {kind!r} is nothing to export{nearest(kind, KINDS)} (kinds: {', '.join(KINDS)})")
+        if kind not in KINDS and kind not in _ALSO:
+            near = nearest(kind, [*KINDS, *_ALSO])
+            raise UsageError(f"fprf export: {kind!r} is nothing to export{near} (kinds: {', '.join(KINDS)})")
+    kinds = [_ALSO.get(kind, kind) for kind in kinds]
     ending = output.suffix.lower()
     if ending not in _ENDINGS or output.is_dir():
         return Plan(tuple(dict.fromkeys(kinds)) or tuple(KINDS), output, None)

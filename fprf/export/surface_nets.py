@@ -15,6 +15,8 @@ from .voxels import keys
 __all__ = ["surface_nets"]
 
 _CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+_CHUNK = 1 << 20
+"""Cells at a time: few of them have a vertex, and all of their corners at once would take most of the memory."""
 _EDGES = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
 
 
@@ -27,16 +29,27 @@ def surface_nets(
     """
     key, order = keys(cell).sort()
     cell, value = cell[order], value[order].double()
-    corner = torch.stack([_find(key, keys(cell + torch.tensor(shift))) for shift in _CORNERS], 1)
-    whole = (corner >= 0).all(1)
     inside = value < 0
-    signs = inside[corner.clamp_min(0)]
-    mixed = whole & signs.any(1) & ~signs.all(1)
+    mixed = torch.cat([_mixed(key, inside, part) for part in cell.split(_CHUNK)])
     vertex = torch.full((len(cell),), -1, dtype=torch.int64)
     vertex[mixed] = torch.arange(int(mixed.sum()))
-    at = cell[mixed].double() + _crossings(value[corner[mixed]])
+    at = cell[mixed].double() + _crossings(value[_corners(key, cell[mixed])])
     faces = [_quads(cell, key, inside, vertex, at, axis) for axis in range(3)]
     return at, torch.cat(faces)
+
+
+def _corners(key: Annotated[Tensor, "M"], cell: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 8"]:
+    """Where in the sorted keys the 8 lattice points of each cell are; -1 = not there."""
+    return torch.stack([_find(key, keys(cell + torch.tensor(shift))) for shift in _CORNERS], 1)
+
+
+def _mixed(
+    key: Annotated[Tensor, "M"], inside: Annotated[Tensor, "M"], cell: Annotated[Tensor, "N 3"]
+) -> Annotated[Tensor, "N"]:
+    """Which cells have all corners, and both signs among them."""
+    corner = _corners(key, cell)
+    signs = inside[corner.clamp_min(0)]
+    return (corner >= 0).all(1) & signs.any(1) & ~signs.all(1)
 
 
 def _find(key: Annotated[Tensor, "M"], wanted: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:

@@ -1,14 +1,18 @@
 """Which views see a point, and how well."""
 
+import math
 from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ..rendering.cameras import project
 from .sights import Sights, gaps
 
-__all__ = ["Witnesses", "alone", "witnesses"]
+__all__ = ["Witnesses", "alone", "expected_presence", "witnesses"]
 
+_DECAY = math.log(9)
+"""Extinctions of a uniform medium over the distance in which a ray meets the middle 80 % of its light."""
 _GRAZING = 1e-3
 """Smallest cosine: a view that sees a surface from its edge still says more than none."""
 
@@ -56,3 +60,27 @@ def witnesses(
     weight = (best / best[:, :1].clamp_min(1e-300)).clamp_min(0)
     weight[:, 0] = 1
     return Witnesses(found, weight)
+
+
+def expected_presence(
+    sights: Sights, point: Annotated[Tensor, "N 3"], seen: Witnesses, tolerance: float
+) -> Annotated[Tensor, "N"]:
+    """How much light comes from within `tolerance` of a point's distance where it lies in a surface as thick as its views see.
+
+    1 for sharp surfaces. A surface that training has left thick, as far ones in forward-facing captures are, has only a part of
+    its light there; between two surfaces, where nothing is, less light comes than from either. In (0, 1], float32.
+    """
+    total, weight = torch.zeros(len(point)), torch.zeros(len(point))
+    if not sights.thickness:
+        return torch.ones(len(point))
+    for view, thickness in enumerate(sights.thickness):
+        row, rank = ((seen.view == view) & (seen.weight > 0)).nonzero().unbind(1)
+        pixel, _ = project(sights.cameras, torch.full((len(row),), view, dtype=torch.int64), point[row])
+        height, width = thickness.shape
+        pixel = torch.nan_to_num(pixel)
+        x, y = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
+        light = -torch.expm1(-_DECAY * 2 * tolerance / thickness[y, x].clamp_min(1e-6))
+        share = seen.weight[row, rank].float()
+        total.index_add_(0, row, light * share)
+        weight.index_add_(0, row, share)
+    return torch.where(weight > 0, total / weight.clamp_min(1e-10), 1.0)

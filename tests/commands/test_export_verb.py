@@ -47,7 +47,17 @@ def test_everything_in_two_styles(world: World, tmp_path: Path, capsys: pytest.C
     for a, b in ((plain, dusk), (plain, snow), (dusk, snow)):
         assert np.abs(a.colors[:, :3].astype(float) - b.colors[:, :3]).mean() > 2
     assert (tmp_path / "splats.splat").stat().st_size == 32 * made["splats"]
-    assert "ply, splat" in capsys.readouterr().out
+    told, share = capsys.readouterr().out, made["points"] / (made["points"] + made["floating"])
+    assert "ply, splat" in told and f"points: {made['points']} of" in told and f"({share:.0%})" in told
+    assert f"mesh: {made['vertices']} vertices" in told
+    assert f"{made['pixels']['agreed'] / made['pixels']['seen']:.0%} of these" in told
+
+
+def test_points_of_thick_surfaces_stay(world: World, tmp_path: Path) -> None:
+    """Of a field that is trained too little to be sharp, a narrow piece of each ray holds but a part of the light."""
+    assert export(world, "points", *LOOSE[:4], "--output", str(tmp_path)) == 0
+    made = json.loads((tmp_path / "export.json").read_text())
+    assert made["points"] > made["floating"]
 
 
 def test_kinds_are_words_behind_the_run_or_a_flag(world: World, tmp_path: Path) -> None:

@@ -9,6 +9,9 @@ from fprf.export.plan import KINDS, look_file, plan
 def test_a_folder_takes_all_kinds_or_those_that_are_named(tmp_path: Path) -> None:
     assert plan([], tmp_path) == (tuple(KINDS), tmp_path, None)
     assert plan(["splat", "ply", "splat"], Path("out")) == (("splat", "ply"), Path("out"), None)
+    assert plan(["splats", "mesh", "points", "glb"], Path("out")).kinds == ("splat", "glb", "ply"), (
+        "by what they are called, too"
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,14 @@
+import math
+
+import pytest
 import torch
 from analytic import RADIUS, globe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.export.depths import half_way
 from fprf.export.sights import gaps
-from fprf.export.witness import alone, witnesses
+from fprf.export.witness import alone, expected_presence, witnesses
 
 
 def sphere(count: int, seed: int) -> torch.Tensor:
@@ -48,3 +52,18 @@ def test_the_first_witness_does_not_depend_on_how_many_are_asked() -> None:
 def test_alone() -> None:
     seen = alone(torch.tensor([3, 1]))
     assert seen.view.tolist() == [[3], [1]] and seen.weight.tolist() == [[1.0], [1.0]]
+
+
+@pytest.mark.parametrize("extinction", [0.5, 3.0, 200.0])
+def test_expected_presence_is_the_light_of_a_uniform_medium_of_that_thickness(extinction: float) -> None:
+    depth, tolerance = 4.0, 0.05
+    edges = torch.linspace(0, 40 / extinction, 4001, dtype=torch.float64)
+    weights = torch.exp(-extinction * edges[:-1]) - torch.exp(-extinction * edges[1:])
+    first, last = (half_way(weights[None], edges[None], torch.tensor([share]).double()) for share in (0.1, 0.9))
+    sights, point = globe(6), sphere(20, 2)
+    maps = tuple(torch.full_like(view, float(last - first) / depth) for view in sights.depth)
+    seen = witnesses(sights, point, point.float(), 0.05, 3)
+    light = -math.expm1(-extinction * 2 * tolerance * depth)
+    found = expected_presence(sights._replace(thickness=maps), point, seen, tolerance)
+    assert torch.allclose(found, torch.full((20,), light), rtol=1e-3)
+    assert bool((expected_presence(sights, point, seen, tolerance) == 1).all()), "sharp where nothing else is known"
