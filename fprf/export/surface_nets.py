@@ -30,7 +30,7 @@ def surface_nets(
     key, order = keys(cell).sort()
     cell, value = cell[order], value[order].double()
     inside = value < 0
-    mixed = torch.cat([_mixed(key, inside, part) for part in cell.split(_CHUNK)])
+    mixed = torch.cat([_mixed(key, inside, part) for part in torch.split(cell, _CHUNK)])
     vertex = torch.full((len(cell),), -1, dtype=torch.int64)
     vertex[mixed] = torch.arange(int(mixed.sum()))
     at = cell[mixed].double() + _crossings(value[_corners(key, cell[mixed])])

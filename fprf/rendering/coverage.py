@@ -47,7 +47,7 @@ def coverage(cameras: Cameras, train: Sequence[int], space: Space) -> Annotated[
     pixels = torch.cartesian_prod(*centres).double()
     others = torch.tensor(_thinned(train, _MOST))
     score = torch.zeros(len(cameras), dtype=torch.float64)
-    for views in torch.tensor(_thinned(range(len(cameras)), _MOST)).split(_CHUNK):
+    for views in torch.split(torch.tensor(_thinned(range(len(cameras)), _MOST)), _CHUNK):
         view = views.repeat_interleave(len(pixels))
         origin, direction = rays_through(cameras, view, pixels.repeat(len(views), 1) * cameras.size[view])
         points = (origin[:, None] + direction[:, None] * distances[:, None]).reshape(-1, 3)
