@@ -187,7 +187,7 @@ def test_a_size_that_is_found_stays_with_the_run(world: World, tmp_path: Path, m
 def test_few_pixels_and_slow_features_are_told_before_the_training(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def slow(config: TrainConfig, progress: Callable[[int, int, str], None], look: object) -> None:
+    def slow(config: TrainConfig, progress: Callable[[int, int, str], None], *rest: object) -> None:
         progress(0, 100, "features of slow")
         sleep(0.05)
         progress(1, 100, "features of slow")
