@@ -26,7 +26,7 @@ POINTS = 2**18
 """Points that regions are measured on, at most: 128 + 64 channels of them take 200 MB."""
 
 _PAIRS = 8
-"""Of the rays, one in so many has a neighbour, and the pairs are rendered again: a quarter of the pass."""
+"""One pair for so many rays: a quarter more rays, at a twelfth of the pass's time (fox, 0.32 of 4 s)."""
 _REACH = 24
 """A neighbour lies so many-th of an image's shorter side away."""
 
