@@ -82,7 +82,7 @@ class LossConfig:
     """Proposals must bound the field's weights from above."""
     distortion: float = 1e-3
     """Weights should gather at one place along a ray."""
-    depth: float = 0.4
+    depth: float = 0.1
     """Rays through points of the reconstruction should end there (where `datamanager.depth_share` draws such rays). It falls to
     a hundredth in the course of training."""
     sky: float = 0.1

@@ -113,9 +113,7 @@ class RayBatches(DataManager):
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
         self._chosen = None if seen is None and not masks else self._choose(seen, masks)
         sky = self._skies(skies) if skies else None
-        # Many views find depth by themselves, and need the rays for what points are not on.
-        self._depth_share = min(0.25, 2.5 / len(self._views)) if config.depth_share is None else config.depth_share
-        marks = self._marked() if self._depth_share > 0 else None
+        marks = self._marked() if config.depth_share > 0 else None
         self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marks)
         self.content_store: FeatureStore | None = None
         self.semantic_store: FeatureStore | None = None
@@ -139,7 +137,7 @@ class RayBatches(DataManager):
         distance = None
         if source.marks is not None:
             # The last rays: the first ones carry semantics, which must stay an even sample.
-            count = round(self._depth_share * len(at))
+            count = round(self._config.depth_share * len(at))
             mark = torch.randint(len(source.marks.at), (count,), generator=generator, device=device)
             at = torch.cat([at[: len(at) - count], source.marks.at[mark]])
             unknown = torch.full((len(at) - count,), torch.nan, device=device)

@@ -87,13 +87,11 @@ class RayBatchesConfig(DataManagerConfig):
     """Rays per step."""
     semantic_share: float = 1.0
     """Share of the rays that also carry a semantic target."""
-    depth_share: float | None = None
-    """Share of the rays that are drawn through sparse points of the reconstruction, where there are any, for `loss.depth`;
-    none = a quarter for up to ten training views, less in proportion where there are more."""
+    depth_share: float = 0.25
+    """Share of the rays that are drawn through sparse points of the reconstruction, where there are any, for `loss.depth`."""
 
     def __post_init__(self) -> None:
-        if self.depth_share is not None:
-            between("datamanager.depth_share", self.depth_share, 0.0, 1.0)
+        between("datamanager.depth_share", self.depth_share, 0.0, 1.0)
         at_least("datamanager.rays", self.rays, 1)
         between("datamanager.semantic_share", self.semantic_share, 0.0, 1.0)
 

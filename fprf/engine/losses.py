@@ -27,7 +27,7 @@ FADE = 0.01
 SHELL = 4.0
 """Sky lies at least so many space units away: times what views commonly see, or the scene's inner radius."""
 NEARBY = 0.04
-"""Share of its distance by which a ray's end may miss a point: what a reconstruction is uncertain by, and samples are apart."""
+"""Share of its distance by which a ray's end may miss a point: what a reconstruction is uncertain by."""
 
 
 def extra_term(config: LossConfig) -> LossTerm | None:
@@ -117,22 +117,25 @@ def ending(
 ) -> Tensor | None:
     """How far rays are from ending at their known ray parameters (NaN = unknown); None where none is known.
 
-    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, both within [0, 1], and 0 of other rays; the mean over all
-    rays. On an accelerator it is 0 where none is known: the host would have to wait to find out.
+    (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. On an
+    accelerator it is 0 where none is known: the host would have to wait to find out.
     """
     known = torch.isfinite(ends)
     if t.device.type == "cpu":
         index = known.nonzero()[:, 0]
         if not len(index):
             return None
-        return _missed(*(x.index_select(0, index) for x in (t, weights, ends)), ndc=ndc).sum() / len(ends)
-    return torch.where(known, _missed(t, weights, torch.where(known, ends, 0.5), ndc=ndc), 0.0).mean()
+        return _missed(*(x.index_select(0, index) for x in (t, weights, ends)), ndc=ndc).mean()
+    return _mean_of(_missed(t, weights, torch.where(known, ends, 0.5), ndc=ndc), known)
 
 
 def _missed(t: Tensor, weights: Tensor, ends: Tensor, *, ndc: bool) -> Annotated[Tensor, "R"]:
     # In NDC 1 - t is in proportion to 1 / depth.
-    middle = (1 - ends)[:, None] / (1 - midpoints(t)) if ndc else midpoints(t) / ends[:, None]
-    there, before = (middle - 1).abs() <= NEARBY, middle < 1 - NEARBY
+    low, high = (1 - (1 - ends) / near if ndc else ends * near for near in (1 - NEARBY, 1 + NEARBY))
+    start, stop = t[:, :-1], t[:, 1:]
+    before = stop <= low[:, None]
+    # An interval that reaches into the range counts: far from the camera intervals are wider than the range.
+    there = ~before & (start < high[:, None])
     return (1 - (weights * there).sum(-1)).square() + (weights * before).sum(-1).square()
 
 
