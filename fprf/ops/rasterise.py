@@ -1,13 +1,13 @@
 """3D Gaussians to images, forward and backward, and image features back to Gaussians.
 
-`rasterise_reference` defines what is computed, in plain torch; on the CPU in float32 compiled kernels do it (`rasterise_kernels`).
+`rasterise_reference` defines what is computed, in plain torch; on the CPU in float32 compiled kernels do (`rasterise_kernels`).
 These skip and count: Gaussians whose opacity stays below 1/255, behind the camera, outside the image, or not finite (exact:
 the reference gives them nothing either), and what lies behind rows of a tile through which less than 1/1000 of the light passes
 (an error of at most 1/1000 of the largest value). Their exponential errs by 1.1e-4 of alpha.
 """
 
 # The checker takes compiled functions to have one argument.
-# mypy: disable-error-code="call-arg"
+# mypy: disable-error-code="call-arg, attr-defined"
 
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
@@ -56,7 +56,7 @@ class _View(NamedTuple):
     camera: _Array
     blocks: _Array
     bands: int
-    count: int
+    total: int
     splats: _Array
     start: _Array
     ids: _Array
@@ -85,25 +85,26 @@ def rasterise(
 ) -> Rasterised:
     """Render Gaussians: quaternions are wxyz of any length, scales natural logarithms, opacities logits, K 1, 4, 9 or 16.
 
-    Every tensor argument has a gradient, through every output. Features must be finite. `antialiased` is for Gaussians trained that way; the background is black
-    by default. Raises FprfError where shapes do not fit.
+    Every tensor has a gradient, through every output. Features must be finite. `antialiased` is for Gaussians trained that way;
+    the background is black by default. Raises FprfError where shapes do not fit.
     """
     _check(means, quaternions, log_scales, logits, harmonics, features)
     features = means.new_zeros(len(means), 0) if features is None else features
     background = means.new_zeros(3) if background is None else background
-    given = (means, quaternions, log_scales, logits, harmonics, features, background)
+    shape = (means, quaternions, log_scales)
+    given = (*shape, logits, harmonics, features, background)
     counts: dict[str, int] = {}
     if _fits(*given):
         if torch.is_grad_enabled() and any(x.requires_grad for x in given):
             planes, passing, counts = _Rasterise.apply(*given, camera, antialiased)  # type: ignore[no-untyped-call]
         else:
-            planes, passing, counts = _forward(_view(*given[:5], camera, antialiased), features, background)[:3]
+            planes, passing, counts = _forward(_view(*shape, logits, harmonics, camera, antialiased), features, background)[:3]
     else:
         colours, fine = view_colours(means, harmonics, camera)
         logits = torch.where(fine, logits, torch.nan)  # what is not finite is not drawn
         behind = torch.cat([background, features.new_zeros(features.shape[1])])
         planes, passing = rasterise_reference(
-            *given[:3], logits, torch.cat([colours, features], -1), camera, behind, antialiased=antialiased
+            *shape, logits, torch.cat([colours, features], -1), camera, behind, antialiased=antialiased
         )
         planes = torch.cat([planes[..., :3], planes[..., -1:], planes[..., 3:-1]], -1)
     opacity = 1 - passing
@@ -129,7 +130,7 @@ def lift(
     if pixels.shape[:2] != (camera.height, camera.width):
         raise FprfError(f"pixels {tuple(pixels.shape)}: a camera of {camera.height} x {camera.width} has other ones")
     pixels = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1).detach()
-    shape = tuple(x.detach() for x in (means, quaternions, log_scales, logits))
+    shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
     if _fits(*shape, pixels):
         found = _lifted(_view(*shape, harmonics, camera, antialiased), pixels)
     else:
@@ -169,7 +170,7 @@ class _Rasterise(torch.autograd.Function):
             blocks[:, 6:10],
             blocks[:, 3:6],
             blocks[:, 10],
-            blocks[:, 11:].unflatten(1, (ctx.view.bands, 3)),
+            blocks[:, 11:].reshape(-1, ctx.view.bands, 3),
         )
         return *parts, of_features, (grad[..., :3] * passing[..., None]).sum((0, 1)), None, None
 
@@ -205,8 +206,9 @@ def camera_array(camera: Pinhole, antialiased: bool) -> _Array:
         -cy / fy - 0.15 * camera.height / fy,
         (camera.height - cy) / fy + 0.15 * camera.height / fy,
     ]
-    parts = [pose[:3, :3].flatten().tolist(), pose[:3, 3].tolist(), [fx, fy, cx, cy], (-pose[:3, :3].T @ pose[:3, 3]).tolist()]
-    return np.array([*sum(parts, []), *limits, camera.near, float(antialiased)], np.float32)
+    turn, shift = pose[:3, :3], pose[:3, 3]
+    place = [*turn.flatten().tolist(), *shift.tolist(), fx, fy, cx, cy, *(-turn.T @ shift).tolist()]
+    return np.array([*place, *limits, camera.near, float(antialiased)], np.float32)
 
 
 def _view(
@@ -273,7 +275,7 @@ def _backward(
 
     of_left = _planes(view, grad_passing[..., None])[0]
     groups = _groups(view, features)
-    of_features = np.empty((view.count, 8 * (len(groups) - 1)), np.float32)
+    of_features = np.empty((view.total, 8 * (len(groups) - 1)), np.float32)
     total: _Array | None = None
     begin = 0
     for (channels, values, stride, first), (out, left) in zip(groups, made, strict=True):
@@ -288,13 +290,13 @@ def _backward(
         else:
             total.reshape(-1, kernels.SUMS)[:, :6] += found.reshape(-1, kernels.SUMS)[:, :6]
             kernels.lift_values(
-                found, view.first_slot, view.count, of_features.reshape(-1), of_features.shape[1], first, channels
+                found, view.first_slot, view.total, of_features.reshape(-1), of_features.shape[1], first, channels
             )
     assert total is not None
     blocks = np.empty_like(view.blocks)
-    kernels.gradients(view.blocks, view.count, view.bands, view.camera, total, view.first_slot, 4, blocks)
+    kernels.gradients(view.blocks, view.total, view.bands, view.camera, total, view.first_slot, 4, blocks)
     rows = torch.from_numpy(blocks).view(-1, 11 + 3 * view.bands, 16).transpose(1, 2).reshape(-1, 11 + 3 * view.bands)
-    return rows[: view.count], torch.from_numpy(of_features)[:, : features.shape[1]]
+    return rows[: view.total], torch.from_numpy(of_features)[:, : features.shape[1]]
 
 
 def _planes(view: _View, pixels: Tensor, channels: int = 1) -> _Array:
@@ -309,7 +311,7 @@ def _lifted(view: _View, pixels: Tensor) -> Tensor:
     from . import rasterise_gradient_kernels as kernels
 
     channels = pixels.shape[-1]
-    out = np.empty((view.count, -(-channels // 8) * 8), np.float32)
+    out = np.empty((view.total, -(-channels // 8) * 8), np.float32)
     nothing = np.empty(0, np.float32)
     for first in range(0, out.shape[1], 8):
         slope = _planes(view, pixels[..., first : first + 8], 8)
@@ -317,5 +319,5 @@ def _lifted(view: _View, pixels: Tensor) -> Tensor:
             view.start, view.ids, view.slots, view.rows, view.splats, view.splats, 16, 0, view.width, view.height,
             nothing, nothing, slope.reshape(-1), nothing,
         )  # fmt: skip
-        kernels.lift_values(found, view.first_slot, view.count, out.reshape(-1), out.shape[1], first, 8)
+        kernels.lift_values(found, view.first_slot, view.total, out.reshape(-1), out.shape[1], first, 8)
     return torch.from_numpy(out)[:, :channels]

@@ -1,10 +1,11 @@
 """Compiled backward pass of the rasteriser of 3D Gaussians; blocks, splats and entries are those of `rasterise_kernels`.
 
-Of every entry SUMS floats are kept: the sums over its pixels of p, p dx, p dx^2, p dy, p dx dy, p dy^2, where p is dL / d ln alpha,
-then of weight times the gradient of each channel. Slots of one Gaussian lie together, so its sums have one order on any number of threads.
+Of every entry SUMS floats are kept: the sums over its pixels of p, p dx, p dx^2, p dy, p dx dy, p dy^2, where p is
+dL / d ln alpha, then of weight times the gradient of each channel. Slots of one Gaussian lie together, so its sums have one
+order on any number of threads.
 """
 
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
 
 import math
 
@@ -29,7 +30,6 @@ from .rasterise_kernels import (
 )
 from .simd import (
     LANES,
-    absolute,
     add_scaled,
     dot,
     exp2_rough,
@@ -59,7 +59,7 @@ _f = np.float32
 _0, _1, _2, _3, _4, _HALF = _f(0), _f(1), _f(2), _f(3), _f(4), _f(0.5)
 _BLUR, _STOP, _MAX = _f(BLUR), _f(STOP), _f(MAX_ALPHA)
 _LOG_MIN, _LOG_MAX = _f(math.log2(MIN_ALPHA)), _f(math.log2(MAX_ALPHA))
-_HUGE = _f(1e16)
+_HUGE, _TENTH = _f(1e16), _f(0.1)
 _PARTS = 64
 
 
@@ -209,7 +209,7 @@ def _direction_slopes(x, y, z, bands, blocks, at, red, green, blue):
 
 @serial
 def _block_gradient(blocks, at, bands, view, tmp, out, to):
-    """Rows of out from `to` on: the gradient of the parameters of a block, from sums in tmp: shape (6), red, green, blue, depth.
+    """Rows of out from `to` on: the gradient of the parameters of a block, from sums in tmp: shape (6), colour, depth.
 
     Sigma' = -Sigma^-1 G Sigma^-1 turns the shape's sums into those of the covariance; then back through `footprint` and `axes`.
     """
@@ -324,3 +324,31 @@ def gradients(blocks, count, bands, view, found, first_slot, channels, out):
                 continue
             _block_sums(found, first_slot, first, channels, tmp)
             _block_gradient(blocks, at, bands, view, tmp, out, at)
+
+
+@jit
+def adam(blocks, first, second, count, bands, view, found, first_slot, rates, grown, beta2):
+    """One step of Adam, in place, for the blocks that have an entry; the others keep their moments as well.
+
+    rates: a learning rate for each row of a block; grown: what the two moments are multiplied by early on (1 / (1 - beta^step)).
+    """
+    rows = FIXED + 3 * bands
+    for part in numba.prange((count + _PARTS * LANES - 1) // (_PARTS * LANES)):
+        tmp = np.empty(26 * LANES, np.float32)
+        slopes = np.empty(rows * LANES, np.float32)
+        for start in range(part * _PARTS * LANES, min(count, (part + 1) * _PARTS * LANES), LANES):
+            if first_slot[start + LANES] == first_slot[start]:
+                continue
+            at = start * rows
+            _block_sums(found, first_slot, start, 3, tmp)
+            _block_gradient(blocks, at, bands, view, tmp, slopes, 0)
+            for row in range(rows):
+                o = at + row * LANES
+                g = load(slopes, row * LANES)
+                m, s = load(first, o), load(second, o)
+                m = m + _TENTH * (g - m)
+                s = s + (_1 - beta2) * (g * g - s)
+                store(first, o, m)
+                store(second, o, s)
+                moved = rates[row] * grown[0] * m / (square_root(s * grown[1]) + _f(1e-15))
+                store(blocks, o, load(blocks, o) - moved)

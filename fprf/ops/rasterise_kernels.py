@@ -1,16 +1,16 @@
 """Compiled forward pass of the rasteriser of 3D Gaussians: projection, tiles, compositing. `rasterise` is their bridge.
 
-Blocks: parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion wxyz 6-9, logit
-of the opacity 10, then harmonics [K 3]. A flat array of blocks, so that every load is one vector.
+Blocks: parameters of LANES Gaussians lie together, one row of LANES numbers each: mean 0-2, ln scale 3-5, quaternion wxyz 6-9,
+logit of the opacity 10, then harmonics [K 3]. A flat array of blocks, so that every load is one vector.
 
-Splats: SLOTS floats a Gaussian after projection: x y, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D, red green blue, depth,
-half width and half height of the ellipse where alpha is 1/255, then what cuts it into rows: xy/xx, det/xx, 1/xx, and dx of its top.
-A half width of no more than 0 says why there is nothing to draw: FAINT, BEHIND, OUTSIDE, INVALID.
+Splats: SLOTS floats a Gaussian after projection: x y, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D, red green blue,
+depth, half width and half height of the ellipse where alpha is 1/255, then what cuts it into rows: xy/xx, det/xx, 1/xx, and dx
+of its top. A half width of no more than 0 says why there is nothing to draw: FAINT, BEHIND, OUTSIDE, INVALID.
 
 Entries: a Gaussian in a tile, LANES pixels wide and ROWS high, with the rows that it may reach: first + 256 * (last + 1).
 """
 
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
 
 import math
 
@@ -175,7 +175,7 @@ def axes(blocks, at, view):
 
 @serial
 def footprint(centre, camera, view):
-    """The image position u, v (tangents), the axes in pixels j, and their covariance xx, yy, xy with its determinant, blur apart.
+    """The image position u, v (tangents), the axes in pixels j, their covariance xx, yy, xy and its determinant, blur apart.
 
     The determinant is the squared length of a cross product: xx yy - xy^2 would lose the digits of thin ellipses.
     """
@@ -264,9 +264,9 @@ def _grown(array, room):
 def bins(splats_in, count, width, height):
     """Entries of the Gaussians that are seen: sorted by tile, then by depth.
 
-    Returns where each tile starts; Gaussian, slot and rows of each entry; where the slots of each Gaussian start [count + LANES + 1];
-    and how many Gaussians were left out as FAINT, BEHIND, OUTSIDE, INVALID. Slots number entries Gaussian by Gaussian.
-    Depths closer than 2^-20 of what is seen keep their order.
+    Returns where each tile starts; Gaussian, slot and rows of each entry; where the slots of each Gaussian start
+    [count + LANES + 1]; and how many Gaussians were left out as FAINT, BEHIND, OUTSIDE, INVALID. Slots number entries Gaussian
+    by Gaussian. Depths closer than 2^-20 of what is seen keep their order.
     """
     across, down = (width + LANES - 1) // LANES, (height + ROWS - 1) // ROWS
     bits = splats_in.view(np.int32)
@@ -364,8 +364,8 @@ def _by_depth(seen, key, low, high):
 def _composite(channels):
     @jit
     def composite(start, ids, rows, splats_in, values, stride, offset, background, width, height, out, left):
-        """Planes out [channels, H16, W16] of values[stride * i + offset ...] and the transmittance left [H16, W16], both padded to
-        whole tiles; returns how many entries were skipped because nothing passed any more."""
+        """Planes out [channels, H16, W16] of values[stride * i + offset ...] and the transmittance left [H16, W16], both padded
+        to whole tiles; returns how many entries were skipped because nothing passed any more."""
         across, down = (width + LANES - 1) // LANES, (height + ROWS - 1) // ROWS
         padded, area, tile_area = across * LANES, across * LANES * down * ROWS, ROWS * LANES
         skipped = np.zeros(across * down, np.int64)

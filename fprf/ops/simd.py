@@ -1,8 +1,8 @@
 """Vectors of sixteen float32 as a type of compiled kernels: `+ - * /`, tuples of vectors, and the functions below.
 
-The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may fuse and a division may
-become a product with the reciprocal, nothing else: NaN and infinity keep their meaning. Only `sums` and `total` add lanes, in
-pairs. A number among vectors counts in every lane.
+The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may fuse and a division
+may become a product with the reciprocal, nothing else: NaN and infinity keep their meaning. Only `sums` and `total` add lanes,
+in pairs. A number among vectors counts in every lane.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
