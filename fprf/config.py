@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
-from .errors import ConfigError
+from .errors import ConfigError, UsageError
 from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
 from .fields.layouts import LayoutConfig, SingleConfig
 from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig
@@ -15,6 +15,9 @@ from .plugins.executors.config import ExecutorConfig, SerialConfig
 from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
 
+if TYPE_CHECKING:
+    from .commands.verbs import Verbs
+
 __all__ = [
     "RESUMABLE",
     "ContentConfig",
@@ -22,6 +25,7 @@ __all__ = [
     "LossConfig",
     "OptimizerConfig",
     "RenderConfig",
+    "RunConfig",
     "SemanticConfig",
     "StatisticsConfig",
     "TrainConfig",
@@ -187,8 +191,8 @@ class StatisticsConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """Everything that decides a run."""
+class RunConfig:
+    """What every run has, whatever its scene is made of."""
 
     data: Path | None = None
     """Scene folder, which must be named; `town` is the embedded one."""
@@ -203,6 +207,34 @@ class TrainConfig:
     """Wall-clock limit, features included; the schedule ends with whichever comes first, steps or minutes."""
     seed: int = 0
     """Every draw is a function of it."""
+    checkpoint_minutes: float = 5.0
+    """Time between checkpoints."""
+
+    def __post_init__(self) -> None:
+        if self.downscale is not None:
+            at_least("downscale", self.downscale, 1)
+        at_least("steps", self.steps, 0)
+        between("seed", self.seed, 0, 2**31 - 1)
+        if self.minutes is not None:
+            positive("minutes", self.minutes)
+        positive("checkpoint_minutes", self.checkpoint_minutes)
+
+    def verbs(self) -> "Verbs":
+        """How a run of this kind is trained, judged, filmed and exported; imports its implementation."""
+        raise ConfigError(f"{type(self).__name__} does not say how it is trained; its method has to give a config that does")
+
+    def fields_only(self, run: Path) -> "TrainConfig":
+        """This config where the run is of fields. Raises UsageError, with the way out, where it is of another kind."""
+        raise UsageError(
+            f"{run}: is of Gaussians, which `train`, `eval`, `render` and `export` know; for anything else write them with "
+            f"`fprf export {run} ply` and go on with `fprf restyle`"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig(RunConfig):
+    """Everything that decides a run of fields."""
+
     device: str = "auto"
     """cpu, cuda, mps, or auto."""
     device_memory: float = 0.5
@@ -211,8 +243,6 @@ class TrainConfig:
     precision: Literal["float32", "tf32", "bfloat16"] = "float32"
     """Of matrix products on a GPU in training: tf32 rounds their factors to 11 bits (CUDA), bfloat16 those of the networks to 8
     bits; geometry and sums stay in float32. docs/speed.md has the errors."""
-    checkpoint_minutes: float = 5.0
-    """Time between checkpoints."""
     datamanager: DataManagerConfig = RayBatchesConfig()
     """Feeds training."""
     sampler: SamplerConfig = ProposalConfig()
@@ -241,19 +271,23 @@ class TrainConfig:
     """Scene statistics for styling."""
 
     def __post_init__(self) -> None:
-        if self.downscale is not None:
-            at_least("downscale", self.downscale, 1)
-        at_least("steps", self.steps, 0)
-        between("seed", self.seed, 0, 2**31 - 1)
-        if self.minutes is not None:
-            positive("minutes", self.minutes)
-        positive("checkpoint_minutes", self.checkpoint_minutes)
+        super().__post_init__()
         between("device_memory", self.device_memory, 0.0, 1.0)
         between("poses", self.poses, 0.0, 1.0)
 
+    def verbs(self) -> "Verbs":
+        """How a run of fields is trained, judged, filmed and exported."""
+        from .commands.fields import FieldVerbs
+
+        return FieldVerbs(self)
+
+    def fields_only(self, run: Path) -> "TrainConfig":
+        """This config."""
+        return self
+
 
 RESUMABLE = ("steps", "minutes", "output", "data", "device", "device_memory", "precision", "checkpoint_minutes")
-"""Fields of a `TrainConfig` that may differ when a run is resumed."""
+"""Fields of a run's config that may differ when a run is resumed."""
 
 
 @dataclass(frozen=True, kw_only=True)

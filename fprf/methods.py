@@ -6,8 +6,9 @@ from .fields.config import PlanesConfig, SemanticPlanesConfig
 from .plugins.decoders.config import MlpDecoderConfig
 from .plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from .plugins.samplers.config import ProposalConfig
+from .splats.config import GaussiansConfig
 
-__all__ = ["fprf", "fprf_lite"]
+__all__ = ["fprf", "fprf_lite", "fprf_splats"]
 
 
 def fprf() -> TrainConfig:
@@ -35,6 +36,11 @@ def fprf_lite() -> TrainConfig:
         # more of it, or planes that end at 256, pictures stay blurred however long one trains (fox: 27 -> 29.7 dB).
         loss=LossConfig(content=3e-3, variation=5e-4, proposal_variation=1e-3, distortion=1e-2, penalty_every=8),
     )
+
+
+def fprf_splats() -> GaussiansConfig:
+    """3D Gaussians instead of fields, made for a CPU: seconds to minutes a scene; a file that `fprf restyle` takes."""
+    return GaussiansConfig()
 
 
 _LEAN_SEMANTICS = SemanticPlanesConfig(resolutions=(32, 128), channels=16, hidden=64, layers=1)

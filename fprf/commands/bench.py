@@ -18,7 +18,7 @@ from ..benchmarking.config import (
 )
 from ..errors import UsageError
 from . import evidence
-from .parsing import load_method, parse
+from .parsing import load_field_method, parse
 from .progress import Display
 from .train import train_scene
 
@@ -72,7 +72,7 @@ def run(args: list[str]) -> int:
 
 
 def _train(config: BenchConfig, output: Path) -> Path:
-    method, name = load_method(config.method)
+    method, name = load_field_method(config.method)
     data = config.data or method.data or Path("town")
     return train_scene(replace(method, data=data, output=output, steps=config.steps, minutes=None, device=config.device), name)
 

@@ -86,7 +86,7 @@ def run_block(task: "BlockTask", view: "Aside | None" = None) -> None:
 
     name = "surroundings" if task.block == SURROUNDINGS else f"block {task.block:02d}"
     log = EventLog(Run(folder_of(Path(task.root), task.block)))
-    device = Run(Path(task.root)).load_config()[0].device
+    device = Run(Path(task.root)).load_config()[0].fields_only(Path(task.root)).device
     with Display(quiet=task.quiet) as display:
 
         def report(event: "Report") -> None:

@@ -80,7 +80,7 @@ def run(args: list[str]) -> int:
         views = trained.known.test[:SHOWN]
         styles = restyled(trained, [(n, StyleFile(StyleConfig(references=p))) for n, p in chosen], views, display)
         film = config.output / "film.mp4"
-        tour = camera_path(trained, RenderVerbConfig(frames=config.frames, split="train"))[0]
+        tour = camera_path(trained.known, RenderVerbConfig(frames=config.frames, split="train"))[0]
         write_video(film, frames_of(trained, tour, lambda _: styles[-1].styled.restyle, display), fps=12)
     seconds = {
         "dictionary_seconds": sum(style.dictionary_seconds for style in styles) / len(styles),

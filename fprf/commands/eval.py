@@ -1,8 +1,9 @@
 """`fprf eval RUN`: measure a run on views it has not seen."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -11,8 +12,13 @@ from ..engine.quality import QualityConfig, at_quality
 from ..errors import UsageError
 from .parsing import parse
 from .progress import Display
+from .verbs import verbs_of
 
-__all__ = ["EvalConfig", "run"]
+if TYPE_CHECKING:
+    from ..engine.run import Known
+    from ..engine.views import View
+
+__all__ = ["EvalConfig", "evaluate_fields", "run", "store"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,14 +44,17 @@ def run(args: list[str]) -> int:
     """Render the split, write metrics.json, print a table."""
     description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
     config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
+    _print(verbs_of(config.run).evaluate(config))
+    return 0
+
+
+def evaluate_fields(config: EvalConfig) -> dict[str, object]:
+    """Judge a run of fields."""
     from ..engine.loading import load_run
     from ..engine.prepare import scene_of
     from ..engine.run import view_names
     from ..evaluation.alignment import align, described
     from ..evaluation.judge import judge
-    from ..output.atomic import write_json
-    from ..output.images import to_uint8
-    from ..output.video import write_frames
 
     trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
     data = config.data or trained.config.data
@@ -61,20 +70,23 @@ def run(args: list[str]) -> int:
             trained, moves = align(trained, scene, views, display.count)
             fitted = {"fitted_poses": {trained.known.names[view]: described(move) for view, move in moves.items()}}
         metrics, renders = judge(trained, scene, views, display.count)
-    metrics = {
-        "method": trained.method,
-        "scene": trained.known.name,
-        "split": config.split,
-        "quality": config.quality,
-        **metrics,
-        **fitted,
-    }
+    return store(config, trained.known, trained.method, views, metrics | fitted, renders)
+
+
+def store(
+    config: EvalConfig, known: "Known", method: str, views: Sequence[int], found: dict[str, Any], renders: "list[View]"
+) -> dict[str, object]:
+    """Write metrics.json and, if they are wanted, the renders; returns what is written."""
+    from ..output.atomic import write_json
+    from ..output.images import to_uint8
+    from ..output.video import write_frames
+
+    metrics = {"method": method, "scene": known.name, "split": config.split, "quality": config.quality, **found}
     write_json(config.run / "metrics.json", metrics)
     if config.images:
-        names = [trained.known.names[v] for v in views]
+        names = [known.names[v] for v in views]
         write_frames(config.run / "renders" / config.split, names, [to_uint8(v.rgb) for v in renders])
-    _print(metrics)
-    return 0
+    return metrics
 
 
 def _print(metrics: dict[str, object]) -> None:

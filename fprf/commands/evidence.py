@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from ..evidence.config import EvidenceConfig, PaperConfig, PeerConfig, RestyleConfig
-from .parsing import load_method, parse
+from .parsing import load_field_method, parse
 from .progress import Display
 from .train import train_scene
 
@@ -72,7 +72,7 @@ def _paper(args: list[str]) -> int:
     from ..evidence.provenance import provenance
 
     with Display() as display:
-        document = paper(config, *load_method(config.method), display.count)
+        document = paper(config, *load_field_method(config.method), display.count)
     document["provenance"] = provenance(config.device)
     page = paper_page(document)
     print(page)
@@ -86,7 +86,7 @@ def about(config: EvidenceConfig) -> str:
 
 
 def _town(minutes: float, device: str, output: Path) -> Path:
-    method, name = load_method("fprf-lite")
+    method, name = load_field_method("fprf-lite")
     return train_scene(replace(method, data=Path("town"), output=output, minutes=minutes, device=device), name)
 
 

@@ -11,6 +11,7 @@ from ..export.looks import Look, Named, make_looks, named_styles, style_name
 from ..export.plan import KINDS, Plan, look_file, plan
 from .progress import Display
 from .style_flags import read_flags, say
+from .verbs import verbs_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,8 +21,9 @@ if TYPE_CHECKING:
     from ..export.fusion import Cloud
     from ..export.sights import Sights
     from ..export.witness import Witnesses
+    from ..style.files import StyleFile
 
-__all__ = ["run"]
+__all__ = ["export_fields", "run"]
 
 _FEW = 0.5
 """A smaller share of what there was is worth a warning."""
@@ -38,6 +40,12 @@ def run(args: list[str]) -> int:
     config, file = read_flags(
         ExportConfig(), _kinds_as_flag(args), prog="fprf export", description=_DESCRIPTION, positional=("run",)
     )
+    verbs_of(config.run).export(config, file)
+    return 0
+
+
+def export_fields(config: ExportConfig, file: "StyleFile") -> None:
+    """Write a run of fields."""
     what = plan(config.kinds, config.output or config.run / "exports")
     styles = named_styles(config.styles, file, say)
     if config.references:
@@ -67,7 +75,6 @@ def run(args: list[str]) -> int:
     for line in _coverage(made):
         print(line)
     print(f"{', '.join(what.kinds)} in {what.single or what.folder}  ({made['seconds']:.1f} s)")
-    return 0
 
 
 def _coverage(made: dict[str, Any]) -> list[str]:

@@ -102,7 +102,7 @@ def run(args: list[str]) -> int:
         shown = restyled(trained, chosen, views, display)
         if config.frames:
             film = output.with_suffix(".mp4")
-            flight = camera_path(trained, RenderVerbConfig(path=config.path, frames=config.frames))[0]
+            flight = camera_path(trained.known, RenderVerbConfig(path=config.path, frames=config.frames))[0]
             write_video(film, frames_of(trained, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
     width, height = (int(v) for v in known.cameras.size[views[0]])
     write_page(

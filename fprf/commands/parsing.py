@@ -19,9 +19,9 @@ from .describe import describe
 from .flags import Flag, explain, flags_of, spell
 
 if TYPE_CHECKING:
-    from ..config import TrainConfig
+    from ..config import RunConfig, TrainConfig
 
-__all__ = ["DESCRIBE", "LIST_FLAGS", "load_method", "methods", "parse"]
+__all__ = ["DESCRIBE", "LIST_FLAGS", "load_field_method", "load_method", "methods", "parse"]
 
 C = TypeVar("C")
 
@@ -69,7 +69,7 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     return parsed
 
 
-def load_method(name: str) -> "tuple[TrainConfig, str]":
+def load_method(name: str) -> "tuple[RunConfig, str]":
     """The config of a method, or of a saved `config.json` with the name of the method that it started from."""
     from ..config import IncompleteConfig
 
@@ -82,6 +82,12 @@ def load_method(name: str) -> "tuple[TrainConfig, str]":
     if (Path(name) / "config.json").is_file() and name not in registry.installed("fprf.methods"):
         raise UsageError(f"{name}: is a folder, not a method; to train with its config name {Path(name) / 'config.json'}")
     return method_config(name), name
+
+
+def load_field_method(name: str) -> "tuple[TrainConfig, str]":
+    """The same for what is made of fields alone. Raises UsageError for a method of another kind."""
+    config, method = load_method(name)
+    return config.fields_only(Path(name)), method
 
 
 def methods() -> Iterator[tuple[str, str]]:

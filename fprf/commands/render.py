@@ -15,16 +15,18 @@ from ..style.config import StyleConfig
 from .keyframes import keyed_looks, read_keyframes
 from .progress import Display
 from .style_flags import read_flags, say
+from .verbs import verbs_of
 
 if TYPE_CHECKING:
     from ..engine.footage import Take
     from ..engine.loading import Trained
+    from ..engine.run import Known
     from ..output.images import Picture
     from ..rendering.cameras import Cameras
     from ..style.files import StyleFile
     from ..style.look import Restyle
 
-__all__ = ["RenderVerbConfig", "camera_path", "frames_of", "run"]
+__all__ = ["RenderVerbConfig", "camera_path", "film", "frames_of", "run"]
 
 
 _NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
@@ -88,6 +90,12 @@ def run(args: list[str]) -> int:
     """Make the path, render it, write the film or the frames."""
     description = "Fly through a trained scene, plain or restyled, to a film or frames."
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
+    verbs_of(config.run).render(config, file)
+    return 0
+
+
+def film(config: RenderVerbConfig, file: "StyleFile") -> None:
+    """Film a run of fields."""
     from ..datamanagers.images import load_image
     from ..engine.loading import load_run
     from ..output.resumed import missing
@@ -96,13 +104,13 @@ def run(args: list[str]) -> int:
     if config.output.suffix.lower() in _NO_FOLDERS:
         raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
     trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
-    cameras, names = camera_path(trained, config)
+    cameras, names = camera_path(trained.known, config)
     if config.lens != "own":
         cameras = _all_round(trained, config, cameras)
     takes = _takes(trained, config, file)
-    film = config.output.suffix.lower() in FILMS
-    folder = config.output.with_suffix(".frames") if film else config.output
-    paths = [folder / f"{name}.{'png' if film else config.format}" for name in names]
+    whole = config.output.suffix.lower() in FILMS
+    folder = config.output.with_suffix(".frames") if whole else config.output
+    paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
     key = _key(trained, config, cameras)
     todo = missing(folder, key, paths)
     if len(todo) < len(paths):
@@ -111,13 +119,12 @@ def run(args: list[str]) -> int:
     with Display() as display:
         _render(trained, config, cameras, takes, dict(zip(paths, range(len(paths)), strict=True)), todo, display)
         made = str(config.output)
-        if film:
+        if whole:
             codec = write_video(config.output, (load_image(path) for path in paths), config.fps)
             made = f"{config.output} ({codec})"
             shutil.rmtree(folder)
     seconds = time.perf_counter() - start
     print(f"{len(cameras)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
-    return 0
 
 
 def _render(
@@ -210,11 +217,11 @@ def _styled_take(trained: "Trained", name: str, file: "StyleFile") -> "Take":
     return Take(name, lambda frame: styled.restyle, styled)
 
 
-def camera_path(trained: "Trained", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
+def camera_path(known: "Known", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
     """Cameras of the path and a name for each frame; captured views keep the stem of their image."""
     from ..rendering.motions import make_path
 
-    known, views = trained.known, trained.known.split(config.split)
+    views = known.split(config.split)
     cameras = make_path(known.cameras, views, config.path, config.frames)
     if config.path == "dataset":
         return cameras, [known.names[view] for view in views]

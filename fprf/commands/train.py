@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from ..errors import UsageError
 from .beside import VIEW, linger, open_view, take_view
-from .blocks import show_plan, train_blocks
+from .blocks import train_blocks
 from .event_log import EventLog
 from .parsing import LIST_FLAGS, load_method, methods, parse
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ..config import TrainConfig
+    from ..config import RunConfig, TrainConfig
     from ..datamanagers.scene import Scene
     from ..engine.model import Model
     from ..engine.prepare import Prepared
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..viewer.aside import Aside
     from .progress import Display
 
-__all__ = ["default_output", "run", "train_scene"]
+__all__ = ["check_same", "default_output", "run", "train_scene"]
 
 PLAN = "--plan"
 CHANGED = "--changed-images"
@@ -60,16 +60,16 @@ def run(args: list[str]) -> int:
     )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
     if len(flags) < len(rest):
-        show_plan(config, method, config.output or default_output(config, method))
+        config.verbs().plan(method)
     elif place is None:
-        train_scene(config, method, others=others)
+        config.verbs().train(method, others=others)
     else:
         with open_view(place) as view:
-            train_scene(config, method, view=view, others=others)
+            config.verbs().train(method, view=view, others=others)
     return 0
 
 
-def default_output(config: "TrainConfig", method: str) -> Path:
+def default_output(config: "RunConfig", method: str) -> Path:
     """runs/SCENE-METHOD."""
     name = "" if config.data is None else config.data.resolve().name
     return Path("runs") / f"{name or 'scene'}-{method}"
@@ -106,7 +106,7 @@ def train_scene(
         if view is not None:
             display.say(f"live at {view.address}")
         config = _sized(folder, config, display)
-        _check_same(folder, config)
+        check_same(folder, config)
         for place in (output, *output.glob("blocks/*")):
             remove_unfinished(place)
         marks: dict[str, str] = {}
@@ -248,7 +248,7 @@ def _say_outcome(folder: "Run", config: "TrainConfig", scene: "Scene", display: 
     display.say(f"{ended} after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
 
 
-def _check_same(folder: "Run", config: "TrainConfig") -> None:
+def check_same(folder: "Run", config: "RunConfig") -> None:
     """A run goes on with its own config; only how long, how often saved and where may change.
 
     Blocks may be cut anew: those that the cut does not concern are kept.
@@ -260,7 +260,8 @@ def _check_same(folder: "Run", config: "TrainConfig") -> None:
     from ..plugins.typed_json import leaves
 
     old, _ = folder.load_config()
-    free = FREE if old.blocks.cuts and config.blocks.cuts else RESUMABLE
+    cut = [getattr(each, "blocks", None) for each in (old, config)]
+    free = FREE if all(blocks is not None and blocks.cuts for blocks in cut) else RESUMABLE
     mine, theirs = leaves(config), leaves(old)
     changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]
     if changed:

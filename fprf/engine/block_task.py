@@ -62,7 +62,7 @@ def train_block(task: BlockTask, report: Callable[[Report], None], begun: Callab
 def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None]) -> bool:
     root = Path(task.root)
     run = Run(root)
-    config, _ = run.load_config()
+    config = run.load_config()[0].fields_only(root)
     facts, boxes = run.load_known().facts, load_boxes(root)
     folder = folder_of(root, task.block)
     scene = scene_of(replace(config, data=Path(task.data)))

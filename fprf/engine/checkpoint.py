@@ -8,6 +8,7 @@ import json
 import math
 import shutil
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from ..output.atomic import remove_unfinished, write_json
 from . import tensorfiles
 from .model import Model
 
-__all__ = ["Saved", "load_latest", "reached", "restore", "save", "steps", "tidy"]
+__all__ = ["Saved", "load_latest", "reached", "restore", "save", "steps", "tidy", "write"]
 
 KEEP = 2
 """Checkpoints that stay on disk."""
@@ -50,6 +51,11 @@ def steps(root: Path) -> list[int]:
 
 
 def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
+    """Write the checkpoint of a model and its optimiser (see `write`)."""
+    return write(root, model.state_dict(), _moments(optimizer), step=step, seconds=seconds)
+
+
+def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tensor], *, step: int, seconds: float) -> Path:
     """Write the checkpoint of a step, then drop all but the newest two; later ones are of a past that was gone back from.
 
     Raises DataError where the system refuses; what was there before is then there still.
@@ -57,8 +63,8 @@ def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: in
     folder = _folder(root, step)
     try:
         files = {
-            "model": tensorfiles.save(folder / "model.safetensors", model.state_dict()),
-            "optimizer": tensorfiles.save(folder / "optimizer.safetensors", _moments(optimizer)),
+            "model": tensorfiles.save(folder / "model.safetensors", model),
+            "optimizer": tensorfiles.save(folder / "optimizer.safetensors", optimizer),
         }
         manifest = {"format": 1, "step": step, "seconds": seconds, "files": files}
         write_json(folder / "manifest.json", manifest | {"crc32": _checksum(manifest)})

@@ -46,7 +46,8 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     Blocks of a large scene are fetched as they are met; at most `max_memory` MiB of them stay (one at least).
     """
     run = Run(root)
-    config, method = run.load_config()
+    saved_config, method = run.load_config()
+    config = saved_config.fields_only(root)
     known = run.load_known()
     if known.facts.space.kind == "open":
         return _load_blocks(run, config, method, known, device_of(device), max_memory)

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..config import TrainConfig
+from ..config import RunConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
 from ..output.atomic import write_json
@@ -79,11 +79,11 @@ class Run:
         """Whether a run was begun here."""
         return (self.root / "config.json").is_file()
 
-    def save_config(self, config: TrainConfig, method: str) -> None:
+    def save_config(self, config: RunConfig, method: str) -> None:
         """Write config.json."""
         save_config(self.root / "config.json", config, method)
 
-    def load_config(self) -> tuple[TrainConfig, str]:
+    def load_config(self) -> tuple[RunConfig, str]:
         """Config and method name. Raises CheckpointError where this is no run folder."""
         if not self.exists:
             raise CheckpointError(f"{self.root}: no config.json here, so it is no run folder; `fprf train` makes one")

@@ -2,12 +2,12 @@
 
 import math
 
-from ..config import OptimizerConfig, TrainConfig
+from ..config import OptimizerConfig, RunConfig
 
 __all__ = ["progress", "rate"]
 
 
-def progress(config: TrainConfig, step: int, seconds: float) -> float:
+def progress(config: RunConfig, step: int, seconds: float) -> float:
     """Share of the way, 0 to 1: by steps or by minutes, whichever is further."""
     share = step / config.steps if config.steps else 1.0
     if config.minutes is not None:

@@ -1,7 +1,7 @@
 """L1 and SSIM between two images with the gradient, compiled: the loss of 3D Gaussian splatting in under a millisecond.
 
-Images are planes [3, H16, W16], flat, padded to multiples of LANES, with `slack(width)` numbers behind; SSIM is Wang's, in windows of
-11 x 11 (Gaussian, sigma 1.5) that lie inside the image, over colours in [0, 1].
+Images are planes [3, H16, W16], flat, padded to multiples of LANES, with `slack(width)` numbers behind; SSIM is Wang's, in
+windows of 11 x 11 (Gaussian, sigma 1.5) that lie inside the image, over colours in [0, 1].
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"

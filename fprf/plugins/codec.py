@@ -2,7 +2,7 @@
 
 Strict: duplicate keys, NaN, unknown keys and foreign formats are refused. Written whole or not at all.
 
-A method may return a subclass of `TrainConfig` with fields of its own: a file is read as the class that its method returns.
+A method returns a `RunConfig`, of fprf or of its own: a file is read as the class that its method returns.
 Where that method is not installed, fields that fprf does not know are kept as data (`IncompleteConfig`).
 """
 
@@ -20,7 +20,7 @@ from .slots import hints_of, slots
 from .typed_json import Missing, from_json, to_json
 
 if TYPE_CHECKING:
-    from ..config import TrainConfig
+    from ..config import RunConfig
 
 __all__ = [
     "Missing",
@@ -39,7 +39,7 @@ _FORMAT = 1
 _KEYS = ("format", "fprf", "method", "plugins", "config")
 
 
-def save_config(path: Path, config: "TrainConfig", method: str) -> None:
+def save_config(path: Path, config: "RunConfig", method: str) -> None:
     """Write the config, synced and then renamed into place, so that a reader finds the old file or the new one.
 
     Raises ConfigError where the config has fields of its own and `method` would not give them back.
@@ -59,7 +59,7 @@ def save_config(path: Path, config: "TrainConfig", method: str) -> None:
     write_text(path, json.dumps(whole, indent=1, allow_nan=False) + "\n")
 
 
-def load_config(path: Path) -> "tuple[TrainConfig, str]":
+def load_config(path: Path) -> "tuple[RunConfig, str]":
     """The config of a file and the name of its method. Raises ConfigError naming the file and the field."""
     whole = read_json(path)
     try:
@@ -69,7 +69,7 @@ def load_config(path: Path) -> "tuple[TrainConfig, str]":
         raise ConfigError(f"{path}: {fault}") from fault
 
 
-def _config(whole: dict[str, Any]) -> "TrainConfig":
+def _config(whole: dict[str, Any]) -> "RunConfig":
     from ..config import IncompleteConfig, TrainConfig
 
     fields, method, packages = whole["config"], whole["method"], whole["plugins"]
@@ -89,9 +89,9 @@ def _config(whole: dict[str, Any]) -> "TrainConfig":
     )
 
 
-def method_config(name: str) -> "TrainConfig":
+def method_config(name: str) -> "RunConfig":
     """The config that an installed method returns. Raises PluginError naming the method and its package."""
-    from ..config import TrainConfig
+    from ..config import RunConfig
 
     method = registry.load_object(_METHODS, name)
     origin = registry.entry(_METHODS, name).origin
@@ -101,8 +101,8 @@ def method_config(name: str) -> "TrainConfig":
         raise PluginError(f"{_METHODS}: {name!r} ({origin}): {fault}") from fault
     except (Exception, SystemExit) as fault:  # a stranger's function
         raise PluginError(f"{_METHODS}: {name!r} ({origin}) failed: {type(fault).__name__}: {fault}") from fault
-    if not isinstance(config, TrainConfig):
-        raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a TrainConfig")
+    if not isinstance(config, RunConfig):
+        raise PluginError(f"{_METHODS}: {name!r} ({origin}) gives {type(config).__name__}, not a RunConfig")
     return config
 
 

@@ -35,7 +35,8 @@ def begun(root: Path, device: str, block: int | None = None) -> Trained:
     Raises CheckpointError.
     """
     run = Run(root)
-    config, method = run.load_config()
+    saved, method = run.load_config()
+    config = saved.fields_only(root)
     known = run.load_known()
     if block is None:
         model = build_model(config, known.facts)

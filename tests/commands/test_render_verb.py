@@ -34,7 +34,7 @@ def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_pa
 @pytest.mark.parametrize("path", ["spiral", "orbit", "interpolate"])
 def test_paths_have_about_the_frames_asked_for(world: World, path: str) -> None:
     trained = world.load()
-    cameras, names = camera_path(trained, RenderVerbConfig(path=path, frames=19))
+    cameras, names = camera_path(trained.known, RenderVerbConfig(path=path, frames=19))
     assert abs(len(cameras) - 19) <= 9 and len(names) == len(cameras)
     assert names == sorted(set(names))
     with Display(quiet=True) as display:

@@ -1,0 +1,65 @@
+"""What a run of 3D Gaussians is made of. Imports no torch."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ..checks import at_least, between, positive
+from ..config import RunConfig
+from ..datamanagers.parsers.config import DataParserConfig
+from ..errors import ConfigError
+
+if TYPE_CHECKING:
+    from ..commands.verbs import Verbs
+
+__all__ = ["GaussiansConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussiansConfig(RunConfig):
+    """3D Gaussians, trained from photographs on the CPU."""
+
+    steps: int = 10_000
+    """Optimiser steps: one view each."""
+    parser: DataParserConfig | None = None
+    """Format of the scene folder; none = recognised from what lies in it."""
+    masks: bool = True
+    """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or `mask_path`)."""
+    initial: int = 40_000
+    """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
+    cap: int = 60_000
+    """Gaussians at the end, at most."""
+    degree: int = 1
+    """Degree of the harmonics of view-dependent colours, 0 to 3."""
+    ssim: float = 0.2
+    """Share of 1 - SSIM in the loss; the rest is the absolute error."""
+    coarse: float = 0.3
+    """Share of training that sees the photographs at half their size."""
+    grow: float = 0.6
+    """Share of training within which the number grows to `cap`."""
+    relocate_every: int = 100
+    """Steps between moves of transparent Gaussians to where opaque ones are."""
+    rate: float = 1.0
+    """Factor of all learning rates."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour behind everything, also where images have transparency."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("initial", self.initial, 1)
+        at_least("cap", self.cap, 1)
+        if self.degree not in range(4):
+            raise ConfigError(f"degree: {self.degree}; 0, 1, 2 or 3 are possible")
+        for name in ("ssim", "coarse"):
+            between(name, getattr(self, name), 0.0, 1.0)
+        positive("grow", self.grow)
+        between("grow", self.grow, 0.0, 1.0)
+        at_least("relocate_every", self.relocate_every, 1)
+        positive("rate", self.rate)
+        for part in self.background:
+            between("background", part, 0.0, 1.0)
+
+    def verbs(self) -> "Verbs":
+        """How such a run is trained, judged, filmed and exported."""
+        from ..commands.splats import SplatVerbs
+
+        return SplatVerbs(self)

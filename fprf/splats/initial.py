@@ -1,0 +1,174 @@
+"""Where Gaussians begin: at the reconstruction's points, else at points matched between posed views, else anywhere in view."""
+
+import math
+from typing import Annotated, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..datamanagers.images import Image
+from ..datamanagers.scene import Scene
+from ..rendering.cameras import project
+from .photographs import pinhole, undistorted
+
+__all__ = ["Points", "initial_points", "spacing", "spatial_order"]
+
+Doubles = NDArray[np.float64]
+_ENOUGH = 100
+"""Points that are worth starting from."""
+_WINDOW = 100
+"""Points to either side on the curve among which the nearest are looked for."""
+_FEATURES, _NEIGHBOURS, _PIXELS, _ANGLE = 1500, 4, 1.5, math.radians(1.5)
+"""SIFT features of a view, views that it is matched with, largest error in pixels and least angle between the rays."""
+
+
+class Points(NamedTuple):
+    """P coloured points in the world."""
+
+    position: Annotated[Doubles, "P 3"]
+    colour: Annotated[NDArray[np.float32], "P 3"]
+
+
+def initial_points(scene: Scene, images: list[Image], count: int, rng: np.random.Generator) -> tuple[Points, str]:
+    """At most `count` points, and where they are from; images as they lie, at the size of the cameras."""
+    if scene.points is not None and len(scene.points) >= _ENOUGH:
+        position = scene.points.double().numpy()
+        position = position[np.isfinite(position).all(1)]
+        chosen = rng.permutation(len(position))[:count]
+        found, kind = _coloured(scene, images, position[np.sort(chosen)]), "points of the reconstruction"
+    else:
+        found, kind = _matched(scene, images), "points matched between views"
+        if len(found.position) < _ENOUGH:
+            found, kind = _scattered(scene, images, min(count, 10_000), rng), "random points"
+        chosen = np.sort(rng.permutation(len(found.position))[:count])
+        found = Points(found.position[chosen], found.colour[chosen])
+    return found, kind
+
+
+def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
+    """Mean distance to the three nearest of the points around on a Morton curve; cut at that of all but 1 % of the points."""
+    count = len(position)
+    if count < 4:
+        return np.ones(count)
+    order = spatial_order(position)
+    sorted_, near = position[order], np.full((3, count), np.inf)
+    for step in range(1, min(_WINDOW, count - 1) + 1):
+        apart = np.linalg.norm(sorted_[step:] - sorted_[:-step], axis=1)
+        for part in (slice(step, None), slice(None, -step)):
+            left = apart
+            for row in near[:, part]:
+                row[:], left = np.minimum(row, left), np.maximum(row, left)
+    mean = np.empty(count)
+    mean[order] = np.maximum(near.mean(0), 1e-7)
+    return np.minimum(mean, np.percentile(mean, 99))
+
+
+def spatial_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[np.int64]:
+    """Indices along a Morton curve: what is near in space is then near in memory."""
+    low, high = np.percentile(position, 2, axis=0), np.percentile(position, 98, axis=0)
+    cell = np.clip((position - low) / np.maximum(high - low, 1e-9) * 1023, 0, 1023).astype(np.int64)
+    code = np.zeros(len(position), np.int64)
+    for axis in range(3):
+        v = cell[:, axis]
+        for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+            v = (v | v << shift) & mask
+        code |= v << axis
+    return np.argsort(code, kind="stable")
+
+
+def _coloured(scene: Scene, images: list[Image], position: Doubles) -> Points:
+    """Points with the mean colour of the training views that have them in the picture."""
+    total, count = np.zeros((len(position), 3)), np.zeros(len(position))
+    points = torch.from_numpy(position)
+    for view in scene.train.tolist():
+        pixel, depth = project(scene.cameras, torch.full((len(points),), view), points)
+        width, height = scene.cameras.size[view].tolist()
+        x, y = pixel.nan_to_num(-1.0).floor().long().unbind(-1)
+        inside = ((depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)).numpy()
+        total[inside] += images[view][y.numpy()[inside], x.numpy()[inside]]
+        count[inside] += 1
+    colour = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None] / 255, 0.5)
+    return Points(position, colour.astype(np.float32))
+
+
+def _matched(scene: Scene, images: list[Image]) -> Points:
+    """Points triangulated from SIFT matches between neighbouring training views."""
+    views = scene.train.tolist()
+    detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.01)
+    cameras = {view: pinhole(scene.cameras, view, 1e-6) for view in views}
+    pictures = {view: undistorted(scene.cameras, view, images[view])[0] for view in views}
+    places: dict[int, Doubles] = {}
+    features: dict[int, NDArray[np.float32]] = {}
+    for view in views:
+        found, described = detector.detectAndCompute(cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY), None)
+        if described is None or len(found) < 2:
+            continue
+        places[view] = np.array([each.pt for each in found], np.float64) + 0.5
+        features[view] = np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9)).astype(np.float32)  # RootSIFT
+    centre = {v: scene.cameras.pose[v][:, 3].numpy() for v in views}
+    axis = {v: -scene.cameras.pose[v][:, 2].numpy() for v in views}
+    middle = np.mean([*centre.values()], axis=0)
+    spread = max(float(np.mean([np.linalg.norm(c - middle) for c in centre.values()])), 1e-9)
+    positions, colours, done = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)], set()
+    for i in features:
+        apart = {j: np.linalg.norm(centre[j] - centre[i]) / spread + 2 * (1 - axis[i] @ axis[j]) for j in features if j != i}
+        for j in sorted(apart, key=lambda j: float(apart[j]))[:_NEIGHBOURS]:
+            if (j, i) in done:
+                continue
+            done.add((i, j))
+            p, q = _pairs(features[i], features[j])
+            if not len(p):
+                continue
+            rays = [(cameras[v].intrinsics @ cameras[v].world_to_camera[:3]).numpy() for v in (i, j)]
+            a, b = places[i][p], places[j][q]
+            position = _triangulated(rays, (a, b), (centre[i], centre[j]))
+            fine = np.isfinite(position).all(1)
+            pixel = a[fine].astype(int)
+            height, width = pictures[i].shape[:2]
+            seen = pictures[i][np.clip(pixel[:, 1], 0, height - 1), np.clip(pixel[:, 0], 0, width - 1)]
+            positions.append(position[fine])
+            colours.append(seen.astype(np.float32) / 255)
+    return Points(np.concatenate(positions), np.concatenate(colours))
+
+
+def _pairs(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Mutual best matches whose second best is clearly worse (Lowe's ratio, 0.85)."""
+    alike = first @ second.T
+    rows = np.arange(len(first))
+    two = np.argpartition(-alike, 1, axis=1)[:, :2]
+    a, b = alike[rows, two[:, 0]], alike[rows, two[:, 1]]
+    best = np.where(a >= b, two[:, 0], two[:, 1])
+    near, next_ = (np.sqrt(np.maximum(2 - 2 * each, 0)) for each in (np.maximum(a, b), np.minimum(a, b)))
+    kept = (near < 0.85 * next_) & (alike.argmax(0)[best] == rows)
+    return rows[kept], best[kept]
+
+
+def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres: tuple[Doubles, Doubles]) -> Doubles:
+    """World points [M 3]; NaN where the error is too large, the point lies behind a view, or the rays are nearly parallel."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = cv2.triangulatePoints(rays[0], rays[1], pixels[0].T, pixels[1].T)
+        position = (found[:3] / found[3]).T
+        good = np.isfinite(position).all(1)
+        for matrix, pixel in zip(rays, pixels, strict=True):
+            shown = position @ matrix[:, :3].T + matrix[:, 3]
+            good &= (shown[:, 2] > 0) & (np.linalg.norm(shown[:, :2] / shown[:, 2:] - pixel, axis=1) < _PIXELS)
+        u, v = position - centres[0], position - centres[1]
+        cosine = (u * v).sum(1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
+    return np.where((good & (cosine < math.cos(_ANGLE)))[:, None], position, np.nan)
+
+
+def _scattered(scene: Scene, images: list[Image], count: int, rng: np.random.Generator) -> Points:
+    """Points on random rays, their distances spread evenly over the logarithm: from a third to 30 times the cameras' spread."""
+    views = rng.choice(scene.train.numpy(), count)
+    centre = scene.cameras.pose[:, :, 3].numpy()
+    spread = max(float(np.linalg.norm(centre - centre.mean(0), axis=1).mean()), 1e-6)
+    size = scene.cameras.size[views].numpy()
+    pixel = rng.random((count, 2)) * size
+    colour = np.stack([images[v][int(y), int(x)] for v, (x, y) in zip(views, pixel, strict=True)])
+    depth = spread * np.exp(rng.uniform(math.log(1 / 3), math.log(30), count))
+    plane = (pixel - scene.cameras.centre[views].numpy()) / scene.cameras.focal[views].numpy()
+    local = np.stack([plane[:, 0], -plane[:, 1], -np.ones(count)], 1) * depth[:, None]
+    pose = scene.cameras.pose[views].numpy()
+    return Points(np.einsum("nij,nj->ni", pose[:, :, :3], local) + pose[:, :, 3], np.divide(colour, 255, dtype=np.float32))

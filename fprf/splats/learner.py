@@ -1,0 +1,190 @@
+"""Training 3D Gaussians step by step, on the CPU: one view a step, Adam, relocation of what became transparent (3DGS-MCMC).
+
+The parameters live in the blocks of `ops.rasterise_kernels`, padded to a fixed room; Adam's moments beside them. Every draw is a
+function of (seed, step), so parameters, moments and the step are all the state there is.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..ops import photometric, rasterise_gradient_kernels, rasterise_kernels
+from ..ops.rasterise_kernels import FIXED, SLOTS
+from ..ops.simd import LANES
+from .config import GaussiansConfig
+from .gaussians import HARMONIC, Gaussians
+from .initial import Points, spacing, spatial_order
+from .photographs import Floats, Level
+
+__all__ = ["Learner", "Step"]
+
+_DEAD = 0.005
+"""Opacity below which a Gaussian is moved elsewhere."""
+_SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
+"""Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
+_START_OPACITY, _START_SCALE = 0.3, 0.7
+_BETA2 = 0.99
+_BINOMIALS = [[math.comb(i, k) for k in range(i + 1)] for i in range(11)]
+
+
+class Step(NamedTuple):
+    """What a step measured before it moved anything."""
+
+    l1: float
+    ssim: float
+    squared: float
+    """Mean squared error."""
+    gaussians: int
+    pixels: int
+
+
+class Learner:
+    """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate."""
+
+    def __init__(self, config: GaussiansConfig, levels: tuple[Level, Level], reach: float, room: int) -> None:
+        self.config, self.fine, self.coarse, self.reach = config, *levels, reach
+        self.bands = (config.degree + 1) ** 2
+        self.room = -(-room // LANES) * LANES
+        self.count = self.begun = 0
+        self.blocks, self.first, self.second = (np.zeros(self.room * self.rows, np.float32) for _ in range(3))
+        self.splats = np.zeros(self.room * SLOTS, np.float32)
+
+    @property
+    def rows(self) -> int:
+        """Parameters of a Gaussian."""
+        return FIXED + 3 * self.bands
+
+    def begin(self, points: Points, rng: np.random.Generator) -> None:
+        """Put a Gaussian at each point: as wide as the points lie apart, in any direction."""
+        order = spatial_order(points.position)
+        position, colour = points.position[order], points.colour[order]
+        count = self.count = self.begun = len(position)
+        rows = np.zeros((self.rows, self.room), np.float32)
+        rows[6], rows[10] = 1, -20
+        rows[0:3, :count] = position.T
+        rows[3:6, :count] = np.log(spacing(position) * _START_SCALE)
+        rows[6:10, :count] = rng.normal(size=(4, count))
+        rows[10, :count] = math.log(_START_OPACITY / (1 - _START_OPACITY))
+        rows[11:14, :count] = (colour.T - 0.5) / HARMONIC
+        self.blocks = _blocks(rows)
+
+    def step(self, step: int, share: float) -> Step | None:
+        """Learn from one view; None where the loss was not finite, and nothing was changed."""
+        level = self.coarse if share < self.config.coarse else self.fine
+        views = list(level.photographs)
+        epoch, turn = divmod(step, len(views))
+        view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
+        camera, planes, blurred, valid = level.photographs[view]
+        width, height = level.width, level.height
+        rasterise_kernels.project(self.blocks, self.count, self.bands, camera, width, height, self.splats)
+        start, ids, slots, rows, first_slot, _ = rasterise_kernels.bins(self.splats, self.count, width, height)
+        out, left = np.zeros(len(planes), np.float32), np.empty(len(planes) // 3, np.float32)
+        behind = np.array(self.config.background, np.float32)
+        rasterise_kernels.composite[3](start, ids, rows, self.splats, self.splats, SLOTS, 6, behind, width, height, out, left)
+        l1, ssim, slope = photometric.loss(out, planes, blurred, width, height, np.float32(self.config.ssim))
+        if not math.isfinite(l1 + ssim):
+            return None
+        if valid is not None:
+            slope *= valid
+        found = rasterise_gradient_kernels.composite_back[3](
+            start, ids, slots, rows, self.splats, self.splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
+        )
+        grown = np.array([1 / (1 - 0.9 ** (step + 1)), 1 / (1 - _BETA2 ** (step + 1))], np.float32)
+        rasterise_gradient_kernels.adam(
+            self.blocks, self.first, self.second, self.count, self.bands, camera, found, first_slot, self._rates(share), grown,
+            np.float32(_BETA2),
+        )  # fmt: skip
+        if (step + 1) % self.config.relocate_every == 0 and step >= _SETTLE and share < max(self.config.grow, _LAST):
+            self._relocate(step, share)
+        squared = float(np.square(out - planes).sum()) / (3 * width * height)
+        return Step(l1, ssim, squared, self.count, width * height)
+
+    def _rates(self, share: float) -> Floats:
+        """Learning rates of the rows of a block. They fall to a tenth, those of the means to a fiftieth."""
+        rest = np.full(3 * (self.bands - 1), 0.01)
+        rates = np.concatenate(
+            [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.04), np.full(4, 0.008), [0.4], np.full(3, 0.28), rest]
+        )
+        falls = np.where(np.arange(len(rates)) < 3, 0.02**share, 0.1**share)
+        found: Floats = (self.config.rate * rates * falls).astype(np.float32)
+        return found
+
+    def _relocate(self, step: int, share: float) -> None:
+        """Move the transparent to places of others, drawn by opacity, and grow towards the cap in the same way.
+
+        Of n in one place each gets the opacity and size with which together they look as the one did (3DGS-MCMC, Eq. 9).
+        """
+        draw = np.random.default_rng((self.config.seed, step, 1))
+        parts = [_rows(each, self.rows) for each in (self.blocks, self.first, self.second)]
+        rows, first, second = parts
+        opacity = 1 / (1 + np.exp(-rows[10, : self.count].astype(np.float64)))
+        dead = np.flatnonzero(opacity < _DEAD)
+        cap = max(self.config.cap, self.begun)
+        wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))
+        more = max(wanted - self.count, 0)
+        chance = opacity.copy()
+        chance[dead] = 0
+        if (len(dead) or more) and chance.sum() > 0:
+            picked = draw.choice(self.count, len(dead) + more, p=chance / chance.sum())
+            origin, times = np.unique(picked, return_counts=True)
+            each, factor = _shared(opacity[origin], times + 1)
+            each = np.clip(each, _DEAD, 0.995)
+            rows[10, origin] = np.log(each / (1 - each))
+            rows[3:6, origin] += np.log(np.clip(factor, 0.2, 1.2))
+            first[:, origin], second[:, origin] = 0, 0.5 * second[:, origin]
+            to = np.concatenate([dead, np.arange(self.count, self.count + more)])
+            rows[:, to], first[:, to], second[:, to] = rows[:, picked], 0, second[:, picked]
+            self.count += more
+        if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * self.count:
+            order = spatial_order(rows[:3, : self.count].T)
+            for part in parts:
+                part[:, : self.count] = part[:, order]
+        self.blocks, self.first, self.second = (_blocks(each) for each in parts)
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as they are now."""
+        rows = torch.from_numpy(_rows(self.blocks, self.rows)[:, : self.count].T.copy())
+        parts = (rows[:, :3], rows[:, 6:10], rows[:, 3:6], rows[:, 10], rows[:, 11:].reshape(-1, self.bands, 3))
+        return Gaussians(*(part.contiguous() for part in parts))
+
+    def moments(self) -> dict[str, Tensor]:
+        """What else a checkpoint holds: Adam's moments, and how many Gaussians training began with."""
+        first, second = (torch.from_numpy(_rows(x, self.rows)[:, : self.count].T.copy()) for x in (self.first, self.second))
+        return {"first": first, "second": second, "begun": torch.tensor(self.begun)}
+
+    def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
+        """Go on from what a checkpoint holds."""
+        self.count, self.begun = len(gaussians), int(moments["begun"])
+        parts = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logits[:, None])
+        rows = np.zeros((self.rows, self.room), np.float32)
+        rows[6], rows[10] = 1, -20
+        rows[:, : self.count] = torch.cat([*parts, gaussians.harmonics.flatten(1)], 1).T.numpy()
+        self.blocks = _blocks(rows)
+        for name in ("first", "second"):
+            rows = np.zeros((self.rows, self.room), np.float32)
+            rows[:, : self.count] = moments[name].T.numpy()
+            setattr(self, name, _blocks(rows))
+
+
+def _rows(blocks: Floats, rows: int) -> Floats:
+    """Blocks as [rows, room], a copy."""
+    return np.ascontiguousarray(blocks.reshape(-1, rows, LANES).transpose(1, 0, 2)).reshape(rows, -1)
+
+
+def _blocks(rows: Floats) -> Floats:
+    return np.ascontiguousarray(rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)).reshape(-1)
+
+
+def _shared(opacity: NDArray[np.float64], times: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Opacity and factor of the size of each of `times` Gaussians (10 at most) that stand for one."""
+    times = np.minimum(times, 10)
+    each = 1 - (1 - opacity) ** (1 / times)
+    total = np.zeros_like(opacity)
+    for i in range(1, 11):
+        term = sum(_BINOMIALS[i - 1][k] * (-1) ** k / math.sqrt(k + 1) * each ** (k + 1) for k in range(i))
+        total += np.where(i <= times, term, 0)
+    return each, opacity / total

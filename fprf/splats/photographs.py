@@ -1,0 +1,170 @@
+"""Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
+
+from typing import Annotated, Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..datamanagers.images import Image, load_mask
+from ..datamanagers.scene import Scene
+from ..errors import DataError
+from ..ops.photometric import blurred, slack
+from ..ops.rasterise import Pinhole, camera_array
+from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
+
+__all__ = ["Floats", "Level", "Photograph", "cover", "distorted", "make_levels", "pinhole", "undistorted"]
+
+Floats = NDArray[np.float32]
+_PANORAMA = 3
+_WIDEST = 4.0
+"""Tangent of the widest angle that a pinhole shows: 76 degrees."""
+
+
+class Photograph(NamedTuple):
+    """One training view at one size, as the kernels take it."""
+
+    camera: Floats
+    planes: Floats
+    """Colours in [0, 1], [3, H16, W16] flat with slack."""
+    blurred: Floats
+    """What SSIM needs of them (`ops.photometric.blurred`)."""
+    valid: Floats | None
+    """1 where the photograph counts, 0 elsewhere, in the shape of the gradient; None = everywhere."""
+
+
+class Level(NamedTuple):
+    """Training views of one size, by view."""
+
+    width: int
+    height: int
+    photographs: dict[int, Photograph]
+
+
+def pinhole(cameras: Cameras, view: int, near: float) -> Pinhole:
+    """The camera of a view without its lens. Raises DataError for a panorama."""
+    if int(cameras.lens[view]) == _PANORAMA:
+        raise DataError("Gaussians are drawn through pinholes: a panorama has to be cut into views first")
+    (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
+    width, height = cameras.size[view].tolist()
+    return Pinhole(_intrinsics(fx, fy, cx, cy), _world_to_camera(cameras.pose[view]), width, height, near)
+
+
+def undistorted(cameras: Cameras, view: int, image: Image) -> tuple[Image, NDArray[np.bool_] | None]:
+    """The image of `pinhole`'s camera, and where it lies within the photograph; None = everywhere."""
+    if int(cameras.lens[view]) == 0:
+        return image, None
+    width, height = cameras.size[view].tolist()
+    local = (pixel_grid(cameras, view) - cameras.centre[view]) / cameras.focal[view]
+    turned = torch.stack([local[:, 0], -local[:, 1], -torch.ones(len(local), dtype=torch.float64)], -1)
+    pose = cameras.pose[view]
+    points = turned @ pose[:, :3].T + pose[:, 3]
+    pixel, _ = project(cameras, torch.full((len(points),), view), points)
+    place = pixel.view(height, width, 2).numpy()
+    inside = np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array([width - 0.5, height - 0.5])).all(-1)
+    return _sampled(image, np.nan_to_num(place, nan=-1e6)), inside
+
+
+def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[Tensor, "H W 2"] | None]:
+    """A pinhole camera that covers what a view shows, and where each of the view's pixels lies in its image.
+
+    The second is None where the view is a pinhole itself.
+    """
+    plain = pinhole(cameras, view, near)
+    if int(cameras.lens[view]) == 0:
+        return plain, None
+    width, height = plain.width, plain.height
+    _, direction = rays_through(cameras, torch.full((width * height,), view), pixel_grid(cameras, view))
+    local = direction @ cameras.pose[view][:, :3]
+    ahead = (-local[:, 2]).clamp_min(1e-9)
+    tangent = torch.stack([local[:, 0] / ahead, -local[:, 1] / ahead], -1).clamp(-_WIDEST, _WIDEST)
+    focal = cameras.focal[view]
+    low, high = (tangent * focal).amin(0).floor() - 2, (tangent * focal).amax(0).ceil() + 2
+    wide, tall = (high - low).int().tolist()
+    intrinsics = _intrinsics(float(focal[0]), float(focal[1]), float(-low[0]), float(-low[1]))
+    return Pinhole(intrinsics, plain.world_to_camera, wide, tall, near), (tangent * focal - low).view(height, width, 2)
+
+
+def distorted(image: Annotated[Tensor, "h w C"], place: Annotated[Tensor, "H W 2"]) -> Annotated[Tensor, "H W C"]:
+    """An image at the places of `cover`."""
+    return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy())))
+
+
+def make_levels(
+    scene: Scene, images: list[Image], background: tuple[float, float, float], near: float, *, masks: bool
+) -> tuple[Level, Level]:
+    """The training views at their own size and at half of it.
+
+    Views of several sizes are brought to the one of the first by cutting and padding, which leaves their pixels alone.
+    """
+    views = scene.train.tolist()
+    width, height = (int(v) for v in scene.cameras.size[scene.train].amax(0))
+    fine: dict[int, Photograph] = {}
+    coarse: dict[int, Photograph] = {}
+    for view in views:
+        image, valid = undistorted(scene.cameras, view, images[view])
+        mask = scene.masks[view] if masks and scene.masks else None
+        if mask is not None:
+            kept = load_mask(mask, (image.shape[1], image.shape[0]))
+            seen = undistorted(scene.cameras, view, np.repeat(kept[..., None], 3, 2).astype(np.uint8) * 255)[0][..., 0] > 254
+            valid = seen if valid is None else valid & seen
+        colours: Floats = np.divide(image, 255, dtype=np.float32)
+        camera = pinhole(scene.cameras, view, near)
+        fine[view] = _photograph(camera, colours, valid, width, height)
+        small = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
+        half: Floats = np.asarray(cv2.resize(colours, small, interpolation=cv2.INTER_AREA), np.float32)
+        half_valid = (
+            None if valid is None else cv2.resize(valid.astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0.999
+        )
+        shrink = torch.tensor([[small[0] / image.shape[1]], [small[1] / image.shape[0]], [1.0]], dtype=torch.float64)
+        halved = camera._replace(intrinsics=camera.intrinsics * shrink, width=small[0], height=small[1])
+        coarse[view] = _photograph(halved, half, half_valid, max(1, width // 2), max(1, height // 2))
+    return Level(width, height, fine), Level(max(1, width // 2), max(1, height // 2), coarse)
+
+
+def _photograph(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, width: int, height: int) -> Photograph:
+    """Pad a view to the size of its level; what is added does not count."""
+    if (camera.width, camera.height) != (width, height):
+        seen = np.zeros((height, width), np.bool_)
+        seen[: camera.height, : camera.width] = True if valid is None else valid
+        whole = np.zeros((height, width, 3), np.float32)
+        whole[: camera.height, : camera.width] = colours
+        colours, valid = whole, seen
+    planes = _planes(colours)
+    used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2).astype(np.float32))
+    if used is not None:
+        used = used[: _area(width, height) * 3 + 64]
+    array = camera_array(camera._replace(width=width, height=height), True)
+    return Photograph(array, planes, blurred(planes, width, height), used)
+
+
+def _area(width: int, height: int) -> int:
+    return (-(-width // 16) * 16) * (-(-height // 16) * 16)
+
+
+def _planes(image: Floats) -> Floats:
+    height, width = image.shape[:2]
+    tall, wide = -(-height // 16) * 16, -(-width // 16) * 16
+    out = np.zeros(3 * tall * wide + slack(wide), np.float32)
+    out[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width] = image.transpose(2, 0, 1)
+    return out
+
+
+def _sampled(image: NDArray[Any], place: NDArray[np.float64]) -> NDArray[Any]:
+    where = (place - 0.5).astype(np.float32)
+    x, y = np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1])
+    return np.asarray(cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def _world_to_camera(pose: Annotated[Tensor, "3 4"]) -> Annotated[Tensor, "4 4"]:
+    """OpenGL camera to world, turned into world to OpenCV camera."""
+    turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype)).T
+    out = torch.eye(4, dtype=torch.float64)
+    out[:3, :3], out[:3, 3] = turn, -turn @ pose[:, 3]
+    return out

@@ -1,0 +1,234 @@
+"""From a scene folder to trained 3D Gaussians in a run folder, and back from there."""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datamanagers.images import load_images
+from ..datamanagers.scene import Scene
+from ..engine import checkpoint
+from ..engine.interrupts import held_back
+from ..engine.model import Facts
+from ..engine.run import Known, Run
+from ..engine.schedule import progress
+from ..engine.trainer import REPORT_SECONDS, Report
+from ..engine.views import View
+from ..errors import CheckpointError, NumericsError
+from ..ops.rasterise import Pinhole, rasterise
+from ..rendering.bounds import find_space
+from ..rendering.cameras import Cameras, project
+from .config import GaussiansConfig
+from .gaussians import Gaussians
+from .initial import Points, initial_points
+from .learner import Learner, Step
+from .photographs import cover, distorted, make_levels
+
+__all__ = ["Prepared", "TrainedGaussians", "draw_view", "facts_of", "load_trained", "prepare", "train"]
+
+_PATIENCE = 3
+"""Steps in a row without a finite loss after which training gives up."""
+_SMOOTHING = 0.95
+_NEAR = 0.25
+"""Of the distance that all but 1 % of the points in view have: nothing is drawn nearer to a camera."""
+
+
+class Prepared(NamedTuple):
+    """A scene ready to be trained."""
+
+    scene: Scene
+    learner: Learner
+    near: float
+    origin: str
+    """Where the first Gaussians are from."""
+
+
+class TrainedGaussians(NamedTuple):
+    """A run of Gaussians in memory."""
+
+    run: Run
+    config: GaussiansConfig
+    method: str
+    known: Known
+    gaussians: Gaussians
+    near: float
+    step: int
+    seconds: float
+    """How long it was trained."""
+
+
+def prepare(config: GaussiansConfig, scene: Scene) -> Prepared:
+    """Load photographs and find the first points."""
+    images = load_images(scene, config.background)
+    draw = np.random.default_rng((config.seed, 0))
+    points, origin = initial_points(scene, images, config.initial, draw)
+    near = _near(scene, points)
+    levels = make_levels(scene, images, config.background, near, masks=config.masks)
+    centre = scene.cameras.pose[scene.train][:, :, 3]
+    reach = 1.1 * float((centre - centre.mean(0)).norm(dim=1).max())
+    learner = Learner(config, levels, reach or 1.0, max(config.cap, len(points.position)))
+    learner.begin(points, draw)
+    return Prepared(scene, learner, near, origin)
+
+
+def facts_of(config: GaussiansConfig, scene: Scene) -> Facts:
+    """What scene.json says of a scene without fields."""
+    return Facts(
+        space=find_space(scene),
+        channels=0,
+        dim=0,
+        content_encoder="",
+        semantic_encoder="",
+        content_scale=1.0,
+        semantic_scale=1.0,
+        background=config.background,
+    )
+
+
+def train(config: GaussiansConfig, prepared: Prepared, run: Run, report: Callable[[Report], None], *, spent: float) -> None:
+    """Train, or go on from the newest checkpoint, until the steps or the minutes are over; `spent` seconds count as used.
+
+    An interrupt saves first, then goes on upwards. A step whose loss is not finite changes nothing; raises NumericsError
+    after several in a row.
+    """
+    learner = prepared.learner
+    checkpoint.tidy(run.checkpoints)
+    saved, damaged = checkpoint.load_latest(run.checkpoints)
+    for line in damaged:
+        run.log({"damaged": line})
+    step, clock = 0, spent
+    if saved is not None:
+        learner.restore(_gaussians(saved), saved.optimizer)
+        step, clock = saved.step, saved.seconds
+    meter = _Meter(clock)
+    last_saved = last_report = time.perf_counter()
+
+    def save() -> None:
+        state = {name: getattr(found, name) for found in (learner.gaussians(),) for name in _PARTS}
+        state["near"] = torch.tensor(prepared.near, dtype=torch.float64)
+        checkpoint.write(run.checkpoints, state, learner.moments(), step=step, seconds=clock)
+
+    with held_back() as stop:
+        try:
+            while (share := progress(config, step, clock)) < 1:
+                stop.obey()
+                found = learner.step(step, share)
+                step += 1
+                meter.add(found)
+                if found is None:
+                    run.log({"step": step - 1, "skipped": "loss"})
+                if meter.failed >= _PATIENCE:
+                    raise NumericsError(f"step {step}: the loss is not finite for {_PATIENCE} steps in a row; lower --rate")
+                now = time.perf_counter()
+                clock = meter.clock(now)
+                if now - last_report > REPORT_SECONDS:
+                    last_report = now
+                    report(meter.report(step, progress(config, step, clock), clock))
+                if now - last_saved > 60 * config.checkpoint_minutes:
+                    save()
+                    last_saved = time.perf_counter()
+            stop.obey()
+        except KeyboardInterrupt:
+            if not stop.hurried:
+                save()
+            raise
+    if saved is None or step > saved.step:
+        save()
+        report(meter.report(step, 1.0, clock))
+
+
+class _Meter:
+    """Running means of training for the display."""
+
+    def __init__(self, before: float) -> None:
+        self.before, self.begun = before, time.perf_counter()
+        self.steps = self.skipped = self.failed = self.pixels = 0
+        self.means: dict[str, float] = {}
+
+    def clock(self, now: float) -> float:
+        """Seconds of training, those of earlier starts included."""
+        return self.before + now - self.begun
+
+    def add(self, step: Step | None) -> None:
+        """Count a step."""
+        self.steps += 1
+        if step is None:
+            self.skipped, self.failed = self.skipped + 1, self.failed + 1
+            return
+        self.failed = 0
+        self.pixels += step.pixels
+        for name, value in (("rgb", step.squared), ("l1", step.l1), ("ssim", step.ssim), ("gaussians", float(step.gaussians))):
+            keep = 0.0 if name == "gaussians" else _SMOOTHING
+            self.means[name] = keep * self.means.get(name, value) + (1 - keep) * value
+
+    def report(self, step: int, share: float, seconds: float) -> Report:
+        """How it goes."""
+        rgb = max(self.means.get("rgb", 1.0), 1e-10)
+        speed = self.pixels / max(time.perf_counter() - self.begun, 1e-9)
+        return Report(step, share, seconds, -10 * math.log10(rgb), speed, 1.0, dict(self.means), self.skipped)
+
+
+_PARTS = ("means", "quaternions", "log_scales", "logits", "harmonics")
+
+
+def _gaussians(saved: checkpoint.Saved) -> Gaussians:
+    try:
+        return Gaussians(*(saved.model[name] for name in _PARTS))
+    except KeyError as error:
+        raise CheckpointError(f"checkpoint of step {saved.step}: holds no {error}, so it is not of Gaussians") from error
+
+
+def load_trained(root: Path, config: GaussiansConfig) -> TrainedGaussians:
+    """A run's Gaussians from its folder alone; `config` is its own. Raises CheckpointError with what is missing and what to do."""
+    run = Run(root)
+    saved, _ = checkpoint.load_latest(run.checkpoints)
+    if saved is None:
+        raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
+    near = float(saved.model.get("near", torch.tensor(0.01)))
+    return TrainedGaussians(
+        run, config, run.load_config()[1], run.load_known(), _gaussians(saved), near, saved.step, saved.seconds
+    )
+
+
+def draw_view(trained: TrainedGaussians, cameras: Cameras, view: int) -> View:
+    """Render a view, its lens included."""
+    camera, place = cover(cameras, view, trained.near)
+    found = trained.gaussians
+    seen = rasterise(
+        found.means,
+        found.quaternions,
+        found.log_scales,
+        found.logits,
+        found.harmonics,
+        camera,
+        background=torch.tensor(trained.config.background),
+        antialiased=True,
+    )
+    layers = torch.cat([seen.image, (seen.depth * _ray_lengths(camera))[..., None], seen.opacity[..., None]], -1)
+    if place is not None:
+        layers = torch.cat([distorted(layers[..., :3], place), distorted(layers[..., 3:].contiguous(), place)], -1)
+    return View(layers[..., :3].clamp(0, 1), layers[..., 3], layers[..., 4], 1.0)
+
+
+def _ray_lengths(camera: Pinhole) -> Tensor:
+    """Length of the ray to each pixel where z is 1."""
+    inverse = camera.intrinsics.inverse().float()
+    x = (torch.arange(camera.width) + 0.5) * inverse[0, 0] + inverse[0, 2]
+    y = (torch.arange(camera.height) + 0.5) * inverse[1, 1] + inverse[1, 2]
+    return (x.square() + y.square()[:, None] + 1).sqrt()
+
+
+def _near(scene: Scene, points: Points) -> float:
+    """How near to a camera something is drawn."""
+    positions, depths = torch.from_numpy(points.position), []
+    for view in scene.train.tolist():
+        pixel, depth = project(scene.cameras, torch.full((len(positions),), view), positions)
+        size = scene.cameras.size[view]
+        depths.append(depth[(depth > 0) & (pixel >= 0).all(-1) & (pixel < size).all(-1)])
+    seen = torch.cat(depths)
+    return _NEAR * float(seen.quantile(0.01)) if 0 < len(seen) < 10_000_000 else 0.01
