@@ -330,7 +330,7 @@ def gradients(blocks, count, bands, view, found, first_slot, channels, out):
 def adam(blocks, first, second, count, bands, view, found, first_slot, rates, grown, beta2):
     """One step of Adam, in place, for the blocks that have an entry; the others keep their moments as well.
 
-    rates: a learning rate for each row of a block; grown: what the two moments are multiplied by early on (1 / (1 - beta^step)).
+    rates: a learning rate for each row of a block; grown: what the two moments are multiplied by, 1 / (1 - beta^step).
     """
     rows = FIXED + 3 * bands
     for part in numba.prange((count + _PARTS * LANES - 1) // (_PARTS * LANES)):

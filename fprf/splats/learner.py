@@ -1,7 +1,7 @@
 """Training 3D Gaussians step by step, on the CPU: one view a step, Adam, relocation of what became transparent (3DGS-MCMC).
 
-The parameters live in the blocks of `ops.rasterise_kernels`, padded to a fixed room; Adam's moments beside them. Every draw is a
-function of (seed, step), so parameters, moments and the step are all the state there is.
+The parameters live in the blocks of `ops.rasterise_kernels`, padded to a fixed room; Adam's moments beside them. Every draw is
+a function of (seed, step), so parameters, moments and the step are all the state there is.
 """
 
 import math

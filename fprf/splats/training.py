@@ -184,7 +184,7 @@ def _gaussians(saved: checkpoint.Saved) -> Gaussians:
 
 
 def load_trained(root: Path, config: GaussiansConfig) -> TrainedGaussians:
-    """A run's Gaussians from its folder alone; `config` is its own. Raises CheckpointError with what is missing and what to do."""
+    """A run's Gaussians from its folder alone; `config` is its own. Raises CheckpointError with what is missing."""
     run = Run(root)
     saved, _ = checkpoint.load_latest(run.checkpoints)
     if saved is None:

@@ -1,0 +1,228 @@
+"""Gaussians from photographs: that they learn, go on where they stopped, and come out as every verb says."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from fprf.cli import main
+from fprf.datamanagers.images import load_images
+from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.scene import Scene
+from fprf.evaluation.metrics import psnr
+from fprf.ops.rasterise import rasterise
+from fprf.output.images import write_image
+from fprf.rendering.cameras import project
+from fprf.splats import initial, photographs
+from fprf.splats.config import GaussiansConfig
+from fprf.splats.files import read_capture
+from fprf.splats.gaussians import Gaussians
+from fprf.splats.initial import spacing, spatial_order
+from fprf.splats.learner import Learner
+from fprf.splats.training import prepare
+from fprf.town.write import write_town
+
+STEPS = 260
+
+
+def learnt(config: GaussiansConfig, scene: Scene, begin: int = 0, end: int = STEPS, before: Learner | None = None) -> Learner:
+    learner = prepare(config, scene).learner
+    if before is not None:
+        learner.restore(before.gaussians(), before.moments())
+    for step in range(begin, end):
+        assert learner.step(step, step / STEPS) is not None
+    return learner
+
+
+def equal(a: Gaussians, b: Gaussians) -> bool:
+    return all(x.shape == y.shape and torch.equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> GaussiansConfig:
+    town = tmp_path_factory.mktemp("splats") / "town"
+    write_town(town, seed=0, palette="day", views=10, width=32, height=24)
+    return GaussiansConfig(data=town, initial=300, cap=600, relocate_every=20)
+
+
+@pytest.fixture(scope="module")
+def scene(config: GaussiansConfig) -> Scene:
+    return parse_scene(config.data, 1, None)
+
+
+@pytest.fixture(scope="module")
+def trained(config: GaussiansConfig, scene: Scene) -> Learner:
+    return learnt(config, scene)
+
+
+def test_it_learns_views_that_it_has_not_seen(config: GaussiansConfig, scene: Scene, trained: Learner) -> None:
+    images = load_images(scene)
+
+    def quality(found: Gaussians) -> float:
+        rows = []
+        for view in scene.test.tolist():
+            camera = photographs.pinhole(scene.cameras, view, 0.01)
+            seen = rasterise(*vars(found).values(), camera, antialiased=True).image.clamp(0, 1)
+            rows.append(psnr(seen, torch.from_numpy(images[view]).float() / 255))
+        return float(np.mean(rows))
+
+    before = quality(prepare(config, scene).learner.gaussians())
+    assert quality(trained.gaussians()) > before + 3
+    assert len(trained.gaussians()) == 600
+
+
+def test_it_goes_on_bit_for_bit(config: GaussiansConfig, scene: Scene, trained: Learner) -> None:
+    half = learnt(config, scene, 0, 230)
+    assert equal(learnt(config, scene, 230, STEPS, half).gaussians(), trained.gaussians())
+
+
+SECOND: dict[str, Any] = {
+    "initial": 200, "cap": 500, "degree": 2, "ssim": 0.0, "coarse": 0.0, "grow": 0.9, "relocate_every": 30, "rate": 0.5,
+    "background": (1.0, 0.0, 0.0), "seed": 1, "masks": False,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SECOND)
+def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tmp_path: Path, name: str) -> None:
+    if name == "masks":
+        width, height = scene.cameras.size[0].tolist()
+        write_image(tmp_path / "mask.png", np.zeros((height, width, 3), np.uint8))
+        scene = replace(scene, masks=(tmp_path / "mask.png",) * len(scene.paths))
+    end = 3 if name in ("initial", "degree", "ssim", "coarse", "rate", "background", "seed", "masks") else STEPS
+    first, second = (learnt(each, scene, 0, end) for each in (config, replace(config, **{name: SECOND[name]})))
+    assert not equal(first.gaussians(), second.gaussians())
+
+
+def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: Scene) -> None:
+    learner = prepare(config, scene).learner
+    before = learner.gaussians()
+    for photograph in learner.coarse.photographs.values():
+        photograph.planes[:] = np.nan
+    assert learner.step(0, 0.0) is None and equal(learner.gaussians(), before)
+
+
+@pytest.fixture(scope="module")
+def run(config: GaussiansConfig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    root = tmp_path_factory.mktemp("splats") / "run"
+    flags = ["--initial", "300", "--cap", "400", "--steps", "40", "--output", str(root)]
+    assert main(["train", "fprf-splats", "--data", str(config.data), *flags]) == 0
+    return root
+
+
+def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
+    assert main(["eval", str(run)]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["method"] == "fprf-splats" and metrics["train_steps"] == 40 and metrics["psnr"] > 10
+    assert len([*(run / "renders" / "test").iterdir()]) == metrics["views"]
+    assert main(["render", str(run), "--path", "dataset", "--show", "colour", "depth", "--output", str(tmp_path / "film")]) == 0
+    assert len([*(tmp_path / "film").glob("*.png")]) == metrics["views"] + len(
+        json.loads((run / "scene.json").read_text())["train"]
+    )
+    assert main(["export", str(run)]) == 0
+    capture = read_capture(run / "exports" / "splats.ply")
+    assert len(capture.gaussians) == metrics["gaussians"] and capture.antialiased
+    assert main(["export", str(run), "--output", str(tmp_path / "x.spz")]) == 0
+    # A run that is done goes on doing nothing.
+    before = (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes()
+    assert main(["train", str(run / "config.json")]) == 0
+    assert (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "stylize RUN --references a.png",
+        "gallery RUN --references .",
+        "export RUN glb",
+        "export RUN --references a.png",
+        "render RUN --show normals",
+        "train fprf-splats --plan",
+        "bench speed RUN",
+        "train fprf-splats --degree 4",
+    ],
+)
+def test_what_gaussians_do_not_know_is_refused_in_one_line(run: Path, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(run) if word == "RUN" else word for word in line.split()]) == 2
+    told = capsys.readouterr().err.strip().splitlines()
+    assert len([text for text in told if text.startswith("error: ")]) == 1
+
+
+def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
+    """A dot drawn through `cover` and `distorted` lies where the lens maps its place; `undistorted` brings it back."""
+    distortion = torch.zeros(len(scene.paths), 6, dtype=torch.float64)
+    distortion[:, 0] = -0.2
+    cameras = replace(scene.cameras, distortion=distortion, lens=torch.ones_like(scene.cameras.lens))
+    cameras = cameras.resized(torch.tensor([[160, 120]]).expand(len(cameras), 2))
+    pose = cameras.pose[0]
+    local = torch.tensor([0.32, 0.22, -1.0], dtype=torch.float64)
+    place = pose[:, :3] @ local + pose[:, 3]
+    pixel, _ = project(cameras, torch.tensor([0]), place[None])
+    straight, _ = project(replace(cameras, lens=torch.zeros_like(cameras.lens)), torch.tensor([0]), place[None])
+    assert (pixel - straight).norm() > 1
+    shape = (torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), -4.0), torch.full((1,), 4.0), torch.ones(1, 1, 3))
+    camera, where = photographs.cover(cameras, 0, 0.01)
+    assert where is not None
+    drawn = photographs.distorted(rasterise(place[None].float(), *shape, camera).image, where)
+    x, y = torch.meshgrid(torch.arange(160) + 0.5, torch.arange(120) + 0.5, indexing="xy")
+
+    def middle(image: torch.Tensor) -> torch.Tensor:
+        weight = image.sum(-1).clamp_min(0)
+        return torch.stack([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
+
+    assert (middle(drawn) - pixel[0]).norm() < 0.1
+    bytes_ = (drawn.clamp(0, 1) * 255).byte().numpy()
+    back, inside = photographs.undistorted(cameras, 0, bytes_)
+    assert inside is not None and 0.8 < inside.mean() < 1.01
+    assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
+
+
+def test_points_begin_where_there_are_none(scene: Scene) -> None:
+    bare = replace(scene, points=None, seen=None)
+    found, origin = initial.initial_points(bare, load_images(bare), 500, np.random.default_rng(0))
+    assert origin == "random points" and len(found.position) == 500 and np.isfinite(found.position).all()
+    assert found.colour.min() >= 0 and found.colour.max() <= 1
+
+
+def test_matches_between_views_give_points_on_the_surface() -> None:
+    """Views of a textured plane z = 0: what is triangulated lies in it."""
+    from fprf.rendering.cameras import Cameras
+
+    draw = np.random.default_rng(1)
+    texture = np.kron(draw.integers(0, 256, (60, 60, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    count, width, height, focal = 4, 200, 160, 180.0
+    pose = torch.eye(4, dtype=torch.float64)[:3].repeat(count, 1, 1)
+    pose[:, 0, 3], pose[:, 2, 3] = torch.linspace(-0.3, 0.3, count, dtype=torch.float64), 3.0
+    cameras = Cameras(
+        pose=pose,
+        focal=torch.full((count, 2), focal, dtype=torch.float64),
+        centre=torch.tensor([[width / 2, height / 2]], dtype=torch.float64).repeat(count, 1),
+        size=torch.tensor([[width, height]]).repeat(count, 1),
+        distortion=torch.zeros(count, 6, dtype=torch.float64),
+        lens=torch.zeros(count, dtype=torch.int64),
+    )
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    images = []
+    for view in range(count):
+        u = (x * 3 / focal + float(pose[view, 0, 3])) * 100 + 240
+        v = y * 3 / focal * 100 + 240
+        images.append(texture[v.astype(int), u.astype(int)])
+    train = torch.arange(count)
+    scene = Scene(name="plane", paths=(Path("a"),) * count, cameras=cameras, train=train, test=train[:0])
+    found, origin = initial.initial_points(scene, images, 1000, draw)
+    assert origin == "points matched between views" and len(found.position) > 100
+    assert np.median(np.abs(found.position[:, 2])) < 0.03
+
+
+def test_spacing_is_the_distance_to_the_three_nearest() -> None:
+    points = np.random.default_rng(0).normal(size=(150, 3))
+    apart = np.sort(np.linalg.norm(points[:, None] - points, axis=-1), 1)[:, 1:4].mean(1)
+    found = spacing(points)
+    close = np.minimum(apart, np.percentile(apart, 99))
+    # 100 neighbours to either side of the curve are not all of 150.
+    assert (found >= close * 0.99).all() and np.median(found / close) < 1.01
+    assert sorted(spatial_order(points).tolist()) == [*range(150)]
