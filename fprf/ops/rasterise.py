@@ -108,7 +108,7 @@ def rasterise(
         )
         planes = torch.cat([planes[..., :3], planes[..., -1:], planes[..., 3:-1]], -1)
     opacity = 1 - passing
-    depth = torch.where(opacity > 0, planes[..., 3] / torch.where(opacity > 0, opacity, 1), 0)
+    depth = planes[..., 3] / opacity.clamp_min(1e-6)  # a drawn alpha is at least 1/255
     return Rasterised(planes[..., :3], depth, opacity, planes[..., 4:], counts)
 
 
@@ -262,7 +262,7 @@ def _forward(
         )  # fmt: skip
         made.append((out, left))
     planes = torch.cat([torch.from_numpy(out[:, : view.height, : view.width]) for out, _ in made])
-    planes = planes[: 4 + features.shape[1]].permute(1, 2, 0).contiguous()
+    planes = planes[: 4 + features.shape[1]].permute(1, 2, 0)
     passing = torch.from_numpy(made[0][1][: view.height, : view.width].copy())
     return planes, passing, view.counts | {"saturated": int(saturated)}, made
 
@@ -288,7 +288,7 @@ def _backward(
         if total is None:
             total, of_left = found, np.zeros_like(of_left)
         else:
-            total.reshape(-1, kernels.SUMS)[:, :6] += found.reshape(-1, kernels.SUMS)[:, :6]
+            total.reshape(-1, kernels.SUMS)[:-1, :6] += found.reshape(-1, kernels.SUMS)[:-1, :6]  # the last is spare
             kernels.lift_values(
                 found, view.first_slot, view.total, of_features.reshape(-1), of_features.shape[1], first, channels
             )

@@ -100,7 +100,9 @@ class Learner:
         )  # fmt: skip
         if (step + 1) % self.config.relocate_every == 0 and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, share)
-        squared = float(np.square(out - planes).sum()) / (3 * width * height)
+        tall, wide = -(-height // LANES) * LANES, -(-width // LANES) * LANES
+        apart = (out - planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
+        squared = float(np.square(apart).mean())
         return Step(l1, ssim, squared, self.count, width * height)
 
     def _rates(self, share: float) -> Floats:

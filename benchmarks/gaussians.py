@@ -1,0 +1,116 @@
+"""The rasteriser of 3D Gaussians: time, error and what was skipped, kernels against the plain torch form.
+
+    python benchmarks/gaussians.py [--count 50000] [--threads 1] [--output FILE.json]
+
+A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained scene. Seconds are the
+least of several calls: of wall time, and of processor time, which counts all threads. The plain form runs once.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+from torch import Tensor
+
+from fprf.ops import backend
+from fprf.ops.rasterise import Pinhole, Rasterised, lift, rasterise
+
+WIDTH, HEIGHT, BANDS, CHANNELS = 500, 375, 4, 32
+
+
+def cloud(count: int) -> list[Tensor]:
+    draw = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=draw)
+
+    depth = 2 + 6 * torch.rand(count, generator=draw)
+    across = (torch.rand(count, 2, generator=draw) - 0.5) * torch.tensor([1.3, 1.0])
+    means = torch.cat([across * depth[:, None], depth[:, None]], 1)
+    pixel = depth / (0.8 * WIDTH)
+    # Standard deviations of about a pixel where there are 50 000; fewer are larger, so that they cover the image as well.
+    scales = (math.sqrt(50_000 / count) * pixel).log()[:, None] + 0.5 * normal(count, 3)
+    return [means, normal(count, 4), scales, 2 * normal(count), 0.4 * normal(count, BANDS, 3)]
+
+
+def camera() -> Pinhole:
+    focal = 0.8 * WIDTH
+    intrinsics = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    return Pinhole(intrinsics, torch.eye(4), WIDTH, HEIGHT)
+
+
+def least(call: Callable[[], object], times: int) -> dict[str, float]:
+    wall, processor = [], []
+    for _ in range(times):
+        before = time.perf_counter(), time.process_time()
+        call()
+        wall.append(time.perf_counter() - before[0])
+        processor.append(time.process_time() - before[1])
+    return {"seconds": min(wall), "processor_seconds": min(processor)}
+
+
+def learn(given: list[Tensor], pull: Tensor) -> list[Tensor]:
+    learnt = [x.detach().clone().requires_grad_() for x in given]
+    found = rasterise(*learnt, camera())
+    (found.image * pull.to(found.image)).sum().backward()
+    return [x.grad for x in learnt if x.grad is not None]
+
+
+def measure(count: int, times: int) -> dict[str, Any]:
+    given, pixels = cloud(count), torch.rand(HEIGHT, WIDTH, CHANNELS, generator=torch.Generator().manual_seed(1))
+    pull = torch.randn(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
+
+    def render() -> Rasterised:
+        return rasterise(*given, camera())
+
+    fast, slopes = render(), learn(given, pull)
+    lift(*given[:4], camera(), pixels)
+    rows = {
+        "render": least(render, times),
+        "render_and_gradients": least(lambda: learn(given, pull), times),
+        f"lift_{CHANNELS}_channels": least(lambda: lift(*given[:4], camera(), pixels), times),
+    }
+    exact = [x.double() for x in given]
+    with backend.plain():
+        rows["render_plain"] = least(render, 1)
+        true = rasterise(*exact, camera())
+        wanted = learn(exact, pull)
+    apart = (fast.image.double() - true.image).abs()
+    return {
+        "gaussians": count,
+        "pixels": WIDTH * HEIGHT,
+        "counts": dict(fast.counts),
+        "rows": rows,
+        "pixels_per_second": WIDTH * HEIGHT / rows["render"]["seconds"],
+        "pixels_per_processor_second": WIDTH * HEIGHT / rows["render"]["processor_seconds"],
+        "times_plain": rows["render_plain"]["processor_seconds"] / rows["render"]["processor_seconds"],
+        "mean_error": float(apart.mean()),
+        "largest_error": float(apart.max()),
+        "gradient_errors": [float((a.double() - b).norm() / b.norm()) for a, b in zip(slopes, wanted, strict=True)],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=50_000)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--times", type=int, default=30)
+    parser.add_argument("--output", type=Path)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    numba.set_num_threads(args.threads)
+    found = {"threads": args.threads, **measure(args.count, args.times)}
+    text = json.dumps(found, indent=1)
+    print(text)
+    if args.output is not None:
+        args.output.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
