@@ -198,10 +198,10 @@ def _beside(output: Path, what: str) -> Path:
 
 
 def _pictures(scene: "SplatScene", styles: "Sequence[Tensor]", shown: int) -> "list[tuple[str, list[Picture]]]":
-    """Views, evenly taken from all, with their pictures: as it is, then in each style."""
+    """Views, evenly taken from the nearer half, with their pictures: as it is, then in each style."""
     from ..engine.restyle_gaussians import SplatViews
 
-    views, count = SplatViews(scene), len(scene.names)
+    views, count = SplatViews(scene), max(min(shown, len(scene.names)), len(scene.names) // 2)
     cameras = scene.cameras.scaled(0.5)
     chosen = sorted({round((k + 0.5) * count / min(shown, count) - 0.5) for k in range(min(shown, count))})
     return [

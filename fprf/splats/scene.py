@@ -29,8 +29,8 @@ from .views import camera_of, draw, find_views
 
 __all__ = ["SplatScene", "cache_name", "load_scene", "look_at_capture", "scene_tensors"]
 
-_CHANNELS = 32
-"""Principal components of the semantics that are kept, as `fprf-lite` does."""
+_CHANNELS = 31
+"""Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
 _SOLID = 0.5
 """Pixels and cells less opaque than this say nothing about the scene."""
 _BACKDROPS = (1.0, 0.0)
@@ -39,8 +39,8 @@ _TRUST = 4.0
 """Pixels count by this power of their opacity: a soft edge would carry the backdrop's semantics."""
 _SAMPLES = 65_536
 """Pixels of all views together that statistics are taken of, about."""
-_CARRIED = 2
-"""Features are carried back at this share of the views' resolution; they are smooth."""
+_COARSER = 2
+"""Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
 _NEIGHBOURS, _LEVELS, _REACH = 1.0, 8, 0.02
 """Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the edge of the
 nearest one, as a share of the spread of the positions."""
@@ -94,25 +94,28 @@ def look_at_capture(
     basis = fit_basis(torch.cat(solid), _CHANNELS)
     dim = basis.matrix.shape[1]
     sums, weights = torch.zeros(len(gaussians), dim), torch.zeros(len(gaussians))
-    every = max(1, sum(opacity.numel() for _, opacity in pictures) // _SAMPLES)
+    every = max(1, sum(opacity.numel() for _, opacity in pictures) // (_SAMPLES * _COARSER**2))
     samples: list[tuple[Tensor, Tensor, Tensor]] = []
     for view, (maps, (image, opacity)) in enumerate(zip(cells, pictures, strict=True)):
         progress(len(cameras) + view, total)
-        fine = _pixel_features(basis, maps, image, opacity)
-        trust = opacity[..., None] ** _TRUST
-        small = cameras.select(torch.tensor([view])).scaled(_CARRIED)
-        pixels = _reduced(torch.cat([fine * trust, trust], 2), small)
+        small = cameras.select(torch.tensor([view])).scaled(_COARSER)
+        coarse = _reduced(torch.cat([image, opacity[..., None]], 2), small)
+        fine = _pixel_features(basis, maps, coarse[..., :3], coarse[..., 3])
+        trust = coarse[..., 3:] ** _TRUST
         parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
+        pixels = torch.cat([fine * trust, trust], 2)
         found = lift(*parts, camera_of(small, 0), pixels, antialiased=antialiased).features
         sums += found[:, :dim]
         weights += found[:, dim]
-        at = (opacity.flatten()[::every] > _SOLID).nonzero()[:, 0] * every
-        seen = opacity.flatten()[at]
-        samples.append(((image.flatten(0, 1)[at] / seen[:, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen))
+        # Colours are those of single pixels of the whole picture: averages would have less contrast.
+        height, width = fine.shape[:2]
+        colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
+        at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
+        samples.append(((colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]))
     progress(total, total)
     colour, semantic, seen = (torch.cat(each) for each in zip(*samples, strict=True))
     style = scene_style(colour, semantic, seen, None, config.regions, seed=0)
-    features = _spread(gaussians.means, sums, weights * _CARRIED**2, style.semantic_mean)
+    features = _spread(gaussians.means, sums * _COARSER**2, weights * _COARSER**2, style.semantic_mean)
     # Half precision is what a cache holds: a capture seen again must give the same colours.
     return SplatScene(gaussians, antialiased, cameras, style, basis, features.half().float(), encoder.identity)
 

@@ -68,7 +68,10 @@ def draw(
 def find_views(
     gaussians: Gaussians, *, count: int, size: tuple[int, int], up: Annotated[Tensor, "3"], antialiased: bool = False
 ) -> Cameras:
-    """At most `count` views of `size` (width, height). Raises DataError where nothing can be seen from anywhere."""
+    """At most `count` views of `size` (width, height), the nearer ones around an object first.
+
+    Raises DataError where nothing can be seen from anywhere.
+    """
     up = up.double() / up.double().norm()
     opacity = gaussians.opacities
     ends = torch.stack([_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]).double()

@@ -1,0 +1,158 @@
+"""Restyling captures of Gaussians: processor seconds, peak memory, and what sharp edges become.
+
+    python benchmarks/splat_restyle.py --captures plant.splat --references autumn.jpg night.jpg --output splat_restyle.json
+
+Each capture, and made-up ones of --synthetic Gaussians, is looked at in a process of its own with one thread. `rims` is how
+much the brightness that stands out at depth edges is amplified, relative to that inside of surfaces: above 1 edges glow.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--captures", type=Path, nargs="*", default=[])
+    parser.add_argument("--synthetic", type=int, nargs="*", default=[115_000, 1_000_000])
+    parser.add_argument("--references", type=Path, nargs="+", required=True)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one:
+        print(json.dumps(measured(arguments.one, arguments.references)))
+        return
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for count in arguments.synthetic:
+            path = Path(folder) / f"synthetic-{count}.splat"
+            made_up(path, count)
+            arguments.captures.append(path)
+        for path in arguments.captures:
+            words = [
+                sys.executable,
+                __file__,
+                "--one",
+                str(path),
+                "--output",
+                "-",
+                "--references",
+                *map(str, arguments.references),
+            ]
+            single = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+            said = subprocess.run(words, capture_output=True, text=True, check=True, env=single).stdout
+            rows.append(json.loads(said.splitlines()[-1]))
+            print(rows[-1], flush=True)
+            arguments.output.write_text(json.dumps(report(rows), indent=1) + "\n")
+
+
+def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    from fprf.evidence.provenance import provenance
+
+    return {"threads": 1, "seconds": "of the processor, kernels compiled", "captures": rows, **provenance("cpu")}
+
+
+def made_up(path: Path, count: int) -> None:
+    """A capture that fills its views as real ones do: discs on a bumpy ball above a plane."""
+    import torch
+
+    from fprf.splats.files import write_gaussians
+    from fprf.splats.gaussians import HARMONIC, Gaussians
+
+    draw = torch.Generator().manual_seed(0)
+    around = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=1)
+    bumps = 1 + 0.15 * (around * 5).sin().prod(1, keepdim=True)
+    ground = torch.rand(count, 1, generator=draw) < 0.4
+    flat = (4 * torch.rand(count, 3, generator=draw) - 2) * torch.tensor([1.0, 0.0, 1.0]) + torch.tensor([0.0, 1.1, 0.0])
+    means = torch.where(ground, flat, around * bumps)
+    colour = torch.where(ground, torch.tensor([0.5, 0.45, 0.4]), torch.tensor([0.3, 0.5, 0.25]))
+    colour = colour + 0.15 * (means * 9).sin().prod(1, keepdim=True) + 0.05 * torch.randn(count, 3, generator=draw)
+    size = (6.0 / count) ** 0.5
+    scales = torch.full((count, 3), size).log() + 0.3 * torch.randn(count, 3, generator=draw)
+    parts = (
+        means,
+        torch.randn(count, 4, generator=draw),
+        scales,
+        torch.full((count,), 2.0),
+        (colour[:, None] - 0.5) / HARMONIC,
+    )
+    write_gaussians(path, Gaussians(*parts))
+
+
+def measured(path: Path, references: list[Path]) -> dict[str, Any]:
+    import torch
+
+    from fprf.engine.restyle_gaussians import restyle_gaussians, restyled_harmonics
+    from fprf.memory import peak
+    from fprf.plugins.encoders.config import BundledSemanticConfig
+    from fprf.plugins.stylizers.config import RegionToneConfig
+    from fprf.splats.files import read_capture, write_capture
+    from fprf.splats.look_config import LookConfig
+    from fprf.splats.scene import look_at_capture
+    from fprf.style.config import StyleConfig
+    from fprf.style.files import StyleFile
+
+    torch.set_num_threads(1)
+    start = time.process_time()
+    capture = read_capture(path)
+    read = time.process_time() - start
+    encoder = BundledSemanticConfig().build()
+    few = capture.gaussians.select(torch.arange(0, len(capture.gaussians), max(1, len(capture.gaussians) // 300)))
+    look_at_capture(few, capture.antialiased, encoder, LookConfig(views=1, size=(64, 48)))  # compiles
+    start = time.process_time()
+    scene = look_at_capture(capture.gaussians, capture.antialiased, encoder, LookConfig())
+    looked = time.process_time() - start
+    seconds, rims = [], []
+    for reference in references:
+        start = time.process_time()
+        style = StyleConfig(references=(reference,), stylizer=RegionToneConfig(centred=False))
+        new = restyled_harmonics(scene, restyle_gaussians(scene, StyleFile(style), encoder).restyle)
+        with tempfile.TemporaryDirectory() as folder:
+            write_capture(Path(folder) / path.name, capture, new)
+        seconds.append(time.process_time() - start)
+        rims.append(rim_ratio(scene, new))
+    return {
+        "capture": path.name,
+        "gaussians": len(capture.gaussians),
+        "read_seconds": round(read, 2),
+        "look_seconds": round(looked, 2),
+        "style_seconds": round(sorted(seconds)[len(seconds) // 2], 2),
+        "peak_mib": round((peak() or 0) / 2**20),
+        "rims": {reference.stem: round(ratio, 2) for reference, ratio in zip(references, rims, strict=True)},
+    }
+
+
+def rim_ratio(scene: Any, new: Any) -> float:
+    """Amplification of what stands out at depth edges, over that inside of surfaces."""
+    found = np.array([[standing_out(scene, each, view) for view in range(0, len(scene.names), 4)] for each in (None, new)])
+    before, after = found.mean(1)
+    return float(after[0] / before[0] / (after[1] / before[1]))
+
+
+def standing_out(scene: Any, harmonics: Any, view: int) -> tuple[float, float]:
+    """How much brighter than their surroundings pixels are, at depth edges and elsewhere."""
+    from fprf.splats.views import camera_of, draw
+    from fprf.style.controls import luma
+
+    gaussians = scene.gaussians if harmonics is None else scene.gaussians.recoloured(harmonics)
+    drawn = draw(gaussians, camera_of(scene.cameras, view), background=0.5)
+    level = luma(drawn.image.flatten(0, 1)).view(drawn.opacity.shape).numpy()
+    above = np.maximum(level - cv2.GaussianBlur(level, (0, 0), 3), 0)
+    solid = drawn.opacity.numpy() > 0.9
+    depth = np.where(drawn.opacity > 0.5, drawn.depth, 1.5 * drawn.depth.max()).astype(np.float32)
+    steep = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((5, 5))) > 0.15 * float(scene.gaussians.means.std())
+    away = cv2.dilate(steep.astype(np.uint8), np.ones((3, 3))) == 0
+    return float(above[solid & steep].mean()), float(above[solid & away].mean())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,233 @@
+"""Styles on Gaussians: exact where colours are affine, nothing but colours, and the scene itself where nothing is asked."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from splat_ball import ball
+
+from fprf import cli
+from fprf.engine.restyle_gaussians import as_drawn, restyle_gaussians, restyled_harmonics, splat_regions
+from fprf.errors import CheckpointError, DataError, UsageError
+from fprf.fields.harmonics import harmonics as functions
+from fprf.interfaces import Encoder
+from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.splats.files import read_capture, write_gaussians
+from fprf.splats.gaussians import Gaussians
+from fprf.splats.look_config import LookConfig
+from fprf.splats.scene import SplatScene, load_scene, look_at_capture, scene_tensors
+from fprf.splats.views import camera_of, draw, find_views
+from fprf.style.config import StyleConfig
+from fprf.style.controls import luma
+from fprf.style.files import StyleFile, write_style
+
+SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
+TONE = RegionToneConfig(centred=False)
+
+
+@pytest.fixture(scope="module")
+def encoder() -> Encoder:
+    return BundledSemanticConfig().build()
+
+
+@pytest.fixture(scope="module")
+def scene(encoder: Encoder) -> SplatScene:
+    return look_at_capture(ball(400), False, encoder, LookConfig(views=6, size=(96, 72), regions=4))
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder, draw_ = tmp_path_factory.mktemp("photographs"), np.random.default_rng(0)
+    paths = []
+    for name, low, high in (("dusk", (30, 20, 60), (20, 90, 200)), ("snow", (200, 190, 180), (250, 240, 230))):
+        picture = np.concatenate([np.full((60, 160, 3), high), np.full((60, 160, 3), low)]) + draw_.normal(0, 12, (120, 160, 3))
+        cv2.imwrite(str(folder / f"{name}.png"), picture.clip(0, 255).astype(np.uint8))
+        paths.append(folder / f"{name}.png")
+    return paths
+
+
+def styled(
+    scene: SplatScene, encoder: Encoder, *photos: Path, stylizer: StylizerConfig = TONE, **wishes: object
+) -> torch.Tensor:
+    style = StyleConfig(references=photos, stylizer=stylizer, **wishes)  # type: ignore[arg-type]
+    return restyled_harmonics(scene, restyle_gaussians(scene, StyleFile(style), encoder).restyle)
+
+
+@pytest.mark.parametrize(
+    "stylizer", [TONE, RegionOtConfig(), AdainConfig(), LocalAdainConfig()], ids=lambda s: type(s).__name__
+)
+def test_a_style_is_one_affine_map_of_what_is_seen(
+    scene: SplatScene, encoder: Encoder, photographs: list[Path], stylizer: StylizerConfig
+) -> None:
+    """Seen from anywhere, the new colour of a Gaussian is an affine function of its old one."""
+    new = styled(scene, encoder, *photographs, stylizer=stylizer)
+    before = as_drawn(scene.gaussians.harmonics)
+    around = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    basis = functions(around, 2)
+    old, now = (torch.einsum("db,nbc->ndc", basis, each) for each in (before, new))
+    inside = (0.5 + 0.2820948 * new[:, 0]).sub(0.5).abs().amax(1) < 0.499  # nothing was cut
+    assert int(inside.sum()) > 20
+    for k in inside.nonzero()[:20, 0].tolist():
+        plus = torch.cat([old[k], torch.ones(64, 1)], 1)
+        left = now[k] - plus @ torch.linalg.lstsq(plus, now[k]).solution
+        assert left.abs().max() < 1e-4 and (now[k] - old[k]).abs().max() > 1e-3
+
+
+def test_at_strength_0_and_in_kept_regions_nothing_changes(
+    scene: SplatScene, encoder: Encoder, photographs: list[Path]
+) -> None:
+    before = scene.gaussians.harmonics
+    assert torch.equal(styled(scene, encoder, photographs[0], strength=0.0), before)
+    everything = tuple(str(k) for k in range(len(scene.style.share)))
+    assert torch.equal(styled(scene, encoder, photographs[0], keep=everything), before)
+    full, half = (styled(scene, encoder, photographs[0], strength=s) for s in (1.0, 0.5))
+    assert torch.allclose(half, (full + as_drawn(before)) / 2, atol=1e-5), "half of the way, where nothing is cut"
+    one = styled(scene, encoder, photographs[0], keep=everything[1:])
+    changed = (one != before).flatten(1).any(1)
+    assert changed.any() and not changed.all() and not torch.equal(one, full)
+
+
+def test_pinned_regions_take_one_photograph_alone(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
+    everything = tuple(f"{k}=snow.png" for k in range(len(scene.style.share)))
+    pinned, alone = styled(scene, encoder, *photographs, pin=everything), styled(scene, encoder, photographs[1])
+    assert torch.allclose(pinned, alone, atol=1e-4)
+    assert (styled(scene, encoder, *photographs) - alone).abs().max() > 0.01
+    with pytest.raises(UsageError, match="region 9"):
+        styled(scene, encoder, photographs[0], keep=("9",))
+
+
+def test_a_pixel_names_the_region_that_is_seen_there(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
+    regions = splat_regions(scene, StyleFile(StyleConfig()))
+    drawn = draw(scene.gaussians, camera_of(scene.cameras, 2))
+    y, x = divmod(int(drawn.opacity.argmax()), drawn.opacity.shape[1])
+    share, opacity = regions.views.membership(scene.style, scene.cameras, 2, torch.tensor([[x + 0.5, y + 0.5]]))
+    assert opacity[0] > 0.9 and float(share.sum()) == pytest.approx(1, abs=1e-4)
+    number = str(int(share[0].argmax()))
+    by_pixel, by_number = (styled(scene, encoder, photographs[0], keep=(text,)) for text in (f"02:{x},{y}", number))
+    assert torch.equal(by_pixel, by_number)
+
+
+def test_luminance_is_kept_and_styles_mix(scene: SplatScene, encoder: Encoder, photographs: list[Path], tmp_path: Path) -> None:
+    def colours(harmonics: torch.Tensor) -> torch.Tensor:
+        return 0.5 + 0.28209479 * harmonics[:, 0]
+
+    before = colours(as_drawn(scene.gaussians.harmonics))
+    tinted = colours(styled(scene, encoder, photographs[0], luminance=1.0))
+    free = ((tinted > 1e-4) & (tinted < 1 - 1e-4)).all(1)
+    assert int(free.sum()) > 100 and (luma(tinted) - luma(before))[free].abs().max() < 1e-4
+    write_style(tmp_path / "style.json", StyleFile(StyleConfig(references=(photographs[1],), stylizer=TONE)))
+    a, b = (styled(scene, encoder, photo) for photo in photographs)
+    mixed = styled(scene, encoder, photographs[0], between=tmp_path / "style.json", at=0.25)
+    free = ((colours(mixed) > 1e-3) & (colours(mixed) < 1 - 1e-3) & (colours(b) > 1e-3) & (colours(b) < 1 - 1e-3)).all(1)
+    free &= ((colours(a) > 1e-3) & (colours(a) < 1 - 1e-3)).all(1)
+    assert int(free.sum()) > 50 and torch.allclose(mixed[free], (0.75 * a + 0.25 * b)[free], atol=1e-4)
+
+
+def test_harmonics_become_those_of_colours_as_they_are_drawn() -> None:
+    made = torch.zeros(3, 4, 3)
+    made[0, 0], made[0, 2] = 1.0, 0.2  # nowhere below 0
+    made[1, 0] = -5.0  # black from everywhere
+    made[2, 2] = 3.0  # below 0 on one side
+    out = as_drawn(made)
+    assert torch.equal(out[0], made[0])
+    assert torch.allclose(0.5 + 0.28209479 * out[1, 0], torch.zeros(3), atol=1e-5) and out[1, 1:].abs().max() < 1e-5
+    around = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+    cut = (0.5 + torch.einsum("db,bc->dc", functions(around, 2), made[2])).clamp_min(0)
+    fitted, plain = (0.5 + torch.einsum("db,bc->dc", functions(around, 2), each) for each in (out[2], made[2]))
+    assert (fitted - cut).square().mean() < 0.2 * (plain - cut).square().mean()
+
+
+def test_a_scene_that_was_kept_gives_the_same_colours(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
+    again = load_scene(scene_tensors(scene), scene.gaussians, False, scene.encoder)
+    assert torch.equal(styled(again, encoder, photographs[0]), styled(scene, encoder, photographs[0]))
+    with pytest.raises(CheckpointError, match="of another one"):
+        load_scene(scene_tensors(scene), ball(10), False, scene.encoder)
+
+
+def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
+    up = torch.tensor([0.0, -1.0, 0.0])
+    seen = find_views(ball(400), count=8, size=(64, 48), up=up)
+    assert len(seen) == 8 and (seen.pose[:, :, 3].norm(dim=1) > 1.2).all()
+    assert (seen.pose[:, 1, 1] < 0).all(), "upright: the camera's up is -y"
+    # A room: a closed box of flat Gaussians, seen from within.
+    side = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, 24)] * 2, indexing="xy"), -1).reshape(-1, 2)
+    walls = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            at = torch.zeros(len(side), 3)
+            at[:, axis], at[:, [k for k in range(3) if k != axis]] = sign, side
+            walls.append(at * torch.tensor([3.0, 1.0, 2.0]))
+    means = torch.cat(walls)
+    count = len(means)
+    flat, opaque = torch.full((count, 3), -2.0), torch.full((count,), 4.0)
+    room = Gaussians(means, torch.eye(4)[:1].expand(count, 4), flat, opaque, torch.zeros(count, 1, 3))
+    within = find_views(room, count=8, size=(64, 48), up=up)
+    assert (within.pose[:, :, 3].abs() < torch.tensor([3.0, 1.0, 2.0])).all()
+    assert all(float(draw(room, camera_of(within, v)).opacity.mean()) > 0.95 for v in range(len(within)))
+    nothing = Gaussians(means[:4], room.quaternions[:4], room.log_scales[:4] - 30, room.logits[:4] - 30, room.harmonics[:4])
+    with pytest.raises(DataError, match="--up"):
+        find_views(nothing, count=2, size=(64, 48), up=up)
+
+
+def test_the_verb_writes_capture_sheet_page_and_style(
+    photographs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = ball(200)
+    made.means[7, 0] = torch.nan
+    write_gaussians(tmp_path / "in.ply", made)
+    words = [
+        "restyle",
+        str(tmp_path / "in.ply"),
+        *SMALL,
+        "--cache",
+        str(tmp_path / "cache"),
+        "--references",
+        *map(str, photographs),
+    ]
+    outputs = [
+        "--output",
+        str(tmp_path / "out.ply"),
+        "--sheet",
+        str(tmp_path / "out.png"),
+        "--page",
+        str(tmp_path / "out.html"),
+    ]
+    assert cli.main([*words, "--each", "true", *outputs, "--explain", "true"]) == 0
+    said = capsys.readouterr().out
+    assert "1 that are not finite left as they are" in said and "region  share" in said
+    first, second = (read_capture(tmp_path / f"out-{name}.ply").gaussians for name in ("dusk", "snow"))
+    assert torch.equal(first.log_scales, made.log_scales) and torch.equal(first.harmonics[7], made.harmonics[7])
+    assert second.colours.nanmean() > first.colours.nanmean() + 0.1, "snow is brighter than dusk"
+    assert cv2.imread(str(tmp_path / "out.png")).shape[1] > 3 * 240 and "dusk" in (tmp_path / "out.html").read_text()
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    again = ["--style", str(tmp_path / "out-dusk.style.json"), "--output", str(tmp_path / "again.ply")]
+    assert cli.main([*words[: words.index("--references")], *again]) == 0
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "out-dusk.ply").read_bytes()
+    same = ["--strength", "0", "--output", str(tmp_path / "same.ply")]
+    assert cli.main([*words, *same]) == 0
+    assert (tmp_path / "same.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+    kept = next((tmp_path / "cache").iterdir())
+    kept.write_bytes(kept.read_bytes()[:-9])
+    assert cli.main([*words, *same]) == 0, "what is damaged is made again"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--references", "x.jpg"], "name what to write"),
+        (["--output", "out.ply"], "at least one photograph"),
+        (["--references", "x.jpg", "--output", "out.obj"], "known endings"),
+        (["--references", "x.jpg", "--page", "out.png"], "html"),
+        (["--references", "x.jpg", "--output", "out.ply", "--up", "0", "0", "0"], "no direction"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_gaussians(tmp_path / "in.ply", ball(20))
+    cv2.imwrite(str(tmp_path / "x.jpg"), np.full((64, 64, 3), 90, np.uint8))
+    words = [str(tmp_path / word) if word == "x.jpg" else word for word in words]
+    assert cli.main(["restyle", str(tmp_path / "in.ply"), "--cache", str(tmp_path), *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
