@@ -47,7 +47,7 @@ def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, st
     trained = world.load()
     style = StyleConfig(references=world.references, clusters=3, keep=("1",), forbid=("0=0",))
     styled = apply_style(trained, StyleFile(replace(style, stylizer=stylizer)))  # type: ignore[arg-type]
-    found = explain(trained, styled.orders.regions, styled)
+    found = explain(styled.orders.regions, styled)
     match = styled.restyle.stylizer.match(styled.scene.keys)
     for each in found:
         for taken in each.taken:
