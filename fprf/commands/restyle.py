@@ -161,7 +161,7 @@ def _known(capture: "Capture", finite: "Tensor", encoder: "Encoder", config: Res
     from ..engine.tensorfiles import load_sealed, save_sealed
     from ..splats.scene import cache_name, load_scene, look_at_capture, scene_tensors
 
-    look = LookConfig(up=config.up, views=config.views, size=config.size, regions=config.regions)
+    look = LookConfig(up=config.up, inside=config.inside, views=config.views, size=config.size, regions=config.regions)
     folder = config.cache or cache_folder() / "captures"
     path = folder / cache_name(capture.data, encoder.identity, look)
     gaussians = capture.gaussians if bool(finite.all()) else capture.gaussians.select(finite)

@@ -13,6 +13,8 @@ class LookConfig:
 
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
     """Direction that points up in the capture's own axes; most captures have y down."""
+    inside: bool | None = None
+    """Look from within, as in rooms and streets, or around an object; none = found out."""
     views: int = 32
     """Views that are looked at."""
     size: tuple[int, int] = (320, 240)

@@ -76,7 +76,7 @@ def look_at_capture(
     up = torch.tensor(config.up)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
-    cameras = find_views(gaussians, count=config.views, size=config.size, up=up, antialiased=antialiased)
+    cameras = find_views(gaussians, count=config.views, size=config.size, up=up, inside=config.inside, antialiased=antialiased)
     total = 2 * len(cameras)
     pictures, cells, solid = [], [], []
     for view in range(len(cameras)):

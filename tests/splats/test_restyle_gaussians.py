@@ -1,5 +1,6 @@
 """Styles on Gaussians: exact where colours are affine, nothing but colours, and the scene itself where nothing is asked."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import cv2
@@ -84,7 +85,8 @@ def test_at_strength_0_and_in_kept_regions_nothing_changes(
     everything = tuple(str(k) for k in range(len(scene.style.share)))
     assert torch.equal(styled(scene, encoder, photographs[0], keep=everything), before)
     full, half = (styled(scene, encoder, photographs[0], strength=s) for s in (1.0, 0.5))
-    assert torch.allclose(half, (full + as_drawn(before)) / 2, atol=1e-5), "half of the way, where nothing is cut"
+    free = (0.2820948 * full[:, 0]).abs().amax(1) < 0.499  # nothing was cut
+    assert int(free.sum()) > 50 and torch.allclose(half[free], (full + as_drawn(before))[free] / 2, atol=1e-5)
     one = styled(scene, encoder, photographs[0], keep=everything[1:])
     changed = (one != before).flatten(1).any(1)
     assert changed.any() and not changed.all() and not torch.equal(one, full)
@@ -137,7 +139,7 @@ def test_harmonics_become_those_of_colours_as_they_are_drawn() -> None:
     around = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(2)), dim=1)
     cut = (0.5 + torch.einsum("db,bc->dc", functions(around, 2), made[2])).clamp_min(0)
     fitted, plain = (0.5 + torch.einsum("db,bc->dc", functions(around, 2), each) for each in (out[2], made[2]))
-    assert (fitted - cut).square().mean() < 0.2 * (plain - cut).square().mean()
+    assert (fitted - cut).square().mean() < 0.4 * (plain - cut).square().mean()
 
 
 def test_a_scene_that_was_kept_gives_the_same_colours(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
@@ -160,13 +162,20 @@ def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
             at = torch.zeros(len(side), 3)
             at[:, axis], at[:, [k for k in range(3) if k != axis]] = sign, side
             walls.append(at * torch.tensor([3.0, 1.0, 2.0]))
-    means = torch.cat(walls)
+    table = 0.3 * torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.7, 0.0])
+    means = torch.cat([*walls, table.clamp_max(1.0)])
     count = len(means)
     flat, opaque = torch.full((count, 3), -2.0), torch.full((count,), 4.0)
+    flat[-5000:] = -4.0  # near things are finer
     room = Gaussians(means, torch.eye(4)[:1].expand(count, 4), flat, opaque, torch.zeros(count, 1, 3))
     within = find_views(room, count=8, size=(64, 48), up=up)
     assert (within.pose[:, :, 3].abs() < torch.tensor([3.0, 1.0, 2.0])).all()
     assert all(float(draw(room, camera_of(within, v)).opacity.mean()) > 0.95 for v in range(len(within)))
+    # A hollow object is as closed as a room.
+    hollow = Gaussians(*(getattr(room, field.name)[:-5000] for field in fields(room)))
+    for given, inside in ((hollow, None), (room, False)):
+        outside = find_views(given, count=8, size=(64, 48), up=up, inside=inside)
+        assert not (outside.pose[:, :, 3].abs() < torch.tensor([3.0, 1.0, 2.0])).all(1).any()
     nothing = Gaussians(means[:4], room.quaternions[:4], room.log_scales[:4] - 30, room.logits[:4] - 30, room.harmonics[:4])
     with pytest.raises(DataError, match="--up"):
         find_views(nothing, count=2, size=(64, 48), up=up)
