@@ -154,7 +154,8 @@ def _free_places(gaussians: Gaussians, ends: Tensor, up: Tensor) -> Annotated[Te
     height = places @ up
     bottom, top = (ends * up[:, None]).amin(1).sum(), (ends * up[:, None]).amax(1).sum()
     places = places[height <= bottom + 0.67 * (top - bottom)]
-    picked, apart = [], torch.full((len(places),), math.inf, dtype=torch.float64)
+    picked: list[int] = []
+    apart = torch.full((len(places),), math.inf, dtype=torch.float64)
     for _ in range(min(_PLACES, len(places))):
         nearest = int(apart.argmax()) if picked else int((places - ends.mean(1)).norm(dim=1).argmin())
         picked.append(nearest)
