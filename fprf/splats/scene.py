@@ -20,7 +20,7 @@ from ..interfaces import Encoder
 from ..ops.guided import upsample
 from ..ops.rasterise import lift
 from ..rendering.cameras import Cameras
-from ..style.scene import SceneStyle, scene_style
+from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
 from .gaussians import Gaussians
@@ -96,6 +96,7 @@ def look_at_capture(
     sums, weights = torch.zeros(len(gaussians), dim), torch.zeros(len(gaussians))
     every = max(1, sum(opacity.numel() for _, opacity in pictures) // (_SAMPLES * _COARSER**2))
     samples: list[tuple[Tensor, Tensor, Tensor]] = []
+    pairs: list[Tensor] = []
     for view, (maps, (image, opacity)) in enumerate(zip(cells, pictures, strict=True)):
         progress(len(cameras) + view, total)
         small = cameras.select(torch.tensor([view])).scaled(_COARSER)
@@ -112,9 +113,17 @@ def look_at_capture(
         colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
         at = (seen[::every] > _SOLID).nonzero()[:, 0] * every
         samples.append(((colour[at] / seen[at, None]).clamp(0, 1), fine.flatten(0, 1)[at], seen[at]))
+        # Neighbours along rows: where both are solid.
+        solid_here = coarse[..., 3] > _SOLID
+        pair = (solid_here[:, :-1] & solid_here[:, 1:]).flatten().nonzero()[::every, 0]
+        shown = torch.cat([(coarse[..., :3] / coarse[..., 3:].clamp_min(_SOLID)).clamp(0, 1), fine], 2)
+        pairs.append(torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1))
     progress(total, total)
     colour, semantic, seen = (torch.cat(each) for each in zip(*samples, strict=True))
     style = scene_style(colour, semantic, seen, None, config.regions, seed=0)
+    ends = torch.cat(pairs)
+    if len(style.share) > 1:
+        style = style._replace(contacts=region_contacts(style, ends[..., 3:], ends[..., :3]))
     features = _spread(gaussians.means, sums * _COARSER**2, weights * _COARSER**2, style.semantic_mean)
     # Half precision is what a cache holds: a capture seen again must give the same colours.
     return SplatScene(gaussians, antialiased, cameras, style, basis, features.half().float(), encoder.identity)
@@ -147,7 +156,7 @@ def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bo
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"1 {encoder} {config}".encode())
+    digest.update(f"2 {encoder} {config}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 
