@@ -149,14 +149,10 @@ def speed(environment: Mapping[str, str]) -> Iterator[Finding]:
 
 def method_needs(name: str) -> Iterator[Finding]:
     """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be loaded."""
-    from ..engine.needs import decoder_needs, plugin_needs
     from ..plugins.codec import method_config
 
     config = method_config(name)
-    needs = plugin_needs(config)
-    if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in needs):
-        needs += decoder_needs(config)
-    for need in needs:
+    for need in config.verbs().needs():
         later = ", is downloaded when it is needed" if need.downloaded else " is missing"
         yield Finding("needs", need.what + later, need.remedy, optional=need.downloaded)
     filled = (f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}" for slot in slots(config) if slot.value)

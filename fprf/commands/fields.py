@@ -8,6 +8,7 @@ from .verbs import Verbs
 if TYPE_CHECKING:
     from ..config import TrainConfig
     from ..export.config import ExportConfig
+    from ..plugins.config import Need
     from ..style.files import StyleFile
     from ..viewer.aside import Aside
     from .eval import EvalConfig
@@ -34,6 +35,15 @@ class FieldVerbs(Verbs):
         from .train import train_scene
 
         return train_scene(self.config, method, quiet=quiet, view=view, others=others)
+
+    def needs(self) -> "list[Need]":
+        """What plug-ins and the decoder need."""
+        from ..engine.needs import decoder_needs, plugin_needs
+
+        found = plugin_needs(self.config)
+        if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in found):
+            found = [*found, *decoder_needs(self.config)]
+        return found
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Judge a model."""

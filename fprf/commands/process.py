@@ -94,7 +94,7 @@ def _check(root: Path) -> None:
     from ..engine.prepare import with_downscale
     from .train import default_output
 
-    config = replace(method_config(METHOD), data=root, minutes=MINUTES)
+    config = replace(method_config(METHOD).fields_only(root), data=root, minutes=MINUTES)
     delivered = parse_scene(root, 1, None)
     size = with_downscale(config).downscale or 1
     width, height = delivered.cameras.scaled(size).size[0].tolist()

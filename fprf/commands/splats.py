@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
     from ..engine.trainer import Report
     from ..export.config import ExportConfig
+    from ..plugins.config import Need
     from ..splats.config import GaussiansConfig
     from ..style.files import StyleFile
     from ..viewer.aside import Aside
@@ -43,19 +44,22 @@ class SplatVerbs(Verbs):
             raise UsageError(f"--view: {method} is not shown while it trains; leave --view out")
         return _train(self.config, method, quiet, others)
 
+    def needs(self) -> "list[Need]":
+        """Nothing: what it takes is installed with fprf."""
+        return []
+
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Judge renders, lenses included, as those of fields are judged."""
-        from ..datamanagers.parsers.recognise import parse_scene
         from ..engine.run import view_names
         from ..evaluation.judge import judge_views
-        from ..splats.training import draw_view, load_trained
+        from ..splats.training import draw_view, load_trained, scene_of
         from .eval import store
 
         if config.fit_poses:
             raise UsageError("--fit-poses: is for runs of fields; leave it out")
         trained = load_trained(config.run, self.config)
         data = config.data or trained.config.data
-        scene = parse_scene(data, trained.config.downscale, trained.config.parser)
+        scene = scene_of(replace(trained.config, data=data))
         if tuple(view_names(scene.paths)) != trained.known.names:
             raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
         views = trained.known.split(config.split)
@@ -137,12 +141,11 @@ def _refuse_styles(run: Path, *styles: object) -> None:
 
 def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) -> Path:
     """Train to the end, or go on; see `train.train_scene` for fields."""
-    from ..datamanagers.parsers.recognise import parse_scene
     from ..engine import originals
     from ..engine.lock import held
     from ..engine.run import Run
     from ..output.atomic import remove_unfinished
-    from ..splats.training import facts_of, prepare, train
+    from ..splats.training import facts_of, prepare, scene_of, train, with_downscale
     from .event_log import EventLog
     from .train import check_same, default_output
 
@@ -152,9 +155,12 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
     folder = Run(output)
     with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
+        if config.downscale is None and folder.exists:
+            config = replace(config, downscale=folder.load_config()[0].downscale)
+        config = with_downscale(config)
         check_same(folder, config)
         remove_unfinished(output)
-        scene = parse_scene(config.data, config.downscale, config.parser)
+        scene = scene_of(config)
         marks = originals.fingerprints(scene)
         if folder.exists and not others:
             originals.refuse_others(output, scene, marks)

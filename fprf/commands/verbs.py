@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..export.config import ExportConfig
+    from ..plugins.config import Need
     from ..style.files import StyleFile
     from ..viewer.aside import Aside
     from .eval import EvalConfig
@@ -30,6 +31,10 @@ class Verbs(ABC):
 
         `view` shows how it goes; `others` lets the images differ from those that the run was begun with.
         """
+
+    @abstractmethod
+    def needs(self) -> "list[Need]":
+        """Packages and weights that training needs and that are not here."""
 
     @abstractmethod
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene
 from ..rendering.cameras import project
-from .photographs import pinhole, undistorted
+from .photographs import cover, undistorted
 
 __all__ = ["Points", "initial_points", "spacing", "spatial_order"]
 
@@ -97,8 +97,8 @@ def _matched(scene: Scene, images: list[Image]) -> Points:
     """Points triangulated from SIFT matches between neighbouring training views."""
     views = scene.train.tolist()
     detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.01)
-    cameras = {view: pinhole(scene.cameras, view, 1e-6) for view in views}
-    pictures = {view: undistorted(scene.cameras, view, images[view])[0] for view in views}
+    cameras = {view: cover(scene.cameras, view, 1e-6)[0] for view in views}
+    pictures = {view: undistorted(scene.cameras, view, images[view], cameras[view])[0] for view in views}
     places: dict[int, Doubles] = {}
     features: dict[int, NDArray[np.float32]] = {}
     for view in views:

@@ -52,17 +52,22 @@ def pinhole(cameras: Cameras, view: int, near: float) -> Pinhole:
     return Pinhole(_intrinsics(fx, fy, cx, cy), _world_to_camera(cameras.pose[view]), width, height, near)
 
 
-def undistorted(cameras: Cameras, view: int, image: Image) -> tuple[Image, NDArray[np.bool_] | None]:
-    """The image of `pinhole`'s camera, and where it lies within the photograph; None = everywhere."""
+def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> tuple[Image, NDArray[np.bool_] | None]:
+    """What a pinhole camera at a view's place sees of its image, and where that lies within it; None = everywhere.
+
+    The image is returned as it is where the view is a pinhole, which `camera` is then taken to be.
+    """
     if int(cameras.lens[view]) == 0:
         return image, None
     width, height = cameras.size[view].tolist()
-    local = (pixel_grid(cameras, view) - cameras.centre[view]) / cameras.focal[view]
+    x, y = torch.arange(camera.width).double() + 0.5, torch.arange(camera.height).double() + 0.5
+    grid = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).view(-1, 2)
+    local = (grid - camera.intrinsics[:2, 2]) / camera.intrinsics.diagonal()[:2]
     turned = torch.stack([local[:, 0], -local[:, 1], -torch.ones(len(local), dtype=torch.float64)], -1)
     pose = cameras.pose[view]
     points = turned @ pose[:, :3].T + pose[:, 3]
     pixel, _ = project(cameras, torch.full((len(points),), view), points)
-    place = pixel.view(height, width, 2).numpy()
+    place = pixel.view(camera.height, camera.width, 2).numpy()
     inside = np.isfinite(place).all(-1) & (place >= 0.5).all(-1) & (place <= np.array([width - 0.5, height - 0.5])).all(-1)
     return _sampled(image, np.nan_to_num(place, nan=-1e6)), inside
 
@@ -95,23 +100,22 @@ def distorted(image: Annotated[Tensor, "h w C"], place: Annotated[Tensor, "H W 2
 def make_levels(
     scene: Scene, images: list[Image], background: tuple[float, float, float], near: float, *, masks: bool
 ) -> tuple[Level, Level]:
-    """The training views at their own size and at half of it.
-
-    Views of several sizes are brought to the one of the first by cutting and padding, which leaves their pixels alone.
-    """
+    """The training views at their own size and at half of it, brought to the size of the largest one by padding."""
     views = scene.train.tolist()
-    width, height = (int(v) for v in scene.cameras.size[scene.train].amax(0))
+    cameras = {view: cover(scene.cameras, view, near)[0] for view in views}
+    width, height = max(each.width for each in cameras.values()), max(each.height for each in cameras.values())
     fine: dict[int, Photograph] = {}
     coarse: dict[int, Photograph] = {}
     for view in views:
-        image, valid = undistorted(scene.cameras, view, images[view])
+        camera = cameras[view]
+        image, valid = undistorted(scene.cameras, view, images[view], camera)
         mask = scene.masks[view] if masks and scene.masks else None
         if mask is not None:
-            kept = load_mask(mask, (image.shape[1], image.shape[0]))
-            seen = undistorted(scene.cameras, view, np.repeat(kept[..., None], 3, 2).astype(np.uint8) * 255)[0][..., 0] > 254
+            kept = load_mask(mask, (images[view].shape[1], images[view].shape[0]))
+            white = np.repeat(kept[..., None], 3, 2).astype(np.uint8) * 255
+            seen = undistorted(scene.cameras, view, white, camera)[0][..., 0] > 254
             valid = seen if valid is None else valid & seen
         colours: Floats = np.divide(image, 255, dtype=np.float32)
-        camera = pinhole(scene.cameras, view, near)
         fine[view] = _photograph(camera, colours, valid, width, height)
         small = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
         half: Floats = np.asarray(cv2.resize(colours, small, interpolation=cv2.INTER_AREA), np.float32)

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.images import load_images
+from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
 from ..engine import checkpoint
 from ..engine.interrupts import held_back
@@ -19,7 +21,7 @@ from ..engine.run import Known, Run
 from ..engine.schedule import progress
 from ..engine.trainer import REPORT_SECONDS, Report
 from ..engine.views import View
-from ..errors import CheckpointError, NumericsError
+from ..errors import CheckpointError, NumericsError, UsageError
 from ..ops.rasterise import Pinhole, rasterise
 from ..rendering.bounds import find_space
 from ..rendering.cameras import Cameras, project
@@ -29,11 +31,23 @@ from .initial import Points, initial_points
 from .learner import Learner, Step
 from .photographs import cover, distorted, make_levels
 
-__all__ = ["Prepared", "TrainedGaussians", "draw_view", "facts_of", "load_trained", "prepare", "train"]
+__all__ = [
+    "Prepared",
+    "TrainedGaussians",
+    "draw_view",
+    "facts_of",
+    "load_trained",
+    "prepare",
+    "scene_of",
+    "train",
+    "with_downscale",
+]
 
 _PATIENCE = 3
 """Steps in a row without a finite loss after which training gives up."""
 _SMOOTHING = 0.95
+_PIXELS = 200_000
+"""Of an image, where nobody says how far to reduce them."""
 _NEAR = 0.25
 """Of the distance that all but 1 % of the points in view have: nothing is drawn nearer to a camera."""
 
@@ -60,6 +74,21 @@ class TrainedGaussians(NamedTuple):
     step: int
     seconds: float
     """How long it was trained."""
+
+
+def scene_of(config: GaussiansConfig) -> Scene:
+    """The scene of a config, at its size. Raises UsageError where it names none, DataError where that cannot be read."""
+    if config.data is None:
+        raise UsageError("no scene is named: give --data FOLDER, or --data town for the embedded one")
+    return parse_scene(config.data, config.downscale or 1, config.parser)
+
+
+def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
+    """The config with the size of its images decided: the smallest factor at which none has more than 200 000 pixels."""
+    if config.downscale is not None:
+        return config
+    pixels = int(scene_of(config).cameras.size.prod(1).max())
+    return replace(config, downscale=max(1, math.ceil(math.sqrt(pixels / _PIXELS))))
 
 
 def prepare(config: GaussiansConfig, scene: Scene) -> Prepared:

@@ -162,8 +162,8 @@ def test_methods_by_name_and_by_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("def m(): return 3", "gives int, not a TrainConfig"),
-        ("m = 4", "gives int, not a TrainConfig"),
+        ("def m(): return 3", "gives int, not a RunConfig"),
+        ("m = 4", "gives int, not a RunConfig"),
         ("def m(): return {}['x']", "failed: KeyError: 'x'"),
         ("from fprf.config import TrainConfig\ndef m(): return TrainConfig(steps=-1)", "steps: -1 must be at least 0"),
         ("import nothing_like_it", "failed to import"),

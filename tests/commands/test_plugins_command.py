@@ -44,7 +44,7 @@ def test_every_group_that_is_installed_is_known() -> None:
             "from fprf.commands.config import CommandConfig as thing",
             "is never called: fprf has a verb",
         ),
-        ("fprf.methods", "x", "def thing(): return None", "gives NoneType, not a TrainConfig"),
+        ("fprf.methods", "x", "def thing(): return None", "gives NoneType, not a RunConfig"),
     ],
 )
 def test_what_is_broken_is_told_and_nothing_else(

@@ -174,7 +174,7 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
 
     assert (middle(drawn) - pixel[0]).norm() < 0.1
     bytes_ = (drawn.clamp(0, 1) * 255).byte().numpy()
-    back, inside = photographs.undistorted(cameras, 0, bytes_)
+    back, inside = photographs.undistorted(cameras, 0, bytes_, photographs.pinhole(cameras, 0, 0.01))
     assert inside is not None and 0.8 < inside.mean() < 1.01
     assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
 
