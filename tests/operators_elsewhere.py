@@ -12,6 +12,7 @@ ELSEWHERE = {
     "march_gradient_kernels": "compiled loops behind march, in test_march",
     "march_kernels": "compiled loops behind march, in test_march",
     "mixture_kernels": "compiled loops behind mixture, in test_mixture",
+    "photometric": "of images as planes, in test_photometric",
     "rasterise": "of a camera and Gaussians, in test_rasterise",
     "rasterise_gradient_kernels": "compiled loops behind rasterise, in test_rasterise",
     "rasterise_kernels": "compiled loops behind rasterise, in test_rasterise",
