@@ -75,5 +75,5 @@ def test_a_scene_without_semantics_is_one_region(world: World) -> None:
         share=torch.ones(1),
         semantic_mean=scene.semantic_mean[:0],
     )
-    (found,) = explain(trained, Regions(TrainedViews(trained), one, None))
+    (found,) = explain(Regions(TrainedViews(trained), one, None))
     assert found.share == 1.0 and found.picture.shape == (24, 32, 3)
