@@ -41,7 +41,7 @@ VERBS = {
     "train": Verb("METHOD|CONFIG.json --data DIR", "train a scene, or go on where a run stopped"),
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
-    "restyle": Verb("CAPTURE.ply --references A.jpg ...", "restyle a finished capture of 3D Gaussians, from its file alone"),
+    "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),
     "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("RUN", "in the browser: drop a photograph on the scene to restyle it"),
@@ -52,7 +52,7 @@ VERBS = {
     "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
     "completion": Verb("bash|zsh|fish", "a script by which a shell completes verbs and flags"),
-    "doctor": Verb("[RUN|DIR|METHOD]", "look over this machine, a run, a scene folder, a method's needs"),
+    "doctor": Verb("[RUN|DIR|METHOD]", "look over this machine, a run, a scene or a method's needs"),
 }
 
 

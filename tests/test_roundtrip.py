@@ -11,7 +11,6 @@ import pytest
 from fprf.commands.flags import flags_of
 from fprf.commands.parsing import load_method, parse
 from fprf.commands.plugins import KINDS
-from fprf.config import TrainConfig
 from fprf.plugins import registry
 from fprf.plugins.codec import from_json, load_config, save_config, to_json
 from fprf.plugins.slots import slots
@@ -42,11 +41,13 @@ def command_line(config: Any) -> Iterator[str]:
 @pytest.mark.parametrize("name", METHODS)
 def test_a_method_survives_json_and_the_command_line(name: str, tmp_path: Path) -> None:
     config, _ = load_method(name)
-    assert from_json(json.loads(json.dumps(to_json(config))), TrainConfig) == config
+    assert from_json(json.loads(json.dumps(to_json(config))), type(config)) == config
     save_config(tmp_path / "config.json", config, name)
     assert load_config(tmp_path / "config.json") == (config, name)
     for start in METHODS:
         default, _ = load_method(start)
+        if type(default) is not type(config):  # their flags differ
+            continue
         assert parse(default, list(command_line(config)), prog="x", description="") == config
 
 

@@ -78,7 +78,7 @@ def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:
         flag = flags.get(_dashed(key))
         if flag and equals:
             spelled.append(f"{key}={_literal(inline, flag)}")
-        elif flag and flag.boolean and args[at + 1 : at + 2] not in _TRUTHS:
+        elif flag and flag.boolean and args[at + 1 : at + 2] not in (*_TRUTHS, *(_NONES if flag.optional else ())):
             spelled += [arg, "True"]
         elif (opposite := flags.get(re.sub(r"(^--|\.)no-(?=[^.]*$)", r"\1", _dashed(arg)))) and not flag and opposite.boolean:
             spelled += [opposite.text, "False"]
@@ -180,4 +180,5 @@ def _words(hint: Any) -> str:
 
 
 _TRUTHS = (["True"], ["False"], ["true"], ["false"])
+_NONES = (["none"], ["None"])
 _SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}

@@ -63,7 +63,7 @@ def small(town: Path, output: Path, blocks: LayoutConfig = BLOCKS, steps: int = 
 
 def block_flags(town: Path, output: Path, steps: int = STEPS) -> list[str]:
     """`small` on the command line, from the method `fprf-lite`."""
-    words = f"""--data {town} --output {output} --steps {steps} --device cpu --blocks street --blocks.segments 3
+    words = f"""--data {town} --output {output} --downscale 1 --steps {steps} --device cpu --blocks street --blocks.segments 3
         --datamanager.rays 128 --datamanager.semantic-share 0.5 --sampler.samples 12 --sampler.final 8
         --sampler.resolutions 8 --sampler.anneal-steps 4 --content.field.resolutions 8 --content.field.channels 8
         --content.field.hidden 16 --content.field.layers 1 --semantic.field.resolutions 8 --semantic.field.channels 8

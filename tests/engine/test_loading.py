@@ -61,7 +61,9 @@ def test_a_scene_without_semantics_has_no_basis(moved: Path) -> None:
     run = load_run(moved).run
     tensors = run.load_tensors("style")
     one = {name: tensors[name][:1] for name in ("region_mean", "region_covariance")} | {"share": torch.ones(1)}
-    run.save_tensors("style", tensors | one | {"keys": torch.zeros(1, 0), "semantic_mean": torch.zeros(0)})
+    run.save_tensors(
+        "style", tensors | one | {"keys": torch.zeros(1, 0), "semantic_mean": torch.zeros(0), "contacts": torch.zeros(1, 1)}
+    )
     scene, basis = load_style(run)
     assert basis is None and scene.keys.shape == (1, 0)
 

@@ -29,7 +29,7 @@ def test_features_are_computed_once(world: World) -> None:
     told: list[tuple[int, int, str]] = []
 
     def files() -> dict[Path, int]:
-        return {p: p.stat().st_mtime_ns for p in cache_folder().rglob("*") if p.is_file() and p.suffix != ".json"}
+        return {p: p.stat().st_ino for p in cache_folder().rglob("*") if p.is_file() and p.suffix != ".json"}
 
     before = files()
     again = prepare(world.config, lambda *of: told.append(of))

@@ -60,7 +60,14 @@ def test_regions_are_known_again_whatever_their_order() -> None:
     def style(keys: torch.Tensor) -> SceneStyle:
         k, c = len(keys), 3
         return SceneStyle(
-            torch.zeros(c), torch.eye(c), keys, torch.zeros(k, c), torch.zeros(k, c, c), torch.full((k,), 1 / k), middle
+            torch.zeros(c),
+            torch.eye(c),
+            keys,
+            torch.zeros(k, c),
+            torch.zeros(k, c, c),
+            torch.full((k,), 1 / k),
+            middle,
+            torch.zeros(k, k),
         )
 
     order = torch.randperm(6, generator=generator)
