@@ -168,7 +168,7 @@ def cleaned(folder: Path) -> Iterator[Finding]:
 
 
 def feature_folder() -> Path:
-    """Where feature targets are cached."""
+    """Folder of cached feature targets."""
     from ..engine.prepare import cache_folder
 
     return cache_folder() / "features"

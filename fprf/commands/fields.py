@@ -18,7 +18,7 @@ __all__ = ["FieldVerbs"]
 
 
 class FieldVerbs(Verbs):
-    """What the verbs' own modules do."""
+    """Verbs on runs of fields; each calls its own module."""
 
     def __init__(self, config: "TrainConfig") -> None:
         self.config = config
@@ -37,7 +37,7 @@ class FieldVerbs(Verbs):
         return train_scene(self.config, method, quiet=quiet, view=view, others=others)
 
     def needs(self) -> "list[Need]":
-        """What plug-ins and the decoder need."""
+        """List packages and weights that plug-ins and the decoder lack."""
         from ..engine.needs import decoder_needs, plugin_needs
 
         found = plugin_needs(self.config)

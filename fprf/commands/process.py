@@ -19,7 +19,7 @@ from .progress import Display
 __all__ = ["ProcessConfig", "run"]
 
 METHOD, MINUTES = "fprf-lite", 8
-"""What the command that is printed trains with: on two cores, together with poses, in less than twelve minutes."""
+"""Method and minutes of the printed training command; with poses less than twelve minutes in all on two cores."""
 
 _DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
 

@@ -39,7 +39,7 @@ in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png. REFERENCE is a f
 
 @dataclass(frozen=True, kw_only=True)
 class RestyleConfig(StyleConfig, LookConfig):
-    """What to restyle, with what, and what to write."""
+    """Flags of `fprf restyle`: the capture, the style and the files to write."""
 
     capture: Path = Path()
     """The capture: a file of Gaussians, or a SOG folder."""
@@ -48,7 +48,7 @@ class RestyleConfig(StyleConfig, LookConfig):
     style: Path | None = None
     """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
     stylizer: StylizerConfig = RegionToneConfig(centred=False)
-    """What moves the capture's colours."""
+    """Method that changes the colours of the capture."""
     each: bool = False
     """Each reference is a style of its own; its name is added to those of the files."""
     sheet: Path | None = None
@@ -156,7 +156,7 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
 
 
 def _known(capture: "Capture", finite: "Tensor", encoder: "Encoder", config: RestyleConfig, display: Display) -> "SplatScene":
-    """What the cache knows of a capture; else what looking at it tells, which the cache then keeps."""
+    """Return the views and features of a capture from the cache; compute and store them where they are absent."""
     from ..engine.prepare import cache_folder
     from ..engine.tensorfiles import load_sealed, save_sealed
     from ..splats.scene import cache_name, load_scene, look_at_capture, scene_tensors

@@ -236,7 +236,7 @@ def _told_features(config: "TrainConfig", display: "Display") -> "Callable[[int,
 
 
 def _say_outcome(folder: "Run", config: "TrainConfig", scene: "Scene", display: "Display", seconds: float) -> None:
-    """What training came to, and what comes next."""
+    """Say the quality that training reached and the next command."""
     from ..engine.budget import outcome
 
     quoted = shlex.quote(str(folder.root))
