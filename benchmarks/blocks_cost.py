@@ -15,11 +15,11 @@ from pathlib import Path
 import torch
 
 from fprf.blocks.plan import boxes_to
-from fprf.engine.blocks import SURROUNDINGS, folder_of
-from fprf.engine.lay_out import load_boxes
-from fprf.engine.loading import load_run
-from fprf.engine.views import render_view
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
+from fprf.training.blocks import SURROUNDINGS, folder_of
+from fprf.training.lay_out import load_boxes
+from fprf.training.loading import load_run
+from fprf.training.views import render_view
 from fprf.types import Boxes
 
 Row = dict[str, float | int]

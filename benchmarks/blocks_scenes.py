@@ -18,12 +18,12 @@ from typing import Any
 import torch
 from large_scene import parameters, psnr, trained_seconds, use_processor_time, widened
 
-from fprf.commands.parsing import load_method, parse
-from fprf.commands.train import train_scene
-from fprf.engine.lay_out import lay_out, load_boxes, plan_scene
-from fprf.engine.loading import load_run
+from fprf.cli.parsing import load_method, parse
+from fprf.cli.train import train_scene
 from fprf.fields.layouts import SingleConfig
 from fprf.process import keep_memory
+from fprf.training.lay_out import lay_out, load_boxes, plan_scene
+from fprf.training.loading import load_run
 
 
 def main() -> None:

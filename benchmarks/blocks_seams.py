@@ -10,9 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from fprf.engine.loading import Trained
 from fprf.rendering.renderer import render_rays
 from fprf.style.look import Restyle
+from fprf.training.loading import Trained
 from fprf.types import Boxes, Want
 
 APART = 1e-3

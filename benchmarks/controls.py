@@ -20,15 +20,15 @@ from pathlib import Path
 
 import torch
 
-from fprf.engine.explain import explain
-from fprf.engine.loading import Trained, load_run
-from fprf.engine.matches import match_map
-from fprf.engine.restyle import Encoders, Styled, apply_style, open_encoders
-from fprf.engine.views import render_view
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
+from fprf.training.explain import explain
+from fprf.training.loading import Trained, load_run
+from fprf.training.matches import match_map
+from fprf.training.restyle import Encoders, Styled, apply_style, open_encoders
+from fprf.training.views import render_view
 
 Row = dict[str, str | float | None]
 SIZE = (240, 135)
@@ -52,9 +52,9 @@ def median(call: Callable[[], object]) -> float:
 def start_seconds() -> float:
     """Processor time of a fresh interpreter that has imported what a restyle needs, and parsed flags."""
     code = (
-        "import time, fprf.commands.stylize as s\n"
+        "import time, fprf.cli.stylize as s\n"
         "s.read_flags(s.StylizeConfig(), ['RUN'], prog='x', description='', positional=('run',))\n"
-        "import fprf.engine.loading, fprf.engine.restyle, fprf.engine.matches\n"
+        "import fprf.training.loading, fprf.training.restyle, fprf.training.matches\n"
         "print(time.process_time())"
     )
     ran = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout for _ in range(3)]

@@ -23,7 +23,7 @@ import torch
 from safetensors.torch import load_file
 
 from fprf.interfaces import Encoder
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
 from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
 from fprf.plugins.decoders.mlp import MlpDecoder
 from fprf.plugins.encoders.config import BundledContentConfig, EncoderConfig, Vgg19Config

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fprf import cli
-from fprf.commands.parsing import parse
+from fprf.cli import main as cli
+from fprf.cli.parsing import parse
 from fprf.errors import FprfError, UsageError
 
 HERE = Path(__file__).resolve().parents[1]

@@ -19,10 +19,10 @@ import trimesh
 
 import fprf
 from fprf.api import TrainedScene
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.errors import UsageError
-from fprf.output.atomic import write_json
-from fprf.output.images import write_image
+from fprf.io.atomic import write_json
+from fprf.io.images import write_image
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
 

@@ -18,17 +18,17 @@ from sheets import sheet
 from torch import Tensor
 
 from fprf.datamanagers.images import load_image
-from fprf.engine.cached_view import cache_view
-from fprf.engine.loading import load_run
-from fprf.engine.restyle import apply_style, open_encoders
 from fprf.evaluation.false_edges import false_edges
 from fprf.evaluation.structure import structure
-from fprf.output.atomic import write_json
-from fprf.output.images import shrink, write_image
+from fprf.io.atomic import write_json
+from fprf.io.images import shrink, write_image
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.presets import PRESETS, with_preset
+from fprf.training.cached_view import cache_view
+from fprf.training.loading import load_run
+from fprf.training.restyle import apply_style, open_encoders
 
 HERE = Path(__file__).resolve().parents[1]
 BASE = StyleConfig()

@@ -23,17 +23,17 @@ from typing import Any
 
 import numpy as np
 
-from fprf.commands.parsing import load_method, parse
-from fprf.commands.train import train_scene
+from fprf.cli.parsing import load_method, parse
+from fprf.cli.train import train_scene
 from fprf.datamanagers.parsers.files import read_json
 from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.datamanagers.scene import Scene
-from fprf.engine.loading import load_run
 from fprf.evaluation.judge import judge
 from fprf.evidence.provenance import commit
-from fprf.output.images import to_uint8
-from fprf.output.video import write_frames
+from fprf.io.images import to_uint8
+from fprf.io.video import write_frames
 from fprf.process import keep_memory
+from fprf.training.loading import load_run
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
 from fprf.stress.fuzz import Target, fuzz
 from fprf.stress.readers import targets
 

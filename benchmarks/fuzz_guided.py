@@ -24,7 +24,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
 from fprf.stress.readers import targets
 
 ROOM = 2 << 30

@@ -17,13 +17,13 @@ from styles import HERE, judges, observer, say
 from torch import Tensor
 
 from fprf.checks import at_least
-from fprf.commands.parsing import parse
-from fprf.engine.loading import Trained, load_run
+from fprf.cli.parsing import parse
 from fprf.errors import FprfError
 from fprf.evaluation.contest import PLAIN, STYLIZERS, Row, mean_rows
-from fprf.output.atomic import write_text
-from fprf.output.images import write_image
+from fprf.io.atomic import write_text
+from fprf.io.images import write_image
 from fprf.plugins.encoders.config import BundledSemanticConfig, EncoderConfig
+from fprf.training.loading import Trained, load_run
 
 SETS = (("autumn",), ("winter",), ("sunset",), ("night",), ("autumn", "night"))
 LICENCES = {

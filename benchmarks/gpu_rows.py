@@ -17,8 +17,8 @@ import torch
 from rich.console import Console
 
 from fprf.benchmarking.report import Row, document, rows_table, table
+from fprf.io.atomic import write_json
 from fprf.ops import triplane_numba, triplane_triton
-from fprf.output.atomic import write_json
 
 FRAME = 1008 * 756
 STYLES = ("stylised, region-tone", "stylised, region-ot", "stylised, local-adain")

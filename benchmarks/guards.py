@@ -18,11 +18,11 @@ from unittest import mock
 import torch
 
 from fprf.benchmarking.report import machine
-from fprf.commands.parsing import load_method
-from fprf.engine import guards, trainer
-from fprf.engine.model import build_model
-from fprf.engine.prepare import prepare
-from fprf.output.atomic import write_json
+from fprf.cli.parsing import load_method
+from fprf.io.atomic import write_json
+from fprf.training import guards, trainer
+from fprf.training.model import build_model
+from fprf.training.prepare import prepare
 
 SHARE = 0.5
 

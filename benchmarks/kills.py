@@ -26,17 +26,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fprf.commands.train import train_scene
+from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
-from fprf.engine import lay_out, prepare, style_pass, trainer
-from fprf.engine.checkpoint import load
-from fprf.engine.checkpoint import steps as saved
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.io.atomic import write_json
 from fprf.methods import fprf_lite
-from fprf.output.atomic import write_json
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.town.write import write_town
+from fprf.training import lay_out, prepare, style_pass, trainer
+from fprf.training.checkpoint import load
+from fprf.training.checkpoint import steps as saved
 
 KILLED = -9
 PARTS = (lay_out, prepare, style_pass, trainer)

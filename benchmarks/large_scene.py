@@ -22,28 +22,28 @@ import torch
 from blocks_cost import costs
 from blocks_seams import jumps, ratios
 
-from fprf.commands import blocks as blocks_verb
-from fprf.commands import train as train_verb
-from fprf.commands.train import train_scene
+from fprf.cli import blocks as blocks_verb
+from fprf.cli import train as train_verb
+from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import TownConfig
 from fprf.datamanagers.parsers.recognise import parse_scene
-from fprf.engine import trainer
-from fprf.engine.lay_out import lay_out, load_boxes, plan_scene
-from fprf.engine.loading import Trained, load_run
-from fprf.engine.restyle import apply_style
-from fprf.engine.views import render_view
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.layouts import SingleConfig, StreetConfig
+from fprf.io.images import to_uint8, write_image
 from fprf.methods import fprf_lite
-from fprf.output.images import to_uint8, write_image
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.process import keep_memory
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.town.write import write_town
+from fprf.training import trainer
+from fprf.training.lay_out import lay_out, load_boxes, plan_scene
+from fprf.training.loading import Trained, load_run
+from fprf.training.restyle import apply_style
+from fprf.training.views import render_view
 
 METRES = 17.0
 """Of street in a block."""

@@ -20,12 +20,12 @@ import numpy as np
 from sheets import sheet
 from town_references import town_reference
 
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.errors import UsageError
-from fprf.output.atomic import write_json
-from fprf.output.images import to_uint8, write_image
+from fprf.io.atomic import write_json
+from fprf.io.images import to_uint8, write_image
 from fprf.town.write import write_town
 
 HERE = Path(__file__).resolve().parent.parent

@@ -28,16 +28,16 @@ from kills import tiny
 
 from fprf.config import TrainConfig
 from fprf.datamanagers.images import load_images
-from fprf.engine import checkpoint
-from fprf.engine.model import Model
-from fprf.engine.prepare import Prepared, prepare
-from fprf.engine.run import Run
-from fprf.engine.trainer import Report, train
-from fprf.engine.views import render_view
 from fprf.evaluation.metrics import psnr
 from fprf.interfaces import DataManager
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
 from fprf.town.write import write_town
+from fprf.training import checkpoint
+from fprf.training.model import Model
+from fprf.training.prepare import Prepared, prepare
+from fprf.training.run import Run
+from fprf.training.trainer import Report, train
+from fprf.training.views import render_view
 from fprf.types import Batch
 
 NAN, INF = float("nan"), float("inf")

@@ -23,17 +23,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fprf.commands.parsing import load_method, parse
-from fprf.commands.train import train_scene
+from fprf.cli.parsing import load_method, parse
+from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 from fprf.datamanagers.parsers.recognise import parse_scene
-from fprf.engine.loading import load_run
-from fprf.engine.poses import rotated
-from fprf.engine.prepare import with_downscale
 from fprf.evaluation.alignment import align
 from fprf.evaluation.judge import judge
 from fprf.process import keep_memory
 from fprf.rendering.cameras import Cameras
+from fprf.training.loading import load_run
+from fprf.training.poses import rotated
+from fprf.training.prepare import with_downscale
 
 
 def perturbed(source: Path, folder: Path, degrees: float, share: float, seed: int) -> Path:

@@ -20,13 +20,13 @@ from fprf.benchmarking.report import machine
 from fprf.benchmarking.training import batch_rays
 from fprf.config import TrainConfig
 from fprf.datamanagers.parsers.recognise import parse_scene
-from fprf.engine import checkpoint
-from fprf.engine.model import Model, background_of, build_model
-from fprf.engine.prepare import Prepared, cache_folder
-from fprf.engine.run import Run
+from fprf.io.atomic import write_json
 from fprf.ops.backend import plain
-from fprf.output.atomic import write_json
 from fprf.rendering.renderer import render_rays
+from fprf.training import checkpoint
+from fprf.training.model import Model, background_of, build_model
+from fprf.training.prepare import Prepared, cache_folder
+from fprf.training.run import Run
 from fprf.types import Want
 
 

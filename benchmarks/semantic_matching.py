@@ -15,13 +15,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.errors import FprfError
 from fprf.evaluation.semantic_matching import palette_match, semantic_matching
 from fprf.evaluation.town_classes import town_cells
 from fprf.evaluation.triplets import read_triplets
 from fprf.interfaces import Encoder
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
 from fprf.plugins.encoders.config import BundledSemanticConfig, EncoderConfig
 from fprf.town.palettes import PALETTES
 

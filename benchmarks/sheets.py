@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from fprf.output.images import Picture, to_uint8
+from fprf.io.images import Picture, to_uint8
 
 BAR = 18
 GAP = 4

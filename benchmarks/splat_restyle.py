@@ -91,7 +91,6 @@ def made_up(path: Path, count: int) -> None:
 def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     import torch
 
-    from fprf.engine.restyle_gaussians import restyle_gaussians, restyled_harmonics
     from fprf.memory import peak
     from fprf.plugins.encoders.config import BundledSemanticConfig
     from fprf.plugins.stylizers.config import RegionToneConfig
@@ -100,6 +99,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     from fprf.splats.scene import look_at_capture
     from fprf.style.config import StyleConfig
     from fprf.style.files import StyleFile
+    from fprf.training.restyle_gaussians import restyle_gaussians, restyled_harmonics
 
     torch.set_num_threads(1)
     start = time.process_time()

@@ -16,19 +16,19 @@ from town_references import SETS, town_reference
 
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.recognise import parse_scene
-from fprf.engine.loading import Trained, load_run
-from fprf.engine.restyle import apply_style, open_encoders
 from fprf.errors import DataError
 from fprf.evaluation.consistency import consistency
 from fprf.evaluation.contest import PLAIN, STYLIZERS, Exhibit, Row, colour_baselines, judge_exhibit
 from fprf.evaluation.looks import render_looks
 from fprf.evaluation.matched_regions import matched_regions
 from fprf.interfaces import Encoder
-from fprf.output.images import shrink, to_uint8, write_image
+from fprf.io.images import shrink, to_uint8, write_image
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.town.write import read_truth
+from fprf.training.loading import Trained, load_run
+from fprf.training.restyle import apply_style, open_encoders
 
 SINGLE, SEVERAL = 4, 2
 """References of a scene: so many alone, so many sets of several."""

@@ -14,7 +14,7 @@ from fprf.evaluation.contest import PLAIN, STYLIZERS, Exhibit, Row, colour_basel
 from fprf.evaluation.flat import cells_basis, encoded, flat_look, flat_reference, flat_scene, painted, render_flat
 from fprf.evaluation.triplets import COLOURS, Triplet, read_triplets, triplet_names
 from fprf.interfaces import Decoder, Encoder
-from fprf.output.images import shrink
+from fprf.io.images import shrink
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig
 from fprf.plugins.stylizers.config import IdentityConfig

@@ -19,12 +19,12 @@ import torch
 from sheets import sheet
 
 from fprf.checks import at_least
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.errors import FprfError
 from fprf.evaluation.contest import GOALS, RECOMMENDED, Row, mean_rows, verdict
 from fprf.interfaces import Encoder
-from fprf.output.atomic import write_json
-from fprf.output.images import write_image
+from fprf.io.atomic import write_json
+from fprf.io.images import write_image
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, RandomConfig, Vgg19Config
 from fprf.plugins.encoders.segmenter_config import DeepLabConfig
 

@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "viewer")
 
 from browser import front, served
 
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
 
 FORMAT = 1
 TARGETS = {"start_seconds": 3.0, "drop_seconds": 0.5, "memory_ratio": 1.05}

@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "viewer")
 
 from browser import Front, front, served
 
-from fprf.output.images import Picture, write_image
-from fprf.output.video import write_video
+from fprf.io.images import Picture, write_image
+from fprf.io.video import write_video
 
 WIDTH, HEIGHT = 1280, 720
 FILM = (960, 540)

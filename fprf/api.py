@@ -19,13 +19,8 @@ import torch
 from torch import Tensor
 
 from .checks import at_least, between
-from .engine.loading import Trained, load_run
-from .engine.matches import MatchMap, match_map
-from .engine.quality import Name, QualityConfig, at_quality
-from .engine.restyle import Encoders, Styled, apply_style, mixed, open_encoders
-from .engine.views import render_view
 from .errors import UsageError
-from .output.images import Picture, to_uint8, write_image
+from .io.images import Picture, to_uint8, write_image
 from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
@@ -35,6 +30,11 @@ from .style.config import StyleConfig
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
 from .style.presets import with_preset
+from .training.loading import Trained, load_run
+from .training.matches import MatchMap, match_map
+from .training.quality import Name, QualityConfig, at_quality
+from .training.restyle import Encoders, Styled, apply_style, mixed, open_encoders
+from .training.views import render_view
 
 __all__ = ["Shot", "TrainedScene", "open_scene"]
 

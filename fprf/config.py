@@ -16,7 +16,7 @@ from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
 
 if TYPE_CHECKING:
-    from .commands.verbs import Verbs
+    from .cli.verbs import Verbs
 
 __all__ = [
     "RESUMABLE",
@@ -277,7 +277,7 @@ class TrainConfig(RunConfig):
 
     def verbs(self) -> "Verbs":
         """How a run of fields is trained, judged, filmed and exported."""
-        from .commands.fields import FieldVerbs
+        from .cli.fields import FieldVerbs
 
         return FieldVerbs(self)
 

@@ -9,8 +9,8 @@ import torch
 from tiny_world import World
 
 import fprf
-from fprf import cli
 from fprf.api import TrainedScene
+from fprf.cli import main as cli
 from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
 from fprf.rendering.cameras import project
 from fprf.style.config import StyleConfig

@@ -10,14 +10,14 @@ import pytest
 from fake_packages import packages_in
 from tiny_world import World, trained_for
 
-from fprf.commands.parsing import load_method, parse
-from fprf.commands.plugins import run as plugins
-from fprf.engine.trainer import Report
+from fprf.cli.parsing import load_method, parse
+from fprf.cli.plugins import run as plugins
 from fprf.plugins import registry
 from fprf.plugins.codec import Missing, load_config, save_config
 from fprf.plugins.encoders.config import EncoderConfig
 from fprf.plugins.losses.config import LossTermConfig
 from fprf.testing import check_encoder, check_loss_term
+from fprf.training.trainer import Report
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "plugin"
 
@@ -91,7 +91,7 @@ def test_a_run_with_it_opens_where_it_is_not_installed(site: Path, tmp_path: Pat
 
 def test_choosing_it_imports_no_torch(site: Path) -> None:
     code = (
-        "import sys; from fprf.cli import main\n"
+        "import sys; from fprf.cli.main import main\n"
         "code = main(['train', 'fprf-lite', '--semantic.encoder', 'gabor', '--help'])\n"
         "print(code, 'torch' in sys.modules, file=sys.stderr)"
     )

@@ -16,16 +16,16 @@ from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
 
 from fprf.config import TrainConfig
-from fprf.engine import trainer
-from fprf.engine.loading import load_run
-from fprf.engine.prepare import prepare
-from fprf.engine.restyle import restyle
-from fprf.engine.run import Run
-from fprf.engine.style_pass import measure_style
-from fprf.engine.views import View, render_view
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.style.scene import to_tensors
+from fprf.training import trainer
+from fprf.training.loading import load_run
+from fprf.training.prepare import prepare
+from fprf.training.restyle import restyle
+from fprf.training.run import Run
+from fprf.training.style_pass import measure_style
+from fprf.training.views import View, render_view
 
 LEVEL = 1 / 255
 
@@ -131,7 +131,7 @@ def test_views_are_those_of_the_cpu(world: World, device: Device) -> None:
 OTHERS = [AdainConfig(), LocalAdainConfig(), RegionOtConfig()]
 OTHERS += [LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)]
 STYLES = [RegionToneConfig(), *(pytest.param(config, marks=pytest.mark.gpu) for config in OTHERS)]
-"""On the pretended device tests/engine/test_views_on_a_device.py has the others."""
+"""On the pretended device tests/training/test_views_on_a_device.py has the others."""
 
 
 @pytest.mark.parametrize("stylizer", STYLES, ids=lambda config: type(config).__name__)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from fprf.cli import VERBS
+from fprf.cli.main import VERBS
 
 HEAVY = ("torch", "numpy", "cv2", "kornia", "trimesh", "numba", "safetensors", "transformers", "av")
 BUILT_INS = """
@@ -45,7 +45,7 @@ def test_configs_import_nothing_heavy(code: str) -> None:
 
 
 def test_help_and_parsing_import_nothing_heavy() -> None:
-    code = f"from fprf.cli import main\nfor args in {COMMANDS!r}:\n    report(f'{{args}} {{main(args)}}')"
+    code = f"from fprf.cli.main import main\nfor args in {COMMANDS!r}:\n    report(f'{{args}} {{main(args)}}')"
     lines = [line for line in _fresh(code) if line.startswith("[")]
     codes = [2 if args in (["train"], ["train", "fprf", "--stpes", "3"]) else 0 for args in COMMANDS]
     assert lines == [f"{args} {code}" for args, code in zip(COMMANDS, codes, strict=True)]

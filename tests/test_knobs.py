@@ -15,21 +15,21 @@ import torch
 from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, trained_for
 
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
 from fprf.datamanagers.batches import RayBatches
 from fprf.datamanagers.parsers.recognise import parse_scene
-from fprf.engine import checkpoint
-from fprf.engine.model import build_model
-from fprf.engine.prepare import device_of, prepare
-from fprf.engine.schedule import progress
-from fprf.engine.style_pass import measure_style
-from fprf.engine.trainer import Loop, optimizer_of
-from fprf.engine.views import render_view
 from fprf.errors import ConfigError
+from fprf.io.images import write_image
 from fprf.methods import fprf_lite
-from fprf.output.images import write_image
 from fprf.plugins.codec import from_json, to_json
+from fprf.training import checkpoint
+from fprf.training.model import build_model
+from fprf.training.prepare import device_of, prepare
+from fprf.training.schedule import progress
+from fprf.training.style_pass import measure_style
+from fprf.training.trainer import Loop, optimizer_of
+from fprf.training.views import render_view
 
 SECOND: dict[str, tuple[Any, str]] = {
     "data": (Path("other"), "scene"),
@@ -267,7 +267,7 @@ def test_points_count_where_several_views_see_them(world: World, tmp_path: Path)
 
 
 def test_penalties_are_looked_up_in_the_parts(world: World, tmp_path: Path) -> None:
-    """The built-in ones have fields of their own; tests/engine/test_losses.py weighs another."""
+    """The built-in ones have fields of their own; tests/training/test_losses.py weighs another."""
     assert shown("penalties") == ["loss.penalties"]
     with pytest.raises(ConfigError, match=r"has a penalty 'opacity' \(penalties that can be named: none\)"):
         trained_for(world, tmp_path / "run", changed(world.config, "loss.penalties", SECOND["loss.penalties"][0]))

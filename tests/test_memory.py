@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pretend_cuda import pretend_cuda
 
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.errors import OutOfMemoryError
 from fprf.memory import LEAST, chunk_size, free_memory, in_parts, out_of_memory, shortage, wanted
 
@@ -111,7 +111,7 @@ def test_the_command_line_ends_with_one_line_and_2(
     def fail(args: list[str]) -> int:
         raise error
 
-    monkeypatch.setattr("fprf.commands.plugins.run", fail)
+    monkeypatch.setattr("fprf.cli.plugins.run", fail)
     assert cli.main(["plugins"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: fprf: not enough memory")

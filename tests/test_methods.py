@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from fprf.commands.parsing import load_method
+from fprf.cli.parsing import load_method
 from fprf.config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from fprf.commands.flags import flags_of
-from fprf.commands.parsing import load_method, parse
-from fprf.commands.plugins import KINDS
+from fprf.cli.flags import flags_of
+from fprf.cli.parsing import load_method, parse
+from fprf.cli.plugins import KINDS
 from fprf.plugins import registry
 from fprf.plugins.codec import from_json, load_config, save_config, to_json
 from fprf.plugins.slots import slots

@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from fprf.commands.train import train_scene
+from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
-from fprf.engine.loading import Trained, load_run
-from fprf.engine.prepare import Prepared, prepare
-from fprf.engine.run import Run
-from fprf.engine.trainer import Report, train
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import DataManager
+from fprf.io.images import write_image
 from fprf.methods import fprf_lite
-from fprf.output.images import write_image
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.pixel_rays import PixelRays
 from fprf.town.write import write_town
+from fprf.training.loading import Trained, load_run
+from fprf.training.prepare import Prepared, prepare
+from fprf.training.run import Run
+from fprf.training.trainer import Report, train
 from fprf.types import Batch, Rays
 
 __all__ = [
@@ -154,7 +154,7 @@ def trained_for(
 
 def parameters(run: Run, step: int) -> dict[str, torch.Tensor]:
     """Everything a checkpoint holds, by name."""
-    from fprf.engine.checkpoint import load
+    from fprf.training.checkpoint import load
 
     saved = load(run.checkpoints, step)
     named = {**{f"model.{k}": v for k, v in saved.model.items()}, **{f"adam.{k}": v for k, v in saved.optimizer.items()}}

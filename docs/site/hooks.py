@@ -15,9 +15,9 @@ from typing import Any
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from fprf.cli import VERBS, Verb
-from fprf.commands.completion import _FIRST, _WORDS
-from fprf.commands.parsing import DESCRIBE
+from fprf.cli.completion import _FIRST, _WORDS
+from fprf.cli.main import VERBS, Verb
+from fprf.cli.parsing import DESCRIBE
 
 ROOT = Path(__file__).resolve().parents[2]
 LOG = logging.getLogger("mkdocs.hooks.fprf")
@@ -113,7 +113,7 @@ def described(verb: str, word: str | None) -> dict[str, Any] | None:
     """What the verb says of itself; None if it has no flags."""
     heard = io.StringIO()
     with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit, Exception):
-        importlib.import_module(f"fprf.commands.{verb}").run([*([word] if word else []), DESCRIBE])
+        importlib.import_module(f"fprf.cli.{verb}").run([*([word] if word else []), DESCRIBE])
     return json.loads(heard.getvalue()) if heard.getvalue().startswith("{") else None
 
 
@@ -121,7 +121,7 @@ def help_of(verb: str) -> str:
     """What `--help` prints."""
     heard = io.StringIO()
     with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit):
-        importlib.import_module(f"fprf.commands.{verb}").run(["--help"])
+        importlib.import_module(f"fprf.cli.{verb}").run(["--help"])
     return heard.getvalue().strip()
 
 

@@ -10,16 +10,16 @@ import torch
 from torch import Tensor, nn
 
 from ..config import RenderConfig
-from ..engine.loading import Trained
-from ..engine.model import Facts, Model
-from ..engine.quality import PRESETS, QualityConfig, at_quality
-from ..engine.restyle import Styled
-from ..engine.views import render_view
 from ..fields.planes import Planes
 from ..interfaces import SemanticField
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
 from ..style.look import Restyle
+from ..training.loading import Trained
+from ..training.model import Facts, Model
+from ..training.quality import PRESETS, QualityConfig, at_quality
+from ..training.restyle import Styled
+from ..training.views import render_view
 from .naive import plain_planes, replaced
 from .views import plainly, view_rays
 

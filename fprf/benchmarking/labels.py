@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, Protocol
 from torch import nn
 from torch.profiler import record_function
 
-from ..engine.model import Model
 from ..interfaces import Stylizer
+from ..training.model import Model
 from .naive import replaced
 
 __all__ = ["PREFIX", "REST", "Event", "Range", "attribute", "exclusive", "labelled"]

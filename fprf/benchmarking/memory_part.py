@@ -57,9 +57,9 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
     trained = subject.trained
     known = trained.known
     if part in ("render", "restyle"):
-        from ..engine.restyle import restyle
-        from ..engine.views import render_view
         from ..plugins.stylizers.config import RegionOtConfig
+        from ..training.restyle import restyle
+        from ..training.views import render_view
 
         look = restyle(trained, subject.references, RegionOtConfig()).restyle if part == "restyle" else None
         render_view(trained.model, known.facts, test_view(config, trained), 0, trained.config.render, look)

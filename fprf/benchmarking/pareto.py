@@ -10,16 +10,16 @@ from rich.table import Table
 from torch import Tensor
 
 from ..datamanagers.images import load_image
-from ..engine.loading import Trained, load_run
-from ..engine.prepare import scene_of
-from ..engine.restyle import restyle
-from ..engine.run import view_names
 from ..errors import FprfError, UsageError
-from ..output.figures import number
-from ..output.images import write_image
+from ..io.figures import number
+from ..io.images import write_image
 from ..plugins.stylizers.config import RegionOtConfig
 from ..rendering.cameras import Cameras
 from ..style.look import Restyle
+from ..training.loading import Trained, load_run
+from ..training.prepare import scene_of
+from ..training.restyle import restyle
+from ..training.run import view_names
 from .config import ParetoConfig
 from .front import Point, front
 from .knobs import BUDGETS, as_rendered, plain_settings, styled_settings

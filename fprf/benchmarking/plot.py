@@ -7,8 +7,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..output.images import Picture
-from ..output.maps import palette
+from ..io.images import Picture
+from ..io.maps import palette
 from .front import Point
 
 __all__ = ["Panel", "draw", "ticks"]

@@ -15,10 +15,10 @@ import torch
 from rich.table import Table
 from torch.autograd.profiler import profile as recording
 
-from ..engine.model import background_of
-from ..engine.restyle import restyle
 from ..plugins.stylizers.config import RegionOtConfig
 from ..rendering.renderer import render_rays
+from ..training.model import background_of
+from ..training.restyle import restyle
 from ..types import Rays, Want
 from .config import ProfileConfig
 from .labels import PREFIX, REST, Range, attribute, exclusive, labelled

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from .. import __version__
-from ..output.figures import number
+from ..io.figures import number
 from .timing import Spread
 
 __all__ = ["Outcome", "Row", "document", "falls_short", "machine", "rows_table", "table"]

@@ -6,10 +6,6 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from ..engine.cached_view import cache_view
-from ..engine.folding import folded
-from ..engine.restyle import restyle
-from ..engine.views import render_view
 from ..fields.networks import weights
 from ..fields.semantic import ProjectedPlanes, SemanticPlanes
 from ..interfaces import Stylizer
@@ -18,6 +14,10 @@ from ..plugins.stylizers.config import LocalAdainConfig, StylizerConfig
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import march
 from ..style.look import Restyle
+from ..training.cached_view import cache_view
+from ..training.folding import folded
+from ..training.restyle import restyle
+from ..training.views import render_view
 from .config import SpeedConfig
 from .report import Row
 from .subject import Subject, size_of, small_view, watch_of

@@ -11,8 +11,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..engine.loading import Trained
 from ..ops import triplane
+from ..training.loading import Trained
 from .config import SpeedConfig
 from .report import Row
 from .subject import watch_of

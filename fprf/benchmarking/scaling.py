@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from ..engine.prepare import Prepared
-from ..engine.restyle import restyle
-from ..engine.views import render_view
+from ..io.figures import number
 from ..ops import triplane
-from ..output.figures import number
 from ..plugins.stylizers.config import RegionOtConfig
+from ..training.prepare import Prepared
+from ..training.restyle import restyle
+from ..training.views import render_view
 from .config import ScalingConfig
 from .report import Outcome, document, table
 from .subject import Subject, attempt, find, settings, test_view, watch_of

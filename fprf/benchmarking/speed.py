@@ -8,14 +8,14 @@ from pathlib import Path
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..engine.model import Facts, Model
-from ..engine.prepare import Prepared
-from ..engine.restyle import restyle
-from ..engine.views import render_view
 from ..interfaces import Stylizer
 from ..plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from ..rendering.cameras import Cameras
 from ..style.look import Restyle
+from ..training.model import Facts, Model
+from ..training.prepare import Prepared
+from ..training.restyle import restyle
+from ..training.views import render_view
 from .config import SpeedConfig
 from .naive import plain_planes, without_skipping
 from .report import Outcome, Row, document, rows_table

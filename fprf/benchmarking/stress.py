@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from ..output.atomic import write_text
+from ..io.atomic import write_text
 from ..stress import files, pipeline, rays, styles
 from ..stress.check import Check, markdown
 from .config import StressConfig

@@ -8,17 +8,17 @@ from typing import NamedTuple
 import torch
 
 from ..config import TrainConfig
-from ..engine.loading import Trained, load_run
-from ..engine.model import Model, build_model
-from ..engine.prepare import Prepared, prepare
-from ..engine.run import view_names
 from ..errors import FprfError, UsageError, WeightsError
-from ..output.images import write_image
+from ..io.images import write_image
 from ..rendering.cameras import Cameras
 from ..town.layout import build_town
 from ..town.palettes import palette
 from ..town.render import render
 from ..town.views import walk
+from ..training.loading import Trained, load_run
+from ..training.model import Model, build_model
+from ..training.prepare import Prepared, prepare
+from ..training.run import view_names
 from .config import BenchConfig
 from .timing import Watch
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from ..config import TrainConfig
-from ..engine.run import Run
-from ..engine.trainer import Report, train
 from ..errors import ConfigError
 from ..plugins import slots
+from ..training.run import Run
+from ..training.trainer import Report, train
 from .front import Point
 from .knobs import as_rendered
 from .points import Scenes, measure

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from ..config import TrainConfig
-from ..engine.model import Model, background_of
-from ..engine.prepare import Prepared
-from ..engine.trainer import Loop, optimizer_of
 from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
+from ..training.model import Model, background_of
+from ..training.prepare import Prepared
+from ..training.trainer import Loop, optimizer_of
 from ..types import Batch, Rays, Want
 
 __all__ = ["batch_rays", "colour_gradient", "loop_of", "stepper"]

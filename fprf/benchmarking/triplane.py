@@ -6,9 +6,9 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..engine.loading import Trained
 from ..fields.planes import Planes
 from ..ops import triplane
+from ..training.loading import Trained
 from .config import SpeedConfig
 from .naive import grid_sample_lookup
 from .report import Row

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from ..config import RenderConfig
-from ..engine.model import Facts, Model, background_of
 from ..ops import backend
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import Parts, march, render_rays
 from ..style.look import Restyle
+from ..training.model import Facts, Model, background_of
 from ..types import Rays, Want
 
 __all__ = ["Counts", "Difference", "count", "difference", "exact", "plainly", "view_rays"]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.scene import Scene
-from ..output.images import Picture
+from ..io.images import Picture
 from .charts import chart_of, surroundings_of
 from .plan import Plan
 from .space import site_of

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from ..errors import DataError, NumericsError, PluginError
 from ..interfaces import Encoder
+from ..io.atomic import write_json
 from ..ops import guided
-from ..output.atomic import write_json
 from . import store_files
 from .basis import Basis, fit_basis
 from .config import GuidedConfig

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..output.atomic import unwritable
+from ..io.atomic import unwritable
 
 __all__ = ["HELD", "room_for"]
 

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from safetensors import SafetensorError
 from torch import Tensor
 
-from ..output.atomic import atomic_path
+from ..io.atomic import atomic_path
 
 __all__ = [
     "GREY",

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
-from ..engine.loading import Trained
-from ..engine.model import background_of
-from ..engine.poses import moved, moving, rotated
-from ..engine.prepare import reach_of
 from ..rendering.cameras import Cameras
 from ..rendering.pixel_rays import PixelRays
 from ..rendering.renderer import render_rays
+from ..training.loading import Trained
+from ..training.model import background_of
+from ..training.poses import moved, moving, rotated
+from ..training.prepare import reach_of
 from ..types import Rays, Want
 
 __all__ = ["AlignmentConfig", "align", "align_view", "described"]

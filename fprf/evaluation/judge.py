@@ -8,10 +8,10 @@ import torch
 
 from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
-from ..engine.loading import Trained
-from ..engine.run import Known
-from ..engine.views import View, render_view
 from ..memory import peak
+from ..training.loading import Trained
+from ..training.run import Known
+from ..training.views import View, render_view
 from .consistency import consistency
 from .metrics import image_metrics, mean_metrics
 

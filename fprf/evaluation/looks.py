@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..engine.model import Facts, Model, background_of
-from ..engine.views import on_host
 from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import composite, march
 from ..style.look import Restyle
+from ..training.model import Facts, Model, background_of
+from ..training.views import on_host
 from ..types import Rays, Want
 
 __all__ = ["render_looks"]

@@ -6,12 +6,12 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..engine.loading import Trained
-from ..engine.restyle import Encoders
 from ..errors import DataError
 from ..evaluation.flat import encoded
 from ..style.dictionary import BLEND, StyleDictionary, blend_codes
 from ..style.statistics import covariance, group_moments, moments
+from ..training.loading import Trained
+from ..training.restyle import Encoders
 
 __all__ = ["CELL", "cell_dictionary", "cells"]
 

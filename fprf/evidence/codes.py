@@ -12,11 +12,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..datamanagers.config import GuidedConfig
-from ..engine.restyle import Encoders
 from ..errors import DataError
 from ..evaluation.flat import encoded
 from ..style.dictionary import StyleDictionary
 from ..town.classes import CAR, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
+from ..training.restyle import Encoders
 from .references import Reference
 
 __all__ = ["KINDS", "Matched", "code_classes", "interior", "match_rates", "winners"]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from ..output.images import Picture, to_uint8
+from ..io.images import Picture, to_uint8
 
 __all__ = ["contact_sheet"]
 

@@ -8,9 +8,6 @@ from typing import Annotated, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ..engine.cached_view import CachedView
-from ..engine.loading import Trained
-from ..engine.restyle import Encoders, dress, encode_photograph
 from ..evaluation.colour_transfer import histogram_matching, reinhard
 from ..evaluation.contest import STYLIZERS
 from ..evaluation.flat import encoded, flat_look, flat_scene, render_flat
@@ -21,6 +18,9 @@ from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.wishes import labels
+from ..training.cached_view import CachedView
+from ..training.loading import Trained
+from ..training.restyle import Encoders, dress, encode_photograph
 from ..types import Want
 
 __all__ = ["FLAT", "GLOBAL", "PLAIN", "Shown", "dictionary_of", "in_scene", "lineup", "nothing", "one_by_one", "transfers"]

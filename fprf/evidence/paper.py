@@ -15,17 +15,17 @@ import torch
 
 from ..config import TrainConfig
 from ..datamanagers.images import load_image
-from ..engine.loading import Trained, load_run
-from ..engine.prepare import prepare, scene_of
-from ..engine.restyle import Encoders, encoders_of, open_encoders
-from ..engine.run import Run
-from ..engine.style_pass import measure_style
-from ..engine.trainer import Report, train
-from ..engine.views import render_view
 from ..errors import UsageError
 from ..evaluation.metrics import image_metrics, mean_metrics
 from ..plugins.decoders.config import ResidualDecoderConfig
 from ..plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
+from ..training.loading import Trained, load_run
+from ..training.prepare import prepare, scene_of
+from ..training.restyle import Encoders, encoders_of, open_encoders
+from ..training.run import Run
+from ..training.style_pass import measure_style
+from ..training.trainer import Report, train
+from ..training.views import render_view
 from .config import PaperConfig
 from .paper_styles import Bench, restyled, set_up, style_rows, styled_by_photographs
 from .scene_decoder import SceneDecoderConfig

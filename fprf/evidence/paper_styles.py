@@ -13,15 +13,12 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.images import load_image
-from ..engine.cached_view import CachedView
-from ..engine.loading import Trained
-from ..engine.restyle import Encoders, apply_style
 from ..evaluation.contest import PLAIN, Exhibit, judge_exhibit
 from ..evaluation.looks import render_looks
 from ..evaluation.matched_regions import matched_regions
 from ..evaluation.steadiness import steadiness
 from ..evaluation.structure import structure
-from ..output.images import shrink, to_uint8, write_image
+from ..io.images import shrink, to_uint8, write_image
 from ..plugins.encoders.config import Vgg19Config
 from ..plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from ..style.config import StyleConfig
@@ -29,6 +26,9 @@ from ..style.dictionary import StyleDictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.scene import scene_style
+from ..training.cached_view import CachedView
+from ..training.loading import Trained
+from ..training.restyle import Encoders, apply_style
 from .cells import cell_dictionary
 from .codes import code_classes, match_rates, winners
 from .config import PaperConfig

@@ -7,8 +7,6 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.images import load_image
-from ..engine.loading import load_run
-from ..engine.views import render_view
 from ..errors import DataError
 from ..evaluation.colour_difference import delta_e
 from ..evaluation.matched_regions import matched_regions
@@ -19,6 +17,8 @@ from ..evaluation.structure import structure
 from ..evaluation.style_distance import style_distances
 from ..plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from ..rendering.cameras import Cameras
+from ..training.loading import load_run
+from ..training.views import render_view
 from .config import PeerConfig
 from .frames import Frames, read_cameras, read_depths, read_pictures
 

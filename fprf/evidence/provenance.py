@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from .. import __version__
-from ..engine.prepare import device_of
+from ..training.prepare import device_of
 
 __all__ = ["commit", "provenance", "words"]
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from ..engine.loading import load_run
-from ..engine.restyle import Encoders, open_encoders
 from ..errors import UsageError
 from ..evaluation.steadiness import steadiness
-from ..output.images import Picture, to_uint8, write_image
+from ..io.images import Picture, to_uint8, write_image
+from ..training.loading import load_run
+from ..training.restyle import Encoders, open_encoders
 from .codes import Matched, code_classes, match_rates, winners
 from .config import RestyleConfig
 from .contact import contact_sheet

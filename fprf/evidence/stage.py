@@ -14,9 +14,6 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from ..engine.cached_view import CachedView, cache_view
-from ..engine.loading import Trained
-from ..engine.prepare import scene_of
 from ..errors import DataError, UsageError
 from ..rendering.cameras import Cameras
 from ..town.layout import Town, build_town
@@ -24,6 +21,9 @@ from ..town.palettes import palette
 from ..town.render import geometry, render
 from ..town.trace import View
 from ..town.write import TownSettings, is_town
+from ..training.cached_view import CachedView, cache_view
+from ..training.loading import Trained
+from ..training.prepare import scene_of
 
 __all__ = ["Stage", "Truth", "set_stage", "short_path", "town_folder", "town_settings", "town_view", "true_views"]
 

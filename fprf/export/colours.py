@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..engine.model import Facts, Model, background_of
-from ..engine.views import on_host
 from ..memory import chunk_size
 from ..plugins.samplers.config import UniformConfig
 from ..plugins.samplers.uniform import UniformSampler
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Parts, Restyle, composite, march
+from ..training.model import Facts, Model, background_of
+from ..training.views import on_host
 from ..types import Rays, Want
 from .witness import Witnesses, alone
 

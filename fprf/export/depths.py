@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..engine.model import Model
-from ..engine.views import on_host
 from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.renderer import march
 from ..rendering.space import Space
+from ..training.model import Model
+from ..training.views import on_host
 from ..types import Rays
 from .sights import Sights
 

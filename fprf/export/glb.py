@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..output.atomic import write_bytes
+from ..io.atomic import write_bytes
 
 __all__ = ["linear", "write_glb"]
 

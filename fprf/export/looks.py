@@ -11,8 +11,8 @@ from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
 
 if TYPE_CHECKING:
-    from ..engine.loading import Trained
     from ..rendering.renderer import Restyle
+    from ..training.loading import Trained
 
 __all__ = ["Look", "Named", "make_looks", "named_styles", "style_name"]
 
@@ -67,7 +67,7 @@ def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], 
 
 def make_looks(trained: "Trained", styles: Sequence[Named]) -> list[Look]:
     """The scene as it is, and each style. Raises UsageError for two of one name, and what `apply_style` raises."""
-    from ..engine.restyle import apply_style, open_encoders
+    from ..training.restyle import apply_style, open_encoders
 
     names = [style.name for style in styles]
     for name in names:

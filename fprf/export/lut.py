@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..engine.model import Model
-from ..engine.style_pass import lattice
+from ..io.atomic import write_text
 from ..memory import chunk_size
-from ..output.atomic import write_text
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import Restyle, composite, march
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
+from ..training.model import Model
+from ..training.style_pass import lattice
 from ..types import Rays
 from .colours import paint
 from .lattice import apply_lattice, fit_lattice

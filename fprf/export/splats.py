@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..output.atomic import write_bytes
+from ..io.atomic import write_bytes
 from .fusion import Cloud
 from .ply import write_ply
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from .. import __version__
 from ..errors import ConfigError, FprfError, PluginError
-from ..output.atomic import write_text
+from ..io.atomic import write_text
 from . import registry
 from .slots import hints_of, slots
 from .typed_json import Missing, from_json, to_json

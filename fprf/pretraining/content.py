@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..datamanagers.config import GuidedConfig
-from ..engine.prepare import device_of
 from ..errors import UsageError
 from ..interfaces import Encoder
 from ..ops.precision import double
@@ -20,6 +19,7 @@ from ..plugins.encoders.bundled import CONTENT_KIND, load_content_encoder
 from ..plugins.encoders.students import ContentStudent
 from ..plugins.encoders.vgg_weights import build_vgg19
 from ..plugins.weightfiles import write_weights
+from ..training.prepare import device_of
 from .basis import Basis, fit_basis
 from .config import DistilConfig
 from .filtered import filtered_at, filtered_whole, random_pixels

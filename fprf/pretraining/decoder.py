@@ -14,11 +14,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..datamanagers.config import GuidedConfig
-from ..engine.prepare import device_of
 from ..interfaces import Decoder, Encoder
 from ..plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder
 from ..plugins.weightfiles import write_weights
 from ..style.statistics import deviation, double
+from ..training.prepare import device_of
 from .config import PretrainDecoderConfig
 from .filtered import filtered_at, filtered_whole, random_pixels
 from .loop import generator_of, train

@@ -14,7 +14,7 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
-from ..output.images import to_uint8, write_image
+from ..io.images import to_uint8, write_image
 from ..plugins.weightfiles import read_weights, write_weights
 from .config import PretrainConfig
 from .report import samples_folder

@@ -7,7 +7,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..output.atomic import write_json
+from ..io.atomic import write_json
 
 __all__ = ["report_path", "samples_folder", "sheet", "write_report"]
 

@@ -11,13 +11,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..engine.prepare import device_of
 from ..errors import UsageError
 from ..interfaces import Encoder
 from ..ops.precision import double
 from ..plugins.encoders.bundled import SEMANTIC_KIND, load_semantic_encoder
 from ..plugins.encoders.students import SemanticStudent
 from ..plugins.weightfiles import write_weights
+from ..training.prepare import device_of
 from .config import SemanticDistilConfig
 from .ensemble import COMPONENTS, Ensemble, semantic_ensemble, taught
 from .loop import generator_of, train

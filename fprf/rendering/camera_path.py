@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError
-from ..output.atomic import write_json
+from ..io.atomic import write_json
 from .cameras import Cameras
 from .lens import PINHOLE
 

@@ -9,7 +9,7 @@ from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
 
 if TYPE_CHECKING:
-    from ..commands.verbs import Verbs
+    from ..cli.verbs import Verbs
 
 __all__ = ["GaussiansConfig"]
 
@@ -60,6 +60,6 @@ class GaussiansConfig(RunConfig):
 
     def verbs(self) -> "Verbs":
         """How such a run is trained, judged, filmed and exported."""
-        from ..commands.splats import SplatVerbs
+        from ..cli.splats import SplatVerbs
 
         return SplatVerbs(self)

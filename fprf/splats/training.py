@@ -14,17 +14,17 @@ from torch import Tensor
 from ..datamanagers.images import load_images
 from ..datamanagers.parsers.recognise import parse_scene
 from ..datamanagers.scene import Scene
-from ..engine import checkpoint
-from ..engine.interrupts import held_back
-from ..engine.model import Facts
-from ..engine.run import Known, Run
-from ..engine.schedule import progress
-from ..engine.trainer import REPORT_SECONDS, Report
-from ..engine.views import View
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..ops.rasterise import Pinhole, rasterise
 from ..rendering.bounds import find_space
 from ..rendering.cameras import Cameras, project
+from ..training import checkpoint
+from ..training.interrupts import held_back
+from ..training.model import Facts
+from ..training.run import Known, Run
+from ..training.schedule import progress
+from ..training.trainer import REPORT_SECONDS, Report
+from ..training.views import View
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import torch
 
-from ..engine import tensorfiles
 from ..errors import FprfError
 from ..testing import cases
+from ..training import tensorfiles
 from .check import Check
 from .fuzz import fuzz
 from .readers import targets

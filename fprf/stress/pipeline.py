@@ -11,14 +11,14 @@ from torch import Tensor
 from ..benchmarking.views import exact, view_rays
 from ..config import RenderConfig
 from ..datamanagers.scene import Scene
-from ..engine.loading import Trained
-from ..engine.model import Facts, Model, background_of
-from ..engine.restyle import restyle
 from ..plugins.stylizers.config import RegionOtConfig
 from ..rendering.bounds import find_space
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import render_rays
 from ..style.look import Restyle
+from ..training.loading import Trained
+from ..training.model import Facts, Model, background_of
+from ..training.restyle import restyle
 from ..types import Rays, Want
 from .check import Check
 

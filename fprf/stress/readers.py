@@ -26,7 +26,6 @@ from ..datamanagers.parsers.config import (
 from ..datamanagers.parsers.files import read_npz
 from ..datamanagers.parsers.phototourism import read_list
 from ..datamanagers.parsers.tfrecord import read_examples
-from ..engine import checkpoint, tensorfiles
 from ..plugins.codec import load_config
 from ..rendering.camera_path import read_camera_path
 from ..splats.files import read_capture, write_gaussians
@@ -34,6 +33,7 @@ from ..splats.gaussians import Gaussians
 from ..style.dictionary import load_dictionary, save_dictionary
 from ..style.files import read_style
 from ..testing import cases
+from ..training import checkpoint, tensorfiles
 from .fuzz import Target
 
 __all__ = ["targets"]

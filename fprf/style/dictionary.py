@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..checks import at_least, between
 from ..errors import CheckpointError, DataError
-from ..output.atomic import write_bytes
+from ..io.atomic import write_bytes
 from .clusters import kmeans
 from .statistics import covariance, double, group_moments, mix, moments
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from .. import __version__
 from ..errors import ConfigError, DataError
-from ..output.atomic import write_json
+from ..io.atomic import write_json
 from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig

@@ -2,7 +2,7 @@
 
 A region is named by its number, by its name in a style file, by a pixel of a view (`VIEW:X,Y`) or by a mask over one
 (`VIEW:MASK.png`); a reference by its file or by its number, from 0 in the order given. What each text means is found out on
-a scene (`engine.regions`); here is only the grammar.
+a scene (`training.regions`); here is only the grammar.
 """
 
 import re

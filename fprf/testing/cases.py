@@ -9,7 +9,7 @@ from torch import Tensor
 from ..datamanagers.scene import Scene
 from ..fields.config import PlanesConfig, SemanticPlanesConfig
 from ..interfaces import Decoder
-from ..output.images import write_image
+from ..io.images import write_image
 from ..plugins.samplers.config import UniformConfig
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Parts

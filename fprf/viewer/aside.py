@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..errors import UsageError
 
 if TYPE_CHECKING:
-    from ..engine.model import Model
-    from ..engine.trainer import Report
+    from ..training.model import Model
+    from ..training.trainer import Report
 
 __all__ = ["Aside", "Place"]
 

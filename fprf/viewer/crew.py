@@ -8,8 +8,8 @@ from queue import Queue
 from typing import TYPE_CHECKING
 
 from ..errors import FprfError
-from ..output.images import Picture
-from ..output.video import write_video
+from ..io.images import Picture
+from ..io.video import write_video
 from .film import FilmPlan, frames_of_film, lay_film, new_folder, path_of, taken
 from .keys import between_keys
 from .stage import Eye

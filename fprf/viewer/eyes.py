@@ -10,9 +10,9 @@ from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-from ..engine.cached_view import Part, view_parts
-from ..engine.loading import Trained
-from ..output.images import Picture
+from ..io.images import Picture
+from ..training.cached_view import Part, view_parts
+from ..training.loading import Trained
 from .ladder import Speed, rungs
 from .painter import Layers, Painter, Shown, compose
 from .stage import Eye, Stage, fitted

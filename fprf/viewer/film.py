@@ -14,16 +14,16 @@ from typing import NamedTuple
 import torch
 
 from ..checks import between
-from ..commands.keyframes import keyed_looks, read_keyframes
-from ..engine.cached_view import view_parts
-from ..engine.loading import Trained
+from ..cli.keyframes import keyed_looks, read_keyframes
 from ..errors import UsageError
-from ..output.atomic import write_json
-from ..output.images import Picture, to_uint8
+from ..io.atomic import write_json
+from ..io.images import Picture, to_uint8
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
+from ..training.cached_view import view_parts
+from ..training.loading import Trained
 from .eyes import CHUNK
 from .looks import Look, settled, style_of
 from .stage import Eye, Stage

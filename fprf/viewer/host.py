@@ -12,7 +12,7 @@ from .access import Access, is_loopback
 from .gate import Answer, Gate, Request
 
 if TYPE_CHECKING:
-    from ..engine.loading import Trained
+    from ..training.loading import Trained
     from .session import Session
     from .studio import Opener
 

@@ -116,8 +116,8 @@ class Follower:
         """The last parameters and the scene's own style are in the run folder now."""
         if self._session is None or self._run is None:
             return
-        from ..engine.loading import load_run
-        from ..engine.restyle import open_encoders
+        from ..training.loading import load_run
+        from ..training.restyle import open_encoders
 
         last = load_run(self._run.root, self._run.device)
         self._session.renew(lambda: last, lambda trained, before: open_encoders(trained))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from ..checks import at_least, between, positive
-from ..output.images import Picture
+from ..io.images import Picture
 from ..plugins.stylizers.config import RegionToneConfig
 from ..style.config import StyleConfig
 from ..style.dictionary import Reference

@@ -9,19 +9,19 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.basis import Basis
-from ..engine import tensorfiles
-from ..engine.block_task import built_block
-from ..engine.blocks import folder_of
-from ..engine.lay_out import RAYS, load_boxes
-from ..engine.loading import Trained
-from ..engine.model import build_model
-from ..engine.prepare import device_of
-from ..engine.restyle import Encoders, encoders_of
-from ..engine.run import Run
-from ..engine.style_pass import measure_style
 from ..errors import CheckpointError
 from ..style.matching import unit
 from ..style.scene import SceneStyle
+from ..training import tensorfiles
+from ..training.block_task import built_block
+from ..training.blocks import folder_of
+from ..training.lay_out import RAYS, load_boxes
+from ..training.loading import Trained
+from ..training.model import build_model
+from ..training.prepare import device_of
+from ..training.restyle import Encoders, encoders_of
+from ..training.run import Run
+from ..training.style_pass import measure_style
 
 __all__ = ["begun", "encoders_now", "filled", "likest"]
 

@@ -15,8 +15,8 @@ from importlib.resources import files
 from typing import Any
 
 from ..errors import UsageError
-from ..output.images import encode
-from ..output.maps import palette
+from ..io.images import encode
+from ..io.maps import palette
 from .gate import Answer, Request
 from .keys import chosen, shifted, without
 from .looks import Card, Verb, only, ordered, weighed

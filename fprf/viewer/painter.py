@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..engine.cached_view import Part
-from ..engine.restyle import Styled
 from ..interfaces import Decoder
-from ..output.images import Picture, to_uint8
-from ..output.maps import depth_image, match_image, palette
+from ..io.images import Picture, to_uint8
+from ..io.maps import depth_image, match_image, palette
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
+from ..training.cached_view import Part
+from ..training.restyle import Styled
 from .looks import Look
 
 __all__ = ["MAPS", "Layers", "Map", "Painter", "Shown", "compose"]

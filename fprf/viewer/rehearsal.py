@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..output.images import encode
+from ..io.images import encode
 from .eyes import Glance, Sight
 from .looks import only
 from .stage import Stage

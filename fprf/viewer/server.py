@@ -16,9 +16,9 @@ import numpy as np
 import torch
 import viser
 
-from ..engine.lay_out import load_boxes
 from ..errors import FprfError
 from ..rendering.cameras import pixel_grid
+from ..training.lay_out import load_boxes
 from .eyes import Frame
 from .film import path_of
 from .lines import box_lines, camera_lines, path_lines

@@ -10,9 +10,9 @@ from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 
-from ..engine.loading import Trained
 from ..errors import FprfError, UsageError
-from ..output.images import Picture, shrink
+from ..io.images import Picture, shrink
+from ..training.loading import Trained
 from .crew import Crew
 from .desk import Desk
 from .eyes import Frame, Glance, Sight

@@ -14,11 +14,8 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.images import load_image
-from ..engine.loading import Trained
-from ..engine.restyle import Encoders, Styled, dress, encode_photograph, mixed, open_encoders
-from ..engine.views import paint_pixels
 from ..errors import UsageError
-from ..output.images import shrink
+from ..io.images import shrink
 from ..rendering.cameras import Cameras
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
@@ -26,6 +23,9 @@ from ..style.look import Restyle
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..style.wishes import labels
+from ..training.loading import Trained
+from ..training.restyle import Encoders, Styled, dress, encode_photograph, mixed, open_encoders
+from ..training.views import paint_pixels
 from .looks import Card, Look, settled, style_of
 
 __all__ = ["Opener", "Picked", "Studio", "joined", "names_of"]

@@ -7,11 +7,11 @@ from tiny_world import World
 from fprf.benchmarking.naive import plain_planes
 from fprf.benchmarking.subject import small_view
 from fprf.benchmarking.views import count, difference, exact, plainly, view_rays
-from fprf.engine.restyle import restyle
-from fprf.engine.views import render_view
 from fprf.ops import dense
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.rendering.renderer import march
+from fprf.training.restyle import restyle
+from fprf.training.views import render_view
 
 
 def test_exact_is_double_and_every_way_comes_near_it(world: World) -> None:

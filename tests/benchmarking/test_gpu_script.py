@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.methods import fprf
 from fprf.plugins.encoders.config import BundledSemanticConfig
 

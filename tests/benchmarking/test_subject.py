@@ -10,7 +10,7 @@ from fprf.benchmarking.config import SpeedConfig
 from fprf.benchmarking.subject import LOOKS, attempt, find, fresh_model, settings, town_references
 from fprf.benchmarking.training import batch_rays, colour_gradient, loop_of, stepper
 from fprf.datamanagers.images import load_image
-from fprf.output.images import Picture
+from fprf.io.images import Picture
 
 
 def test_a_run_with_its_images(world: World, tmp_path: Path) -> None:

@@ -11,18 +11,18 @@ ROOT = Path(fprf.__file__).parent
 ABOVE = {
     "datamanagers": {
         "blocks",
-        "engine",
+        "training",
         "style",
         "evaluation",
-        "commands",
+        "cli",
         "viewer",
         "export",
         "evidence",
         "benchmarking",
         "api",
     },
-    "blocks": {"engine", "style", "evaluation", "commands", "viewer", "export", "evidence", "benchmarking", "api"},
-    "ops": {"fields", "rendering", "datamanagers", "blocks", "engine", "style", "evaluation", "commands", "viewer"},
+    "blocks": {"training", "style", "evaluation", "cli", "viewer", "export", "evidence", "benchmarking", "api"},
+    "ops": {"fields", "rendering", "datamanagers", "blocks", "training", "style", "evaluation", "cli", "viewer"},
 }
 """Packages, and what they must not import."""
 

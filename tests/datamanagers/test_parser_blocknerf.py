@@ -137,14 +137,14 @@ def test_no_files(tmp_path: Path) -> None:
 
 
 def test_it_trains_in_blocks_from_end_to_end(bay: tuple[Path, Cameras], tmp_path: Path) -> None:
-    from fprf.commands.train import train_scene
+    from fprf.cli.train import train_scene
     from fprf.config import StatisticsConfig
     from fprf.datamanagers.config import RayBatchesConfig
-    from fprf.engine.loading import load_run
-    from fprf.engine.views import render_view
     from fprf.fields.config import PlanesConfig
     from fprf.fields.layouts import StreetConfig
     from fprf.methods import fprf_lite
+    from fprf.training.loading import load_run
+    from fprf.training.views import render_view
 
     lite = fprf_lite()
     config = replace(

@@ -7,10 +7,8 @@ from pathlib import Path
 import pytest
 from tiny_world import World
 
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
-from fprf.engine.decoder import build_decoder
-from fprf.engine.prepare import prepare
 from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
@@ -20,6 +18,8 @@ from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, Enc
 from fprf.plugins.typed_json import Missing
 from fprf.plugins.weightfiles import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig
+from fprf.training.decoder import build_decoder
+from fprf.training.prepare import prepare
 
 ENCODERS = [
     BundledContentConfig(),

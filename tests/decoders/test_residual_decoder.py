@@ -12,11 +12,6 @@ from hypothesis import strategies as st
 from tiny_world import World, parameters, rays_of, trained_for
 
 from fprf.config import TrainConfig
-from fprf.engine.loading import Trained, load_run
-from fprf.engine.losses import terms, total
-from fprf.engine.model import build_model
-from fprf.engine.style_pass import measure_style
-from fprf.engine.views import render_view
 from fprf.errors import ConfigError
 from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
 from fprf.plugins.decoders.mlp import MlpDecoder
@@ -26,6 +21,11 @@ from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, Region
 from fprf.rendering.renderer import Parts, Restyle, render_rays
 from fprf.style.scene import own_style
 from fprf.testing import check_decoder
+from fprf.training.loading import Trained, load_run
+from fprf.training.losses import terms, total
+from fprf.training.model import build_model
+from fprf.training.style_pass import measure_style
+from fprf.training.views import render_view
 from fprf.types import Batch, Rendered, Sampled, Want
 
 C = 6

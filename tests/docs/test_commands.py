@@ -18,10 +18,10 @@ import pytest
 from splat_ball import ball
 from tiny_world import World, flags
 
-from fprf import cli
-from fprf.cli import VERBS
-from fprf.output.atomic import write_json
-from fprf.output.video import write_video
+from fprf.cli import main as cli
+from fprf.cli.main import VERBS
+from fprf.io.atomic import write_json
+from fprf.io.video import write_video
 from fprf.splats.files import write_gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,10 +30,10 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 RUN = ("eval", "stylize", "restyle", "render", "gallery", "report", "export", "cluster", "plugins", "doctor", "completion")
 """Verbs whose commands are run here."""
 PARSED = {
-    "demo": "minutes; tests/commands/test_demo_verb.py runs it small",
-    "process": "needs pycolmap; tests/sfm/test_town_sfm.py runs it",
+    "demo": "minutes; tests/cli/test_demo_verb.py runs it small",
+    "process": "needs pycolmap; tests/reconstruction/test_town_sfm.py runs it",
     "train": "minutes; run below with `-m slow`",
-    "bench": "minutes; tests/commands/test_bench_verb.py and tests/evidence run them small",
+    "bench": "minutes; tests/cli/test_bench_verb.py and tests/evidence run them small",
     "view": "stays up; tests/viewer run it",
     "pretrain": "hours; tests/pretraining run it small",
 }
@@ -41,7 +41,7 @@ PARSED = {
 ELSEWHERE = {
     "gabor": "the encoder of examples/plugin: tests/test_example_plugin.py installs and runs it",
     "opacity": "the loss of examples/plugin, likewise",
-    "--tone": "needs a run whose photographs differ in exposure: tests/engine/test_tones.py",
+    "--tone": "needs a run whose photographs differ in exposure: tests/training/test_tones.py",
 }
 """Commands with these words, and where they are tested instead."""
 TOOLS = ("python3", "python", ".", "pip", "export", "pytest", "ruff", "mypy", "mkdocs")
@@ -158,7 +158,7 @@ def test_it_is_understood(place: Path, lines: list[list[str]], monkeypatch: pyte
 
 def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     """The config that a verb would start with."""
-    module = importlib.import_module(f"fprf.commands.{words[1]}")
+    module = importlib.import_module(f"fprf.cli.{words[1]}")
     real, heard = module.parse, []
 
     def stop(*args: Any, **named: Any) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fprf import cli
+from fprf.cli import main as cli
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "defaults.md").read_text("utf-8")
 SECTIONS = dict(re.findall(r"^## fprf (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))

@@ -11,8 +11,8 @@ from types import ModuleType
 
 import pytest
 
-from fprf.cli import VERBS
-from fprf.commands.parsing import LIST_FLAGS
+from fprf.cli.main import VERBS
+from fprf.cli.parsing import LIST_FLAGS
 
 ROOT = Path(__file__).resolve().parents[2]
 MISSING = "the extra `docs` is not installed: pip install -e '.[docs]'"
@@ -53,7 +53,7 @@ def test_a_page_has_every_flag_of_its_verb(hooks: ModuleType, verb: str, capsys:
     words = hooks._WORDS[verb] if verb in hooks._FIRST else ("fprf-lite",) if verb == "train" else (None,)
     for word in words:
         try:
-            importlib.import_module(f"fprf.commands.{verb}").run([*([word] if word else []), LIST_FLAGS])
+            importlib.import_module(f"fprf.cli.{verb}").run([*([word] if word else []), LIST_FLAGS])
         except SystemExit:
             flags = [line for line in capsys.readouterr().out.splitlines() if line.startswith("--")]
         else:

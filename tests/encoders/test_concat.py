@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from network_files import deeplab_file
 from torch import Tensor
 
-from fprf.commands.parsing import parse
+from fprf.cli.parsing import parse
 from fprf.errors import ConfigError, WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import from_json, to_json

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from tiny_world import World
 
-from fprf.engine.poses import rotated
-from fprf.engine.views import render_view
 from fprf.evaluation.alignment import AlignmentConfig, align, align_view
-from fprf.output.images import to_uint8, write_image
+from fprf.io.images import to_uint8, write_image
+from fprf.training.poses import rotated
+from fprf.training.views import render_view
 
 
 def test_a_turned_view_comes_back(world: World, tmp_path: Path) -> None:

@@ -5,10 +5,10 @@ import torch
 from tiny_world import World
 
 from fprf.datamanagers.images import load_image
-from fprf.engine.views import render_view
 from fprf.errors import DataError
 from fprf.evaluation.judge import judge, peak_memory
 from fprf.evaluation.metrics import image_metrics
+from fprf.training.views import render_view
 
 
 def test_metrics_are_those_of_the_renders(world: World) -> None:

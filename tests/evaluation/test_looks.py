@@ -1,11 +1,11 @@
 import torch
 from tiny_world import World
 
-from fprf.engine.restyle import restyle
-from fprf.engine.views import render_view
 from fprf.evaluation.looks import render_looks
 from fprf.plugins.stylizers.config import AdainConfig, RegionOtConfig
 from fprf.style.look import Restyle
+from fprf.training.restyle import restyle
+from fprf.training.views import render_view
 
 
 def test_looks_are_the_renders_of_each_style(world: World) -> None:

@@ -8,7 +8,7 @@ from fprf.errors import DataError
 from fprf.evaluation.semantic_matching import semantic_matching
 from fprf.evaluation.town_classes import town_cells
 from fprf.evaluation.triplets import COLOURS, SIZE, read_regions, read_triplets, triplet_names
-from fprf.output.images import write_image
+from fprf.io.images import write_image
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.town.classes import CLASSES, SKY
 

@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.engine.restyle import Encoders, open_encoders
 from fprf.errors import DataError
 from fprf.evaluation.flat import encoded
 from fprf.evidence.cells import CELL, cell_dictionary, cells
 from fprf.style.dictionary import StyleDictionary, whole_style
+from fprf.training.restyle import Encoders, open_encoders
 
 
 def image(height: int, width: int, seed: int = 0) -> torch.Tensor:

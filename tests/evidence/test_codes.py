@@ -2,7 +2,6 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.engine.restyle import open_encoders
 from fprf.errors import DataError
 from fprf.evaluation.flat import encoded
 from fprf.evidence.codes import KINDS, code_classes, interior, match_rates, winners
@@ -10,6 +9,7 @@ from fprf.evidence.references import Reference, photograph, places
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
 from fprf.town.classes import CAR, CLASSES, FACADE, SKY, WINDOW
+from fprf.training.restyle import open_encoders
 
 
 def reference(classes: torch.Tensor) -> Reference:

@@ -13,7 +13,7 @@ from fprf.errors import DataError
 from fprf.evidence.contact import contact_sheet
 from fprf.evidence.frames import read_cameras, read_depths, read_pictures
 from fprf.evidence.provenance import commit, provenance, words
-from fprf.output.images import write_image
+from fprf.io.images import write_image
 
 
 @settings(max_examples=25, deadline=None)

@@ -7,15 +7,15 @@ import torch
 from tiny_world import World
 
 from fprf.datamanagers.images import load_image
-from fprf.engine.cached_view import CachedView, cache_view
-from fprf.engine.loading import Trained
-from fprf.engine.restyle import Encoders, apply_style, open_encoders
-from fprf.engine.views import render_view
 from fprf.evidence.methods import dictionary_of, in_scene, lineup, nothing, one_by_one, transfers
 from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, RegionToneConfig, StylizerConfig
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.files import StyleFile
+from fprf.training.cached_view import CachedView, cache_view
+from fprf.training.loading import Trained
+from fprf.training.restyle import Encoders, apply_style, open_encoders
+from fprf.training.views import render_view
 
 
 class Stand:

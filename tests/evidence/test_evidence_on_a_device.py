@@ -8,10 +8,8 @@ import torch
 from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
 
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.datamanagers.images import load_image
-from fprf.engine.loading import load_run
-from fprf.engine.restyle import open_encoders
 from fprf.evidence.cells import cell_dictionary
 from fprf.evidence.codes import code_classes
 from fprf.evidence.config import PaperConfig
@@ -20,6 +18,8 @@ from fprf.evidence.paper_styles import Case, _by_view, set_up
 from fprf.evidence.references import Reference
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
+from fprf.training.loading import load_run
+from fprf.training.restyle import open_encoders
 
 
 def measured(world: World, device: str, folder: Path) -> list[Any]:

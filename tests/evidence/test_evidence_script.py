@@ -8,8 +8,8 @@ from types import ModuleType
 
 import pytest
 
-from fprf import cli
-from fprf.commands.parsing import parse
+from fprf.cli import main as cli
+from fprf.cli.parsing import parse
 from fprf.evidence.config import PaperConfig, RestyleConfig
 
 ROOT = Path(__file__).resolve().parents[2]

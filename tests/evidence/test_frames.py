@@ -24,7 +24,7 @@ def test_a_scene_folder_is_read_as_its_parser_reads_it(world: World) -> None:
 
 
 def test_frames_of_another_size_have_cameras_of_that_size(world: World, tmp_path: Path) -> None:
-    from fprf.output.images import write_image
+    from fprf.io.images import write_image
 
     for k in (2, 5):
         write_image(tmp_path / f"{k:04d}.png", np.zeros((48, 64, 3), dtype=np.uint8))
@@ -72,7 +72,7 @@ def test_what_does_not_fit_is_named(world: World, tmp_path: Path) -> None:
 
 
 def test_entries_are_found_by_place_where_no_name_agrees(world: World, tmp_path: Path) -> None:
-    from fprf.output.images import write_image
+    from fprf.io.images import write_image
 
     for k in range(10):
         write_image(tmp_path / f"frame_{k}.png", np.zeros((24, 32, 3), dtype=np.uint8))

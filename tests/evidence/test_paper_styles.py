@@ -7,11 +7,11 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.engine.restyle import open_encoders
 from fprf.evidence.config import PaperConfig
 from fprf.evidence.paper_styles import ONE_TRAINING, Bench, restyled, set_up, style_rows
 from fprf.evidence.scores import Row
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig
+from fprf.training.restyle import open_encoders
 
 CONFIG = PaperConfig(table="multi-reference", views=2, palettes=("night",), device="cpu", codes=4)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.evidence.paper import TRAINED
 from fprf.evidence.scene_decoder import SceneDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig

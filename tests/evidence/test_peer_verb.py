@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from tiny_world import World
 
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.town.write import write_town
 
 

@@ -8,7 +8,7 @@ import cv2
 import pytest
 from tiny_world import World
 
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.evidence.restyle import BOUND, GOALS, MATCHED
 
 SMALL = ["--palettes", "night", "--views", "1", "--longest", "24", "--clusters", "4", "--device", "cpu"]

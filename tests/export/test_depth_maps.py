@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.engine.views import render_view
 from fprf.export.colours import Coloured, seen_colours
 from fprf.export.depths import chosen, half_way, reach_of, render_sights
 from fprf.export.witness import alone
 from fprf.rendering.cameras import pixel_grid, rays_through
 from fprf.rendering.renderer import Restyle
 from fprf.rendering.space import Space
+from fprf.training.views import render_view
 
 
 @settings(deadline=None, max_examples=40)
@@ -129,7 +129,7 @@ def test_near_a_point_nothing_else_of_its_rays_is_seen(world: World) -> None:
 
 
 def trained_restyle(world: World) -> Restyle:
-    from fprf.engine.restyle import restyle
     from fprf.plugins.stylizers.config import RegionOtConfig
+    from fprf.training.restyle import restyle
 
     return restyle(world.load(), world.references, RegionOtConfig()).restyle

@@ -6,13 +6,13 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.engine.loading import load_style
-from fprf.engine.restyle import restyle
-from fprf.engine.views import render_view
 from fprf.export.lattice import apply_lattice, identity
 from fprf.export.lut import Pairs, fit_quality, look_pairs, write_cube
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.renderer import Restyle
+from fprf.training.loading import load_style
+from fprf.training.restyle import restyle
+from fprf.training.views import render_view
 
 
 def read_cube(path: Path) -> np.ndarray:

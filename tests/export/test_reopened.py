@@ -10,7 +10,7 @@ import trimesh
 from splatter import read_gaussians, read_splat, table
 from tiny_world import World
 
-from fprf import cli
+from fprf.cli import main as cli
 
 LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--no-sky"]
 LOOKS = {"": "plain", ".dusk": "dusk", ".snow": "snow"}

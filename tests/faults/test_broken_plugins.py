@@ -12,10 +12,8 @@ from fake_packages import Packages, packages_in
 from tiny_world import World
 from torch import Tensor, nn
 
-from fprf import cli
-from fprf.commands.train import train_scene
-from fprf.engine.first_use import check_parts, check_stylizer
-from fprf.engine.model import build_model
+from fprf.cli import main as cli
+from fprf.cli.train import train_scene
 from fprf.errors import PluginError
 from fprf.fields.config import PlanesConfig
 from fprf.interfaces import Stylizer
@@ -23,6 +21,8 @@ from fprf.plugins.decoders.config import DecoderConfig
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.style.scene import own_style
 from fprf.testing import cases
+from fprf.training.first_use import check_parts, check_stylizer
+from fprf.training.model import build_model
 from fprf.types import FieldSample, Want
 
 CONFIG = '''

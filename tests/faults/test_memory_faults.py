@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from tiny_world import World, flags
 
-from fprf import cli
-from fprf.engine import checkpoint
+from fprf.cli import main as cli
+from fprf.training import checkpoint
 
 BEGIN = """
 import json, re, resource, sys
@@ -20,9 +20,10 @@ from dataclasses import replace
 from pathlib import Path
 import numpy as np
 import torch
-from fprf import cli, memory
-from fprf.engine import cached_view, style_pass, views
-from fprf.engine.loading import load_run
+from fprf import memory
+from fprf.cli import main as cli
+from fprf.training import cached_view, style_pass, views
+from fprf.training.loading import load_run
 from fprf.evaluation.looks import render_looks
 
 def limit(room):
@@ -68,7 +69,7 @@ print(json.dumps({
 """
 
 TRAIN = """
-from fprf.engine import trainer
+from fprf.training import trainer
 before, keep = trainer.Loop.step, []
 
 def step(self, step, share):

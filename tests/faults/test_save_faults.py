@@ -15,13 +15,13 @@ import torch
 from forked import DEAD, Deadly, forked
 from tiny_world import World
 
-from fprf import cli
-from fprf.commands.train import train_scene
-from fprf.engine import checkpoint
-from fprf.engine.lock import held
-from fprf.engine.model import Model, build_model
-from fprf.engine.run import Run
+from fprf.cli import main as cli
+from fprf.cli.train import train_scene
 from fprf.errors import CheckpointError, DataError
+from fprf.training import checkpoint
+from fprf.training.lock import held
+from fprf.training.model import Model, build_model
+from fprf.training.run import Run
 
 Trainer = tuple[Model, torch.optim.Optimizer]
 
@@ -113,7 +113,7 @@ def test_a_file_that_the_system_cuts_off_is_one_line_and_costs_nothing(root: Pat
 
 
 def test_a_folder_that_cannot_be_written_to_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.engine.prepare.prepare", None)
+    monkeypatch.setattr("fprf.training.prepare.prepare", None)
     place = Path("/proc/fprf-run")
     if not place.parent.is_dir():
         pytest.skip("no folder that refuses everybody")
@@ -241,14 +241,14 @@ if sys.argv[3] == "8m":
     subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
 from kills import tiny
 from dataclasses import replace
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.plugins.codec import save_config
 config = Path(sys.argv[2]).parent / "config.json"
 save_config(config, replace(tiny(town, 40), output=folder / "run"), "fprf-lite")
 code = cli.main(["train", str(config)])
 left = sorted(str(p.relative_to(folder)) for p in folder.rglob("*"))
 print(code, left)
-from fprf.engine import checkpoint
+from fprf.training import checkpoint
 print("latest", checkpoint.load_latest(folder / "run" / "checkpoints")[0] is not None)
 """
 

@@ -16,9 +16,9 @@ import pytest
 import torch
 from tiny_world import World, flags, parameters
 
-from fprf import cli
-from fprf.engine import checkpoint
-from fprf.engine.run import Run
+from fprf.cli import main as cli
+from fprf.training import checkpoint
+from fprf.training.run import Run
 
 
 def kills() -> ModuleType:
@@ -137,7 +137,7 @@ def test_places_names_clocks_and_languages_of_all_kinds(world: World, tmp_path: 
 
 
 def test_a_clock_that_jumps_changes_nothing(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fprf.commands.train import train_scene
+    from fprf.cli.train import train_scene
 
     ticks = iter(range(0, -(10**9), -3600))
     monkeypatch.setattr(time, "time", lambda: float(next(ticks)))

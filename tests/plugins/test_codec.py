@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf import __version__
-from fprf.commands.parsing import load_method, parse
+from fprf.cli.parsing import load_method, parse
 from fprf.config import IncompleteConfig
 from fprf.errors import ConfigError, PluginError
 from fprf.methods import fprf, fprf_lite

@@ -11,7 +11,7 @@ from photo_folder import photo_folder, teacher_files
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from fprf.commands.pretrain import run
+from fprf.cli.pretrain import run
 from fprf.errors import UsageError
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig

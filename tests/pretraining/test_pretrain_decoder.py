@@ -11,8 +11,7 @@ import torch
 from photo_folder import photo_folder
 from safetensors.torch import save_file
 
-from fprf.commands.pretrain import run
-from fprf.engine.decoder import build_decoder
+from fprf.cli.pretrain import run
 from fprf.errors import ConfigError, WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
@@ -20,6 +19,7 @@ from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.weightfiles import read_weights
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.pretraining.report import report_path, samples_folder
+from fprf.training.decoder import build_decoder
 
 ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
 QUICK = ["--pixels", "60", "--batch", "64", "--size", "24", "--pairs", "1"]

@@ -9,7 +9,7 @@ from photo_folder import photo_folder, teacher_files
 from pretend_cuda import pretend_cuda
 from safetensors.torch import save_file
 
-from fprf.commands.pretrain import run
+from fprf.cli.pretrain import run
 from fprf.ops import backend
 from fprf.plugins.weightfiles import read_weights
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 from splat_ball import ball
 
-from fprf import cli
-from fprf.engine.restyle_gaussians import as_drawn, restyle_gaussians, restyled_harmonics, splat_regions
+from fprf.cli import main as cli
 from fprf.errors import CheckpointError, DataError, UsageError
 from fprf.fields.harmonics import harmonics as functions
 from fprf.interfaces import Encoder
@@ -24,6 +23,7 @@ from fprf.splats.views import camera_of, draw, find_views
 from fprf.style.config import StyleConfig
 from fprf.style.controls import luma
 from fprf.style.files import StyleFile, write_style
+from fprf.training.restyle_gaussians import as_drawn, restyle_gaussians, restyled_harmonics, splat_regions
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
 TONE = RegionToneConfig(centred=False)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from fprf.cli import main
+from fprf.cli.main import main
 from fprf.datamanagers.images import load_images
 from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.evaluation.metrics import psnr
+from fprf.io.images import write_image
 from fprf.ops.rasterise import rasterise
-from fprf.output.images import write_image
 from fprf.rendering.cameras import project
 from fprf.splats import initial, photographs
 from fprf.splats.config import GaussiansConfig

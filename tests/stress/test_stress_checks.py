@@ -9,7 +9,7 @@ from tiny_world import World
 
 from fprf.benchmarking.config import StressConfig
 from fprf.errors import FprfError
-from fprf.output.atomic import write_json
+from fprf.io.atomic import write_json
 from fprf.stress import files, pipeline, rays, styles
 from fprf.stress.check import Check, markdown, relative, scaled, unsound
 from fprf.stress.rays import exact_weights

@@ -152,7 +152,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fprf.output.atomic.os.fsync", full)
+    monkeypatch.setattr("fprf.io.atomic.os.fsync", full)
     with pytest.raises(DataError, match="No space"):
         save_dictionary(file, build_dictionary([reference("new")]))
     assert load_dictionary(file).names == ("old",)

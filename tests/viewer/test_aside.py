@@ -8,8 +8,8 @@ import torch
 from stand_in_viewers import DEAD, DEAF, GREEDY, NONSENSE, QUIET, REFUSED, viewer
 from tiny_world import World
 
-from fprf.engine.trainer import Report
 from fprf.errors import UsageError
+from fprf.training.trainer import Report
 from fprf.viewer import aside
 from fprf.viewer.aside import Aside, Place
 

@@ -10,7 +10,7 @@ import pytest
 from test_session import Listener
 from tiny_world import World
 
-from fprf.engine.loading import load_run
+from fprf.training.loading import load_run
 from fprf.viewer import crew
 from fprf.viewer.film import FilmPlan, Key
 from fprf.viewer.looks import Look

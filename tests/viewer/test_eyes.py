@@ -6,8 +6,8 @@ import pytest
 from shelves import cards_of
 from tiny_world import World
 
-from fprf.engine.views import render_view
-from fprf.output.images import to_uint8
+from fprf.io.images import to_uint8
+from fprf.training.views import render_view
 from fprf.viewer import eyes
 from fprf.viewer.eyes import Frame, Glance, Sight
 from fprf.viewer.looks import Look

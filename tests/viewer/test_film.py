@@ -10,9 +10,9 @@ import pytest
 from shelves import cards_of
 from tiny_world import World
 
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.errors import ConfigError, UsageError
-from fprf.output.images import Picture
+from fprf.io.images import Picture
 from fprf.viewer.film import FilmPlan, Key, frames_of_film, lay_film, new_folder, path_of, taken
 from fprf.viewer.looks import Look, ordered
 from fprf.viewer.stage import stage_of

@@ -12,7 +12,7 @@ import pytest
 from safetensors.torch import save_file
 from tiny_world import World
 
-from fprf.engine.loading import Trained
+from fprf.training.loading import Trained
 from fprf.viewer import live
 from fprf.viewer.host import Host
 from fprf.viewer.live import Follower, main

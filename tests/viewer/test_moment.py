@@ -5,10 +5,10 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.engine.loading import load_run, load_style
-from fprf.engine.views import render_view
 from fprf.errors import CheckpointError
 from fprf.style.scene import SceneStyle
+from fprf.training.loading import load_run, load_style
+from fprf.training.views import render_view
 from fprf.viewer.moment import begun, encoders_now, filled, likest
 
 

@@ -6,11 +6,11 @@ import torch
 from shelves import cards_of
 from tiny_world import World
 
-from fprf.engine.cached_view import view_parts
-from fprf.engine.matches import match_map
-from fprf.engine.views import render_view
-from fprf.output.images import to_uint8
-from fprf.output.maps import match_image
+from fprf.io.images import to_uint8
+from fprf.io.maps import match_image
+from fprf.training.cached_view import view_parts
+from fprf.training.matches import match_map
+from fprf.training.views import render_view
 from fprf.viewer.looks import Look, ordered
 from fprf.viewer.painter import Layers, Painter, Shown, compose
 from fprf.viewer.studio import Studio

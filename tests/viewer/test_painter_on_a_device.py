@@ -9,9 +9,9 @@ from pretend_cuda import CUDA, pretend_cuda
 from shelves import cards_of
 from tiny_world import World
 
-from fprf.engine.cached_view import view_parts
-from fprf.engine.loading import load_run
 from fprf.ops import backend
+from fprf.training.cached_view import view_parts
+from fprf.training.loading import load_run
 from fprf.viewer.looks import Look, ordered
 from fprf.viewer.painter import MAPS, Painter, Shown
 from fprf.viewer.studio import Studio

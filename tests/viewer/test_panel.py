@@ -11,10 +11,10 @@ from fake_gui import Client, Gui
 from test_session import Listener
 from tiny_world import World
 
-from fprf.engine.loading import load_run
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.config import StyleConfig
 from fprf.style.presets import with_preset
+from fprf.training.loading import load_run
 from fprf.viewer import crew
 from fprf.viewer.looks import style_of
 from fprf.viewer.panel import Panel

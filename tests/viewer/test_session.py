@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from tiny_world import World
 
-from fprf.engine.loading import load_run
 from fprf.errors import DataError, UsageError
+from fprf.training.loading import load_run
 from fprf.viewer.eyes import Frame
 from fprf.viewer.film import FilmPlan, Key
 from fprf.viewer.looks import Look

@@ -5,14 +5,14 @@ import torch
 from shelves import cards_of
 from tiny_world import World
 
-from fprf.engine.regions import membership_view
-from fprf.engine.restyle import apply_style
-from fprf.engine.views import render_view
 from fprf.errors import UsageError
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import build_dictionary
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
+from fprf.training.regions import membership_view
+from fprf.training.restyle import apply_style
+from fprf.training.views import render_view
 from fprf.viewer.looks import Look, ordered, style_of
 from fprf.viewer.studio import Studio, joined, names_of
 
@@ -82,7 +82,7 @@ def test_a_click_finds_the_region_that_is_there(world: World) -> None:
     trained = studio.trained
     _, *_ = cards_of(studio, world)
     cameras = trained.known.cameras.select(torch.tensor([2]))
-    from fprf.engine.regions import Regions, TrainedViews
+    from fprf.training.regions import Regions, TrainedViews
 
     share, _ = membership_view(Regions(TrainedViews(trained), studio.encoders.scene, studio.encoders.basis), 2, 1000)
     for x, y in ((3, 4), (20, 18), (31, 23)):

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ...output.atomic import atomic_path, write_json
+from ...io.atomic import atomic_path, write_json
 from ...rendering.lens import OPENCV
 from ..scene import Scene
 from .config import BlockNerfConfig

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from ...errors import DataError
-from ...output.atomic import write_bytes
+from ...io.atomic import write_bytes
 from ..gaussians import Gaussians
 from .base import Capture
 from .ply import compressed_bytes, is_compressed, ply_bytes, read_ply

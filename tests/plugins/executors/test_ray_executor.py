@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fprf.commands.cluster import run as cluster
+from fprf.cli.cluster import run as cluster
 from fprf.errors import ConfigError, DataError, PluginError
 from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.executors.ray import resources

@@ -10,16 +10,16 @@ import torch
 from tiny_world import World
 from torch import Tensor, nn
 
-from fprf import cli
+from fprf.cli import main as cli
 from fprf.datamanagers.basis import Basis, fit_basis
-from fprf.engine.loading import load_style
-from fprf.engine.views import render_view
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import LocalAdainConfig
 from fprf.plugins.stylizers.local import LocalAdainStylizer
 from fprf.style.dictionary import Reference, build_dictionary, load_dictionary
 from fprf.style.look import Restyle
 from fprf.style.scene import SceneStyle, scene_style
+from fprf.training.loading import load_style
+from fprf.training.views import render_view
 from fprf.types import Want
 
 FORM = LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)

@@ -1,0 +1,130 @@
+"""What `fprf train` does with a scene of several blocks: plan it, train each one as a task, measure the style of the whole."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .event_log import EventLog
+from .progress import Display
+
+if TYPE_CHECKING:
+    from ..blocks.plan import Plan
+    from ..config import TrainConfig
+    from ..datamanagers.scene import Scene
+    from ..training.block_task import BlockTask
+    from ..training.model import Model
+    from ..training.run import Run
+    from ..training.trainer import Report
+    from ..viewer.aside import Aside
+
+__all__ = ["SHARE", "block_minutes", "run_block", "show_plan", "train_blocks"]
+
+SHARE = 0.2
+"""Share of a time limit that the surroundings take, which all blocks start from; the blocks share the rest."""
+
+
+def train_blocks(
+    config: "TrainConfig",
+    method: str,
+    folder: "Run",
+    scene: "Scene",
+    plan: "Plan",
+    display: Display,
+    start: float,
+    view: "Aside | None" = None,
+) -> None:
+    """Features of all views, the surroundings, the blocks, largest first, and the style of the whole. Finished ones stay.
+
+    With a `view` all is trained here, where it can be looked at, whatever the executor.
+    """
+    from ..style.scene import to_tensors
+    from ..training.block_task import BlockTask
+    from ..training.blocks import SURROUNDINGS
+    from ..training.lay_out import lay_out, write_down
+    from ..training.loading import load_run
+    from ..training.prepare import device_of
+    from ..training.style_pass import measure_style
+
+    laid = lay_out(config, scene, plan, display.features, folder.saved_facts())
+    write_down(folder, config, method, laid)
+    count = len(plan.boxes.low)
+    display.say(f"{scene.name}: {len(scene.train)} + {len(scene.test)} views, {count} blocks and their surroundings")
+    executor = config.executor.on(device_of(config.device).type).build()
+    around, each = block_minutes(config, count, time.perf_counter() - start)
+    scene_folder = config.data or Path()
+    root, data = str(folder.root.resolve()), str(scene_folder.resolve() if scene_folder.exists() else scene_folder)
+
+    def task(block: int, minutes: float | None) -> BlockTask:
+        return BlockTask(root=root, data=data, block=block, minutes=minutes, quiet=display.quiet)
+
+    rays = plan.rays
+    tasks = [task(block, each) for block in rays.argsort(descending=True).tolist()]
+    if view is None:
+        executor.map(run_block, [task(SURROUNDINGS, around)])
+        executor.map(run_block, tasks)
+    else:
+        for one in (task(SURROUNDINGS, around), *tasks):
+            run_block(one, view)
+    display.say("measuring the scene's own style")
+    trained = load_run(folder.root, config.device)
+    folder.save_tensors("style", to_tensors(measure_style(config, trained.model, scene.cameras, scene.train)))
+
+
+def block_minutes(config: "TrainConfig", blocks: int, spent: float) -> tuple[float | None, float | None]:
+    """Minutes for the surroundings, and for each block, one after the other; `spent` seconds of the limit are gone."""
+    if config.minutes is None:
+        return None, None
+    left = max(config.minutes - spent / 60, 0.05 * config.minutes)
+    return SHARE * left, (1 - SHARE) * left / blocks
+
+
+def run_block(task: "BlockTask", view: "Aside | None" = None) -> None:
+    """Train one block, here or on a worker, and show how it goes."""
+    from ..training.block_task import train_block
+    from ..training.blocks import SURROUNDINGS, folder_of
+    from ..training.run import Run
+
+    name = "surroundings" if task.block == SURROUNDINGS else f"block {task.block:02d}"
+    log = EventLog(Run(folder_of(Path(task.root), task.block)))
+    device = Run(Path(task.root)).load_config()[0].fields_only(Path(task.root)).device
+    with Display(quiet=task.quiet) as display:
+
+        def report(event: "Report") -> None:
+            display.training(event, name)
+            log(event)
+            if view is not None:
+                view(event)
+
+        def begun(model: "Model") -> None:
+            if view is not None:
+                view.begin(Path(task.root), model, device, block=task.block, what=name)
+
+        if not train_block(task, report, begun):
+            display.say(f"{name} is finished already")
+
+
+def show_plan(config: "TrainConfig", method: str, output: Path) -> None:
+    """Print the blocks with what each will cost, and write a top view beside."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..blocks.picture import top_view
+    from ..io.atomic import write_json
+    from ..io.images import write_image
+    from ..training.estimate import estimates
+    from ..training.lay_out import plan_scene
+
+    scene, plan = plan_scene(config)
+    rows = estimates(config, scene, plan)
+    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0))
+    for column in ("block", "images", "rays", "size", "memory", "disk", "time"):
+        table.add_column(column, justify="left" if column == "block" else "right")
+    for row in rows:
+        table.add_row(*row.cells())
+    console = Console(highlight=False, width=100)
+    console.print(f"{method} on {scene.name}: {len(scene.train)} training images, space unit {1 / plan.space.scale:.3g}")
+    console.print(table)
+    picture = output / "plan.png"
+    write_image(picture, top_view(scene, plan))
+    write_json(output / "plan.json", {"method": method, "scene": scene.name, "blocks": [row.json() for row in rows]})
+    console.print(f"seen from above: {picture}")

@@ -1,0 +1,339 @@
+"""`fprf doctor`: what this machine offers, what a method needs, what a scene folder holds, how a run stands.
+
+Each problem names its remedy.
+"""
+
+import os
+import platform
+import shlex
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
+
+from .. import __version__
+from ..errors import CheckpointError
+from ..plugins import registry
+from ..plugins.codec import Missing
+from ..plugins.slots import slots
+from .parsing import parse
+
+__all__ = ["Finding", "cleaned", "machine", "method_needs", "run", "run_folder", "scene_folder", "self_test", "speed"]
+
+_MIB = 1 << 20
+_LEAST_DISK = 1 << 30
+"""Bytes below which a training may fail for want of room."""
+
+
+class Finding(NamedTuple):
+    """One line of the report."""
+
+    what: str
+    found: str
+    remedy: str = ""
+    """The one command or act that mends it; empty where nothing is wrong."""
+    optional: bool = False
+    """Everything else works without it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorConfig:
+    """What to look over."""
+
+    target: Path | None = None
+    """A run, a scene folder or a method; none = this machine."""
+    device: str = "auto"
+    """Device of this machine that is tested: cpu, cuda, mps, or auto."""
+    clean: bool = False
+    """Delete the cached feature targets of all scenes; they are made again when needed."""
+
+
+def run(args: list[str]) -> int:
+    """Print the findings; 1 if something that is needed is wrong."""
+    if args and not args[0].startswith("-"):  # tyro has no positional argument that may be absent
+        args = ["--target", *args]
+    about = (
+        "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene\n"
+        "folder, `fprf doctor METHOD` what a method needs here."
+    )
+    config = parse(DoctorConfig(), args, prog="fprf doctor", description=about)
+    target = config.target
+    if config.clean:
+        findings: Iterator[Finding] = cleaned(feature_folder())
+    elif target is None:
+        findings = chain(machine(), self_test(config.device))
+    elif (target / "config.json").is_file():
+        findings = run_folder(target)
+    elif str(target) in registry.installed("fprf.methods"):
+        findings = method_needs(str(target))
+    else:
+        findings = scene_folder(target)
+    console = Console(highlight=False)
+    bad = False
+    for finding in findings:
+        mark = "[green]ok[/]      " if not finding.remedy else "[yellow]optional[/]" if finding.optional else "[red]problem[/] "
+        bad |= bool(finding.remedy) and not finding.optional
+        console.print(f"{mark}  [bold]{escape(finding.what):<14}[/] {escape(finding.found)}", soft_wrap=True)
+        if finding.remedy:
+            console.print(f"{'':<26} → {escape(finding.remedy)}", soft_wrap=True)
+    return int(bad)
+
+
+def machine() -> Iterator[Finding]:
+    """Versions, processors, accelerators, optional packages, weights, plug-ins."""
+    yield Finding("fprf", f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
+    yield from _packages()
+    yield from _guarded("torch", _torch)
+    yield from speed(os.environ)
+    yield _disk(shutil.disk_usage(Path.cwd()).free)
+    yield _cache(feature_folder())
+    yield from _weights()
+    count = sum(len(registry.installed(group)) for group in registry.groups())
+    bad = registry.unreadable()
+    yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
+    for complaint in bad:
+        yield Finding("plug-ins", complaint, "reinstall or uninstall that package")
+
+
+def self_test(name: str) -> Iterator[Finding]:
+    """Report a device's kernels and precision, and compare a tiny training step, render and restyle on it with the CPU's.
+
+    Raises PluginError for a device that is not here.
+    """
+    from ..training.device_check import compare, fast_paths
+    from ..training.prepare import device_of
+
+    device = device_of(name)
+    yield Finding("device", f"`--device {name}` is {device}")
+    remedy = f"train and render with --device cpu; update torch and the driver of {device}"
+    start = time.perf_counter()
+    try:
+        for what, found in fast_paths(device):
+            yield Finding(what, found)
+        outcomes = compare(device)
+    except Exception as error:
+        yield Finding("self-test", f"{device} fails: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}", remedy)
+        return
+    wrong = [f"{each.what} is off by {each.error:.2g}, {each.allowed:g} is allowed" for each in outcomes if not each.right]
+    if wrong:
+        yield Finding("self-test", f"{device} differs from the CPU: {'; '.join(wrong)}", remedy)
+        return
+    worst = max(outcomes, key=lambda each: each.error / each.allowed)
+    figure = f"at worst the {worst.what} is off by {worst.error:.1g}, {worst.allowed:g} is allowed"
+    names = ", ".join(each.what for each in outcomes)
+    yield Finding("self-test", f"{names} as on the CPU: {figure}; {time.perf_counter() - start:.1f} s")
+
+
+def speed(environment: Mapping[str, str]) -> Iterator[Finding]:
+    """What makes this machine slower than it could be: fewer threads than cores, other programs, a GPU that torch misses."""
+    cores = _cores()
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        threads = environment.get(name, "")
+        if threads.isdecimal() and int(threads) < cores:
+            yield Finding("threads", f"{name}={threads}, {cores} cores are usable", f"unset {name}", optional=True)
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    if busy > cores + 1:
+        found = f"{busy:.0f} programs want the {cores} cores: everything here takes that much longer"
+        yield Finding("load", found, "top    # and end what is not needed", optional=True)
+    if Path("/proc/driver/nvidia/version").is_file() and "+cpu" in _version("torch"):
+        remedy = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu126"
+        yield Finding("cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True)
+
+
+def method_needs(name: str) -> Iterator[Finding]:
+    """Packages and weights that training by a method needs. Raises PluginError for a method that cannot be loaded."""
+    from ..plugins.codec import method_config
+
+    config = method_config(name)
+    for need in config.verbs().needs():
+        later = ", is downloaded when it is needed" if need.downloaded else " is missing"
+        yield Finding("needs", need.what + later, need.remedy, optional=need.downloaded)
+    filled = (f"{slot.path} {registry.name_of(slot.kind.group, type(slot.value))}" for slot in slots(config) if slot.value)
+    yield Finding("method", f"{name}: {', '.join(filled)}")
+    yield Finding("next", f"fprf train {name} --data FOLDER")
+
+
+def cleaned(folder: Path) -> Iterator[Finding]:
+    """Delete the cached feature targets."""
+    size = _size(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    yield Finding("features", f"{(size - _size(folder)) / _MIB:.0f} MiB deleted in {folder}")
+
+
+def feature_folder() -> Path:
+    """Folder of cached feature targets."""
+    from ..training.prepare import cache_folder
+
+    return cache_folder() / "features"
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _cache(folder: Path) -> Finding:
+    from ..datamanagers.features import CACHED_BYTES
+
+    most = 2 * CACHED_BYTES / _MIB  # content and semantics
+    return Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
+
+
+def _disk(free: int) -> Finding:
+    remedy = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
+    return Finding("disk", f"{free / 1024**3:.1f} GiB free here", remedy if free < _LEAST_DISK else "")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def scene_folder(data: Path) -> Iterator[Finding]:
+    """Format, views, sizes and splits of a scene. Raises DataError where it cannot be parsed."""
+    from ..datamanagers.parsers.config import DataParserConfig
+    from ..datamanagers.parsers.recognise import recognise
+
+    parser = recognise(data)
+    yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
+    scene = parser.build().parse(data, 1)
+    sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
+    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
+    lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
+    yield Finding("views", f"{len(scene.paths)} of {shown} pixels, {' and '.join(lenses)} lens")
+    yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
+    absent = [path for path in scene.paths if not path.is_file()]
+    if absent:
+        yield Finding("images", f"{len(absent)} are absent, the first is {absent[0]}", "restore them, or remove their poses")
+    points = 0 if scene.points is None else len(scene.points)
+    yield Finding("points", f"{points} of the reconstruction" if points else "none; bounds come from the cameras")
+    yield Finding("next", f"fprf train fprf-lite --data {shlex.quote(str(data))}")
+
+
+def run_folder(folder: Path) -> Iterator[Finding]:
+    """Config, progress, plug-ins and what was computed of a run. Raises ConfigError where its config cannot be read."""
+    from ..plugins.codec import load_config
+
+    config, method = load_config(folder / "config.json")
+    yield Finding("run", f"method {method}, scene {config.data}, {config.steps} steps asked for")
+    steps = _steps(folder)
+    again = f"fprf train {shlex.quote(str(folder / 'config.json'))} --output {shlex.quote(str(folder))}"
+    if not steps:
+        yield Finding("checkpoints", "none is complete", again)
+    else:
+        short = steps[-1] < config.steps and config.minutes is None
+        yield Finding("checkpoints", f"step {steps[-1]} of {config.steps}", again if short else "", optional=True)
+    for slot in slots(config):
+        if isinstance(slot.value, Missing):
+            package = slot.value.package or "the package that provides it"
+            remedy = f"install {package}, or choose another with --{slot.path} NAME; rendering goes on without it"
+            yield Finding("plug-ins", slot.value.reason, remedy, optional=slot.path.endswith("encoder"))
+    for name, use in (("scene.json", "rendering"), ("style.safetensors", "restyling")):
+        there = (folder / name).is_file()
+        yield Finding(name, "there" if there else f"absent; {use} needs it", "" if there else again)
+    measure = f"fprf eval {shlex.quote(str(folder))}"
+    measured = (folder / "metrics.json").is_file()
+    yield Finding("metrics", "there" if measured else "not measured yet", "" if measured else measure, True)
+    yield from _trouble(folder)
+    yield Finding("size", f"{_size(folder) / _MIB:.1f} MiB")
+
+
+def _trouble(folder: Path) -> Iterator[Finding]:
+    """What training noted on the way: skipped steps, damaged checkpoints."""
+    from ..training.events import read_history
+
+    if not (folder / "events.jsonl").is_file():
+        return
+    try:
+        notes = [note for history in read_history(folder) for note in history.notes]
+    except CheckpointError:
+        return
+    if notes:
+        more = f" and {len(notes) - 1} more" if len(notes) > 1 else ""
+        yield Finding("events", notes[-1] + more, f"fprf report {shlex.quote(str(folder))}", True)
+
+
+def _packages() -> Iterator[Finding]:
+    """What pyproject.toml asks for, without importing it."""
+    for requirement in requires("fprf") or ():
+        name = requirement.split(";")[0].split("<")[0].split(">")[0].split("=")[0].strip()
+        extra = requirement.partition("extra == ")[2].strip("\"'")
+        if extra in ("test", "dev"):
+            continue
+        try:
+            yield Finding(name, version(name))
+        except PackageNotFoundError:
+            remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
+            yield Finding(name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra))
+
+
+def _torch() -> Iterator[Finding]:
+    import torch
+
+    yield Finding("processor", f"{platform.machine()}, {_cores()} cores usable, {torch.get_num_threads()} threads")
+    if torch.cuda.is_available():
+        for at in range(torch.cuda.device_count()):
+            device = torch.cuda.get_device_properties(at)
+            yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
+        yield _installed("triton", "kernels for CUDA", "pip install triton")
+    elif torch.backends.mps.is_available():
+        yield Finding("mps", "Apple GPU")
+    else:
+        yield Finding("accelerator", "none: `--device auto` takes the processor")
+
+
+def _installed(name: str, purpose: str, remedy: str) -> Finding:
+    try:
+        return Finding(name, f"{version(name)}, {purpose}")
+    except PackageNotFoundError:
+        return Finding(name, f"not installed: no {purpose}", remedy, optional=True)
+
+
+def _weights() -> Iterator[Finding]:
+    """Networks that ship with the package, and those that were downloaded."""
+    plugins = Path(__file__).parents[1] / "plugins"
+    for folder, names in _SHIPPED.items():
+        there = sorted(path.stem for path in (plugins / folder / "weights").glob("*.safetensors"))
+        absent = [name for name in names if name not in there] or (["any"] if not there else [])
+        found = ", ".join(there) or "none"
+        remedy = "pip install --force-reinstall --no-deps fprf" if absent else ""
+        yield Finding(folder, f"in the package: {found}" + (f"; absent: {', '.join(absent)}" if absent else ""), remedy)
+    cached = []
+    for folder, pattern in _CACHES:
+        cached += sorted((Path.home() / folder).glob(pattern))
+    yield Finding("cached", ", ".join(path.name for path in cached) or "no downloads yet")
+
+
+def _steps(folder: Path) -> list[int]:
+    """Steps of the complete checkpoints; complete is what has a manifest."""
+    names = [path.parent.name.removeprefix("step-") for path in folder.glob("checkpoints/step-*/manifest.json")]
+    return sorted(int(name) for name in names if name.isdecimal())
+
+
+def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """A broken installation is a finding, not a crash."""
+    try:
+        yield from look()
+    except Exception as error:
+        yield Finding(what, f"{type(error).__name__}: {error}", f"pip install --force-reinstall {what}")
+
+
+_SHIPPED: dict[str, tuple[str, ...]] = {"encoders": ("content", "semantic"), "decoders": ()}
+"""Files that must be there; of decoders any will do."""
+_CACHES = (
+    (".cache/fprf/weights", "*"),
+    (".cache/torch/hub/checkpoints", "vgg19-*.pth"),
+    (".cache/huggingface/hub", "models--facebook--dino*"),
+)

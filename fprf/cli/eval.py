@@ -1,0 +1,103 @@
+"""`fprf eval RUN`: measure a run on views it has not seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+
+from ..errors import UsageError
+from ..training.quality import QualityConfig, at_quality
+from .parsing import parse
+from .progress import Display
+from .verbs import verbs_of
+
+if TYPE_CHECKING:
+    from ..training.run import Known
+    from ..training.views import View
+
+__all__ = ["EvalConfig", "evaluate_fields", "run", "store"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalConfig(QualityConfig):
+    """What to measure."""
+
+    run: Path = Path()
+    """Run folder."""
+    split: Literal["test", "train", "all"] = "test"
+    """Views to judge."""
+    data: Path | None = None
+    """Scene folder, where it has moved since training."""
+    fit_poses: bool = False
+    """Fit each view's own pose to its image first, the scene as it is: for captures whose poses are rough, or were refined.
+    metrics.json then says how far they were moved."""
+    images: bool = True
+    """Write the renders to RUN/renders/SPLIT."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+
+def run(args: list[str]) -> int:
+    """Render the split, write metrics.json, print a table."""
+    description = "Measure a run: PSNR, SSIM, speed, memory, consistency over views."
+    config = parse(EvalConfig(), args, prog="fprf eval", description=description, positional=("run",))
+    _print(verbs_of(config.run).evaluate(config))
+    return 0
+
+
+def evaluate_fields(config: EvalConfig) -> dict[str, object]:
+    """Judge a run of fields."""
+    from ..evaluation.alignment import align, described
+    from ..evaluation.judge import judge
+    from ..training.loading import load_run
+    from ..training.prepare import scene_of
+    from ..training.run import view_names
+
+    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
+    data = config.data or trained.config.data
+    scene = scene_of(replace(trained.config, data=data))
+    if tuple(view_names(scene.paths)) != trained.known.names:
+        raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
+    views = trained.known.split(config.split)
+    if not views:
+        raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
+    fitted: dict[str, object] = {}
+    with Display() as display:
+        if config.fit_poses:
+            trained, moves = align(trained, scene, views, display.count)
+            fitted = {"fitted_poses": {trained.known.names[view]: described(move) for view, move in moves.items()}}
+        metrics, renders = judge(trained, scene, views, display.count)
+    return store(config, trained.known, trained.method, views, metrics | fitted, renders)
+
+
+def store(
+    config: EvalConfig, known: "Known", method: str, views: Sequence[int], found: dict[str, Any], renders: "list[View]"
+) -> dict[str, object]:
+    """Write metrics.json and, if they are wanted, the renders; returns what is written."""
+    from ..io.atomic import write_json
+    from ..io.images import to_uint8
+    from ..io.video import write_frames
+
+    metrics = {"method": method, "scene": known.name, "split": config.split, "quality": config.quality, **found}
+    write_json(config.run / "metrics.json", metrics)
+    if config.images:
+        names = [known.names[v] for v in views]
+        write_frames(config.run / "renders" / config.split, names, [to_uint8(v.rgb) for v in renders])
+    return metrics
+
+
+def _print(metrics: dict[str, object]) -> None:
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
+    units = {"psnr": "dB", "rays_per_second": "rays/s", "peak_rss_mib": "MiB", "seconds_per_view": "s", "train_seconds": "s"}
+    for key in ("psnr", "ssim", "seconds_per_view", "rays_per_second", "kept_samples_share", "peak_rss_mib", "train_seconds"):
+        value = metrics[key]
+        assert isinstance(value, float)
+        table.add_row(key, f"{value:,.3f}" if value < 1000 else f"{value:,.0f}", units.get(key, ""))
+    warped = metrics["consistency"]
+    assert isinstance(warped, dict)
+    if warped["rmse"] is not None:
+        table.add_row("consistency rmse", f"{warped['rmse']:.4f}", f"over {warped['valid_share']:.0%} of the pixels")
+    Console(highlight=False).print(table)

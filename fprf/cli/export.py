@@ -1,0 +1,281 @@
+"""`fprf export RUN [ply splat cameras ...]`: a scene, plain or restyled, as files that other programs open."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ..errors import DataError, UsageError
+from ..export.config import ExportConfig
+from ..export.looks import Look, Named, make_looks, named_styles, style_name
+from ..export.plan import KINDS, Plan, look_file, plan
+from .progress import Display
+from .style_flags import read_flags, say
+from .verbs import verbs_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..export.colours import Coloured
+    from ..export.fusion import Cloud
+    from ..export.sights import Sights
+    from ..export.witness import Witnesses
+    from ..style.files import StyleFile
+    from ..training.loading import Trained
+
+__all__ = ["export_fields", "run"]
+
+_FEW = 0.5
+"""A smaller share of what there was is worth a warning."""
+
+_DESCRIPTION = f"""A scene as files that other programs open, in the capture's own frame.
+
+Kinds may follow the run; several share one geometry, none = all of them:
+{", ".join(f"{name} = {what}" for name, what in KINDS.items())}. A look of the scene is a file:
+points.ply as it is, points.NAME.ply in a style, with the same points in the same order."""
+
+
+def run(args: list[str]) -> int:
+    """Render depths, fuse them, colour the points in every look, write the files."""
+    config, file = read_flags(
+        ExportConfig(), _kinds_as_flag(args), prog="fprf export", description=_DESCRIPTION, positional=("run",)
+    )
+    verbs_of(config.run).export(config, file)
+    return 0
+
+
+def export_fields(config: ExportConfig, file: "StyleFile") -> None:
+    """Write a run of fields."""
+    what = plan(config.kinds, config.output or config.run / "exports")
+    styles = named_styles(config.styles, file, say)
+    if config.references:
+        styles.insert(0, Named(style_name(config.references, config.style), file))
+    if config.kinds and "lut" in what.kinds and not styles:
+        raise UsageError("fprf export: a lut is the way into a style; name one with --references, --style or --styles")
+    if what.single is not None and len(styles) > 1:
+        raise UsageError(f"--output {what.single}: one file holds one style, {len(styles)} are asked for; name a folder")
+    from ..io.atomic import write_json
+    from ..training.loading import load_run
+
+    start = time.perf_counter()
+    trained = load_run(config.run, config.device)
+    looks = make_looks(trained, styles)
+    if what.single is not None:
+        looks = looks[-1:]
+    made: dict[str, Any] = {"run": trained.known.name, "step": trained.step, "styles": [s.name for s in styles]}
+    with Display() as display:
+        made |= _geometry(trained, config, what, looks, display)
+        if "cameras" in what.kinds:
+            made |= _cameras(trained, config, what, looks, display)
+        if "lut" in what.kinds and styles:
+            made |= _tables(trained, config, what, looks)
+    made["seconds"] = time.perf_counter() - start
+    if what.single is None:
+        write_json(what.folder / "export.json", made)
+    for line in _coverage(made):
+        print(line)
+    print(f"{', '.join(what.kinds)} in {what.single or what.folder}  ({made['seconds']:.1f} s)")
+
+
+def _coverage(made: dict[str, Any]) -> list[str]:
+    """Lines on how much of the scene the files hold, with what to do where that is little."""
+    lines: list[tuple[str, float, str]] = []
+    if "pixels" in made:
+        every, seen, agreed = (made["pixels"][name] for name in ("all", "seen", "agreed"))
+        text = f"depth maps of {made['views']} views: {seen / every:.0%} of the pixels see a surface within reach"
+        lines.append((f"{text}, other views agree on {agreed / seen:.0%} of these", agreed / seen, "raise --tolerance"))
+    if "points" in made:
+        kept, total = made["points"], made["points"] + made["floating"]
+        text = f"points: {kept} of {total} ({kept / total:.0%}) kept"
+        lines.append((f"{text}, {made['floating']} float where the field has no surface", kept / total, "lower --presence"))
+    if "vertices" in made:
+        lines.append((f"mesh: {made['vertices']} vertices, {made['triangles']} triangles", 1.0, ""))
+    return [text if share >= _FEW else f"warning: {text}: train longer, or {remedy}" for text, share, remedy in lines]
+
+
+class _Place(NamedTuple):
+    """What every file of surfaces needs."""
+
+    trained: "Trained"
+    what: Plan
+    looks: Sequence[Look]
+    sights: "Sights"
+    origin: "Tensor"
+    display: Display
+
+    def paths(self, base: str, look: Look, ending: str) -> list[Path]:
+        """Where the file of a look goes; nowhere if a single file of another ending is wanted."""
+        if self.what.single is None:
+            return [self.what.folder / look_file(base, look.name, ending)]
+        return [self.what.single] if self.what.single.suffix.lower() == ending else []
+
+    def colours(self, point: "Tensor", seen: "Witnesses", tolerance: float | None) -> "Coloured":
+        """Every look's colours of points that views of the sights see."""
+        from ..export.colours import seen_colours
+
+        return seen_colours(
+            self.trained.model,
+            self.trained.known.facts,
+            self.sights.cameras,
+            point,
+            seen,
+            self.trained.config.render,
+            [look.restyle for look in self.looks],
+            tolerance=tolerance,
+            report=lambda done, total: self.display.count(done, total, "colouring"),
+        )
+
+
+def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequence[Look], display: Display) -> dict[str, Any]:
+    """Everything that is made of surfaces."""
+    if not {"ply", "splat", "glb"} & set(what.kinds):
+        return {}
+    from ..export.fusion import fuse
+    from ..export.points import origin_of
+
+    sights = _sights(trained, config, display)
+    counts: dict[str, int] = {}
+    cloud = fuse(
+        sights,
+        edge=config.edge,
+        most=config.points,
+        tolerance=config.tolerance,
+        agree=config.agree,
+        report=lambda done, total: display.count(done, total, "fusing"),
+        counts=counts,
+    )
+    place = _Place(trained, what, looks, sights, origin_of(cloud), display)
+    pixels = sum(depth.numel() for depth in sights.depth)
+    made: dict[str, Any] = {
+        "origin": place.origin.tolist(),
+        "views": len(sights.depth),
+        "pixels": {"all": pixels, **counts},
+        "finest_edge": float(cloud.edge.amin()),
+    }
+    if {"ply", "splat"} & set(what.kinds):
+        made |= _points(place, cloud, config)
+    if "glb" in what.kinds:
+        made |= _mesh(place, cloud, config)
+    return made
+
+
+def _sights(trained: "Trained", config: ExportConfig, display: Display) -> "Sights":
+    from ..export.depths import chosen, reach_of, render_sights
+
+    known = trained.known
+    return render_sights(
+        trained.model,
+        known.cameras,
+        chosen(known.train, config.views),
+        trained.config.render,
+        side=config.side,
+        reach=reach_of(trained.model.space) if config.reach is None else config.reach,
+        report=lambda done, total: display.count(done, total, "rendering depth"),
+    )
+
+
+def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
+    """Points and splats: one geometry, a colour set for each look."""
+    import torch
+
+    from ..export.fusion import Cloud, joined
+    from ..export.points import write_points
+    from ..export.sky import dome
+    from ..export.splats import discs, write_gaussians, write_splat
+    from ..export.witness import alone, expected_presence, witnesses
+
+    kinds = place.what.kinds
+    seen = witnesses(place.sights, cloud.point, cloud.normal, cloud.edge, config.witnesses)
+    found = place.colours(cloud.point, seen, config.tolerance)
+    solid = found.presence >= config.presence * expected_presence(place.sights, cloud.point, seen, config.tolerance)
+    if not bool(solid.any()):
+        raise DataError(f"export: no point is as present as {config.presence:g} in the field; lower --presence")
+    cloud, colours = Cloud(*(column[solid] for column in cloud)), [colour[solid] for colour in found.colours]
+    above = dome(place.sights, cloud) if config.sky and "splat" in kinds else None
+    whole = cloud if above is None else joined(cloud, above)
+    beyond = None if above is None else place.colours(above.point, alone(above.view), None).colours
+    splats = discs(whole)
+    for number, look in enumerate(place.looks):
+        colour = colours[number]
+        every = colour if beyond is None else torch.cat([colour, beyond[number]])
+        if "ply" in kinds:
+            for path in place.paths("points", look, ".ply"):
+                write_points(path, cloud, colour, place.origin)
+        if "splat" in kinds:
+            for path in place.paths("splats", look, ".ply"):
+                write_gaussians(path, splats, every, place.origin)
+            for path in place.paths("splats", look, ".splat"):
+                write_splat(path, splats, every, place.origin)
+    return {"points": len(cloud.point), "floating": int((~solid).sum()), "splats": len(whole.point)}
+
+
+def _mesh(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
+    """The mesh in both formats, a file for each look."""
+    from ..export.mesh import build_mesh, write_mesh_glb, write_mesh_ply
+    from ..export.witness import witnesses
+
+    mesh = build_mesh(
+        place.sights,
+        cloud,
+        edge=config.mesh_edge,
+        report=lambda done, total: place.display.count(done, total, "building the mesh"),
+    )
+    seen = witnesses(place.sights, mesh.point, mesh.normal, mesh.edge, config.witnesses)
+    for look, colour in zip(place.looks, place.colours(mesh.point, seen, config.tolerance).colours, strict=True):
+        for path in place.paths("mesh", look, ".ply"):
+            write_mesh_ply(path, mesh, colour, place.origin)
+        for path in place.paths("mesh", look, ".glb"):
+            write_mesh_glb(path, mesh, colour, place.origin)
+    return {"vertices": len(mesh.point), "triangles": len(mesh.face), "mesh_edge": mesh.edge}
+
+
+def _cameras(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequence[Look], display: Display) -> dict[str, Any]:
+    """transforms.json, and the pictures that it names if they are wanted."""
+    from ..export.transforms import transforms
+    from ..io.atomic import write_json
+    from ..io.images import to_uint8, write_image
+    from ..training.views import render_view
+
+    known, folder = trained.known, what.folder
+    files = [f"images/{name}.png" for name in known.names]
+    if config.images:
+        for view, file in enumerate(files):
+            display.count(view, len(files), "rendering views")
+            picture = render_view(trained.model, known.facts, known.cameras, view, trained.config.render, looks[-1].restyle)
+            write_image(folder / file, to_uint8(picture.rgb))
+        display.count(len(files), len(files), "rendering views")
+    cloud = look_file("points", looks[-1].name, ".ply") if "ply" in what.kinds and what.single is None else None
+    document = transforms(known.cameras, files, train=known.train, test=known.test, cloud=cloud)
+    write_json(what.single or folder / "transforms.json", document)
+    return {"cameras": len(files)}
+
+
+def _tables(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequence[Look]) -> dict[str, Any]:
+    """Lookup tables of every style, for the whole scene and each region."""
+    from ..export.lut import fit_quality, look_pairs, write_cube
+    from ..training.loading import load_style
+
+    known, scene = trained.known, load_style(trained.run)[0]
+    styled = [(look.name, look.restyle) for look in looks if look.restyle is not None]
+    pairs = look_pairs(
+        trained.model, scene, known.cameras, known.train, trained.config.render, [restyle for _, restyle in styled]
+    )
+    made: dict[str, Any] = {}
+    for number, (name, _) in enumerate(styled):
+        weights = {"all": pairs.share.sum(1)}
+        if what.single is None and pairs.share.shape[1] > 1:
+            weights |= {f"region{k}": pairs.share[:, k] for k in range(pairs.share.shape[1])}
+        for region, weight in weights.items():
+            table, made[f"{name}/{region}"] = fit_quality(pairs, number, weight, config.lut_size)
+            write_cube(what.single or what.folder / "luts" / name / f"{region}.cube", table, f"{name} {region}")
+    return {"luts": made}
+
+
+def _kinds_as_flag(args: list[str]) -> list[str]:
+    """Words behind the run name kinds: RUN ply splat ... is RUN --kinds ply splat ..."""
+    end = 1
+    while end < len(args) and not args[end].startswith("-"):
+        end += 1
+    if end == 1 or args[0].startswith("-"):
+        return args
+    return [args[0], "--kinds", *args[1:end], *args[end:]]

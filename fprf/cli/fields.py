@@ -1,0 +1,64 @@
+"""Runs of fields on the command line."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .verbs import Verbs
+
+if TYPE_CHECKING:
+    from ..config import TrainConfig
+    from ..export.config import ExportConfig
+    from ..plugins.config import Need
+    from ..style.files import StyleFile
+    from ..viewer.aside import Aside
+    from .eval import EvalConfig
+    from .render import RenderVerbConfig
+
+__all__ = ["FieldVerbs"]
+
+
+class FieldVerbs(Verbs):
+    """Verbs on runs of fields; each calls its own module."""
+
+    def __init__(self, config: "TrainConfig") -> None:
+        self.config = config
+
+    def plan(self, method: str) -> None:
+        """Show the blocks and what they will cost."""
+        from .blocks import show_plan
+        from .train import default_output
+
+        show_plan(self.config, method, self.config.output or default_output(self.config, method))
+
+    def train(self, method: str, *, quiet: bool = False, view: "Aside | None" = None, others: bool = False) -> Path:
+        """Train a model."""
+        from .train import train_scene
+
+        return train_scene(self.config, method, quiet=quiet, view=view, others=others)
+
+    def needs(self) -> "list[Need]":
+        """List packages and weights that plug-ins and the decoder lack."""
+        from ..training.needs import decoder_needs, plugin_needs
+
+        found = plugin_needs(self.config)
+        if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in found):
+            found = [*found, *decoder_needs(self.config)]
+        return found
+
+    def evaluate(self, config: "EvalConfig") -> dict[str, object]:
+        """Judge a model."""
+        from .eval import evaluate_fields
+
+        return evaluate_fields(config)
+
+    def render(self, config: "RenderVerbConfig", file: "StyleFile") -> None:
+        """Film a model, plain or restyled."""
+        from .render import film
+
+        film(config, file)
+
+    def export(self, config: "ExportConfig", file: "StyleFile") -> None:
+        """Fuse rendered depths, colour them, write the files."""
+        from .export import export_fields
+
+        export_fields(config, file)

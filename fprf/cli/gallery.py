@@ -1,0 +1,195 @@
+"""`fprf gallery RUN --references DIR`: every view in every style, as one page that needs nothing else."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ..checks import at_least, between
+from ..errors import UsageError
+from ..plugins.registry import nearest
+from ..plugins.stylizers.config import StylizerConfig
+from ..style.config import StyleConfig
+from ..style.files import StyleFile, check_photographs, read_style
+from ..training.quality import QualityConfig, at_quality
+from .parsing import parse
+from .progress import Display
+from .render import RenderVerbConfig, camera_path, frames_of
+from .showcase import restyled, write_page
+from .style_flags import read_preset, say, with_presets_named
+
+if TYPE_CHECKING:
+    from ..training.loading import Trained
+
+__all__ = ["GalleryConfig", "run"]
+
+_DESCRIPTION = """Every view in every style, as one page: wipes, match maps, depth, figures. It loads nothing and can be sent.
+
+Each reference is a style of its own; with several of them all together are one more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GalleryConfig(QualityConfig):
+    """What the page shows."""
+
+    run: Path = Path()
+    """Run folder."""
+    references: tuple[Path, ...] = ()
+    """Photographs, or folders of them."""
+    styles: tuple[Path, ...] = ()
+    """Style files (style.json), each one more style."""
+    together: bool = True
+    """Also show all photographs as one style."""
+    strength: float = 1.0
+    """0 leaves the scene as it is, 1 is the full style; of photographs."""
+    luminance: float = 0.0
+    """How much of the scene's own luminance is kept, in [0, 1]; of photographs."""
+    clusters: int = StyleConfig().clusters
+    """Local styles per photograph, at least 1."""
+    blend: float = StyleConfig().blend
+    """Share of the overall style in each local one, in [0, 1]; of photographs."""
+    stylizer: StylizerConfig = StyleConfig().stylizer
+    """What moves the scene's features; of photographs."""
+    split: Literal["covered", "test", "train", "all"] = "covered"
+    """Views to choose from. covered: at most 8, those that training views surround; test: those held out from training."""
+    most: int = 6
+    """Views that are shown, evenly taken from the split."""
+    views: tuple[str, ...] = ()
+    """Views to show by name, instead."""
+    frames: int = 0
+    """Frames of a flight through the last style; 0 = none."""
+    path: str = "interpolate"
+    """Path of the flight: spiral, orbit, interpolate, or a camera-path file."""
+    title: str = ""
+    """Headline; empty = the scene's name."""
+    output: Path | None = None
+    """The page; by default RUN/gallery.html."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        between("strength", self.strength, 0.0, 1.0)
+        between("luminance", self.luminance, 0.0, 1.0)
+        at_least("clusters", self.clusters, 1)
+        between("blend", self.blend, 0.0, 1.0)
+        at_least("most", self.most, 1)
+        at_least("frames", self.frames, 0)
+
+
+def run(args: list[str]) -> int:
+    """Render the views in every style, film, write the page."""
+    default, args = read_preset(GalleryConfig(), args)
+    config = parse(default, args, prog="fprf gallery", description=with_presets_named(_DESCRIPTION), positional=("run",))
+    output = config.output if config.output is not None else config.run / "gallery.html"
+    if output.suffix.lower() != ".html":
+        raise UsageError(f"--output {output}: the page is an .html file; give such a name")
+    from ..datamanagers.images import photographs as find_photographs
+    from ..io.video import write_video
+    from ..training.loading import load_run
+    from ..training.views import render_view
+
+    photographs = find_photographs(config.references, say)
+    trained = at_quality(load_run(config.run, config.device), config)
+    views, known = _views(trained, config), trained.known
+    chosen = _chosen(config, photographs)
+    film = None
+    with Display() as display:
+        originals = []
+        for i, view in enumerate(views):
+            display.count(i, len(views), "rendering")
+            originals.append(render_view(trained.model, known.facts, known.cameras, view, trained.config.render))
+        shown = restyled(trained, chosen, views, display)
+        if config.frames:
+            film = output.with_suffix(".mp4")
+            flight = camera_path(trained.known, RenderVerbConfig(path=config.path, frames=config.frames))[0]
+            write_video(film, frames_of(trained, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
+    width, height = (int(v) for v in known.cameras.size[views[0]])
+    write_page(
+        output,
+        trained,
+        title=config.title or known.name,
+        facts={
+            "Photographs": len(known.names),
+            "Size": f"{width} × {height}",
+            "Method": trained.method,
+            "Styles": len(shown),
+            "Trained for": f"{trained.seconds / 60:.1f} min",
+        },
+        views=views,
+        originals=originals,
+        shown=shown,
+        references=_named(photographs, [path for each in shown for path in each.sources]),
+        metrics=_metrics(config.run),
+        film=film,
+    )
+    print(f"{len(views)} views in {len(shown)} styles: {output} ({output.stat().st_size / 2**20:.1f} MiB)")
+    return 0
+
+
+def _chosen(config: GalleryConfig, photographs: list[Path]) -> list[tuple[str, StyleFile]]:
+    """The styles with their names. Raises UsageError where there are none."""
+
+    def of(*references: Path) -> StyleFile:
+        return StyleFile(
+            StyleConfig(
+                references=references,
+                strength=config.strength,
+                luminance=config.luminance,
+                clusters=config.clusters,
+                blend=config.blend,
+                stylizer=config.stylizer,
+            )
+        )
+
+    chosen = [(name, of(path)) for name, path in _named(photographs, ()).items()]
+    for path in config.styles:
+        file = read_style(path)
+        check_photographs(path, file)
+        own = path.resolve().parent.name if path.name == "style.json" else path.stem
+        taken = {name for name, _ in chosen}
+        chosen.append((own if own not in taken else f"{own} ({len(chosen) + 1})", file))
+    if config.together and len(photographs) > 1:
+        names = list(_named(photographs, ()))
+        chosen.append((" + ".join(names) if len(names) <= 3 else f"all {len(names)}", of(*photographs)))
+    if not chosen:
+        raise UsageError("fprf gallery: name photographs with --references, or style files with --styles")
+    return chosen
+
+
+def _named(first: Sequence[Path], more: Sequence[Path]) -> dict[str, Path]:
+    """Photographs by their stems; where two agree, by their whole names, with a number where these agree as well."""
+    paths = list(dict.fromkeys([*first, *more]))
+    named: dict[str, Path] = {}
+    for path in paths:
+        alike = sum(other.stem == path.stem for other in paths) > 1
+        name = path.name if alike else path.stem
+        named[name if name not in named else f"{name} ({len(named) + 1})"] = path
+    return named
+
+
+def _views(trained: "Trained", config: GalleryConfig) -> list[int]:
+    """The views to show. Raises UsageError for a name that the run does not hold, or an empty split."""
+    names = list(trained.known.names)
+    for name in config.views:
+        if name not in names:
+            raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
+    if config.views:
+        return [names.index(name) for name in config.views]
+    all_ = trained.known.split(config.split)
+    if not all_:
+        raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
+    count = min(config.most, len(all_))
+    return [all_[k * len(all_) // count] for k in range(count)]
+
+
+def _metrics(run: Path) -> dict[str, Any]:
+    """What `fprf eval` has measured of the run, without the single views; nothing where it has not."""
+    from ..plugins.codec import read_json
+
+    path = run / "metrics.json"
+    if not path.is_file():
+        return {}
+    content = read_json(path, "the metrics.json of `fprf eval`")
+    told = content if isinstance(content, dict) else {}
+    return {name: value for name, value in told.items() if name not in ("per_view", "method", "scene")}

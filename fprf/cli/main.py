@@ -1,0 +1,156 @@
+"""The command line: `fprf VERB ...`. A verb's module is imported when it is used; `--help` imports nothing heavy.
+
+Packages add verbs in the entry-point group `fprf.commands` (`cli/config.py`); a built-in verb takes precedence over one
+of the same name.
+
+Exit codes: 0 done, 1 our fault, 2 the user's mistake (one line on standard error), 130 interrupted.
+"""
+
+import importlib
+import inspect
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from .. import __version__
+from ..errors import FprfError, UsageError
+from ..memory import out_of_memory, shortage
+from ..plugins.registry import installed, make, nearest
+from ..process import settle
+
+__all__ = ["VERBS", "Verb", "main", "packaged", "run_verb"]
+
+_GROUP = "fprf.commands"
+
+_PIPE_CLOSED = 141
+"""What a shell reports for a program that SIGPIPE ended."""
+
+
+class Verb(NamedTuple):
+    """One command: `fprf.cli.NAME` with `run(args) -> exit code`."""
+
+    usage: str
+    summary: str
+
+
+VERBS = {
+    "demo": Verb("[--output DIR]", "embedded scene: train, restyle, gallery; no network, no data"),
+    "process": Verb("IMAGES|VIDEO --output SCENE", "find poses for images or a video that have none"),
+    "train": Verb("METHOD|CONFIG.json --data DIR", "train a scene, or go on where a run stopped"),
+    "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
+    "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
+    "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),
+    "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
+    "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
+    "view": Verb("RUN", "in the browser: drop a photograph on the scene to restyle it"),
+    "report": Verb("RUN", "how training went: charts of loss, PSNR, speed, time per part"),
+    "bench": Verb("speed|profile|pareto|... [RUN]", "time and error, where time goes, memory, scaling"),
+    "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
+    "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),
+    "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
+    "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
+    "completion": Verb("bash|zsh|fish", "a script by which a shell completes verbs and flags"),
+    "doctor": Verb("[RUN|DIR|METHOD]", "look over this machine, a run, a scene or a method's needs"),
+}
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one verb and return its exit code."""
+    given = list(sys.argv[1:] if args is None else args)
+    debug = "--debug" in given or os.environ.get("FPRF_DEBUG", "") not in ("", "0")
+    try:
+        code = _dispatch([arg for arg in given if arg != "--debug"])
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains when it ends
+        return _PIPE_CLOSED
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except FprfError as error:
+        if debug:
+            traceback.print_exc()
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        if out_of_memory(error):
+            print(f"error: {shortage('fprf', error, 'close other programs, or take a larger --downscale')}", file=sys.stderr)
+            return 2
+        if not debug:
+            print(_our_fault(error), file=sys.stderr)
+        return 1
+    return code
+
+
+def _dispatch(args: list[str]) -> int:
+    if not args or args[0] in ("-h", "--help"):
+        print(_help())
+        return 0 if args else 2
+    if args[0] == "--version":
+        print(f"fprf {__version__}")
+        return 0
+    settle()
+    try:
+        return run_verb(args[0], args[1:])
+    except SystemExit as end:  # --help ends this way
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+
+
+def packaged() -> dict[str, str]:
+    """Verbs of packages: name to the packages that provide it. Imports nothing."""
+    return {
+        name: " and ".join(each.package for each in entries) for name, entries in installed(_GROUP).items() if name not in VERBS
+    }
+
+
+def run_verb(verb: str, args: list[str]) -> int:
+    """Run a verb, built-in or of a package, with its arguments. Raises UsageError where there is no such verb."""
+    if verb in VERBS:
+        return int(importlib.import_module(f".{verb}", __package__).run(args))
+    others = packaged()
+    if verb not in others:
+        known = [*VERBS, *others]
+        raise UsageError(f"fprf {verb}: no such verb{nearest(verb, known)} (verbs: {', '.join(known)})")
+    from .config import CommandConfig
+    from .parsing import parse
+
+    config = make(_GROUP, verb, CommandConfig)
+    about = inspect.getdoc(type(config)) or ""
+    return parse(config, args, prog=f"fprf {verb}", description=about, positional=config.positional).run() or 0
+
+
+def _help() -> str:
+    bold, dim, plain = ("\x1b[1m", "\x1b[2m", "\x1b[0m") if _colour() else ("", "", "")
+    others = packaged()
+    width = max(map(len, [*VERBS, *others]))
+    broad = max(len(verb.usage) for verb in VERBS.values())
+    lines = [
+        f"{bold}fprf {__version__}{plain}: restyle 3D radiance fields with photographs, feed-forward",
+        "",
+        "usage: fprf VERB [ARGUMENTS]",
+        "",
+        *(f"  {bold}{name:<{width}}{plain}  {verb.usage:<{broad}}  {dim}{verb.summary}{plain}" for name, verb in VERBS.items()),
+        "",
+        *(f"  {bold}{name:<{width}}{plain}  {dim}of {package}{plain}" for name, package in others.items()),
+        *([""] if others else []),
+        "`fprf VERB --help` shows every flag of a verb, `fprf train` lists the methods. Start with `fprf demo`.",
+    ]
+    return "\n".join(lines)
+
+
+def _colour() -> bool:
+    return sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+
+def _our_fault(error: Exception) -> str:
+    """Kind, text and place of an error that is nobody's mistake but ours, or a plug-in's."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({os.path.relpath(frames[-1].filename)}:{frames[-1].lineno} in {frames[-1].name})" if frames else ""
+    return (
+        f"internal error: {type(error).__name__}: {error}{place}\n"
+        "This is a fault of fprf or of a plug-in. Run it again with --debug for the whole traceback, and report that."
+    )

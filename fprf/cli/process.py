@@ -1,0 +1,104 @@
+"""`fprf process IMAGES|VIDEO --output SCENE`: poses for images that have none, by COLMAP's Python package."""
+
+import shlex
+from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from .. import __version__
+from ..errors import UsageError
+from ..plugins.codec import method_config
+from ..reconstruction.config import SfmConfig
+from .parsing import parse
+from .progress import Display
+
+__all__ = ["ProcessConfig", "run"]
+
+METHOD, MINUTES = "fprf-lite", 8
+"""Method and minutes of the printed training command; with poses less than twelve minutes in all on two cores."""
+
+_DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
+
+Needs the extra `sfm` (pip install 'fprf[sfm]') and no other program. Run again, it goes on where it stopped."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessConfig(SfmConfig):
+    """What to process."""
+
+    source: Path = Path()
+    """A folder of images, or a video."""
+    output: Path | None = None
+    """The scene folder to make; by default scenes/NAME."""
+
+
+def run(args: list[str]) -> int:
+    """Choose, match, reconstruct; report what was dropped; check that the scene can be read."""
+    config = parse(ProcessConfig(), args, prog="fprf process", description=_DESCRIPTION, positional=("source",))
+    if find_spec("pycolmap") is None:
+        raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
+    from ..io.atomic import write_json
+    from ..reconstruction.database import Tables
+    from ..reconstruction.gather import gather
+    from ..reconstruction.place import Place, State
+    from ..reconstruction.report import report
+    from ..reconstruction.steps import find_features, find_matches, find_poses
+
+    place = Place(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
+    state = State.load(place)
+    models: list[dict[str, Any]] = []
+    matching: str = config.matching
+    with Display() as display:
+        gather(config.source, place, state, config, display.count)
+        find_features(place, state, config, display.count)
+        matching = find_matches(place, state, config, display.count)
+        try:
+            models = find_poses(place, state, config, display.count)
+        finally:
+            content = report(asdict(state), matching, Tables(place.database), models, __version__)
+            write_json(place.root / "process.json", content)
+    _print(content, place.root)
+    _check(place.root)
+    return 0
+
+
+def _print(content: dict[str, Any], root: Path) -> None:
+    from ..reconstruction.report import summary
+
+    console = Console(highlight=False)
+    images = content["images"]
+    console.print(
+        f"{images['posed']} of {images['given']} images have a pose; {content['points']} points, "
+        f"{content['error_pixels']:.2f} pixels off; {content['matching']} matching, "
+        f"{sum(content['step_seconds'].values()):.0f} s",
+        soft_wrap=True,
+    )
+    rows = summary(content)
+    if rows:
+        table = Table(box=None, show_header=True, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
+        for head in ("lost in", "image", "why"):
+            table.add_column(head, overflow="fold")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+        console.print(f"all of them in {root / 'process.json'}", soft_wrap=True)
+
+
+def _check(root: Path) -> None:
+    """Read the scene as training will, and print the commands that come next. Raises DataError where it cannot be read."""
+    from ..datamanagers.parsers.recognise import parse_scene
+    from ..training.prepare import with_downscale
+    from .train import default_output
+
+    config = replace(method_config(METHOD).fields_only(root), data=root, minutes=MINUTES)
+    delivered = parse_scene(root, 1, None)
+    size = with_downscale(config).downscale or 1
+    width, height = delivered.cameras.scaled(size).size[0].tolist()
+    run = default_output(config, METHOD)
+    print(f"{len(delivered.train)} + {len(delivered.test)} views, trained at {width}x{height}")
+    print(f"fprf train {METHOD} --data {shlex.quote(str(root))} --minutes {MINUTES}")
+    print(f"fprf stylize {shlex.quote(str(run))} --references PHOTO.jpg")

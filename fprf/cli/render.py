@@ -1,0 +1,241 @@
+"""`fprf render RUN --path PATH --output X.mp4`: fly through a scene, plain or restyled."""
+
+import hashlib
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from ..checks import at_least, positive
+from ..errors import ConfigError, UsageError
+from ..style.config import StyleConfig
+from ..training.quality import QualityConfig, at_quality
+from .keyframes import keyed_looks, read_keyframes
+from .progress import Display
+from .style_flags import read_flags, say
+from .verbs import verbs_of
+
+if TYPE_CHECKING:
+    from ..io.images import Picture
+    from ..rendering.cameras import Cameras
+    from ..style.files import StyleFile
+    from ..style.look import Restyle
+    from ..training.footage import Take
+    from ..training.loading import Trained
+    from ..training.run import Known
+
+__all__ = ["RenderVerbConfig", "camera_path", "film", "frames_of", "run"]
+
+
+_NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
+"""Endings that nobody gives a folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderVerbConfig(StyleConfig, QualityConfig):
+    """What to film, and how."""
+
+    run: Path = Path()
+    """Run folder."""
+    output: Path = Path("render.mp4")
+    """A film (.mp4), an animated picture (.gif .webp .apng), or a folder for numbered frames. Frames that an interrupted
+    render left are not made again."""
+    path: str = "interpolate"
+    """spiral, orbit, interpolate, dataset, or a camera-path JSON file of Nerfstudio."""
+    split: Literal["test", "train", "all"] = "all"
+    """Views that `interpolate` and `dataset` go through."""
+    frames: int = 120
+    """Frames of a spiral or orbit; about as many of an interpolation."""
+    fps: float = 24.0
+    """Frames per second of a film."""
+    style: Path | None = None
+    """A style file, as `fprf stylize` writes it; flags come over it."""
+    keyframes: Path | None = None
+    """Styles along the path: a JSON file that gives frames their style files; between them one fades into the other."""
+    styles: tuple[str, ...] = ()
+    """Further looks beside it: NAME=PHOTO,PHOTO, NAME=STYLE.json, or the word plain for the scene as it is."""
+    show: tuple[Literal["colour", "depth", "normals", "match"], ...] = ("colour",)
+    """What is shown of each frame, from left to right."""
+    layout: Literal["beside", "wipe"] = "beside"
+    """Several pictures of a frame lie beside each other, or share one in strips whose seams swing to and fro."""
+    format: Literal["png", "jpg", "exr"] = "png"
+    """Of frames in a folder; exr holds linear light, coverage, depth and normals as numbers, whatever is shown."""
+    lens: Literal["own", "panorama", "stereo"] = "own"
+    """own: as the path has it. panorama: all round (equirectangular). stereo: the same for two eyes, the left one above."""
+    across: int = 2048
+    """Width of a panorama in pixels; it is half as high."""
+    eyes: float = 0.065
+    """Distance of the eyes of a stereo panorama in the capture's units, above 0."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        StyleConfig.__post_init__(self)
+        QualityConfig.__post_init__(self)
+        at_least("frames", self.frames, 1)
+        at_least("fps", self.fps, 1)
+        at_least("across", self.across, 2)
+        positive("eyes", self.eyes)
+        if not self.show:
+            raise ConfigError("show: name at least one of colour, depth, normals, match")
+        if self.lens == "stereo" and {"normals", "match"} & {*self.show}:
+            raise ConfigError("show: a stereo panorama shows colour and depth only")
+        if self.keyframes is not None and (self.references or self.style):
+            raise ConfigError("keyframes: names styles of its own; leave out --references and --style, or --keyframes")
+
+
+def run(args: list[str]) -> int:
+    """Make the path, render it, write the film or the frames."""
+    description = "Fly through a trained scene, plain or restyled, to a film or frames."
+    config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
+    verbs_of(config.run).render(config, file)
+    return 0
+
+
+def film(config: RenderVerbConfig, file: "StyleFile") -> None:
+    """Film a run of fields."""
+    from ..datamanagers.images import load_image
+    from ..io.resumed import missing
+    from ..io.video import FILMS, write_video
+    from ..training.loading import load_run
+
+    if config.output.suffix.lower() in _NO_FOLDERS:
+        raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
+    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
+    cameras, names = camera_path(trained.known, config)
+    if config.lens != "own":
+        cameras = _all_round(trained, config, cameras)
+    takes = _takes(trained, config, file)
+    whole = config.output.suffix.lower() in FILMS
+    folder = config.output.with_suffix(".frames") if whole else config.output
+    paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
+    key = _key(trained, config, cameras)
+    todo = missing(folder, key, paths)
+    if len(todo) < len(paths):
+        print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
+    start = time.perf_counter()
+    with Display() as display:
+        _render(trained, config, cameras, takes, dict(zip(paths, range(len(paths)), strict=True)), todo, display)
+        made = str(config.output)
+        if whole:
+            codec = write_video(config.output, (load_image(path) for path in paths), config.fps)
+            made = f"{config.output} ({codec})"
+            shutil.rmtree(folder)
+    seconds = time.perf_counter() - start
+    print(f"{len(cameras)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
+
+
+def _render(
+    trained: "Trained",
+    config: RenderVerbConfig,
+    cameras: "Cameras",
+    takes: "list[Take]",
+    numbers: dict[Path, int],
+    todo: list[Path],
+    display: Display,
+) -> None:
+    """Render the frames that are missing, each written as soon as it is done."""
+    from ..io.exr import write_exr
+    from ..io.images import write_image
+    from ..io.panels import beside, wiped
+    from ..training.footage import limits_of, panels, planes
+
+    eyes = config.eyes if config.lens == "stereo" else None
+    limits = limits_of(trained, cameras) if "depth" in config.show and todo else None
+    start = time.perf_counter()
+    for done, path in enumerate(todo):
+        each = (time.perf_counter() - start) / done if done else None
+        display.count(done, len(todo), "rendering", seconds_left=None if each is None else each * (len(todo) - done))
+        frame = numbers[path]
+        if path.suffix == ".exr":
+            write_exr(path, planes(trained, cameras, frame, takes, eyes))
+            continue
+        shown = panels(trained, cameras, frame, takes, config.show, limits, eyes)
+        write_image(path, wiped(shown, frame / len(cameras)) if config.layout == "wipe" else beside(shown))
+    display.count(len(todo), len(todo), "rendering")
+
+
+def _all_round(trained: "Trained", config: RenderVerbConfig, cameras: "Cameras") -> "Cameras":
+    """Panoramas in place of the path's cameras. Raises UsageError where the scene lies in front of its cameras alone."""
+    from ..rendering.motions import upwards
+    from ..rendering.panorama import panoramas
+
+    if trained.known.facts.space.kind == "ndc":
+        raise UsageError(f"--lens {config.lens}: this scene was captured from one side (space ndc); there is nothing all round")
+    return panoramas(cameras, config.across, upwards(trained.known.cameras))
+
+
+def _key(trained: "Trained", config: RenderVerbConfig, cameras: "Cameras") -> str:
+    """A hash of all that frames depend on: the run's state, the path, every setting, and every file that they name."""
+    digest = hashlib.sha256(f"{trained.run.root.resolve()} {trained.step} {trained.seconds}".encode())
+    settings = {name: value for name, value in vars(config).items() if name not in ("output", "device", "fps", "run")}
+    digest.update(repr(sorted(settings.items())).encode() + repr(trained.config.render).encode())
+    for tensor in (cameras.pose, cameras.focal, cameras.centre, cameras.size, cameras.distortion, cameras.lens):
+        digest.update(tensor.numpy().tobytes())
+    named = [*config.references, *config.masks, config.style, config.between, config.keyframes]
+    if config.keyframes is not None:
+        named += [key.style for key in read_keyframes(config.keyframes)]
+    for text in config.styles:
+        named += [Path(part) for part in text.partition("=")[2].split(",")]
+    for path in named:
+        if path is not None and path.is_file():
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _takes(trained: "Trained", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
+    """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
+    from ..export.looks import named_styles
+    from ..training.footage import Take
+
+    takes = []
+    if config.keyframes is not None:
+        takes.append(Take("keyframes", keyed_looks(trained, read_keyframes(config.keyframes))))
+    elif config.references:
+        takes.append(_styled_take(trained, "style", file))
+    for text in config.styles:
+        if text == "plain":
+            takes.append(Take("plain", lambda frame: None))
+        else:
+            ((name, named),) = named_styles([text], file, say)
+            takes.append(_styled_take(trained, name, named))
+    takes = takes or [Take("plain", lambda frame: None)]
+    if "match" in config.show and not any(take.styled is not None for take in takes):
+        raise UsageError("--show match: needs a style that holds throughout; name one with --references, --style or --styles")
+    return takes
+
+
+def _styled_take(trained: "Trained", name: str, file: "StyleFile") -> "Take":
+    from ..training.footage import Take
+    from ..training.restyle import apply_style
+
+    styled = apply_style(trained, file)
+    for note in styled.orders.notes:
+        print(note)
+    return Take(name, lambda frame: styled.restyle, styled)
+
+
+def camera_path(known: "Known", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
+    """Cameras of the path and a name for each frame; captured views keep the stem of their image."""
+    from ..rendering.motions import make_path
+
+    views = known.split(config.split)
+    cameras = make_path(known.cameras, views, config.path, config.frames)
+    if config.path == "dataset":
+        return cameras, [known.names[view] for view in views]
+    return cameras, [f"{i:05d}" for i in range(len(cameras))]
+
+
+def frames_of(
+    trained: "Trained", cameras: "Cameras", looks: "Callable[[int], Restyle | None]", display: Display
+) -> Iterator["Picture"]:
+    """Colours of a flight one by one, each frame in its own look."""
+    from ..io.images import to_uint8
+    from ..training.footage import shoot
+
+    for i in range(len(cameras)):
+        display.count(i, len(cameras), "rendering")
+        yield to_uint8(shoot(trained, cameras, i, looks(i)).rgb)
+    display.count(len(cameras), len(cameras), "rendering")

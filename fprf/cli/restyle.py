@@ -1,0 +1,257 @@
+"""`fprf restyle CAPTURE --references A.jpg B.jpg --output OUT`: new colours for a finished capture of 3D Gaussians."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..checks import at_least
+from ..errors import CheckpointError, UsageError
+from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
+from ..splats.look_config import LookConfig
+from ..style.config import StyleConfig
+from ..style.files import StyleFile, write_style
+from .progress import Display
+from .style_flags import read_flags
+from .stylize import print_explained
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..interfaces import Encoder
+    from ..io.images import Picture
+    from ..splats.files import Capture
+    from ..splats.scene import SplatScene
+    from ..training.restyle import Styled
+
+__all__ = ["RestyleConfig", "run"]
+
+_KEPT = 24
+"""Captures of which the cache keeps what was found out."""
+
+_DESCRIPTION = """Restyle a finished capture of 3D Gaussians with photographs; its own photographs and cameras are not needed.
+
+Reads and writes .ply, .compressed.ply, .splat, .spz, .sog and SOG folders (meta.json); the output's ending says which. In the
+format that was read everything but colours is kept bit for bit. REGION is a region's number (--explain lists them), its name
+in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png. REFERENCE is a file or its number, from 0 in the order given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestyleConfig(StyleConfig, LookConfig):
+    """Flags of `fprf restyle`: the capture, the style and the files to write."""
+
+    capture: Path = Path()
+    """The capture: a file of Gaussians, or a SOG folder."""
+    output: Path | None = None
+    """The restyled capture; its ending says the format."""
+    style: Path | None = None
+    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
+    stylizer: StylizerConfig = RegionToneConfig(centred=False)
+    """Method that changes the colours of the capture."""
+    each: bool = False
+    """Each reference is a style of its own; its name is added to those of the files."""
+    sheet: Path | None = None
+    """A picture (.png .jpg .webp) of views before and after."""
+    page: Path | None = None
+    """A web page (.html) to compare views before and after; it loads nothing and can be sent."""
+    shown: int = 4
+    """Views on the sheet and the page, at least 1."""
+    explain: bool = False
+    """Also list the scene's regions with what each takes: a table, and explain.json and explain.png beside the output."""
+    cache: Path | None = None
+    """Folder for what is found out about captures, so that the next style takes a second; by default the user's cache."""
+
+    def __post_init__(self) -> None:
+        StyleConfig.__post_init__(self)
+        LookConfig.__post_init__(self)
+        at_least("shown", self.shown, 1)
+
+
+def run(args: list[str]) -> int:
+    """Look at the capture, or take what the cache knows of it; build each style; write files, sheet and page."""
+    config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("capture",))
+    _check(config)
+    import torch
+
+    from ..io.images import write_image
+    from ..plugins.encoders.config import BundledSemanticConfig
+    from ..splats.files import read_capture, write_capture
+    from ..training.restyle_gaussians import restyle_gaussians, restyled_harmonics, splat_regions
+
+    begun = time.perf_counter()
+    capture, encoder = read_capture(config.capture), BundledSemanticConfig().build()
+    finite = capture.gaussians.finite
+    with Display() as display:
+        scene = _known(capture, finite, encoder, config, display)
+        looked = time.perf_counter() - begun
+        named, made = _styles(config, file), []
+        for i, (name, each) in enumerate(named):
+            display.count(i, len(named), "restyling")
+            start = time.perf_counter()
+            styled = restyle_gaussians(scene, each, encoder)
+            new = restyled_harmonics(scene, styled.restyle)
+            if config.output is not None:
+                harmonics = capture.gaussians.harmonics
+                if not styled.restyle.idle:
+                    harmonics = torch.zeros_like(harmonics).index_copy_(0, finite.nonzero()[:, 0], new)
+                    harmonics = torch.where(finite[:, None, None], harmonics, capture.gaussians.harmonics)
+                output = _named(config.output, name)
+                write_capture(output, capture, harmonics)
+                write_style(_beside(output, "style.json"), styled.orders.saved)
+            made.append((name, styled, new, time.perf_counter() - start))
+        display.count(len(named), len(named), "restyling")
+    for note in dict.fromkeys(note for _, styled, _, _ in made for note in styled.orders.notes):
+        print(note)
+    if config.explain:
+        folder = (config.output or config.sheet or config.page or Path("x")).parent
+        for name, styled, _, _ in made:
+            print_explained(folder / name if name else folder, styled.orders.regions, styled)
+        if not made:
+            print_explained(folder, splat_regions(scene, file), None)
+    if config.sheet is not None or config.page is not None:
+        pictures = _pictures(scene, [new for _, _, new, _ in made], config.shown)
+        if config.sheet is not None:
+            write_image(config.sheet, _sheet(pictures, [name for name, _, _, _ in made]))
+        if config.page is not None:
+            _write_page(config, scene, made, pictures)
+    each_seconds = sum(seconds for *_, seconds in made) / max(1, len(made))
+    lost = len(finite) - int(finite.sum())
+    left = f", {lost} that are not finite left as they are" if lost else ""
+    print(f"{len(finite)} Gaussians{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles")
+    return 0
+
+
+def _check(config: RestyleConfig) -> None:
+    """Raise UsageError for what cannot be written, before anything takes time."""
+    from ..splats.files import ENDINGS
+
+    if config.output is None and not (config.sheet or config.page or config.explain):
+        raise UsageError("fprf restyle: name what to write, with --output, --sheet, --page or --explain")
+    if config.output is not None and not config.output.name.lower().endswith(ENDINGS):
+        raise UsageError(f"--output {config.output}: no file of Gaussians by its name; known endings are {', '.join(ENDINGS)}")
+    if config.page is not None and config.page.suffix.lower() != ".html":
+        raise UsageError(f"--page {config.page}: the page is an .html file; give such a name")
+    if not config.references and not config.explain:
+        raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
+
+
+def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile]]:
+    """The styles with what is added to the names of their files."""
+    if not config.references:
+        return []
+    if not config.each:
+        return [("", file)]
+    alone = []
+    for i, path in enumerate(config.references):
+        style = replace(
+            file.style,
+            references=(path,),
+            weights=(),
+            masks=file.style.masks[i : i + 1],
+        )
+        name = path.stem if sum(other.stem == path.stem for other in config.references) == 1 else f"{path.stem}-{i}"
+        alone.append((name, file._replace(style=style)))
+    return alone
+
+
+def _known(capture: "Capture", finite: "Tensor", encoder: "Encoder", config: RestyleConfig, display: Display) -> "SplatScene":
+    """Return the views and features of a capture from the cache; compute and store them where they are absent."""
+    from ..splats.scene import cache_name, load_scene, look_at_capture, scene_tensors
+    from ..training.prepare import cache_folder
+    from ..training.tensorfiles import load_sealed, save_sealed
+
+    look = LookConfig(up=config.up, inside=config.inside, views=config.views, size=config.size, regions=config.regions)
+    folder = config.cache or cache_folder() / "captures"
+    path = folder / cache_name(capture.data, encoder.identity, look)
+    gaussians = capture.gaussians if bool(finite.all()) else capture.gaussians.select(finite)
+    if path.is_file():
+        try:
+            scene = load_scene(load_sealed(path), gaussians, capture.antialiased, encoder.identity)
+        except CheckpointError as error:
+            display.say(f"looking again: {error}")
+        else:
+            path.touch()
+            return scene
+    scene = look_at_capture(
+        gaussians, capture.antialiased, encoder, look, lambda done, total: display.count(done, total, "looking")
+    )
+    save_sealed(path, scene_tensors(scene))
+    for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_KEPT]:
+        old.unlink(missing_ok=True)
+    return scene
+
+
+def _named(path: Path, name: str) -> Path:
+    """A path with a name before its ending; a SOG folder gets a folder of that name."""
+    if not name:
+        return path
+    if path.name.lower() == "meta.json":
+        return path.parent / name / path.name
+    stem, dot, ending = path.name.partition(".")
+    return path.with_name(f"{stem}-{name}{dot}{ending}")
+
+
+def _beside(output: Path, what: str) -> Path:
+    """`out.ply` has its `out.style.json`; a SOG folder holds it."""
+    return output.with_name(what if output.name.lower() == "meta.json" else f"{output.name.partition('.')[0]}.{what}")
+
+
+def _pictures(scene: "SplatScene", styles: "Sequence[Tensor]", shown: int) -> "list[tuple[str, list[Picture]]]":
+    """Views, evenly taken from the nearer half, with their pictures: as it is, then in each style."""
+    from ..training.restyle_gaussians import SplatViews
+
+    views, count = SplatViews(scene), max(min(shown, len(scene.names)), len(scene.names) // 2)
+    cameras = scene.cameras.scaled(0.5)
+    chosen = sorted({round((k + 0.5) * count / min(shown, count) - 0.5) for k in range(min(shown, count))})
+    return [
+        (scene.names[view], [views.picture(cameras, view), *(views.picture(cameras, view, new) for new in styles)])
+        for view in chosen
+    ]
+
+
+def _sheet(pictures: "list[tuple[str, list[Picture]]]", names: list[str]) -> "Picture":
+    from ..io.sheet import Tile, sheet
+
+    titles = ["before", *(name or "after" for name in names)]
+    tiles = [Tile(each, (f"view {view}: {title}",)) for view, row in pictures for title, each in zip(titles, row, strict=True)]
+    return sheet(tiles, len(titles))
+
+
+def _write_page(
+    config: RestyleConfig,
+    scene: "SplatScene",
+    made: "list[tuple[str, Styled, Tensor, float]]",
+    pictures: "list[tuple[str, list[Picture]]]",
+) -> None:
+    from ..datamanagers.images import load_image
+    from ..io.gallery import Reference, Style, write_gallery
+    from ..style.wishes import labels
+
+    assert config.page is not None
+    names = labels(config.references)
+    called = dict(zip(names, config.references, strict=True))
+    styles = []
+    for k, (name, styled, _, seconds) in enumerate(made):
+        of = (
+            [label for label in names if called[label] == config.references[k]]
+            if config.each
+            else list(styled.dictionary.names)
+        )
+        styles.append(
+            Style(
+                name or " + ".join(Path(label).stem for label in of),
+                [row[1 + k] for _, row in pictures],
+                references=of,
+                metrics={"new_style_seconds": seconds},
+            )
+        )
+    write_gallery(
+        config.page,
+        title=config.capture.resolve().name.partition(".")[0] or "capture",
+        scene={"Gaussians": len(scene.gaussians), "Regions": len(scene.style.share), "Styles": len(styles)},
+        view_names=[view for view, _ in pictures],
+        originals=[row[0] for _, row in pictures],
+        references=[Reference(label, load_image(path)) for label, path in called.items()],
+        styles=styles,
+    )

@@ -1,0 +1,143 @@
+"""A run in several styles, as a gallery page: what `fprf demo` and `fprf gallery` have in common."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .progress import Display
+
+if TYPE_CHECKING:
+    from ..io.images import Picture
+    from ..style.files import StyleFile
+    from ..training.loading import Trained
+    from ..training.restyle import Styled
+    from ..training.views import View
+
+__all__ = ["Shown", "restyled", "write_page"]
+
+
+class Shown(NamedTuple):
+    """One style on the views of a gallery."""
+
+    name: str
+    styled: "Styled"
+    views: "list[View]"
+    maps: "list[Picture]"
+    """Match maps."""
+    sources: list[Path]
+    """Its photographs, in the order of its match maps' colours."""
+    shares: list[float]
+    """How much of what was seen took its style from each of them."""
+    dictionary_seconds: float
+    view_seconds: float
+    """For all views."""
+    metrics: dict[str, Any]
+    """What is shown beside the style."""
+
+
+def restyled(
+    trained: "Trained", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display
+) -> list[Shown]:
+    """Each style on the views, with match maps and how well the views agree with each other."""
+    from ..style.wishes import labels
+    from ..training.matches import match_map, match_pictures, summarize
+    from ..training.restyle import apply_style, open_encoders
+    from ..training.views import render_view
+
+    known, config = trained.known, trained.config.render
+    encoders, shown = open_encoders(trained), []
+    for i, (name, file) in enumerate(chosen):
+        display.count(i, len(chosen), "restyling")
+        start = time.perf_counter()
+        styled = apply_style(trained, file, encoders)
+        built = time.perf_counter()
+        pictures = [render_view(trained.model, known.facts, known.cameras, view, config, styled.restyle) for view in views]
+        done = time.perf_counter()
+        found = [match_map(trained, styled, view) for view in views]
+        summaries = [summarize(each, styled.codes) for each in found]
+        called = dict(zip(labels(file.style.references), file.style.references, strict=True))
+        shown.append(
+            Shown(
+                name,
+                styled,
+                pictures,
+                [match_pictures(each, styled.codes)["match"] for each in found],
+                [called[label] for label in styled.codes.names],
+                [_mean([row["references"][k]["share"] for row in summaries]) for k in range(len(styled.codes.names))],
+                built - start,
+                done - built,
+                {
+                    "match_score": _mean([row["score"] for row in summaries]),
+                    "match_entropy_bits": _mean([row["entropy_bits"] for row in summaries]),
+                    "warp_error": _warped(trained, views, pictures),
+                    "new_style_seconds": built - start,
+                    "each_view_seconds": (done - built) / max(1, len(views)),
+                },
+            )
+        )
+    display.count(len(chosen), len(chosen), "restyling")
+    return shown
+
+
+def write_page(
+    path: Path,
+    trained: "Trained",
+    *,
+    title: str,
+    facts: Mapping[str, str | int | float],
+    views: Sequence[int],
+    originals: "Sequence[View]",
+    shown: Sequence[Shown],
+    references: Mapping[str, Path],
+    metrics: Mapping[str, Any],
+    film: Path | None = None,
+) -> None:
+    """Write the page. `references` are all photographs by the names that the page gives them."""
+    from ..datamanagers.images import load_image
+    from ..io.gallery import Reference, Style, write_gallery
+    from ..io.images import to_uint8
+    from ..io.maps import depth_image, depth_limits
+
+    limits = depth_limits([view.depth for view in originals], [view.opacity for view in originals])
+    called = {path: name for name, path in references.items()}
+    several = [len(each.sources) > 1 for each in shown]
+    write_gallery(
+        path,
+        title=title,
+        scene=facts,
+        view_names=[trained.known.names[view] for view in views],
+        originals=[to_uint8(view.rgb) for view in originals],
+        references=[Reference(name, load_image(path, upright=True)) for name, path in references.items()],
+        styles=[
+            Style(
+                each.name,
+                [to_uint8(view.rgb) for view in each.views],
+                references=[called[path] for path in each.sources],
+                shares=each.shares if many else (),
+                matches=each.maps if many else (),
+                metrics=each.metrics,
+            )
+            for each, many in zip(shown, several, strict=True)
+        ],
+        depth=[depth_image(view.depth, view.opacity, limits) for view in originals],
+        metrics=metrics,
+        video=film,
+    )
+
+
+def _warped(trained: "Trained", views: Sequence[int], pictures: "Sequence[View]") -> float | None:
+    """RMSE of each view against the next one, warped onto it; None where none sees what the next one sees."""
+    import torch
+
+    from ..evaluation.consistency import consistency
+
+    cameras = trained.known.cameras.select(torch.tensor(list(views), dtype=torch.int64))
+    pairs = [(i, i + 1) for i in range(len(views) - 1)]
+    found = consistency([view.rgb for view in pictures], [view.depth for view in pictures], cameras, pairs)
+    rmse = found["rmse"]
+    return None if rmse is None else float(rmse)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / max(1, len(values))

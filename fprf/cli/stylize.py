@@ -1,0 +1,186 @@
+"""`fprf stylize RUN --references A.jpg B.jpg`: captured views in the style of photographs."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ..errors import UsageError
+from ..plugins.registry import nearest
+from ..style.config import StyleConfig
+from ..style.files import write_style
+from ..training.quality import QualityConfig, at_quality
+from .progress import Display
+from .style_flags import read_flags
+
+if TYPE_CHECKING:
+    from ..training.explain import Region
+    from ..training.loading import Trained
+    from ..training.regions import Regions
+    from ..training.restyle import Styled
+
+__all__ = ["StylizeConfig", "print_explained", "run"]
+
+_LONGEST = 80
+"""Characters of a style's default name."""
+
+_SHOWN = 0.1
+"""References that a region takes less of are not in the table."""
+
+_HEAD = ("region", "share", "seen best at", "strength", "entropy", "takes")
+
+_DESCRIPTION = """Restyle captured views with photographs; no training, the same look from every viewpoint.
+
+REGION is a region's number (--explain lists them), its name in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png
+(what a mask over a view covers). REFERENCE is a file or its number, from 0 in the order given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StylizeConfig(StyleConfig, QualityConfig):
+    """Which views to restyle, and with what."""
+
+    run: Path = Path()
+    """Run folder."""
+    style: Path | None = None
+    """A style file, such as the style.json of an earlier run, of this scene or another; flags come over it."""
+    output: Path | None = None
+    """Folder for what is made; by default RUN/styles/NAME, with the name of the style file's folder or of the references."""
+    split: Literal["covered", "test", "train", "all"] = "covered"
+    """Views to restyle. covered: at most 8, those that training views surround; test: those held out from training."""
+    views: tuple[str, ...] = ()
+    """Views to restyle by name, instead of a split."""
+    explain: bool = False
+    """Render nothing; list the scene's regions with what each takes: a table, explain.json, explain.png."""
+    match_only: bool = False
+    """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-entropy.png."""
+    matches: bool = True
+    """Also write which reference each pixel takes, as VIEW-match.png."""
+    pixels: bool = False
+    """Also write each match map as numbers, as VIEW-match.npz."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        StyleConfig.__post_init__(self)
+        QualityConfig.__post_init__(self)
+
+
+def run(args: list[str]) -> int:
+    """Build the style; explain it, map it, or render the views; write style.json."""
+    config, file = read_flags(StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",))
+    from ..style.dictionary import save_dictionary
+    from ..style.statistics import dead_channels
+    from ..training.loading import load_run, load_style
+    from ..training.regions import Regions, TrainedViews
+    from ..training.restyle import apply_style
+
+    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
+    views, output = _views(trained, config), config.output or config.run / "styles" / _name(config)
+    if config.explain and not config.references:
+        print_explained(output, Regions(TrainedViews(trained), *load_style(trained.run)), None)
+        return 0
+    start = time.perf_counter()
+    styled = apply_style(trained, file)
+    seconds, scene = time.perf_counter() - start, styled.scene
+    made: dict[str, Any] = {
+        "dictionary_seconds": seconds,
+        "codes": len(styled.codes.reference),
+        "dead_channels": dead_channels(scene.mean, scene.covariance.diagonal()).nonzero().flatten().tolist(),
+    }
+    for note in styled.orders.notes:
+        print(note)
+    if config.explain:
+        print_explained(output, styled.orders.regions, styled)
+    if config.match_only or not config.explain:
+        made |= _make(trained, output, styled, views, config)
+    save_dictionary(output / "dictionary.safetensors", styled.dictionary)
+    write_style(output / "style.json", styled.orders.saved, made)
+    return 0
+
+
+def _make(trained: "Trained", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
+    """Pictures and match maps of the views; what was matched and how long it took."""
+    from ..io.images import to_uint8, write_image
+    from ..training.folding import Folded, folded
+    from ..training.matches import match_map, match_pictures, summarize, write_pixels
+    from ..training.views import render_view
+
+    known, render, shown = trained.known, trained.config.render, not config.match_only
+    maps = ("match", "score", "entropy") if config.match_only else ("match",) if config.matches else ()
+    made: dict[str, Any] = {}
+    rendering, matching, summaries = 0.0, 0.0, {}
+    drawn = folded(trained.model, styled, config.stylizer) or Folded(trained.model, styled.restyle)
+    with Display() as display:
+        for i, view in enumerate(views):
+            display.count(i, len(views), "restyling" if shown else "matching")
+            start, name = time.perf_counter(), known.names[view]
+            if shown:
+                picture = render_view(drawn.model, known.facts, known.cameras, view, render, drawn.look)
+                rendering += time.perf_counter() - start
+                write_image(output / f"{name}.png", to_uint8(picture.rgb))
+            if maps or config.pixels:
+                start = time.perf_counter()
+                found = match_map(trained, styled, view)
+                matching += time.perf_counter() - start
+                summaries[name] = summarize(found, styled.codes)
+                pictures = match_pictures(found, styled.codes)
+                for which in maps:
+                    write_image(output / f"{name}-{which}.png", pictures[which])
+                if config.pixels:
+                    write_pixels(output / f"{name}-match.npz", found, styled.codes)
+        display.count(len(views), len(views), "restyling" if shown else "matching")
+    count = max(1, len(views))
+    made = {"match_seconds_per_view": matching / count, "matches": summaries}
+    if shown:
+        made = {"seconds_per_view": rendering / count, **made}
+    what, each = ("views", rendering / count) if shown else ("match maps", matching / count)
+    print(f"{len(views)} {what} in {output}  ({each:.2f} s each)")
+    return made
+
+
+def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -> None:
+    """Show a scene's regions with what they take: a table on standard output, explain.json and explain.png in `output`."""
+    from ..io.atomic import write_json
+    from ..io.images import write_image
+    from ..io.sheet import sheet
+    from ..training.explain import explain, region_row, region_tile
+
+    found = explain(regions, styled)
+    names = styled.dictionary.names if styled is not None else ()
+    _print_table([_HEAD if styled else _HEAD[:3], *(_cells(region) for region in found)])
+    write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in found]})
+    write_image(output / "explain.png", sheet([region_tile(region, names) for region in found]))
+    print(f"the same with pictures in {output / 'explain.png'} and explain.json")
+
+
+def _cells(region: "Region") -> tuple[str, ...]:
+    """A row of the table."""
+    place = (str(region.number), f"{region.share:.1%}", f"{region.view}:{region.pixel[0]},{region.pixel[1]}")
+    if not region.taken:
+        return place
+    best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
+    takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
+    return (*place, "kept" if region.strength == 0 else f"{region.strength:.2g}", f"{region.entropy:.1f} bit", takes)
+
+
+def _print_table(rows: list[tuple[str, ...]]) -> None:
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _views(trained: "Trained", config: StylizeConfig) -> list[int]:
+    """The views asked for. Raises UsageError for a name that the run does not hold."""
+    names = list(trained.known.names)
+    for name in config.views:
+        if name not in names:
+            raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
+    return [names.index(name) for name in config.views] or list(trained.known.split(config.split))
+
+
+def _name(config: StylizeConfig) -> str:
+    """The style file's folder or own name, else the references' stems joined, cut to what every file system takes."""
+    if config.style is not None:
+        return config.style.stem if config.style.name != "style.json" else config.style.resolve().parent.name or "style"
+    joined = "+".join(p.stem for p in config.references) or "regions"
+    return joined if len(joined) <= _LONGEST else f"{joined[:_LONGEST]}+{len(config.references)}"

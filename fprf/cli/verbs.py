@@ -1,0 +1,56 @@
+"""What the command line asks of each kind of scene."""
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..export.config import ExportConfig
+    from ..plugins.config import Need
+    from ..style.files import StyleFile
+    from ..viewer.aside import Aside
+    from .eval import EvalConfig
+    from .render import RenderVerbConfig
+
+__all__ = ["Verbs", "verbs_of"]
+
+
+class Verbs(ABC):
+    """`train`, `eval`, `render` and `export` for a config of one kind, which a run to be measured was trained with.
+
+    Each raises UsageError for flags that the kind does not know.
+    """
+
+    @abstractmethod
+    def plan(self, method: str) -> None:
+        """Show what training would cost, and run nothing."""
+
+    @abstractmethod
+    def train(self, method: str, *, quiet: bool = False, view: "Aside | None" = None, others: bool = False) -> Path:
+        """Train to the end and return the run folder; go on with a run that is there.
+
+        `view` shows how it goes; `others` lets the images differ from those that the run was begun with.
+        """
+
+    @abstractmethod
+    def needs(self) -> "list[Need]":
+        """Packages and weights that training needs and that are not here."""
+
+    @abstractmethod
+    def evaluate(self, config: "EvalConfig") -> dict[str, object]:
+        """Measure a run, write metrics.json and renders, and return the metrics."""
+
+    @abstractmethod
+    def render(self, config: "RenderVerbConfig", file: "StyleFile") -> None:
+        """Film a run."""
+
+    @abstractmethod
+    def export(self, config: "ExportConfig", file: "StyleFile") -> None:
+        """Write a run for other programs."""
+
+
+def verbs_of(run: Path) -> Verbs:
+    """What is done with the run in a folder. Raises CheckpointError where there is none."""
+    from ..training.run import Run
+
+    return Run(run).load_config()[0].verbs()

@@ -1,0 +1,92 @@
+"""`fprf view RUN`: the scene in the browser; drop a photograph on it and it is restyled."""
+
+import importlib.util
+import os
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..checks import at_least, between
+from ..errors import CheckpointError, UsageError
+from ..training.quality import QualityConfig, at_quality
+from .parsing import parse
+from .style_flags import say
+
+if TYPE_CHECKING:
+    from ..training.loading import Trained
+
+__all__ = ["ViewConfig", "run"]
+
+_PATIENCE = 15.0
+"""Seconds after an interrupt within which all must have ended."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig(QualityConfig):
+    """What to look at, and who may."""
+
+    run: Path = Path()
+    """Run folder."""
+    references: tuple[Path, ...] = ()
+    """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
+    host: str = "127.0.0.1"
+    """Address to listen on; any but this machine's own needs a token."""
+    port: int = 8080
+    """Port to listen on; 0 = any that is free."""
+    token: str | None = None
+    """What the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
+    pixels: int = 640
+    """Longest side of the sharpest picture, 64 to 2048."""
+    max_memory: float | None = None
+    """MiB that blocks of a large scene may take; none = no limit."""
+    device: str = "auto"
+    """cpu, cuda, mps, or auto."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("port", self.port, 0)
+        between("port", float(self.port), 0.0, 65535.0)
+        between("pixels", float(self.pixels), 64.0, 2048.0)
+
+
+def run(args: list[str]) -> int:
+    """Serve until interrupted."""
+    config = parse(ViewConfig(), args, prog="fprf view", description="Look at a run in the browser.", positional=("run",))
+    if importlib.util.find_spec("viser") is None:
+        raise UsageError("fprf view: needs viser; install it with pip install 'fprf[viewer]'")
+    from ..viewer.access import make_access
+    from ..viewer.host import Host
+
+    access = make_access(config.host, config.token)
+    with Host(access, config.port) as host:
+        if not (config.run / "config.json").is_file():
+            raise CheckpointError(f"{config.run}: no config.json here, so it is no run folder; `fprf train` makes one")
+        references = _photographs(config.references)
+        print(host.address, flush=True)
+        host.open(lambda: _load(config), references, config.pixels)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            # Whatever a thread is in the middle of, the terminal comes back.
+            last = threading.Timer(_PATIENCE, os._exit, (130,))
+            last.daemon = True
+            last.start()
+            raise
+    return 0
+
+
+def _photographs(references: Sequence[Path]) -> Sequence[Path]:
+    """The images of folders in the folders' place. Raises DataError where there are none."""
+    if not any(path.is_dir() for path in references):  # decoding needs a library that the page does not wait for
+        return references
+    from ..datamanagers.images import photographs
+
+    return photographs(references, say)
+
+
+def _load(config: ViewConfig) -> "Trained":
+    from ..training.loading import load_run
+
+    return at_quality(load_run(config.run, config.device, config.max_memory), config)

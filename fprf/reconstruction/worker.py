@@ -1,0 +1,120 @@
+"""`python -m fprf.reconstruction.worker JOB.json`: one step of COLMAP, in a process of its own.
+
+pycolmap brings libraries that clash with OpenCV's in one process, so nothing here imports cv2, numpy or torch, and nothing
+else in this package imports pycolmap. Progress goes to standard output as JSON lines, COLMAP's own words to standard error.
+Exit codes: 0 done, 3 pycolmap is absent or too old, 4 no reconstruction; anything else is COLMAP's failure.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+__all__ = ["ABSENT", "NOTHING", "main"]
+
+ABSENT, NOTHING = 3, 4
+
+
+def main(job: dict[str, Any]) -> int:
+    """Run a job: `step` is features, matches or mapping."""
+    try:
+        import pycolmap
+
+        steps = {"features": _features, "matches": _matches, "mapping": _mapping}
+        pycolmap.set_random_seed(job["seed"])
+        pycolmap.FeatureExtractionOptions, pycolmap.ImportedPairingOptions  # noqa: B018 - absent before 4
+    except (ImportError, AttributeError) as error:
+        print(f"pycolmap: {error}", file=sys.stderr)
+        return ABSENT
+    return steps[job["step"]](pycolmap, job)
+
+
+def _features(pycolmap: Any, job: dict[str, Any]) -> int:
+    """Features of the images that have none yet; images of a group share a camera."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size, options.num_threads = job["side"], job["threads"]
+    options.sift.max_num_features = job["features"]
+    for group in job["groups"]:
+        missing, camera = _missing(pycolmap, job["database"], group)
+        if not missing:
+            continue
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model, reader.existing_camera_id = job["lens"], camera
+        pycolmap.extract_features(
+            job["database"],
+            job["images"],
+            image_names=missing,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=options,
+            device=pycolmap.Device.cpu if job["cpu"] else pycolmap.Device.auto,
+        )
+    return 0
+
+
+def _missing(pycolmap: Any, database: str, names: list[str]) -> tuple[list[str], int]:
+    """Images of a group without features, and the camera of those that have some; -1 where none has."""
+    camera, missing = -1, []
+    with pycolmap.Database.open(database) as base:
+        images = {image.name: image for image in base.read_all_images()}
+        for name in names:
+            image = images.get(name)
+            if image is not None:
+                camera = image.camera_id
+            if image is None or not base.exists_keypoints(image.image_id):
+                missing.append(name)
+    return missing, camera
+
+
+def _matches(pycolmap: Any, job: dict[str, Any]) -> int:
+    """Matches of listed pairs, verified by geometry; pairs that were matched before are left as they are."""
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = job["threads"]
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = job["pairs"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    pycolmap.match_image_pairs(
+        job["database"],
+        matching_options=options,
+        pairing_options=pairing,
+        verification_options=verification,
+        device=pycolmap.Device.cpu if job["cpu"] else pycolmap.Device.auto,
+    )
+    return 0
+
+
+def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
+    """Poses and points; every model is described in models.json, the largest one is written."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed, options.min_model_size = job["threads"], job["seed"], 3
+    registered = [0]
+
+    def count() -> None:
+        registered[0] += 1
+        print(json.dumps({"registered": registered[0]}), flush=True)
+
+    out = Path(job["models"])
+    out.mkdir(parents=True, exist_ok=True)
+    found = pycolmap.incremental_mapping(
+        job["database"], job["images"], str(out), options, initial_image_pair_callback=count, next_image_callback=count
+    )
+    models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    described = [
+        {
+            "images": sorted(model.image(id_).name for id_ in model.reg_image_ids()),
+            "points": model.num_points3D(),
+            "error_pixels": model.compute_mean_reprojection_error(),
+            "track_length": model.compute_mean_track_length(),
+        }
+        for model in models
+    ]
+    if models:
+        best = out / "best"
+        best.mkdir(exist_ok=True)
+        models[0].write_binary(str(best))
+    (out / "models.json").write_text(json.dumps(described), encoding="utf-8")
+    return 0 if models else NOTHING
+
+
+if __name__ == "__main__":
+    sys.exit(main(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))))

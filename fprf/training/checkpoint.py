@@ -1,0 +1,167 @@
+"""Checkpoints: `checkpoints/step-N/` with model, optimiser and a manifest that is written last.
+
+A folder without a valid manifest was cut short and does not count. The two newest are kept. All draws are functions of
+(seed, step), so parameters, moments and the step are all there is to save.
+"""
+
+import json
+import math
+import shutil
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import CheckpointError, DataError
+from ..io.atomic import remove_unfinished, write_json
+from . import tensorfiles
+from .model import Model
+
+__all__ = ["Saved", "load_latest", "reached", "restore", "save", "steps", "tidy", "write"]
+
+KEEP = 2
+"""Checkpoints that stay on disk."""
+
+
+class Saved(NamedTuple):
+    """What a checkpoint holds."""
+
+    step: int
+    seconds: float
+    """Training time until then."""
+    model: dict[str, Tensor]
+    optimizer: dict[str, Tensor]
+
+
+def _folder(root: Path, step: int) -> Path:
+    return root / f"step-{step:07d}"
+
+
+def steps(root: Path) -> list[int]:
+    """Steps of the complete checkpoints, oldest first."""
+    found = []
+    for manifest in root.glob("step-*/manifest.json"):
+        digits = manifest.parent.name.removeprefix("step-")
+        if digits.isdecimal():
+            found.append(int(digits))
+    return sorted(found)
+
+
+def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
+    """Write the checkpoint of a model and its optimiser (see `write`)."""
+    return write(root, model.state_dict(), _moments(optimizer), step=step, seconds=seconds)
+
+
+def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tensor], *, step: int, seconds: float) -> Path:
+    """Write the checkpoint of a step, then drop all but the newest two; later ones are of a past that was gone back from.
+
+    Raises DataError where the system refuses; what was there before is then there still.
+    """
+    folder = _folder(root, step)
+    try:
+        files = {
+            "model": tensorfiles.save(folder / "model.safetensors", model),
+            "optimizer": tensorfiles.save(folder / "optimizer.safetensors", optimizer),
+        }
+        manifest = {"format": 1, "step": step, "seconds": seconds, "files": files}
+        write_json(folder / "manifest.json", manifest | {"crc32": _checksum(manifest)})
+    except DataError:
+        tidy(root)
+        raise
+    found = steps(root)
+    for old in [s for s in found if s <= step][:-KEEP] + [s for s in found if s > step]:
+        (_folder(root, old) / "manifest.json").unlink()
+        shutil.rmtree(_folder(root, old))
+    return folder
+
+
+def tidy(root: Path) -> None:
+    """Remove what was cut short: folders without a manifest, unfinished files. Only where nobody else writes."""
+    complete = {_folder(root, step) for step in steps(root)}
+    for folder in root.glob("step-*"):
+        if folder in complete:
+            remove_unfinished(folder)
+        elif folder.name.removeprefix("step-").isdecimal() and not (folder / "manifest.json").exists():
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def load(root: Path, step: int) -> Saved:
+    """One checkpoint, verified. Raises CheckpointError."""
+    folder = _folder(root, step)
+    try:
+        manifest = _read(folder / "manifest.json")
+        at, seconds = int(manifest["step"]), float(manifest["seconds"])
+        entries = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as e:
+        raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
+    if at != step or not math.isfinite(seconds):
+        raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
+    model, optimizer = (tensorfiles.load(folder / f"{name}.safetensors", entries[name]) for name in entries)
+    return Saved(at, seconds, model, optimizer)
+
+
+def reached(root: Path) -> tuple[int, float]:
+    """Step and seconds of the newest checkpoint, (0, 0) without one. Raises CheckpointError."""
+    found = steps(root)
+    if not found:
+        return 0, 0.0
+    manifest = _folder(root, found[-1]) / "manifest.json"
+    try:
+        return found[-1], float(_read(manifest)["seconds"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:
+        raise CheckpointError(f"{manifest}: cannot be read ({e!r})") from e
+
+
+def _checksum(manifest: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(manifest, sort_keys=True).encode())
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A manifest, checked; those of before had no checksum of their own. Raises ValueError among others."""
+    manifest: dict[str, Any] = json.loads(path.read_text())
+    if manifest.pop("crc32", None) not in (None, _checksum(manifest)):
+        raise ValueError("its checksum differs")
+    return manifest
+
+
+def load_latest(root: Path) -> tuple[Saved | None, list[str]]:
+    """The newest intact checkpoint, and a line for every newer one that was damaged. Raises where all are damaged."""
+    damaged: list[str] = []
+    for step in reversed(steps(root)):
+        try:
+            return load(root, step), damaged
+        except CheckpointError as e:
+            damaged.append(str(e))
+    if damaged:
+        raise CheckpointError(f"{root}: no intact checkpoint; the newest says: {damaged[0]}")
+    return None, damaged
+
+
+def restore(saved: Saved, model: Model, optimizer: torch.optim.Optimizer | None) -> None:
+    """Put a checkpoint into a model and its optimiser. Raises CheckpointError where they are of another config."""
+    own = model.state_dict()
+    wrong = [n for n in own if n not in saved.model or own[n].shape != saved.model[n].shape]
+    wrong += [n for n in saved.model if n not in own]
+    if wrong:
+        raise CheckpointError(f"checkpoint of step {saved.step}: {wrong[0]} does not fit the config; it was changed since")
+    model.load_state_dict(saved.model)
+    if optimizer is None:
+        return
+    state = optimizer.state_dict()
+    state["state"] = {}
+    for name, tensor in saved.optimizer.items():
+        index, key = name.split(".", 1)
+        state["state"].setdefault(int(index), {})[key] = tensor
+    optimizer.load_state_dict(state)
+
+
+def _moments(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    return {
+        f"{index}.{key}": value
+        for index, values in optimizer.state_dict()["state"].items()
+        for key, value in values.items()
+        if isinstance(value, Tensor)
+    }

@@ -1,0 +1,138 @@
+"""Which reference and which of its style codes each pixel of a view takes, before any colour is rendered."""
+
+import io
+import math
+import zipfile
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..io.atomic import write_bytes
+from ..io.images import Picture
+from ..io.maps import match_image, match_summary, scale_image
+from ..rendering.cameras import pixel_grid
+from ..style.matching import unit
+from ..style.regional import RegionWeight
+from .loading import Trained
+from .restyle import Codes, Styled
+from .views import paint_pixels
+
+__all__ = ["MatchMap", "match_map", "match_pictures", "summarize", "write_pixels"]
+
+_LISTED = 0.005
+"""Codes that less than this share of a view takes are not listed."""
+
+
+class MatchMap(NamedTuple):
+    """One view, means over what each pixel sees; 0 where it sees nothing."""
+
+    taken: Annotated[Tensor, "H W T"]
+    """Share of each style code; sums to 1 less what regions keep of the scene."""
+    score: Annotated[Tensor, "H W"]
+    """Cosine of what lies there with the codes that it takes, seen from the scene's mean, in [-1, 1]."""
+    region: Annotated[Tensor, "H W K"]
+    """Share of each region of the scene."""
+    opacity: Annotated[Tensor, "H W"]
+
+    @property
+    def kept(self) -> Annotated[Tensor, "H W"]:
+        """Share that stays as it is, where anything is."""
+        return (self.region.sum(-1) - self.taken.sum(-1)).clamp(0, 1)
+
+    @property
+    def attention(self) -> Annotated[Tensor, "H W T"]:
+        """Shares of the codes in what is taken at all; sums to 1, or to 0."""
+        return self.taken / self.taken.sum(-1, keepdim=True).clamp_min(1e-10)
+
+    @property
+    def entropy(self) -> Annotated[Tensor, "H W"]:
+        """Of the attention, in bits: 0 = one code, log2(T) = all alike."""
+        bits: Tensor = torch.special.entr(self.attention.clamp_min(0)).sum(-1) / math.log(2)
+        return bits
+
+
+@torch.inference_mode()
+def match_map(trained: Trained, styled: Styled, view: int) -> MatchMap:
+    """Matches of a view: geometry and semantics alone are computed."""
+    cameras, scene, look = trained.known.cameras, styled.scene, styled.restyle
+    device = trained.model.device
+    belongs = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
+    centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
+
+    def values(semantic: Tensor) -> Tensor:
+        taken = look.match(semantic)
+        near = unit(semantic, centre) @ units.T if belongs.divided else taken.new_zeros(taken.shape)
+        return torch.cat([taken, (taken * near).sum(1, keepdim=True), belongs(semantic)], 1)
+
+    pixel = pixel_grid(cameras, view)
+    found, opacity = paint_pixels(trained.model, cameras, view, pixel, trained.config.render, values, semantic=belongs.divided)
+    width, height = (int(v) for v in cameras.size[view])
+    found = found.view(height, width, -1)
+    taken = found[..., :codes]
+    score = found[..., codes] / taken.sum(-1).clamp_min(1e-10)
+    return MatchMap(taken, score.clamp(-1, 1), found[..., codes + 1 :], opacity.view(height, width))
+
+
+def match_pictures(found: MatchMap, codes: Codes) -> dict[str, Picture]:
+    """`match` (hue = reference, shade = code, darkness = doubt, pale = kept), `score` (0 to 1) and `entropy` (0 to log2 T)."""
+    most = math.log2(max(2, len(codes.reference)))
+    return {
+        "match": match_image(found.attention, codes.reference, codes.names, found.opacity, found.kept),
+        "score": scale_image(found.score, 0.0, 1.0, found.opacity * (1 - found.kept)),
+        "entropy": scale_image(found.entropy, 0.0, most, found.opacity * (1 - found.kept)),
+    }
+
+
+def summarize(found: MatchMap, codes: Codes) -> dict[str, Any]:
+    """How the references and their codes were used, and how surely, over the pixels of a view by their opacity."""
+    each = found.opacity.double()
+    total = float(each.sum()) or 1.0
+    weight = each * (1 - found.kept)
+    styled = float(weight.sum()) or 1.0
+    of_code = (found.taken.double() * each[..., None]).sum((0, 1)) / total
+    of_region = (found.region.double() * each[..., None]).sum((0, 1)) / total
+    cluster = clusters(codes)
+    return {
+        **match_summary(found.attention, codes.reference, codes.names, weight),
+        "score": float((found.score * weight).sum()) / styled,
+        "kept_share": float((found.kept * each).sum()) / total,
+        "codes": [
+            {"reference": codes.names[int(codes.reference[t])], "cluster": int(cluster[t]), "share": float(of_code[t])}
+            for t in of_code.argsort(descending=True).tolist()
+            if float(of_code[t]) >= _LISTED
+        ],
+        "regions": [{"region": k, "share": float(share)} for k, share in enumerate(of_region) if float(share) >= _LISTED],
+    }
+
+
+def write_pixels(path: Path, found: MatchMap, codes: Codes) -> None:
+    """Write an .npz: reference, cluster, region (int16, -1 where nothing is), score, entropy_bits, kept, opacity, names."""
+    code = found.taken.argmax(-1)
+    some, styled = found.opacity > 0.5, found.taken.sum(-1) > 0.5
+    arrays = {
+        "reference": torch.where(some & styled, codes.reference[code], -1).short(),
+        "cluster": torch.where(some & styled, clusters(codes)[code], -1).short(),
+        "region": torch.where(some, found.region.argmax(-1), -1).short(),
+        "score": found.score,
+        "entropy_bits": found.entropy,
+        "kept": found.kept,
+        "opacity": found.opacity,
+    }
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, values in {"names": np.asarray(codes.names), **arrays}.items():
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array(file, np.asarray(values), allow_pickle=False)
+    write_bytes(path, data.getvalue())
+
+
+def clusters(codes: Codes) -> Annotated[Tensor, "T"]:
+    """Number of each code within its reference, from 0."""
+    number = torch.zeros_like(codes.reference)
+    for i in range(len(codes.names)):
+        own = codes.reference == i
+        number[own] = torch.arange(int(own.sum()))
+    return number

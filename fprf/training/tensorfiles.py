@@ -1,0 +1,104 @@
+"""Named tensors on disk: safetensors, written atomically, with a checksum and a finite flag for each tensor.
+
+`save` returns the entry that a manifest keeps; `load` checks the file against it, so a flipped bit is found before it is used.
+A sealed file is one that carries its own manifest.
+"""
+
+import json
+import re
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from ..errors import CheckpointError
+from ..io.atomic import atomic_path, unwritable
+
+__all__ = ["load", "load_sealed", "read", "save", "save_sealed"]
+
+_MANIFEST = "manifest"
+_SYSTEM = re.compile(r"os error (\d+)")
+
+
+def _checksum(tensor: Tensor) -> int:
+    return zlib.crc32(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
+
+
+def _entries(plain: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:
+    return {
+        name: {"crc32": _checksum(t), "finite": bool(torch.isfinite(t).all()) if t.is_floating_point() else True}
+        for name, t in plain.items()
+    }
+
+
+def _write(path: Path, plain: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Raises DataError, with what is needed and what is free, where the system refuses."""
+    with atomic_path(path) as temporary:
+        try:
+            safetensors.torch.save_file(plain, temporary, metadata)
+        except SafetensorError as error:
+            found = _SYSTEM.search(str(error))
+            if found is None:
+                raise
+            needed = sum(t.nbytes for t in plain.values())
+            raise unwritable(path, OSError(int(found[1]), str(error)), needed) from error
+
+
+def save(path: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:
+    """Write the tensors; the answer holds checksum and finiteness of each. Raises DataError where the system refuses."""
+    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    _write(path, plain)
+    return _entries(plain)
+
+
+def save_sealed(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write the tensors with their own manifest inside. Raises DataError where the system refuses."""
+    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    _write(path, plain, {_MANIFEST: json.dumps(_entries(plain))})
+
+
+def load_sealed(path: Path) -> dict[str, Tensor]:
+    """The tensors of a sealed file, checked. Raises CheckpointError naming file and tensor.
+
+    A file without any metadata is of before there were seals, and taken as it is.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+    except (OSError, SafetensorError) as e:
+        raise CheckpointError(f"{path}: cannot be read ({e}); train again") from e
+    if metadata is None:
+        return read(path)
+    try:
+        manifest = json.loads(metadata[_MANIFEST])
+        return load(path, {name: dict(entry) for name, entry in manifest.items()})
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as e:
+        raise CheckpointError(f"{path}: its checksums cannot be read ({e!r}); train again") from e
+
+
+def load(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> dict[str, Tensor]:
+    """The tensors of a file, checked against the manifest. Raises CheckpointError naming file and tensor."""
+    tensors = read(path)
+    if tensors.keys() != manifest.keys():
+        odd = ", ".join(sorted(tensors.keys() ^ manifest.keys())[:3])
+        raise CheckpointError(f"{path}: its tensors differ from its manifest ({odd}); use another checkpoint")
+    for name, tensor in tensors.items():
+        entry = dict(manifest[name]) if isinstance(manifest[name], Mapping) else {}
+        if _checksum(tensor) != entry.get("crc32"):
+            raise CheckpointError(f"{path}: tensor {name} is damaged (checksum differs); use another checkpoint")
+        if not entry.get("finite"):
+            raise CheckpointError(f"{path}: tensor {name} was not finite when saved; use another checkpoint")
+    return tensors
+
+
+def read(path: Path) -> dict[str, Tensor]:
+    """The tensors of a file, unchecked. Raises CheckpointError where it is no such file."""
+    try:
+        return safetensors.torch.load_file(path)
+    except (OSError, SafetensorError) as e:
+        raise CheckpointError(f"{path}: cannot be read ({e}); use another checkpoint or train again") from e

@@ -1,0 +1,137 @@
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+from tiny_world import World
+
+from fprf.cli import main as cli
+from fprf.cli.bench import NAMES
+
+SMALL = ["--repeats", "2", "--rays", "64", "--device", "cpu"]
+
+
+def bench(world: World, name: str, output: Path, *more: str) -> dict[str, object]:
+    """The JSON of a benchmark of the tiny run."""
+    references = [str(path) for path in world.references]
+    args = ["bench", name, str(world.run), "--references", *references, *SMALL, "--output", str(output), *more]
+    assert cli.main(args) == 0
+    document = json.loads(output.read_text())
+    assert document["benchmark"] == name and document["settings"]["without"] == ""
+    assert document["machine"]["device"] == "cpu" and document["machine"]["cores"] >= 1
+    return document
+
+
+def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = bench(world, "speed", tmp_path / "speed.json", "--points", "500", "--clusters", "4")
+    rows = {row["name"]: row for row in document["rows"]}
+    styles = ("region-tone", "region-ot", "local-adain")
+    compared = {"train", "render", *(f"stylised, {name}" for name in styles)}
+    assert rows.keys() > compared
+    for name in compared:
+        row = rows[name]
+        assert row["figure"] > 0 and row["peer"] > 0 and row["low"] <= row["figure"] <= row["high"]
+        assert row["ratio_low"] <= row["ratio"] <= row["ratio_high"] and row["error_kind"]
+    budget = world.config.render.budget
+    assert all(rows[name]["error"] <= budget + 1e-5 for name in compared - {"train"})
+    assert rows["render"]["peer_error"] < 1e-4, "the naive path is exact up to float32"
+    assert 0 <= rows["train"]["error"] < 1
+    for name in styles:
+        cached = rows[f"cached view restyled, {name}"]
+        assert cached["error"] == 0 and cached["figure"] > 0 and "goal" not in cached, "goals are for views of full size"
+    for name in ("semantics and matching, dictionary folded", "the same from hidden units to shares, 20 x 4096 samples"):
+        assert rows[name]["error"] < 1e-5 and rows[name]["ratio"] > 0
+    assert rows[name]["ratio_goal"] == 1.5
+    lookup = next(row for name, row in rows.items() if "grid_sample" in name)
+    assert lookup["error"] < 1e-5 and lookup["peer_error"] < 1e-5
+    assert 0 < document["counters"]["kept_samples_share"] <= 1
+    assert all(name in rows for name in document["falls_short"])
+    text = capsys.readouterr().out
+    assert "faster" in text and all(name in text for name in compared), "nothing is cut off"
+
+
+def test_profile(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = bench(world, "profile", tmp_path / "profile.json", "--operators", "3")
+    step, plain, styled = document["parts"].values()
+    for taken in (step, plain, styled):
+        shares = {name: part["share"] for name, part in taken["parts"].items()}
+        assert sum(shares.values()) == pytest.approx(1) and all(share > -1e-6 for share in shares.values())
+        assert taken["low"] <= taken["milliseconds"] <= taken["high"] and len(taken["operators"]) == 3
+    assert step["parts"].keys() >= {
+        "batch", "sampler", "density", "content", "semantic", "decoder", "losses", "optimizer",
+        "backward of density", "backward of content", "backward of decoder", "backward of semantic", "rest",
+    }  # fmt: skip
+    assert "stylizer" in styled["parts"] and "stylizer" not in plain["parts"]
+    assert not any(name.startswith("backward") for name in plain["parts"])
+    captured = capsys.readouterr()
+    assert "training step" in captured.out and all(line.startswith("{") for line in captured.err.splitlines())
+
+
+def test_pareto(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = bench(world, "pareto", tmp_path / "pareto.json", "--also", str(world.run))
+    plain, styled = document["points"].values()
+    knobs = {point["knob"] for point in plain}
+    assert knobs >= {"run", "quality", "budget", "samples", "chunk", "resolution", "precision", "kernels", "method", "style"}
+    assert "semantic channels" in {point["knob"] for point in styled}
+    by_name = {f"{point['knob']} {point['value']}": point for point in plain}
+    assert by_name["budget 0"]["largest_error"] < 1e-4
+    for text, budget in (("1/64", 1 / 64), ("1/16", 1 / 16)):
+        assert by_name[f"budget {text}"]["largest_error"] <= budget + 1e-5
+    assert by_name["quality standard"]["rms_error"] == by_name["budget 1/512"]["rms_error"]
+    assert by_name["run as trained"]["psnr"] == pytest.approx(by_name["method fprf-lite"]["psnr"])
+    assert by_name["style at strength 0"]["rms_error"] == by_name["run as trained"]["rms_error"]
+    assert 0 < by_name["precision planes stored in float16"]["rms_error"] < 1e-2
+    kept = [counters["kept_samples_share"] for counters in document["counters_by_budget"].values()]
+    assert kept[-1] > 0 and kept == sorted(kept, reverse=True)
+    for name, front in document["fronts"].items():
+        assert front["rms_error"] and {*front["rms_error"]} <= {f"{p['knob']} {p['value']}" for p in document["points"][name]}
+    assert cv2.imread(str(tmp_path / "pareto.png")).std() > 5
+    assert "time against error, plain" in capsys.readouterr().out
+
+
+def test_scaling(world: World, tmp_path: Path) -> None:
+    sizes = ["--images", "2", "3", "--downscales", "2", "1", "--styles", "1", "2", "--points", "200", "400"]
+    document = bench(world, "scaling", tmp_path / "scaling.json", *sizes)
+    series = {each["name"]: each for each in document["series"]}
+    assert [each["of"] for each in document["series"]] == ["images", "images", "pixels", "references", "references", "points"]
+    assert series["a batch"]["sizes"] == [2, 3] and series["tri-plane forward + backward"]["sizes"] == [200, 400]
+    assert all(cost > 0 for each in series.values() for cost in each["milliseconds"])
+    assert all(each["exponent"] is not None for each in series.values())
+
+
+@pytest.mark.slow
+def test_memory(world: World, tmp_path: Path) -> None:
+    document = bench(world, "memory", tmp_path / "memory.json")
+    rows = {row["name"]: row["figure"] for row in document["rows"]}
+    assert 20 < rows["interpreter and packages"] < rows["and a loaded run"] < rows["and training steps"] < 4000
+    assert rows["parameters of the field"] > 0
+
+
+def test_every_benchmark_has_a_function() -> None:
+    import importlib
+
+    for name in NAMES:
+        assert callable(getattr(importlib.import_module(f"fprf.benchmarking.{name}"), name))
+
+
+def test_usage_names_every_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {name}" in text for name in NAMES)
+    assert cli.main(["bench"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        (["sped"], "fprf bench sped: no such benchmark; allowed are speed, profile, pareto, memory, scaling"),
+        (["speed", "nowhere"], "nowhere: no config.json here"),
+        (["speed", "--repeats", "0"], "--repeats: 0 must be at least 1"),
+        (["scaling", "--points", "0"], "--points: 0 must be at least 1"),
+        (["speed", "--method", "fprf-quick"], "fprf-quick"),
+    ],
+)
+def test_mistakes(args: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", *args]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and told in err and err.startswith("error: ") and err.count("\n") == 1

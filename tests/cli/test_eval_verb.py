@@ -1,0 +1,87 @@
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import pytest
+from tiny_world import World
+
+from fprf.cli import main as cli
+
+KEYS = {
+    "method", "scene", "split", "psnr", "ssim", "lpips", "views", "render_seconds", "seconds_per_view", "rays_per_second",
+    "kept_samples_share", "peak_rss_mib", "train_seconds", "train_steps", "consistency", "per_view",
+}  # fmt: skip
+
+
+@pytest.fixture
+def run(world: World, tmp_path: Path) -> Path:
+    shutil.copytree(world.run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", str(run)]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics.keys() >= KEYS
+    assert (metrics["method"], metrics["split"], metrics["views"], metrics["train_steps"]) == ("fprf-lite", "test", 2, 15)
+    assert metrics["per_view"].keys() == {"0000", "0008"}
+    assert metrics["psnr"] == pytest.approx(sum(v["psnr"] for v in metrics["per_view"].values()) / 2)
+    assert sorted(p.name for p in (run / "renders" / "test").iterdir()) == ["0000.png", "0008.png"]
+    assert cv2.imread(str(run / "renders" / "test" / "0000.png")).shape == (24, 32, 3)
+    table = capsys.readouterr().out
+    assert "psnr" in table and f"{metrics['psnr']:.3f}" in table and "rays/s" in table
+
+
+def test_poses_are_fitted_where_that_is_asked_and_told(run: Path) -> None:
+    assert cli.main(["eval", str(run), "--no-images"]) == 0
+    plain = json.loads((run / "metrics.json").read_text())
+    assert "fitted_poses" not in plain
+    assert cli.main(["eval", str(run), "--no-images", "--fit-poses"]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["fitted_poses"].keys() == {"0000", "0008"}
+    for move in metrics["fitted_poses"].values():
+        assert move.keys() == {"turn_degrees", "shift"} and move["turn_degrees"] > 0
+    assert metrics["psnr"] > plain["psnr"] - 0.05
+
+
+def test_other_splits_without_pictures(run: Path) -> None:
+    assert cli.main(["eval", str(run), "--split", "train", "--no-images"]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["views"] == 8 and "0000" not in metrics["per_view"] and not (run / "renders").exists()
+
+
+def test_data_that_has_moved(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = run / "config.json"
+    config.write_text(config.read_text().replace(str(world.town), str(tmp_path / "gone")))
+    assert cli.main(["eval", str(run)]) == 2
+    assert f"error: {tmp_path / 'gone'}: no such folder" in capsys.readouterr().err
+    shutil.copytree(world.town, tmp_path / "there")
+    assert cli.main(["eval", str(run), "--data", str(tmp_path / "there"), "--no-images"]) == 0
+
+
+def test_other_images_than_the_runs(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(world.town, other)
+    (other / "images" / "0003.png").rename(other / "images" / "0103.png")
+    manifest = other / "transforms.json"
+    manifest.write_text(manifest.read_text().replace("images/0003.png", "images/0103.png"))
+    assert cli.main(["eval", str(run), "--data", str(other)]) == 2
+    assert "its images are not those of the run; name the folder with --data" in capsys.readouterr().err
+
+
+def test_mistakes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for args, told in (
+        ([], "RUN is missing"),
+        ([str(tmp_path)], "no config.json here, so it is no run folder"),
+        ([str(tmp_path / "absent")], "so it is no run folder"),
+        ([str(run), "--split", "half"], "--split half: "),
+        ([str(run), "--device", "tpu"], "'tpu' is not available here"),
+    ):
+        assert cli.main(["eval", *args]) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and told in err and err.startswith("error: ") and err.count("\n") == 1
+    known = json.loads((run / "scene.json").read_text())
+    (run / "scene.json").write_text(json.dumps(known | {"test": []}))
+    assert cli.main(["eval", str(run)]) == 2
+    assert "--split test: the run holds no such views" in capsys.readouterr().err.splitlines()[-1]

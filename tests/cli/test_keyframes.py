@@ -1,0 +1,118 @@
+"""Styles along a path: the file, the fade, and the frames."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_world import World
+
+from fprf.cli import main as cli
+from fprf.cli.keyframes import Key, fade, keyed_looks, read_keyframes
+from fprf.errors import ConfigError
+from fprf.plugins.stylizers.config import AdainConfig
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile, write_style
+
+
+def write(path: Path, *rows: object, **rest: object) -> Path:
+    path.write_text(json.dumps({"format": 1, "keyframes": rows, **rest}))
+    return path
+
+
+def test_keys_come_in_order_with_paths_from_the_file(tmp_path: Path) -> None:
+    path = write(tmp_path / "k.json", {"frame": 9, "style": "a/b.json"}, {"frame": 0, "style": None})
+    assert read_keyframes(path) == (Key(0, None), Key(9, tmp_path / "a" / "b.json"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"format": 1, "keyframes": []}', "at least one is needed"),
+        ('{"format": 2, "keyframes": []}', 'expected an object with "format": 1'),
+        ('{"format": 1, "keyframes": [], "fps": 3}', "and nothing else"),
+        ('{"format": 1, "keyframes": [{"frame": 1, "style": null}, {"frame": 1, "style": null}]}', "no two at one frame"),
+        ('{"format": 1, "keyframes": [{"frame": -1, "style": null}]}', "keyframes.0: expected"),
+        ('{"format": 1, "keyframes": [{"frame": 1}]}', "keyframes.0: expected"),
+        ('{"format": 1, "keyframes": [{"frame": "1", "style": null}]}', "keyframes.0: expected"),
+        ('{"format": 1, "keyframes": [{"frame": 1, "style": 2}]}', "keyframes.0: expected"),
+        ('{"format": 1, "keyframes": {}}', "expected a list"),
+    ],
+)
+def test_what_is_wrong_with_the_file(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "k.json").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        read_keyframes(tmp_path / "k.json")
+    assert str(caught.value).startswith(f"{tmp_path / 'k.json'}: ") and said in str(caught.value)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 60), min_size=1, max_size=5, unique=True).map(sorted), st.integers(0, 70))
+def test_a_fade_lies_between_its_neighbours(frames: list[int], at: int) -> None:
+    before, after, way = fade(frames, at)
+    assert 0 <= way < 1
+    if before == after:
+        assert way == 0 and (at <= frames[0] or at >= frames[-1] or at == frames[before])
+        assert frames[before] == min(max(at, frames[0]), frames[-1])
+    else:
+        assert after == before + 1 and frames[before] <= at < frames[after]
+        assert (way == 0) == (at == frames[before])
+
+
+def test_a_fade_is_even_about_its_middle_and_starts_and_ends_without_a_jerk() -> None:
+    ways = [fade([0, 100], at)[2] for at in range(100)] + [1.0]
+    steps = np.diff(ways)
+    assert ways[50] == pytest.approx(0.5) and np.allclose(steps, steps[::-1]) and (steps > 0).all()
+    assert steps[0] < 0.05 * steps.max() and np.abs(np.diff(steps)).max() < 0.05 * steps.max()
+
+
+@pytest.fixture
+def styles(world: World, tmp_path: Path) -> tuple[Path, Path]:
+    paths = (tmp_path / "dusk.json", tmp_path / "snow.json")
+    for path, reference, strength in zip(paths, world.references, (1.0, 0.8), strict=True):
+        style = StyleConfig(references=(reference,), clusters=2, stylizer=AdainConfig(), strength=strength, luminance=0.5)
+        write_style(path, StyleFile(style))
+    return paths
+
+
+def test_each_frame_has_its_look(world: World, styles: tuple[Path, Path]) -> None:
+    looks = keyed_looks(world.load(), [Key(2, None), Key(6, styles[0]), Key(10, styles[1]), Key(14, None), Key(20, None)])
+    assert looks(0) is looks(2) is looks(14) is looks(17) is looks(30) is None
+    first, second = looks(6), looks(10)
+    assert first is not None and second is not None and first.others == second.others == ()
+    middle = looks(8)
+    assert middle is not None and [part.share for part in middle.parts] == [0.5, 0.5]
+    assert [part.strength for part in middle.parts] == [1.0, 0.8]
+    for at, strengths in ((4, [0.0, 1.0]), (12, [0.8, 0.0])):
+        rising = looks(at)
+        assert rising is not None and [part.strength for part in rising.parts] == strengths
+        assert {part.luminance for part in rising.parts} == {0.5}, "luminance does not fade: it is kept throughout"
+
+
+def test_a_film_fades_from_plain_to_styled(world: World, styles: tuple[Path, Path], tmp_path: Path) -> None:
+    keys = write(tmp_path / "k.json", {"frame": 0, "style": None}, {"frame": 3, "style": "dusk.json"})
+    common = ["render", str(world.run), "--path", "orbit", "--frames", "5", "--output"]
+    assert cli.main([*common, str(tmp_path / "plain")]) == 0
+    assert cli.main([*common, str(tmp_path / "full"), "--style", str(styles[0])]) == 0
+    assert cli.main([*common, str(tmp_path / "keyed"), "--keyframes", str(keys)]) == 0
+    plain, full, keyed = (
+        [cv2.imread(str(p)).astype(int) for p in sorted((tmp_path / name).glob("*.png"))] for name in ("plain", "full", "keyed")
+    )
+    assert np.array_equal(keyed[0], plain[0]) and np.array_equal(keyed[3], full[3]) and np.array_equal(keyed[4], full[4])
+    away = [np.abs(keyed[i] - plain[i]).mean() / np.abs(full[i] - plain[i]).mean() for i in range(4)]
+    assert away == sorted(away) and 0 < away[1] < 0.5 < away[2] < 1
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["--keyframes", "absent.json"], "absent.json: cannot be read"),
+        (["--keyframes", "k.json", "--references", "a.jpg"], "--keyframes: names styles of its own"),
+    ],
+)
+def test_mistakes(world: World, tmp_path: Path, args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["render", str(world.run), *args, "--output", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -1,0 +1,91 @@
+"""Verbs that packages add: listed without being imported, parsed like built-in ones, broken for themselves alone."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fake_packages import Packages, packages_in
+
+from fprf.cli import main as cli
+from fprf.cli.completion import offers
+from fprf.cli.config import CommandConfig
+from fprf.cli.plugins import rows
+
+COUNT = '''
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+from fprf.cli.config import CommandConfig
+from fprf.errors import DataError
+from fprf.plugins.samplers.config import SamplerConfig, UniformConfig
+
+@dataclass(frozen=True, kw_only=True)
+class CountConfig(CommandConfig):
+    """Count the files of a folder."""
+
+    positional: ClassVar[tuple[str, ...]] = ("folder",)
+    folder: Path = Path()
+    """The folder."""
+    step: int = 1
+    """Count by."""
+    sampler: SamplerConfig = UniformConfig()
+    """A slot."""
+
+    def run(self) -> int:
+        if not self.folder.is_dir():
+            raise DataError(f"{self.folder}: no such folder")
+        print(len(list(self.folder.iterdir())) * self.step, type(self.sampler).__name__)
+        return 3
+'''
+
+
+@pytest.fixture
+def packages(tmp_path: Path) -> Iterator[Packages]:
+    with packages_in(tmp_path) as found:
+        found.install(
+            "acme-count", {CommandConfig.group: {"count": "acme_count:CountConfig"}}, code={"acme_count": COUNT}, version="0.2"
+        )
+        yield found
+
+
+def test_a_packaged_verb_is_listed_without_being_imported(packages: Packages, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--help"]) == 0
+    assert "  count       of acme-count 0.2" in capsys.readouterr().out.splitlines()
+    assert ("count", "acme-count 0.2") in {(row.name, row.package) for row in rows()}
+    assert "acme_count" not in sys.modules
+
+
+def test_it_is_parsed_and_called_like_a_built_in_one(packages: Packages, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = packages.root / "some"
+    folder.mkdir()
+    (folder / "a").touch()
+    assert cli.main(["count", "--step", "4", str(folder), "--sampler", "proposal"]) == 3
+    assert capsys.readouterr().out == "4 ProposalConfig\n"
+    assert cli.main(["count", str(folder / "b")]) == 2
+    assert capsys.readouterr().err == f"error: {folder / 'b'}: no such folder\n"
+    assert cli.main(["count", str(folder), "--stp", "2"]) == 2 and "did you mean --step?" in capsys.readouterr().err
+    assert cli.main(["count", "--help"]) == 0
+    shown = capsys.readouterr().out
+    assert "usage: fprf count" in shown and "Count the files of a folder." in shown and "--step INT" in shown
+    assert cli.main(["cuont"]) == 2 and "did you mean 'count'?" in capsys.readouterr().err
+
+
+def test_completion_knows_its_flags(packages: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fprf.cli.VERBS", {"doctor": cli.VERBS["doctor"]})
+    offer = offers()["count"]
+    assert {"--step", "--folder", "--sampler", "--sampler.samples", "--help"} <= set(offer.flags)
+    assert offer.summary == "of acme-count 0.2"
+
+
+def test_a_broken_verb_harms_only_its_callers(packages: Packages, capsys: pytest.CaptureFixture[str]) -> None:
+    packages.install("acme-bad", {CommandConfig.group: {"bad": "acme_bad5:C"}}, code={"acme_bad5": "1 / 0"})
+    for k in (1, 2):
+        packages.install(f"acme-twice-{k}", {CommandConfig.group: {"twice": "acme_count:CountConfig"}})
+    packages.install("acme-train", {CommandConfig.group: {"completion": "acme_bad5:C"}})
+    assert cli.main(["--help"]) == 0
+    assert "of acme-twice-1 1 and acme-twice-2 1" in capsys.readouterr().out
+    assert cli.main(["bad"]) == 2
+    assert "'bad' (acme_bad5:C from acme-bad 1) failed to import: ZeroDivisionError" in capsys.readouterr().err
+    assert cli.main(["twice"]) == 2 and "several packages provide 'twice'" in capsys.readouterr().err
+    assert cli.main(["completion", "--help"]) == 0, "ours wins"

@@ -1,0 +1,63 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fake_packages import ENCODER, Packages, packages_in
+
+from fprf.cli.plugins import KINDS, METHODS, faults, rows, run
+from fprf.plugins import registry
+
+
+@pytest.fixture
+def packages(tmp_path: Path) -> Iterator[Packages]:
+    with packages_in(tmp_path) as found:
+        yield found
+
+
+def test_built_ins_are_listed_and_load(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "140")
+    assert run([]) == 0
+    text = capsys.readouterr().out
+    assert "vgg19" in text and "fprf.plugins.encoders.config:Vgg19Config" in text and "state" not in text
+    assert run(["--check"]) == 0
+    assert "broken" not in capsys.readouterr().out
+
+
+def test_every_group_that_is_installed_is_known() -> None:
+    assert set(registry.groups()) <= {METHODS, *KINDS}
+    assert {row.group for row in rows()} == set(registry.groups())
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "source", "shown"),
+    [
+        ("fprf.encoders", "x", "import not_there", "ModuleNotFoundError"),
+        ("fprf.encoders", "x", "thing = 3", "is 3, not a EncoderConfig"),
+        ("fprf.encoders", "x", "from fprf.fields.layouts import SingleConfig as thing", "is SingleConfig, not a EncoderConfig"),
+        ("fprf.encoders", "none", ENCODER.format(name="N") + "\nthing = NConfig", "can never be chosen"),
+        ("fprf.encoders", "x", ENCODER.format(name="N").replace("int = 224", "int") + "\nthing = NConfig", "no defaults"),
+        ("fprf.encoders", "vgg19", ENCODER.format(name="N") + "\nthing = NConfig", "several packages provide 'vgg19'"),
+        ("fprf.commands", "x", ENCODER.format(name="N") + "\nthing = NConfig", "not a CommandConfig"),
+        (
+            "fprf.commands",
+            "train",
+            "from fprf.cli.config import CommandConfig as thing",
+            "is never called: fprf has a verb",
+        ),
+        ("fprf.methods", "x", "def thing(): return None", "gives NoneType, not a RunConfig"),
+    ],
+)
+def test_what_is_broken_is_told_and_nothing_else(
+    packages: Packages, capsys: pytest.CaptureFixture[str], group: str, name: str, source: str, shown: str
+) -> None:
+    packages.install("acme", {group: {name: "acme_check:thing"}}, code={"acme_check": source})
+    assert {row.name for row, _ in faults()} == {name}
+    assert run(["--check"]) == 1
+    assert shown in " ".join(capsys.readouterr().out.split())
+    assert run([]) == 0, "listing loads nothing"
+
+
+def test_unreadable_metadata_is_told(packages: Packages, capsys: pytest.CaptureFixture[str]) -> None:
+    packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
+    assert run(["--check"]) == 1
+    assert "entry points cannot be read" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,170 @@
+"""`fprf process` over a fake pycolmap (tests/reconstruction/fake) that records its calls; test_town_sfm has the real one."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from fprf.cli import main as cli
+from fprf.cli.parsing import load_method, parse
+from fprf.cli.train import default_output
+from fprf.datamanagers.parsers.recognise import parse_scene
+
+FAKE = Path(__file__).parents[1] / "sfm" / "fake"
+
+
+@pytest.fixture
+def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.syspath_prepend(str(FAKE))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(FAKE), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    (tmp_path / "in").mkdir()
+    for k in range(5):
+        add(tmp_path / "in", k)
+    return tmp_path / "in"
+
+
+def add(folder: Path, k: int, size: tuple[int, int] = (24, 16)) -> None:
+    pixels = np.random.default_rng(k).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    assert cv2.imwrite(str(folder / f"{k}.png"), pixels)
+
+
+def process(photos: Path, *words: str, plan: dict[str, Any] | None = None) -> int:
+    work = photos.parent / "scene" / "sfm"
+    work.mkdir(parents=True, exist_ok=True)
+    (work / "fake.json").write_text(json.dumps(plan or {}))
+    return cli.main(["process", str(photos), "--output", str(work.parent), *words])
+
+
+def calls(photos: Path) -> list[str]:
+    file = photos.parent / "scene" / "sfm" / "calls.txt"
+    told = file.read_text().splitlines() if file.is_file() else []
+    file.write_text("")
+    return told
+
+
+def report(photos: Path) -> dict[str, Any]:
+    return json.loads((photos.parent / "scene" / "process.json").read_text())
+
+
+def test_images_become_a_scene(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert process(photos) == 0
+    scene = parse_scene(photos.parent / "scene", 1, None)
+    assert [path.name for path in scene.paths] == [f"{k}.png" for k in range(5)]
+    assert scene.cameras.pose[:, 0, 3].tolist() == [1, 2, 3, 4, 5]
+    assert calls(photos) == ["features SIMPLE_RADIAL 1600 0.png 1.png 2.png 3.png 4.png", "matches 10", "mapping"]
+    out = capsys.readouterr().out
+    assert "5 of 5 images have a pose; 50 points, 0.50 pixels off; exhaustive matching" in out
+    train, stylize = (shlex.split(line)[1:] for line in out.splitlines()[-2:])
+    assert train == ["train", "fprf-lite", "--data", str(photos.parent / "scene"), "--minutes", "8"]
+    config = parse(load_method("fprf-lite")[0], train[2:], prog="fprf train fprf-lite", description="")
+    assert stylize[:2] == ["stylize", str(default_output(config, "fprf-lite"))] and stylize[2:] == ["--references", "PHOTO.jpg"]
+    assert report(photos)["images"] == {"given": 5, "used": 5, "posed": 5}
+
+
+def test_what_is_done_is_not_done_again(photos: Path) -> None:
+    assert process(photos) == 0
+    before = {p: p.stat().st_mtime_ns for p in (photos.parent / "scene" / "sparse" / "0").iterdir()}
+    calls(photos)
+    assert process(photos) == 0
+    assert calls(photos) == [] and before == {p: p.stat().st_mtime_ns for p in before}
+    add(photos, 5)
+    assert process(photos) == 0
+    assert calls(photos) == ["features SIMPLE_RADIAL 1600 5.png", "matches 15", "mapping"], "the others keep theirs"
+    assert process(photos, "--matching", "sequential", "--overlap", "1") == 0
+    assert calls(photos) == ["matches 9", "mapping"]
+    assert process(photos, "--matching", "sequential", "--overlap", "1", "--lens", "opencv") == 0
+    assert calls(photos)[0].startswith("features OPENCV 1600 0.png 1.png")
+
+
+def test_an_image_that_changed_starts_features_anew(photos: Path) -> None:
+    assert process(photos) == 0
+    calls(photos)
+    add(photos, 3, (30, 16))
+    assert process(photos) == 0
+    told = calls(photos)
+    assert told[:2] == ["features SIMPLE_RADIAL 1600 0.png 1.png 2.png 4.png", "features SIMPLE_RADIAL 1600 3.png"]
+
+
+@pytest.mark.parametrize("step", ["features", "matches", "mapping"])
+def test_a_step_that_breaks_off_goes_on_where_it_stood(photos: Path, step: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert process(photos, plan={"fail": step}) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: ") and "log.txt" in error
+    assert f"COLMAP's {step} ended with 9: it broke while {step}" in error
+    calls(photos)
+    assert process(photos) == 0
+    rest = ["features SIMPLE_RADIAL 1600 2.png 3.png 4.png", "matches 10", "mapping"]
+    assert calls(photos) == rest[["features", "matches", "mapping"].index(step) :]
+    assert report(photos)["images"]["posed"] == 5
+
+
+def test_dropped_images_are_told_with_their_reasons(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for k in range(5, 11):
+        add(photos, k)
+    (photos / "empty.jpg").write_bytes(b"")
+    plan = {"bare": ["1.png"], "lonely": ["2.png"], "apart": ["3.png", "5.png"], "unposed": ["6.png"]}
+    assert process(photos, plan=plan) == 0
+    dropped = {row["image"]: row["step"] for row in report(photos)["dropped"]}
+    assert dropped == {
+        "empty.jpg": "choosing", "1.png": "features", "2.png": "matching",
+        "3.png": "mapping", "5.png": "mapping", "6.png": "mapping",
+    }  # fmt: skip
+    assert report(photos)["images"] == {"given": 12, "used": 11, "posed": 6} and report(photos)["parts"] == [6, 2]
+    out = capsys.readouterr().out
+    assert "6 of 12 images have a pose" in out and "no other image" in out and "process.json" in out
+
+
+def test_cameras_are_shared_by_size_or_each(photos: Path) -> None:
+    add(photos, 5, (16, 24))
+    assert process(photos) == 0
+    assert len([line for line in calls(photos) if line.startswith("features")]) == 2
+    assert process(photos, "--cameras", "each", "--side", "800") == 0
+    assert [line for line in calls(photos) if line.startswith("features")] == [
+        f"features SIMPLE_RADIAL 800 {k}.png" for k in range(6)
+    ]
+
+
+def test_similar_matching_reads_the_features(photos: Path) -> None:
+    for k in range(5, 30):
+        add(photos, k)
+    assert process(photos, "--matching", "similar", "--neighbours", "3") == 0
+    matched = next(int(line.split()[1]) for line in calls(photos) if line.startswith("matches"))
+    assert 30 * 3 / 2 <= matched < 30 * 29 / 2
+
+
+def test_nothing_fits_together(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert process(photos, plan={"nothing": True}) == 2
+    assert "no two images fit together; take more views" in capsys.readouterr().err
+    assert report(photos)["images"]["posed"] == 0, "the report is written all the same"
+
+
+def test_without_pycolmap_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("fprf.cli.process.find_spec", lambda name: None)
+    assert cli.main(["process", str(tmp_path)]) == 2
+    told = "error: fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'\n"
+    assert capsys.readouterr().err == told
+
+
+def test_an_old_pycolmap_is_refused(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "pycolmap.py").write_text("def set_random_seed(seed): pass\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "old"))
+    assert process(photos) == 2
+    assert "pycolmap 4 or newer is needed" in capsys.readouterr().err
+
+
+def test_the_worker_never_meets_opencv(photos: Path) -> None:
+    code = "import sys, fprf.reconstruction.worker; print({'cv2', 'numpy', 'torch', 'PIL', 'pycolmap'} & {*sys.modules})"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert ended.stdout.strip() == "set()"
+    sources = [path for path in (Path(cli.__file__).parent).rglob("*.py") if "import pycolmap" in path.read_text("utf-8")]
+    assert [path.name for path in sources] == ["worker.py"]

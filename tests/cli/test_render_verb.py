@@ -1,0 +1,183 @@
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tiny_world import World
+
+from fprf.cli import main as cli
+from fprf.cli.progress import Display
+from fprf.cli.render import RenderVerbConfig, camera_path, frames_of
+
+
+@pytest.fixture
+def run(world: World, tmp_path: Path) -> Path:
+    shutil.copytree(world.run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def pictures(folder: Path) -> dict[str, np.ndarray]:
+    return {p.name: cv2.imread(str(p)) for p in sorted(folder.glob("*.png"))}
+
+
+def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_path: Path) -> None:
+    args = ["render", str(run), "--path", "dataset", "--split", "test", "--output", str(tmp_path / "frames")]
+    assert cli.main(args) == 0
+    assert cli.main(["eval", str(run)]) == 0
+    frames, plain = pictures(tmp_path / "frames"), pictures(run / "renders" / "test")
+    assert frames.keys() == plain.keys() == {"0000.png", "0008.png"}
+    assert all(np.array_equal(frames[name], plain[name]) for name in frames)
+
+
+@pytest.mark.parametrize("path", ["spiral", "orbit", "interpolate"])
+def test_paths_have_about_the_frames_asked_for(world: World, path: str) -> None:
+    trained = world.load()
+    cameras, names = camera_path(trained.known, RenderVerbConfig(path=path, frames=19))
+    assert abs(len(cameras) - 19) <= 9 and len(names) == len(cameras)
+    assert names == sorted(set(names))
+    with Display(quiet=True) as display:
+        first = next(iter(frames_of(trained, cameras, lambda _: None, display)))
+    assert first.shape == (24, 32, 3) and first.dtype == np.uint8
+
+
+def test_a_gif_is_a_file_and_other_films_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["render", str(run), "--path", "spiral", "--frames", "2", "--output"]
+    assert cli.main([*args, str(tmp_path / "a.gif")]) == 0
+    assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
+    capsys.readouterr()
+    assert cli.main([*args, str(tmp_path / "a.mov")]) == 2
+    assert "films end in .mp4 .gif .webp .apng" in capsys.readouterr().err and not (tmp_path / "a.mov").exists()
+
+
+def test_frames_in_a_folder_and_depth(run: Path, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "spiral", "--frames", "3"]
+    assert cli.main([*common, "--output", str(tmp_path / "plain")]) == 0
+    assert cli.main([*common, "--show", "depth", "--output", str(tmp_path / "depth")]) == 0
+    plain, depth = pictures(tmp_path / "plain"), pictures(tmp_path / "depth")
+    assert list(plain) == list(depth) == ["00000.png", "00001.png", "00002.png"]
+    assert not any(np.array_equal(plain[name], depth[name]) for name in plain)
+
+
+def test_a_film(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = tmp_path / "x.mp4"
+    assert cli.main(["render", str(run), "--path", "orbit", "--frames", "4", "--output", str(film)]) == 0
+    assert film.stat().st_size > 100 and capsys.readouterr().out.startswith(f"4 frames in {film} (")
+
+
+def test_restyled_frames_differ_and_strength_0_does_not(run: Path, world: World, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "dataset", "--split", "test", "--output"]
+    style = ["--references", str(world.references[0])]
+    assert cli.main([*common, str(tmp_path / "plain")]) == 0
+    assert cli.main([*common, str(tmp_path / "full"), *style]) == 0
+    assert cli.main([*common, str(tmp_path / "none"), *style, "--strength", "0"]) == 0
+    plain, full, none = (pictures(tmp_path / name) for name in ("plain", "full", "none"))
+    assert all(np.array_equal(plain[name], none[name]) and not np.array_equal(plain[name], full[name]) for name in plain)
+
+
+def test_a_camera_path_file(run: Path, tmp_path: Path) -> None:
+    pose = [1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 2.0, 0, 0, 0, 1.0]
+    path = tmp_path / "path.json"
+    camera = {"camera_to_world": pose, "fov": 60.0, "aspect": 1.5}
+    path.write_text(
+        json.dumps({"camera_type": "perspective", "render_height": 10, "render_width": 15, "fps": 24, "seconds": 1,
+                    "camera_path": [camera, camera]})
+    )  # fmt: skip
+    assert cli.main(["render", str(run), "--path", str(path), "--output", str(tmp_path / "frames")]) == 0
+    assert [image.shape for image in pictures(tmp_path / "frames").values()] == [(10, 15, 3)] * 2
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        (["--path", "spirale"], "--path spirale: neither a file nor one of spiral, orbit, interpolate, dataset"),
+        (["--frames", "0"], "--frames: 0 must be at least 1"),
+        (["--fps", "0"], "--fps: 0.0 must be at least 1"),
+        (["--show", "match", "--path", "orbit"], "--show match: needs a style that holds throughout"),
+        (["--show", "colour", "normals", "--lens", "stereo"], "--show: a stereo panorama shows colour and depth only"),
+        (["--eyes", "0"], "--eyes: 0.0 must be above 0"),
+        (["--styles", "dusk", "--path", "orbit"], "--styles dusk: write NAME=PHOTO,PHOTO or NAME=STYLE.json"),
+        (["--references", "absent.png", "--path", "orbit"], "absent.png"),
+    ],
+)
+def test_mistakes(run: Path, args: list[str], told: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert cli.main(["render", str(run), *args, "--output", str(tmp_path / "out")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: ") and err.count("\n") == 1 and told in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: World, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "dataset", "--split", "test", "--output"]
+    dusk = f"dusk={world.references[0]}"
+    assert cli.main([*common, str(tmp_path / "one"), "--styles", dusk]) == 0
+    assert cli.main([*common, str(tmp_path / "plain")]) == 0
+    assert cli.main([*common, str(tmp_path / "two"), "--styles", "plain", dusk]) == 0
+    assert cli.main([*common, str(tmp_path / "all"), "--styles", dusk, "--show", "colour", "depth", "normals", "match"]) == 0
+    assert cli.main([*common, str(tmp_path / "wipe"), "--styles", "plain", dusk, "--layout", "wipe"]) == 0
+    one, plain, two, whole, wipe = (pictures(tmp_path / name) for name in ("one", "plain", "two", "all", "wipe"))
+    for name in one:
+        assert two[name].shape == (24, 66, 3) and whole[name].shape == (24, 134, 3) and wipe[name].shape == (24, 32, 3)
+        assert np.array_equal(two[name][:, :32], plain[name]) and np.array_equal(two[name][:, 34:], one[name])
+        assert np.array_equal(whole[name][:, :32], one[name])
+        assert np.array_equal(wipe[name][:, :7], plain[name][:, :7]) and np.array_equal(wipe[name][:, -7:], one[name][:, -7:])
+
+
+def test_frames_that_are_there_are_not_made_again(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "frames"
+    common = ["render", str(run), "--path", "orbit", "--frames", "4", "--output", str(out)]
+    assert cli.main(common) == 0
+    whole = pictures(out)
+    stamps = {path.name: path.stat().st_mtime_ns for path in out.glob("*.png")}
+    (out / "00002.png").unlink()
+    capsys.readouterr()
+    assert cli.main(common) == 0
+    assert "3 of 4 frames are there already" in capsys.readouterr().out
+    after = {path.name: path.stat().st_mtime_ns for path in out.glob("*.png")}
+    assert [name for name in stamps if stamps[name] != after[name]] == ["00002.png"]
+    assert all(np.array_equal(whole[name], picture) for name, picture in pictures(out).items())
+    assert cli.main([*common, "--show", "depth"]) == 0
+    assert "are there already" not in capsys.readouterr().out, "other frames are other frames"
+    assert not any(np.array_equal(whole[name], picture) for name, picture in pictures(out).items())
+
+
+def test_an_interrupted_film_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fprf.io.images as images
+
+    written, write = [], images.write_image
+
+    def interrupted(path: Path, picture: np.ndarray) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path.name)
+        write(path, picture)
+
+    film = tmp_path / "x.mp4"
+    args = ["render", str(run), "--path", "orbit", "--frames", "4", "--output", str(film)]
+    monkeypatch.setattr(images, "write_image", interrupted)
+    assert cli.main(args) == 130 and not film.exists()
+    monkeypatch.setattr(images, "write_image", lambda path, picture: (written.append(path.name), write(path, picture)))
+    assert cli.main(args) == 0 and film.is_file()
+    assert written == ["00000.png", "00001.png", "00002.png", "00003.png"] and not (tmp_path / "x.frames").exists()
+
+
+def test_exr_holds_everything_as_numbers(run: Path, world: World, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "dataset", "--split", "test", "--format", "exr", "--output"]
+    assert cli.main([*common, str(tmp_path / "exr"), "--styles", "plain", f"dusk={world.references[0]}"]) == 0
+    names = [path.name for path in sorted((tmp_path / "exr").glob("*.exr"))]
+    assert names == ["0000.exr", "0008.exr"]
+    head = (tmp_path / "exr" / "0000.exr").read_bytes()[:900]
+    listed = [b"A", b"N.X", b"N.Y", b"N.Z", b"Z", b"dusk.B", b"dusk.G", b"dusk.R", b"plain.B", b"plain.G", b"plain.R"]
+    assert [head.index(name + b"\0\2\0\0\0") for name in listed] == sorted(head.index(name + b"\0\2\0\0\0") for name in listed)
+
+
+def test_panoramas_for_one_eye_and_two(run: Path, tmp_path: Path) -> None:
+    common = ["render", str(run), "--path", "orbit", "--frames", "1", "--across", "32", "--output"]
+    assert cli.main([*common, str(tmp_path / "mono"), "--lens", "panorama"]) == 0
+    assert cli.main([*common, str(tmp_path / "stereo"), "--lens", "stereo"]) == 0
+    assert cli.main([*common, str(tmp_path / "same"), "--lens", "stereo", "--eyes", "1e-9"]) == 0
+    (mono,), (stereo,), (same,) = (pictures(tmp_path / name).values() for name in ("mono", "stereo", "same"))
+    assert mono.shape == (16, 32, 3) and stereo.shape == same.shape == (32, 32, 3)
+    assert np.abs(same[:16].astype(int) - mono).max() <= 1 and np.abs(same[16:].astype(int) - mono).max() <= 1
+    assert not np.array_equal(stereo[:16], stereo[16:])

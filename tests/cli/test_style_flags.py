@@ -1,0 +1,116 @@
+"""A style file under the flags."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from fprf.cli.style_flags import read_flags
+from fprf.errors import ConfigError, DataError, UsageError
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile, write_style
+from fprf.style.presets import PRESETS, preset_flags, with_preset
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verb(StyleConfig):
+    """A verb that restyles."""
+
+    run: Path = Path()
+    """Run folder."""
+    style: Path | None = None
+    """Style file."""
+    frames: int = 3
+    """Something of its own."""
+
+
+def read(*args: str) -> tuple[Verb, StyleFile]:
+    return read_flags(Verb(), args, prog="fprf verb", description="", positional=("run",))
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    (tmp_path / "a.jpg").write_text("pixels")
+    style = StyleConfig(
+        references=(tmp_path / "a.jpg",), stylizer=LocalAdainConfig(temperature=0.2), pin=("sky=0",), weights=(2.0,)
+    )
+    write_style(tmp_path / "style.json", StyleFile(style, {"sky": (1.0, 2.0)}, "encoder"))
+    return tmp_path / "style.json"
+
+
+def test_flags_alone() -> None:
+    config, found = read("RUN", "--references", "a.jpg", "b.jpg", "--strength", "0.5", "--frames", "7")
+    assert (config.run, config.frames, config.style) == (Path("RUN"), 7, None)
+    assert found == StyleFile(StyleConfig(references=(Path("a.jpg"), Path("b.jpg")), strength=0.5))
+
+
+def test_flags_of_many_values_may_be_repeated() -> None:
+    args = [
+        "RUN",
+        "--pin",
+        "3=a.jpg",
+        "--references=a.jpg",
+        "--pin",
+        "5=b.jpg",
+        "0:1,2=0",
+        "--frames",
+        "7",
+        "--references",
+        "b.jpg",
+    ]
+    config, found = read(*args, "--region_strength", "1=0.5", "--region-strength=2=0.5", "--keep-below", "-0.5")
+    assert config.frames == 7 and found.style.references == (Path("a.jpg"), Path("b.jpg"))
+    assert found.style.pin == ("3=a.jpg", "5=b.jpg", "0:1,2=0") and found.style.keep_below == -0.5
+    assert found.style.region_strength == ("1=0.5", "2=0.5")
+
+
+@pytest.mark.parametrize("spelling", ["--style FILE", "--style=FILE"])
+def test_a_file_gives_what_no_flag_gives(file: Path, spelling: str) -> None:
+    words = spelling.replace("FILE", str(file)).split(" ")
+    config, found = read("RUN", *words, "--stylizer.similarity", "dot", "--clusters", "4")
+    assert config.style == file and config.stylizer == LocalAdainConfig(temperature=0.2, similarity="dot")
+    assert found.style.pin == ("sky=0",) and found.style.clusters == 4 and found.regions == {"sky": (1.0, 2.0)}
+    config, found = read("RUN", *words, "--stylizer", "region-ot", "--pin", "3=0")
+    assert found.style.stylizer == RegionOtConfig() and found.style.pin == ("3=0",)
+
+
+def test_photographs_of_the_file_are_checked_unless_named(file: Path) -> None:
+    photo = file.parent / "a.jpg"
+    photo.write_text("other pixels")
+    with pytest.raises(DataError, match="has changed"):
+        read("RUN", "--style", str(file))
+    assert read("RUN", "--style", str(file), "--references", str(photo))[1].style.references == (photo,)
+
+
+def test_what_does_not_fit_together_is_named(file: Path) -> None:
+    with pytest.raises(ConfigError, match="weights: 1 weights for 2 references"):
+        read("RUN", "--style", str(file), "--references", "x.jpg", "y.jpg")
+    with pytest.raises(ConfigError, match=r"none\.json: cannot be read"):
+        read("RUN", "--style", "none.json")
+    with pytest.raises(UsageError, match="--style"):
+        read("RUN", "--style")
+    with pytest.raises(UsageError, match="RUN is missing"):
+        read("--style", str(file))
+
+
+def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, found = read("--gentle", "RUN", "--references", "a.jpg", "--luminance", "0.9")
+    assert config.luminance == found.style.luminance == 0.9 and found.style.references == (Path("a.jpg"),)
+    assert replace(found.style, luminance=0.0) == replace(
+        with_preset(StyleConfig(references=(Path("a.jpg"),)), "gentle"), luminance=0.0
+    )
+    assert capsys.readouterr().out == f"--gentle: {preset_flags('gentle')}\n"
+    config, _ = read("RUN", "--style", str(file), "--gentle")
+    assert config.strength == PRESETS["gentle"]["strength"] and config.weights == (2.0,)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_what_its_flags_say(name: str) -> None:
+    assert read("RUN", f"--{name}")[1] == read("RUN", *preset_flags(name).split())[1]
+    assert with_preset(StyleConfig(), name) != StyleConfig()
+
+
+def test_an_unknown_preset_is_refused() -> None:
+    with pytest.raises(UsageError, match="'gentel': no such preset; did you mean 'gentle'"):
+        with_preset(StyleConfig(), "gentel")

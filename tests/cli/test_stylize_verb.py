@@ -1,0 +1,222 @@
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from safetensors.torch import load_file, save_file
+from tiny_world import World
+
+from fprf.cli import main as cli
+from fprf.style.dictionary import load_dictionary
+
+MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "dead_channels", "matches"}
+
+
+@pytest.fixture
+def run(world: World, tmp_path: Path) -> Path:
+    shutil.copytree(world.run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def stylize(run: Path, world: World, *args: str) -> int:
+    return cli.main(["stylize", str(run), "--split", "test", "--references", *map(str, world.references), *args])
+
+
+def test_pictures_pair_up_by_stem(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    assert stylize(run, world) == 0
+    folder = run / "styles" / "dusk+snow"
+    names = {p.name for p in folder.iterdir()}
+    assert names == {
+        "0000.png", "0008.png", "0000-match.png", "0008-match.png", "dictionary.safetensors", "style.json"
+    }  # fmt: skip
+    stems = {p.stem for p in (world.town / "images").iterdir()}
+    assert {name.removesuffix(".png") for name in names if name.endswith(".png") and "match" not in name} <= stems
+    assert all(cv2.imread(str(folder / name)).shape == (24, 32, 3) for name in ("0000.png", "0008.png"))
+    assert capsys.readouterr().out.startswith(f"2 views in {folder}  (")
+
+
+def test_folders_stand_for_their_photographs_and_views_are_the_covered_ones(
+    run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photos, out = tmp_path / "photos", tmp_path / "s"
+    photos.mkdir()
+    for path in world.references:
+        shutil.copy(path, photos)
+    (photos / "broken.jpg").write_bytes(b"not a photograph")
+    args = ["stylize", str(run), "--references", str(photos), "--weights", "2", "--no-matches", "--output", str(out)]
+    assert cli.main(args) == 0
+    assert "broken.jpg: no PNG, JPEG" in capsys.readouterr().err
+    style = json.loads((out / "style.json").read_text())["style"]
+    assert [Path(path).name for path in style["references"]] == ["dusk.png", "snow.png"] and style["weights"] == [2, 2]
+    known = world.load().known
+    assert {p.stem for p in out.glob("*.png")} == {known.names[view] for view in known.split("covered")}
+    assert len(known.split("covered")) == 8
+    assert cli.main([*args, "--masks", str(world.references[0])]) == 2
+    assert "is for one photograph" in capsys.readouterr().err
+
+
+def test_style_json_and_the_dictionary(run: Path, world: World, tmp_path: Path) -> None:
+    assert stylize(run, world, "--output", str(tmp_path / "s"), "--clusters", "3", "--strength", "0.5") == 0
+    found = json.loads((tmp_path / "s" / "style.json").read_text())
+    dictionary = load_dictionary(tmp_path / "s" / "dictionary.safetensors")
+    style, made = found["style"], found["made"]
+    assert style["references"] == [str(p) for p in world.references] and style["strength"] == 0.5 and style["clusters"] == 3
+    assert made.keys() == MADE and made["codes"] == len(dictionary.keys) <= 6
+    assert set(dictionary.names) == {"dusk.png", "snow.png"} and made["matches"].keys() == {"0000", "0008"}
+    for summary in made["matches"].values():
+        assert {row["name"] for row in summary["references"]} == {"dusk.png", "snow.png"}
+        assert sum(row["share"] for row in summary["references"]) == pytest.approx(1, abs=0.02)
+        assert summary.keys() > {"score", "entropy_bits", "kept_share", "codes", "regions"}
+
+
+def test_a_style_file_is_the_same_style_again_and_flags_come_over_it(run: Path, world: World, tmp_path: Path) -> None:
+    wishes = ["--clusters", "3", "--pin", "0002:15,20=snow", "--keep", "1", "--luminance", "0.5", "--stylizer", "region-adain"]
+    assert stylize(run, world, *wishes, "--output", str(tmp_path / "a")) == 0
+    file = ["--style", str(tmp_path / "a" / "style.json")]
+    again = ["stylize", str(run), "--split", "test", *file, "--output"]
+    assert cli.main([*again, str(tmp_path / "b")]) == 0
+    assert cli.main([*again, str(tmp_path / "c"), "--strength", "0.5"]) == 0
+    for name in ("0000.png", "0000-match.png", "0008.png"):
+        a, b, c = (cv2.imread(str(tmp_path / folder / name)) for folder in "abc")
+        assert np.array_equal(a, b) and np.array_equal(a, c) == ("match" in name)
+    first, again = (json.loads((tmp_path / folder / "style.json").read_text()) for folder in "ab")
+    assert first.pop("made") and again.pop("made") and first == again
+    third = json.loads((tmp_path / "c" / "style.json").read_text())["style"]
+    assert third == first["style"] | {"strength": 0.5}
+
+
+def test_a_style_of_another_scene_finds_its_regions_by_their_keys(run: Path, world: World, tmp_path: Path) -> None:
+    """The same scene with its regions in another order stands for another scene: numbers differ, semantics don't."""
+    assert stylize(run, world, "--keep", "0", "--output", str(tmp_path / "a"), "--no-matches") == 0
+    other = shutil.copytree(run, tmp_path / "other")
+    tensors = load_file(other / "style.safetensors")
+    turned = {k: v.flip(0) if k in ("keys", "region_mean", "region_covariance", "share") else v for k, v in tensors.items()}
+    save_file({k: v.contiguous() for k, v in turned.items()}, other / "style.safetensors")
+    file = ["--style", str(tmp_path / "a" / "style.json"), "--no-matches"]
+    assert cli.main(["stylize", str(other), *file, "--output", str(tmp_path / "b")]) == 0
+    a, b = (cv2.imread(str(tmp_path / folder / "0000.png")).astype(int) for folder in "ab")
+    assert np.abs(a - b).max() <= 1
+    wrong = tmp_path / "wrong"
+    assert stylize(other, world, "--keep", "0", "--output", str(wrong), "--no-matches") == 0
+    assert np.abs(a - cv2.imread(str(wrong / "0000.png"))).max() > 1
+
+
+def test_explain_lists_regions_and_renders_nothing(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    assert stylize(run, world, "--explain", "--clusters", "3", "--keep", "1") == 0
+    folder, out = run / "styles" / "dusk+snow", capsys.readouterr().out
+    assert {p.name for p in folder.iterdir()} == {"explain.json", "explain.png", "dictionary.safetensors", "style.json"}
+    listed = json.loads((folder / "explain.json").read_text())
+    assert out.splitlines()[0].split() == ["region", "share", "seen", "best", "at", "strength", "entropy", "takes"]
+    assert len(listed["regions"]) == 4 and [line.split()[0] for line in out.splitlines()[1:5]] == list("0123")
+    assert " kept " in out.splitlines()[2] and "(score " in out.splitlines()[1]
+    assert sorted(listed["references"]) == ["dusk.png", "snow.png"]
+    assert cv2.imread(str(folder / "explain.png")).shape[1] > 4 * 240
+
+
+def test_regions_can_be_listed_before_there_is_a_style(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["stylize", str(run), "--explain"]) == 0
+    assert {p.name for p in (run / "styles" / "regions").iterdir()} == {"explain.json", "explain.png"}
+    assert capsys.readouterr().out.splitlines()[0].split() == ["region", "share", "seen", "best", "at"]
+
+
+def test_match_maps_alone(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["--match-only", "--views", "0003", "0001", "--pixels", "--clusters", "2", "--output", str(tmp_path / "m")]
+    assert stylize(run, world, *args) == 0
+    expected = {
+        f"{view}-{kind}" for view in ("0001", "0003") for kind in ("match.png", "score.png", "entropy.png", "match.npz")
+    }
+    assert {p.name for p in (tmp_path / "m").iterdir()} == expected | {"dictionary.safetensors", "style.json"}
+    made = json.loads((tmp_path / "m" / "style.json").read_text())["made"]
+    assert made.keys() == MADE - {"seconds_per_view"} and made["matches"].keys() == {"0003", "0001"}
+    assert "2 match maps in" in capsys.readouterr().out
+    with np.load(tmp_path / "m" / "0003-match.npz") as file:
+        assert file["reference"].shape == (24, 32)
+    assert stylize(run, world, "--match-only", "--explain", "--output", str(tmp_path / "both")) == 0
+    assert {"explain.json", "0000-score.png"} < {p.name for p in (tmp_path / "both").iterdir()}
+
+
+def test_a_changed_photograph_is_named(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo = tmp_path / "a.png"
+    photo.write_bytes(world.references[0].read_bytes())
+    common = ["stylize", str(run), "--no-matches", "--output", str(tmp_path / "s")]
+    assert cli.main([*common, "--references", str(photo)]) == 0
+    photo.write_bytes(world.references[1].read_bytes())
+    capsys.readouterr()
+    file = ["--style", str(tmp_path / "s" / "style.json")]
+    assert cli.main([*common, *file]) == 2
+    assert "a.png has changed since the style was saved" in capsys.readouterr().err
+    assert cli.main([*common, *file, "--references", str(photo)]) == 0
+
+
+def test_strength_0_is_the_plain_render_to_the_byte(run: Path, world: World, tmp_path: Path) -> None:
+    assert cli.main(["eval", str(run)]) == 0
+    assert stylize(run, world, "--strength", "0", "--no-matches", "--output", str(tmp_path / "s")) == 0
+    for stem in ("0000", "0008"):
+        plain, styled = (cv2.imread(str(p / f"{stem}.png")) for p in (run / "renders" / "test", tmp_path / "s"))
+        assert np.array_equal(plain, styled)
+    assert {p.name for p in (tmp_path / "s").iterdir()} == {"0000.png", "0008.png", "dictionary.safetensors", "style.json"}
+
+
+def test_all_splits_and_stylizers(run: Path, world: World, tmp_path: Path) -> None:
+    seen = {}
+    for name in ("identity", "adain", "local-adain", "region-adain", "region-ot"):
+        out = tmp_path / name
+        assert stylize(run, world, "--stylizer", name, "--clusters", "2", "--output", str(out), "--no-matches") == 0
+        seen[name] = cv2.imread(str(out / "0000.png")).astype(int)
+    names = list(seen)
+    assert not any(np.array_equal(seen[a], seen[b]) for i, a in enumerate(names) for b in names[:i])
+    assert stylize(run, world, "--split", "all", "--no-matches", "--output", str(tmp_path / "all")) == 0
+    assert len(list((tmp_path / "all").glob("*.png"))) == 10
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        ([], "--references: at least one photograph is needed"),
+        (["--references", "absent.jpg"], "absent.jpg: "),
+        (["--references", "A", "B", "--weights", "1"], "--weights: 1 weights for 2 references"),
+        (["--references", "A", "B", "--masks", "A"], "--masks: 1 masks for 2 references"),
+        (["--references", "A", "--pin", "3"], "--pin: '3' is not REGION=VALUE"),
+        (["--references", "A", "--pin", "77=A"], "region 77: regions go from 0 to 3; --explain lists them"),
+        (["--references", "A", "--pin", "0=night.jpg"], "reference 'night.jpg': no such reference; there are 0 dusk.png"),
+        (["--references", "A", "--forbid", "0=0"], "region 0: every reference is forbidden"),
+        (["--references", "A", "--keep", "0000:99,1"], "0000:99,1: outside of the view"),
+        (["--references", "A", "--region-strength", "0=2"], "--region-strength: 2.0 must lie in"),
+        (["--references", "A", "--luminance", "-1"], "--luminance"),
+        (["--references", "A", "--keep-below", "3"], "--keep-below: 3.0 must lie in"),
+        (["--references", "A", "--between", "absent.json"], "absent.json: cannot be read"),
+        (["--references", "A", "--views", "000"], "--views 000: no such view in the run; did you mean"),
+        (["--style", "absent.json"], "absent.json: cannot be read"),
+        (["--references", "A", "--weights", "0"], "--weights: 0.0 must be at least 1e-06"),
+        (["--references", "A", "--strength", "2"], "--strength: 2.0 must lie in [0.0, 1.0]"),
+        (["--references", "A", "--clusters", "0"], "--clusters: 0 must be at least 1"),
+        (["--references", "A", "--stylizer", "region-to"], "did you mean 'region-tone'"),
+        (["--references", "A", "--stylizer", "adain", "--stylizer.gain", "2"], "stylizer is adain"),
+        (["--references"], "--references"),
+    ],
+)
+def test_mistakes(run: Path, world: World, args: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    files = {"A": str(world.references[0]), "B": str(world.references[1])}
+    assert cli.main(["stylize", str(run), *(files.get(arg, arg) for arg in args)]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: ") and err.count("\n") == 1 and told in err
+    assert not (run / "styles").exists()
+
+
+def test_a_scene_without_measured_style_says_what_to_do(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "style.safetensors").unlink()
+    assert stylize(run, world) == 2
+    assert "style.safetensors: not written yet; finish training with `fprf train" in capsys.readouterr().err
+
+
+def test_default_names() -> None:
+    from fprf.cli.stylize import StylizeConfig, _name
+
+    few = (Path("a/autumn.jpg"), Path("night.png"))
+    assert _name(StylizeConfig(references=few)) == "autumn+night" and _name(StylizeConfig()) == "regions"
+    many = tuple(Path(f"reference_with_a_long_name_{i}.jpg") for i in range(100))
+    assert len(_name(StylizeConfig(references=many)).encode()) < 100
+    assert _name(StylizeConfig(references=few, style=Path("styles/dusk/style.json"))) == "dusk"
+    assert _name(StylizeConfig(references=few, style=Path("styles/snowy.json"))) == "snowy"

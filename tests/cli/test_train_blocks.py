@@ -1,0 +1,87 @@
+"""`fprf train` with blocks on the command line: plan, train, judge, restyle."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tiny_world import World, flags
+
+from fprf.cli.blocks import SHARE, block_minutes
+from fprf.cli.main import main
+from fprf.cli.train import train_scene
+from fprf.config import TrainConfig
+
+BLOCKS = ["--blocks", "street", "--blocks.segments", "2", "--steps", "4"]
+
+
+def test_the_plan_runs_nothing(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "fprf-lite", *flags(world, tmp_path / "run"), *BLOCKS, "--plan"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "fprf-lite on town: 8 training images" in lines[0]
+    assert lines[1].split() == ["block", "images", "rays", "size", "memory", "disk", "time"]
+    assert [line.split()[0] for line in lines[2:6]] == ["surroundings", "00", "01", "together"]
+    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == ["plan.json", "plan.png"]
+    document = json.loads((tmp_path / "run/plan.json").read_text())
+    assert [row["name"] for row in document["blocks"]] == ["surroundings", "00", "01", "together"]
+    assert all(row["images"] and row["rays"] and row["memory_mib"] > 0 for row in document["blocks"])
+
+
+def test_a_plan_for_one_block(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--plan"]) == 0
+    assert capsys.readouterr().out.splitlines()[2].split()[0] == "whole"
+
+
+def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    command = ["train", "fprf-lite", *flags(world, run), *BLOCKS]
+    assert main(command) == 0
+    assert main(["eval", str(run), "--max-memory", "1"]) == 0
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert 5 < metrics["psnr"] < 40
+    assert main(["stylize", str(run), "--references", *map(str, world.references), "--max-memory", "1"]) == 0
+    assert len(list((run / "styles").rglob("*.png"))) >= 2
+    assert main(["eval", str(run), "--samples", "1.5"]) == 0
+    assert json.loads((run / "metrics.json").read_text())["psnr"] != metrics["psnr"]
+    film = ["render", str(run), "--path", "interpolate", "--frames", "3", "--output", str(tmp_path / "film")]
+    assert main([*film, "--max-memory", "1"]) == 0
+    assert len(list((tmp_path / "film").glob("*.png"))) >= 3
+    before = (run / "blocks/00/done.json").read_bytes()
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "block 00 is finished already" in capsys.readouterr().err
+    assert (run / "blocks/00/done.json").read_bytes() == before
+
+
+def test_a_run_of_blocks_refuses_other_knobs(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    assert main(["train", "fprf-lite", *flags(world, run), *BLOCKS]) == 0
+    assert main(["train", "fprf-lite", *flags(world, run), *BLOCKS, "--seed", "3"]) == 2
+    assert "holds a run with seed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("memory", ["0", "-5", "nan"])
+def test_limits_that_are_none_are_refused(world: World, capsys: pytest.CaptureFixture[str], memory: str) -> None:
+    assert main(["eval", str(world.run), "--max-memory", memory]) == 2
+    assert "--max-memory" in capsys.readouterr().err
+
+
+def test_time_is_shared_between_the_surroundings_and_the_blocks() -> None:
+    config = TrainConfig(minutes=10.0)
+    around, each = block_minutes(config, 4, 60.0)
+    assert around == pytest.approx(9 * SHARE) and each is not None
+    assert around + 4 * each == pytest.approx(9.0)
+    assert block_minutes(TrainConfig(), 4, 60.0) == (None, None)
+    # Features that took longer than the limit leave a little all the same.
+    late = block_minutes(config, 4, 1e4)
+    assert late[0] == pytest.approx(0.5 * SHARE)
+
+
+def test_quiet_training_says_nothing(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from dataclasses import replace
+
+    from fprf.fields.layouts import StreetConfig
+
+    config = replace(world.config, output=tmp_path / "run", blocks=StreetConfig(segments=2), steps=2)
+    train_scene(config, "fprf-lite", quiet=True)
+    said = capsys.readouterr()
+    assert said.out == "" and said.err == ""

@@ -1,0 +1,91 @@
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+from stand_in_viewers import DEAD, DEAF, GREEDY, viewer
+from tiny_world import World, flags, parameters
+
+from fprf.cli import main as cli
+from fprf.cli import train
+from fprf.cli.beside import open_view, take_view
+from fprf.errors import UsageError
+from fprf.training import trainer
+from fprf.training.run import Run
+from fprf.viewer import aside
+from fprf.viewer.aside import Aside, Place
+from fprf.viewer.moment import begun
+
+
+@pytest.mark.parametrize(
+    ("args", "rest", "place"),
+    [
+        (["--steps", "3"], ["--steps", "3"], None),
+        (["--view"], [], Place()),
+        (["--view", "--steps", "3"], ["--steps", "3"], Place()),
+        (["--steps", "3", "--view", "9000", "--seed", "1"], ["--steps", "3", "--seed", "1"], Place("127.0.0.1", 9000, True)),
+        (["--view=0.0.0.0:0"], [], Place("0.0.0.0", 0, True)),
+        (["--view", "[::1]:81"], [], Place("::1", 81, True)),
+        (["--view", ":81"], [], Place("127.0.0.1", 81, True)),
+    ],
+)
+def test_the_flag_is_taken_out_of_the_others(args: list[str], rest: list[str], place: Place | None) -> None:
+    assert take_view(args) == (rest, place)
+
+
+@pytest.mark.parametrize("args", [["--view", "everywhere"], ["--view=70000"], ["--view="], ["--view", "host:"], ["--view=²"]])
+def test_what_is_no_place_is_refused(args: list[str]) -> None:
+    with pytest.raises(UsageError, match="--view"):
+        take_view(args)
+
+
+def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'fprf\[viewer\]'"):
+        open_view(Place())
+
+
+@pytest.mark.parametrize("script", [GREEDY, DEAF, DEAD])
+def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log"
+    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(script, str(log))))
+    monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)  # look after every step
+    assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--view"]) == 0
+    here, there = parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15)
+    assert here.keys() == there.keys() and all(here[name].equal(there[name]) for name in here)
+    assert (tmp_path / "run" / "style.safetensors").read_bytes() == (world.run / "style.safetensors").read_bytes()
+    assert "live at http://here/" in capsys.readouterr().err
+    if script is GREEDY:
+        assert "snapshot" in log.read_text()
+
+
+def test_help_and_completion_know_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["train", "fprf-lite", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert "--view [[HOST:]PORT]" in text and max(len(line) for line in text.splitlines()) <= 110
+    assert cli.main(["train", "fprf-lite", "--list-flags"]) == 0
+    assert {"--view", "--plan", "--steps"} <= set(capsys.readouterr().out.splitlines())
+
+
+def test_blocks_are_shown_one_after_the_other_and_trained_the_same(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(GREEDY, str(tmp_path / "log"))))
+    monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)
+    monkeypatch.setattr(aside, "_SHARE", 1e6)  # so short a training gives no time for more than one copy
+    blocks = ["--blocks", "street", "--blocks.segments", "2", "--steps", "6"]
+    for name, view in (("plain", []), ("shown", ["--view"])):
+        assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / name), *blocks, *view]) == 0
+    for file in ("blocks/surroundings/block.safetensors", "blocks/00/block.safetensors", "style.safetensors"):
+        assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "shown" / file).read_bytes()
+    heard = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    told = [(line["block"], line["what"]) for line in heard if "run" in line]
+    assert told[0][1] == "surroundings" and {what for _, what in told} == {"surroundings", "block 00", "block 01"}
+    shown = None
+    for line in heard:
+        shown = line["block"] if "run" in line else shown
+        if "names" in line:  # what was handed over fits the model that the viewer builds
+            assert line["names"] == sorted(begun(tmp_path / "shown", "cpu", shown).model.state_dict())
+    assert any("names" in line for line in heard)

@@ -1,0 +1,153 @@
+"""Verbs with `--device cuda:0`, pretended: the files of the CPU, bit for bit, where both take plain torch."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from pretend_cuda import pretend_cuda
+from tiny_world import World
+
+import fprf.methods
+from fprf.cli import main as cli
+from fprf.datamanagers.parsers.config import TownConfig
+from fprf.ops import backend
+from fprf.plugins.weightfiles import read_weights
+
+VIEW = ["--views", "0000"]
+QUICK = ["--clusters", "3"]
+LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--side", "16", "--views", "3", "--lut-size", "3"]
+DEVICE = "cuda:0"
+
+
+def ran(args: list[str], device: str) -> dict[str, int]:
+    """Host waits of a verb, by operator."""
+    if device == "cpu":
+        with backend.plain():
+            assert cli.main([*args, "--device", device]) == 0
+        return {}
+    with pretend_cuda() as seen:
+        assert cli.main([*args, "--device", device, "--debug"]) == 0
+    assert seen.uploads, "nothing was on the device"
+    return dict(seen.syncs)
+
+
+def content(path: Path) -> Any:
+    """What a file says, without times; of a page its pictures."""
+    if path.suffix == ".json":
+        return timeless(json.loads(path.read_text()))
+    if path.suffix == ".safetensors":
+        tensors, metadata = read_weights(path)
+        return metadata, {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+    if path.suffix == ".html":
+        return re.findall(r"data:[^\"')]*", path.read_text())
+    return path.read_bytes()
+
+
+def timeless(value: Any) -> Any:
+    clocks = ("seconds", "seconds_per_view", "rays_per_second", "peak_rss_mib", "run", "output")
+    if isinstance(value, dict):
+        return {k: timeless(v) for k, v in value.items() if not k.endswith(clocks)}
+    return [timeless(each) for each in value] if isinstance(value, list) else value
+
+
+def same(here: Path, there: Path) -> None:
+    names = {p.relative_to(here) for p in here.rglob("*") if p.is_file()}
+    assert names and names == {p.relative_to(there) for p in there.rglob("*") if p.is_file()}
+    for name in sorted(names):
+        assert content(here / name) == content(there / name), name
+
+
+def keyed(world: World, folder: Path) -> list[str]:
+    """A film that fades from the scene as it is into a style."""
+    style = {"format": 1, "style": {"references": [str(world.references[0])], "clusters": 3, "luminance": 0.5}}
+    (folder / "style.json").write_text(json.dumps(style))
+    keys = {"format": 1, "keyframes": [{"frame": 0, "style": None}, {"frame": 2, "style": "style.json"}]}
+    (folder / "keys.json").write_text(json.dumps(keys))
+    return ["--keyframes", str(folder / "keys.json"), "--path", "orbit", "--frames", "3", "--output", "OUT/film.mp4"]
+
+
+def between(world: World, folder: Path) -> list[str]:
+    """A style on the way to another, with regions that are kept and pinned, and numbers for every pixel."""
+    style = {"format": 1, "style": {"references": [str(world.references[1])], "clusters": 3}}
+    (folder / "other.json").write_text(json.dumps(style))
+    controls = ["--keep", "0", "--pin", "1=dusk.png", "--forbid", "2=snow.png", "--strength", "0.7", "--luminance", "0.5"]
+    return [
+        *references(world),
+        *controls,
+        "--between",
+        str(folder / "other.json"),
+        "--at",
+        "0.3",
+        "--pixels",
+        "--output",
+        "OUT",
+    ]
+
+
+def references(world: World) -> list[str]:
+    return ["--references", *map(str, world.references), *QUICK]
+
+
+VERBS: dict[str, Callable[[World, Path], list[str]]] = {
+    "stylize": lambda world, folder: [*VIEW, *between(world, folder)],
+    "stylize --explain": lambda world, _: [*references(world), "--explain", "--output", "OUT"],
+    "render": keyed,
+    "render --path": lambda *_: ["--path", "spiral", "--frames", "2", "--resolution", "0.5", "--show", "colour", "depth",
+                                 "normals", "--output", "OUT"],
+    "gallery": lambda world, _: [*references(world), *VIEW, "--output", "OUT/page.html"],
+    "export": lambda world, _: ["ply", "splat", "glb", "cameras", "lut", "--images", *LOOSE, *references(world),
+                                "--output", "OUT"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name == "export" else name for name in VERBS])
+def test_a_verb_writes_what_the_cpu_writes(world: World, tmp_path: Path, name: str) -> None:
+    outputs = [tmp_path / device for device in ("cpu", "cuda")]
+    for output, device in zip(outputs, ("cpu", DEVICE), strict=True):
+        output.mkdir()
+        args = [name.split()[0], str(world.run), *VERBS[name](world, tmp_path)]
+        ran([arg.replace("OUT", str(output)) for arg in args], device)
+    same(*outputs)
+
+
+def test_eval_copies_each_frame_once(world: World, tmp_path: Path) -> None:
+    for device in ("cpu", DEVICE):
+        shutil.copytree(world.run, tmp_path / device)
+        waits = ran(["eval", str(tmp_path / device)], device)
+    assert waits == {"aten._to_copy.default": 2, "aten.nonzero.default": 2}, "two views: two copies, two counts of samples"
+    same(tmp_path / "cpu" / "renders", tmp_path / DEVICE / "renders")
+    here, there = (content(tmp_path / device / "metrics.json") for device in ("cpu", DEVICE))
+    assert here == there
+
+
+def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "fprf.evaluation.alignment.AlignmentConfig.__init__.__kwdefaults__", {"steps": 2, "rays": 32, "rate": 2e-3}
+    )
+    found = []
+    for device in ("cpu", DEVICE):
+        shutil.copytree(world.run, tmp_path / device)
+        ran(["eval", str(tmp_path / device), "--fit-poses", "--images", "false"], device)
+        found.append(content(tmp_path / device / "metrics.json"))
+    assert found[0] == found[1]
+
+
+@pytest.mark.slow
+def test_the_demo(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fprf.methods, "fprf_lite", lambda: replace(world.config, output=None, steps=2))
+    made = TownConfig.__init__
+    monkeypatch.setattr(made, "__kwdefaults__", made.__kwdefaults__ | {"views": 10, "width": 32, "height": 24})
+    monkeypatch.setattr("fprf.cli.demo.LOOKS", {"night": (2, 4)})
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out" / "references").mkdir(parents=True)
+    shutil.copy(world.references[1], tmp_path / "out" / "references" / "night.png")
+    ran(["demo", "--output", "out", "--minutes", "5", "--frames", "2"], DEVICE)
+    assert {p.name for p in (tmp_path / "out").iterdir()} >= {"run", "film.mp4", "metrics.json", "gallery.html"}
+    assert json.loads((tmp_path / "out" / "run" / "config.json").read_text())["config"]["device"] == DEVICE
+    assert torch.isfinite(torch.tensor(json.loads((tmp_path / "out" / "metrics.json").read_text())["psnr"]))

@@ -1,0 +1,127 @@
+import json
+import math
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import DataError, NumericsError
+from fprf.io.atomic import atomic_path, remove_unfinished, write_bytes, write_json, write_text
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=10,
+)
+
+
+def test_the_file_appears_when_the_block_ends(tmp_path: Path) -> None:
+    final = tmp_path / "a" / "b" / "film.mp4"
+    with atomic_path(final) as temporary:
+        assert temporary.parent == final.parent
+        assert temporary.suffix == ".mp4"
+        temporary.write_bytes(b"new")
+        assert not final.exists()
+    assert final.read_bytes() == b"new"
+    assert list(final.parent.iterdir()) == [final]
+
+
+@pytest.mark.parametrize("failure", [ValueError("x"), KeyboardInterrupt(), SystemExit(3)])
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path, failure: BaseException) -> None:
+    final = tmp_path / "m.json"
+    final.write_text("old")
+    with pytest.raises(type(failure)), atomic_path(final) as temporary:
+        temporary.write_text("half")
+        raise failure
+    assert final.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [final]
+
+
+def test_a_failing_flush_or_rename_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    final = tmp_path / "m.json"
+    final.write_text("old")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    for name in ("fsync", "replace"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, full)
+            with pytest.raises(DataError, match=r"m\.json: cannot be written \(No space left on device, \d+ KiB are free"):
+                write_text(final, "new")
+        assert final.read_text() == "old"
+        assert list(tmp_path.iterdir()) == [final]
+
+
+def test_unfinished_files_and_no_others_are_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "folder.0badf00d"
+    for name in (".model.0123abcd.safetensors", ".tmpA1b2C3", ".events.89abcdef"):
+        (tmp_path / name).touch()
+    kept = {".lock", ".hidden", "model.safetensors", ".tmp", ".model.safetensors", "model.0123abcd.json", folder.name}
+    for name in kept - {folder.name}:
+        (tmp_path / name).touch()
+    folder.mkdir()
+    remove_unfinished(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == kept
+    remove_unfinished(tmp_path / "absent")
+
+
+def test_data_is_on_disk_before_the_name_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (calls.append("fsync"), fsync(handle))[1])
+    monkeypatch.setattr(os, "replace", lambda a, b: (calls.append("replace"), replace(a, b))[1])
+    write_bytes(tmp_path / "x", b"1")
+    assert calls == ["fsync", "replace", "fsync"]
+
+
+def test_concurrent_writers_do_not_share_a_temporary_name(tmp_path: Path) -> None:
+    final = tmp_path / "x.txt"
+    with atomic_path(final) as one, atomic_path(final) as two:
+        assert one != two
+        one.write_text("1")
+        two.write_text("2")
+    assert final.read_text() == "1"
+
+
+def test_the_longest_name_can_be_written(tmp_path: Path) -> None:
+    final = tmp_path / ("n" * 251 + ".png")
+    write_bytes(final, b"x")
+    assert final.read_bytes() == b"x"
+
+
+def test_what_is_in_the_way_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="is a file, not a folder"):
+        write_text(tmp_path / "file" / "deep" / "x", "")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DataError, match="a folder is in the place"):
+        write_text(tmp_path / "folder", "")
+
+
+@settings(max_examples=25, deadline=None)
+@given(json_values)
+def test_json_round_trips(tmp_path_factory: pytest.TempPathFactory, value: object) -> None:
+    path = tmp_path_factory.getbasetemp() / "round.json"
+    write_json(path, value)
+    assert json.loads(path.read_text(encoding="utf-8")) == value
+
+
+def test_json_keeps_the_order_of_keys(tmp_path: Path) -> None:
+    write_json(tmp_path / "m.json", {"z": 1, "a": "é"})
+    assert (tmp_path / "m.json").read_text(encoding="utf-8") == '{\n "z": 1,\n "a": "é"\n}\n'
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_json_refuses_what_json_lacks(tmp_path: Path, value: float) -> None:
+    with pytest.raises(NumericsError, match="must be finite"):
+        write_json(tmp_path / "m.json", {"psnr": [value]})
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_from_a_locale_without_utf8_are_written_as_the_bytes_that_they_are(tmp_path: Path) -> None:
+    escaped = "ünïcode 場面".encode().decode("ascii", errors="surrogateescape")
+    write_json(tmp_path / "x.json", {"data": escaped})
+    assert json.loads((tmp_path / "x.json").read_text(encoding="utf-8")) == {"data": "ünïcode 場面"}

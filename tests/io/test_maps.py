@@ -1,0 +1,127 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.errors import DataError
+from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette
+
+
+def lightness(picture: np.ndarray) -> np.ndarray:
+    return picture.astype(float) @ np.array([0.2126, 0.7152, 0.0722])
+
+
+def test_near_is_brighter_than_far_everywhere() -> None:
+    depth = torch.linspace(1, 20, 64).repeat(4, 1)
+    picture = depth_image(depth, torch.ones(4, 64))
+    assert picture.shape == (4, 64, 3) and picture.dtype == np.uint8
+    assert (np.diff(lightness(picture)[0]) <= 1).all() and lightness(picture)[0, 0] > lightness(picture)[0, -1] + 100
+
+
+def test_depth_scale_does_not_matter_and_outliers_do_not_blind() -> None:
+    depth = 1 + torch.rand(30, 30)
+    solid = torch.ones(30, 30)
+    assert np.abs(depth_image(depth, solid).astype(int) - depth_image(depth * 512, solid)).max() <= 1
+    outlier = depth.clone()
+    outlier[0, 0] = 1e-3
+    assert np.abs(depth_image(outlier, solid)[1:].astype(int) - depth_image(depth, solid)[1:]).mean() < 8
+
+
+@pytest.mark.parametrize("nothing", [0.0, -1.0, math.nan, math.inf])
+def test_where_nothing_is_it_is_grey(nothing: float) -> None:
+    depth = torch.full((5, 5), 2.0)
+    depth[0] = nothing
+    picture = depth_image(depth, torch.ones(5, 5))
+    empty = depth_image(torch.full((5, 5), 2.0), torch.zeros(5, 5))
+    assert np.array_equal(picture[0], empty[0]) and np.ptp(empty[0, 0]) < 10
+    assert not np.array_equal(picture[1], empty[1])
+    assert depth_limits([depth], [torch.zeros(5, 5)]) == (0.0, 1.0)
+
+
+def test_views_share_a_scale() -> None:
+    depths = [torch.full((4, 4), 1.0), torch.full((4, 4), 4.0)]
+    solid = [torch.ones(4, 4)] * 2
+    limits = depth_limits(depths, solid)
+    assert limits == pytest.approx((0.25, 1.0))
+    near, far = (depth_image(depth, each, limits) for depth, each in zip(depths, solid, strict=True))
+    assert lightness(near).mean() > lightness(far).mean() + 100
+
+
+def simulate(colours: np.ndarray, kind: str) -> np.ndarray:
+    """Dichromats' view (Viénot, Brettel, Mollon 1999), linear RGB of sRGB colours."""
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    rows = {"protan": [[0.112, 0.888, 0], [0.112, 0.888, 0], [0.004, -0.004, 1]],
+            "deutan": [[0.293, 0.707, 0], [0.293, 0.707, 0], [-0.022, 0.022, 1]], "normal": np.eye(3)}  # fmt: skip
+    return np.clip(linear @ np.array(rows[kind]).T, 0, 1) ** (1 / 2.2)
+
+
+@pytest.mark.parametrize("kind", ["normal", "protan", "deutan"])
+def test_the_palette_is_told_apart_by_the_colour_blind(kind: str) -> None:
+    seen = simulate(palette(7).numpy().astype(float), kind)
+    apart = np.linalg.norm(seen[:, None] - seen, axis=-1) + np.eye(7)
+    assert apart.min() > 0.1
+    assert apart[:4, :4].min() > 0.2
+
+
+def test_the_palette_goes_on_without_repeating() -> None:
+    colours = palette(28)
+    assert colours.shape == (28, 3) and palette(0).shape == (0, 3)
+    assert float((torch.cdist(colours, colours) + torch.eye(28)).min()) > 0.03
+    assert torch.equal(palette(3), colours[:3])
+
+
+def certain(codes: torch.Tensor, count: int) -> torch.Tensor:
+    return torch.nn.functional.one_hot(codes, count).float()
+
+
+def test_match_map_shows_hue_shade_and_doubt() -> None:
+    reference = torch.tensor([0, 0, 1])
+    sure = match_image(certain(torch.tensor([[0, 1, 2]]), 3), reference, ["a", "b"]).astype(int)
+    unsure = match_image(torch.full((1, 3, 3), 1 / 3), reference, ["a", "b"]).astype(int)
+    assert np.abs(sure[0, 2] - (palette(2)[1].numpy() * 255)).max() <= 1
+    assert lightness(sure)[0, 0] < lightness(sure)[0, 1]  # two shades of the first reference
+    assert sure[0, 0, 0] > sure[0, 0, 2] and sure[0, 1, 0] > sure[0, 1, 2]  # both orange
+    assert lightness(unsure)[0, 0] == pytest.approx(0.45 * lightness(sure)[0, 0], rel=0.05)
+    empty = match_image(certain(torch.tensor([[0]]), 3), reference, ["a", "b"], torch.zeros(1, 1))
+    assert np.ptp(empty[0, 0]) < 10
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 99))
+def test_match_summary_adds_up(codes: int, references: int, seed: int) -> None:
+    draw = torch.Generator().manual_seed(seed)
+    attention = torch.rand(6, 5, codes, generator=draw).softmax(-1)
+    reference = torch.randint(references, (codes,), generator=draw)
+    names = [f"r{index}" for index in range(references)]
+    cover = torch.rand(6, 5, generator=draw)
+    row = match_summary(attention, reference, names, cover)
+    shares = row["references"]
+    assert isinstance(shares, list)
+    assert [each["name"] for each in shares] == names
+    assert sum(each["share"] for each in shares) == pytest.approx(1)
+    assert 1 / codes - 1e-6 <= row["mean_score"] <= 1 and -1e-6 <= row["entropy_bits"] <= math.log2(codes) + 1e-6  # type: ignore[operator]
+    assert match_image(attention, reference, names, cover).shape == (6, 5, 3)
+
+
+def test_match_summary_in_closed_form() -> None:
+    attention = torch.tensor([[[1.0, 0, 0], [0, 0.5, 0.5]]])
+    row = match_summary(attention, torch.tensor([0, 1, 1]), ["a", "b"])
+    assert row == {
+        "references": [{"name": "a", "share": 0.5}, {"name": "b", "share": 0.5}],
+        "mean_score": 0.75,
+        "entropy_bits": pytest.approx(0.5),
+    }
+    hidden = match_summary(attention, torch.tensor([0, 1, 1]), ["a", "b"], torch.tensor([[3.0, 0.0]]))
+    assert hidden["references"] == [{"name": "a", "share": 1.0}, {"name": "b", "share": 0.0}]
+    nothing = match_summary(attention, torch.tensor([0, 1, 1]), ["a", "b"], torch.zeros(1, 2))
+    assert nothing["mean_score"] == 0.0
+
+
+def test_what_does_not_fit_is_named() -> None:
+    with pytest.raises(DataError, match="does not fit 2 style codes"):
+        match_image(torch.rand(2, 2, 3), torch.tensor([0, 0]), ["a"])
+    with pytest.raises(DataError, match="name reference 1, but there are 1"):
+        match_summary(torch.rand(2, 2, 2), torch.tensor([0, 1]), ["a"])

@@ -1,0 +1,66 @@
+from typing import Any
+
+from fprf.reconstruction.report import Drop, dropped, report, summary
+
+
+class Matches:
+    """Features and partners of images by name."""
+
+    def __init__(self, **known: tuple[int, int]) -> None:
+        self.known = known
+
+    def features_of(self, name: str) -> int:
+        return self.known[name][0]
+
+    def partners(self, name: str, least: int) -> int:
+        assert least > 0
+        return self.known[name][1]
+
+
+FOUND = Matches(a=(900, 3), b=(900, 2), bare=(0, 0), lonely=(50, 0), apart=(80, 1), odd=(70, 4))
+MODELS: list[dict[str, Any]] = [
+    {"images": ["a", "b"], "points": 10, "error_pixels": 0.5, "track_length": 3.0},
+    {"images": ["apart", "elsewhere"], "points": 4, "error_pixels": 0.7, "track_length": 2.0},
+]
+STATE = {
+    "source": "/photos",
+    "images": dict.fromkeys(["a", "apart", "b", "bare", "lonely", "odd"]),
+    "dropped": {"broken.jpg": "the JPEG is truncated"},
+    "seconds": {"features": 1.5},
+}
+
+
+def test_every_image_has_its_reason() -> None:
+    found = dropped(list(STATE["images"]), STATE["dropped"], FOUND, MODELS)
+    assert [(drop.image, drop.step) for drop in found] == [
+        ("broken.jpg", "choosing"),
+        ("bare", "features"),
+        ("lonely", "matching"),
+        ("apart", "mapping"),
+        ("odd", "mapping"),
+    ]
+    reasons = {drop.image: drop.reason for drop in found}
+    assert reasons["broken.jpg"] == "the JPEG is truncated" and "no other image" in reasons["lonely"]
+    assert reasons["apart"] == "in part 2 (2 images), apart from the rest; take views in between"
+    assert reasons["odd"] == "fits 4 images, but no pose was found for it"
+
+
+def test_the_report_counts() -> None:
+    content = report(STATE, "exhaustive", FOUND, MODELS, "1.2")
+    assert content["images"] == {"given": 7, "used": 6, "posed": 2} and content["parts"] == [2, 2]
+    assert content["points"] == 10 and content["matching"] == "exhaustive" and content["fprf"] == "1.2"
+    assert content["images"]["given"] == content["images"]["posed"] + len(content["dropped"])
+    assert content["dropped"][0] == Drop("broken.jpg", "choosing", "the JPEG is truncated")._asdict()
+
+
+def test_without_a_model_all_are_dropped() -> None:
+    content = report(STATE, "similar", FOUND, [], "1.2")
+    assert content["images"]["posed"] == 0 and len(content["dropped"]) == 7 and content["points"] == 0
+
+
+def test_many_of_a_step_are_told_as_a_number() -> None:
+    drops = [Drop(f"frame {k}", "choosing", f"less sharp {k}")._asdict() for k in range(40)]
+    drops += [Drop("x", "mapping", "why")._asdict()]
+    rows = summary({"dropped": drops}, most=12)
+    assert rows == [("choosing", "40 images", "for example frame 0: less sharp 0"), ("mapping", "x", "why")]
+    assert summary({"dropped": drops[-1:]}) == [("mapping", "x", "why")] and summary({"dropped": []}) == []

@@ -1,0 +1,101 @@
+"""What steps and minutes allow: sizes, forecasts, and what is said at the end."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny_world import World
+
+from fprf.errors import UsageError
+from fprf.methods import fprf, fprf_lite
+from fprf.training.budget import Forecast, Outcome, find_downscale, outcome
+from fprf.training.prepare import scene_of, with_downscale
+from fprf.training.trainer import Report
+
+
+def factor(width: int, height: int, views: int, minutes: float | None = None, device: str = "cpu") -> int:
+    return find_downscale(replace(fprf_lite(), minutes=minutes), torch.tensor([[width, height]] * views), device)
+
+
+@pytest.mark.parametrize(
+    ("views", "size"),
+    [
+        (29, (504, 378)),
+        (43, (270, 480)),
+        (100, (400, 400)),
+        (25, (512, 384)),
+        (66, (500, 376)),
+        (85, (480, 320)),
+        (23, (356, 634)),
+    ],
+)
+@pytest.mark.parametrize("minutes", [None, 2.0, 8.0, 60.0])
+def test_the_sizes_of_published_figures_stay(views: int, size: tuple[int, int], minutes: float | None) -> None:
+    assert factor(*size, views, minutes) == factor(*size, views, minutes, "cuda") == 1
+
+
+def test_photographs_are_reduced_as_far_as_docs_say() -> None:
+    assert (factor(2832, 2128, 9, 8), factor(2832, 2128, 9, 60)) == (5, 3)
+    assert (factor(1920, 1080, 131, 8), factor(4032, 3024, 262, 8)) == (3, 8)
+    assert factor(1008, 756, 29) == 2 and factor(1008, 756, 29, device="cuda") == 1
+
+
+@given(
+    side=st.integers(1, 9000),
+    views=st.integers(1, 2000),
+    minutes=st.floats(0.01, 1000),
+    more=st.floats(1, 10),
+    gpu=st.booleans(),
+)
+def test_more_time_and_fewer_images_never_reduce_further(side: int, views: int, minutes: float, more: float, gpu: bool) -> None:
+    device = "cuda" if gpu else "cpu"
+    found = factor(side, side, views, minutes, device)
+    assert (
+        factor(side, side, views, minutes * more, device) <= found
+        and factor(side, side, max(1, views // 2), minutes, device) <= found
+    )
+    assert factor(max(1, side // 2), side, views, minutes, device) <= found
+    least = (1e6 if gpu else 0.2e6) / 4
+    assert found == 1 or side * side / found**2 > least / 2.25
+
+
+def test_a_config_gets_the_size_of_its_scene(world: World) -> None:
+    config = with_downscale(replace(world.config, downscale=None))
+    assert config == world.config and with_downscale(config) is config
+    half = scene_of(replace(config, downscale=2))
+    assert half.cameras.size[0].tolist() == [16, 12]
+    with pytest.raises(UsageError, match="--data FOLDER, or --data town"):
+        scene_of(replace(config, data=None))
+
+
+def event(step: int, seconds: float) -> Report:
+    return Report(step, 0.0, seconds, 20.0, 1.0, 1.0, {}, 0)
+
+
+def test_hours_are_told_once_from_the_first_steps() -> None:
+    slow = Forecast(fprf(), "fprf", "cpu")
+    assert slow(event(1, 100.0)) == "" and slow(event(2, 103.0)) == "", "the first step compiles"
+    assert "30,000 steps at 3 s a step take 25 hours" in slow(event(3, 106.0)) and slow(event(9, 124.0)) == ""
+    quick = (
+        Forecast(fprf_lite(), "fprf-lite", "cpu"),
+        Forecast(replace(fprf(), minutes=9), "fprf", "cpu"),
+        Forecast(fprf(), "fprf", "cuda"),
+    )
+    for each, pace in zip(quick, (0.1, 3.0, 3.0), strict=True):
+        assert not any(each(event(step, 5 + pace * step)) for step in range(1, 200))
+
+
+def test_what_training_came_to(world: World, tmp_path: Path) -> None:
+    config, scene = world.config, world.prepared.scene
+    found = outcome(world.run, config, scene)
+    assert found is not None and found.steps == 15 and found.passes == pytest.approx(15 * 256 / (8 * 32 * 24))
+    told = found.told(world.run, config)
+    assert found.too_short and told.startswith("warning: ") and f"fprf train {world.run}/config.json --steps 600" in told
+    long = Outcome(4000, 24.5, 9.0)
+    timed, reduced = (long.told(world.run, replace(fprf_lite(), **field)) for field in ({"minutes": 8.0}, {"downscale": 5}))
+    assert not long.too_short and "--minutes 16" in timed and "--downscale" not in timed
+    assert "--steps 24000" in reduced and "--downscale 4" in reduced
+    assert outcome(tmp_path, config, scene) is None

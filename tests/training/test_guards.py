@@ -1,0 +1,222 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
+from tiny_world import Altered, World, events, parameters, spoilt, trained_for
+from torch import nn
+
+from fprf.config import TrainConfig
+from fprf.errors import NumericsError
+from fprf.training import checkpoint
+from fprf.training.guards import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, unfit_gradients, unfit_terms
+from fprf.training.model import build_model
+from fprf.training.run import Run
+from fprf.training.trainer import train
+from fprf.types import Batch
+
+NAN, INF = float("nan"), float("inf")
+TINY = torch.finfo(torch.float32).tiny
+
+
+def bad_gradients(world: World, folder: Path, config: TrainConfig, value: float, *bad: int, stop: int = -1) -> Run:
+    """Train where the loss is fine, and one number of one gradient isn't, in the steps `bad`; interrupted in step `stop`."""
+    now = 0
+
+    def watch(step: int, batch: Batch) -> Batch:
+        nonlocal now
+        now = step
+        if step == stop:
+            raise KeyboardInterrupt
+        return batch
+
+    def spoil(gradient: torch.Tensor) -> torch.Tensor:
+        if now in bad:
+            gradient = gradient.clone()
+            gradient.view(-1)[0] = value
+        return gradient
+
+    model = build_model(config, world.prepared.facts)
+    model.learned()[1].register_hook(spoil)
+    folder.mkdir(exist_ok=True)
+    prepared = world.prepared._replace(manager=Altered(world.prepared.manager, watch))
+    train(config, prepared, Run(folder), lambda event: None, model=model)
+    return Run(folder)
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_terms_that_are_not_finite_are_named() -> None:
+    parts = {"rgb": torch.tensor(1.0), "content": torch.tensor(NAN), "semantic": torch.tensor(INF)}
+    assert unfit_terms(torch.tensor(3.0), parts) is None
+    assert unfit_terms(torch.tensor(NAN), parts) == "content, semantic"
+    assert unfit_terms(torch.tensor(INF), {"rgb": torch.tensor(3e38)}) == "the sum of the loss terms"
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    value=st.sampled_from([NAN, INF, -INF, 3e38, -2e19, 0.0, 1e-45, 1e19]),
+    sizes=st.lists(st.integers(1, 40), min_size=1, max_size=6),
+    data=st.data(),
+)
+def test_any_bad_number_anywhere_is_found_and_no_other(value: float, sizes: list[int], data: st.DataObject) -> None:
+    named = [(f"p{i}", nn.Parameter(torch.zeros(size))) for i, size in enumerate(sizes)]
+    for _, parameter in named[1:]:
+        parameter.grad = torch.ones_like(parameter)
+    which = data.draw(st.integers(0, len(sizes) - 1))
+    gradient = torch.ones(sizes[which])
+    gradient[data.draw(st.integers(0, sizes[which] - 1))] = value
+    named[which][1].grad = gradient
+    found = unfit_gradients(named)
+    if bool(gradient.square().isfinite().all()):
+        assert found is None
+    else:
+        assert found == f"the gradient of p{which}"
+
+
+def test_many_bad_gradients_are_counted() -> None:
+    named = [(f"p{i}", nn.Parameter(torch.zeros(2))) for i in range(5)]
+    assert unfit_gradients(named) is None, "no gradient at all"
+    for _, parameter in named:
+        parameter.grad = torch.full((2,), NAN)
+    assert unfit_gradients(named) == "the gradient of p0, p1, p2 and 2 more"
+
+
+@pytest.mark.parametrize("value", [NAN, INF, 3e38])
+def test_a_bad_gradient_changes_nothing_and_is_named(world: World, tmp_path: Path, value: float) -> None:
+    config = replace(world.config, steps=4)
+    with pytest.raises(KeyboardInterrupt):
+        bad_gradients(world, tmp_path / "three", config, value, stop=3)
+    run = bad_gradients(world, tmp_path / "four", config, value, 3)
+    assert same(parameters(Run(tmp_path / "three"), 3), parameters(run, 4))
+    (event,) = events(run, "skipped")
+    assert event["step"] == 3 and event["skipped"].startswith("the gradient of ")
+
+
+def test_a_run_with_skipped_steps_is_the_same_when_it_is_resumed(world: World, tmp_path: Path) -> None:
+    """Of bad losses and bad gradients, before and after the interruption."""
+    config = replace(world.config, steps=10)
+    straight = bad_gradients(world, tmp_path / "straight", config, NAN, 2, 3, 7)
+    with pytest.raises(KeyboardInterrupt):
+        bad_gradients(world, tmp_path / "halves", config, NAN, 2, 3, 7, stop=5)
+    halves = bad_gradients(world, tmp_path / "halves", config, NAN, 2, 3, 7)
+    assert same(parameters(straight, 10), parameters(halves, 10))
+    assert [e["step"] for e in events(straight, "skipped")] == [e["step"] for e in events(halves, "skipped")] == [2, 3, 7]
+    poisoned = [trained_for(world, tmp_path / name, config, change=spoilt(INF, 4)) for name in ("one", "other")]
+    assert same(parameters(poisoned[0], 10), parameters(poisoned[1], 10))
+    assert not same(parameters(poisoned[0], 10), parameters(straight, 10))
+
+
+def test_three_in_a_row_without_a_checkpoint_end_it_and_the_term_is_named(world: World, tmp_path: Path) -> None:
+    config, spoiling = replace(world.config, steps=20), spoilt(NAN, 3, 4, 6, 8, 9, 10)
+    with pytest.raises(NumericsError, match=r"step 10: rgb is not finite for 3 steps in a row; lower --optimizer\.rate"):
+        trained_for(world, tmp_path / "run", config, change=spoiling)
+    assert checkpoint.steps(tmp_path / "run" / "checkpoints") == [], "nothing doubtful is saved"
+
+
+def test_three_in_a_row_go_back_to_the_last_checkpoint_once(world: World, tmp_path: Path) -> None:
+    config, folder = replace(world.config, steps=12), tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        bad_gradients(world, folder, config, NAN, stop=4)
+    kept = parameters(Run(folder), 4)
+    with pytest.raises(NumericsError, match=r"step 8: .* in a row, again after going back to step 4; lower"):
+        trained_for(world, folder, config, change=spoilt(NAN, 6, 7, 8))
+    (event,) = events(Run(folder), "gone_back_to")
+    assert (event["step"], event["gone_back_to"]) == (8, 4) and "rgb is not finite" in event["because"]
+    assert [e["step"] for e in events(Run(folder), "skipped")] == [6, 7, 8, 6, 7, 8]
+    assert checkpoint.steps(Run(folder).checkpoints) == [4] and same(kept, parameters(Run(folder), 4))
+
+
+def test_a_passing_fault_costs_the_steps_since_the_checkpoint_and_nothing_else(world: World, tmp_path: Path) -> None:
+    """Something that hits once, as a failing device does: after going back the run is the one without it."""
+    config, folder, left = replace(world.config, steps=9), tmp_path / "run", 3
+    with pytest.raises(KeyboardInterrupt):
+        bad_gradients(world, folder, config, NAN, stop=3)
+
+    def once(step: int, batch: Batch) -> Batch:
+        nonlocal left
+        if step >= 5 and left:
+            left -= 1
+            return batch._replace(rgb=torch.full_like(batch.rgb, NAN))
+        return batch
+
+    run = trained_for(world, folder, config, change=once)
+    assert left == 0 and len(events(run, "gone_back_to")) == 1
+    assert same(parameters(run, 9), parameters(trained_for(world, tmp_path / "clean", config), 9))
+
+
+def faded(steps: int, clear: bool) -> tuple[nn.Parameter, torch.optim.Optimizer]:
+    """One gradient, then none, as for what is never seen again."""
+    parameter = nn.Parameter(torch.linspace(-1, 1, 64))
+    optimizer = torch.optim.Adam([parameter], lr=1e-2, betas=(0.9, 0.99), eps=1e-12, fused=True)
+    for step in range(steps):
+        parameter.grad = torch.linspace(-1, 1, 64) ** 5 if step == 0 else torch.zeros(64)
+        optimizer.step()
+        if clear and (step + 1) % CLEAR_EVERY == 0:
+            clear_denormals(optimizer)
+    return parameter, optimizer
+
+
+def denormal(optimizer: torch.optim.Optimizer) -> int:
+    (state,) = optimizer.state.values()
+    return sum(int(((t != 0) & (t.abs() < TINY)).sum()) for t in (state["exp_avg"], state["exp_avg_sq"]))
+
+
+def test_moments_fade_to_zero_and_not_into_denormals() -> None:
+    plain, before = faded(2000, clear=False)
+    cleared, after = faded(2000, clear=True)
+    assert denormal(before) > 0, "else there is nothing to guard against"
+    assert denormal(after) == 0
+    assert float((plain - cleared).detach().abs().max()) < 1e-12
+
+
+def test_clearing_leaves_what_matters_alone_and_can_be_repeated() -> None:
+    parameter, optimizer = faded(1, clear=False)
+    (state,) = optimizer.state.values()
+    state["exp_avg"][:3] = torch.tensor([1e-40, -1e-40, -1e-30])
+    before = {key: value.clone() for key, value in state.items()}
+    clear_denormals(optimizer)
+    assert all(torch.equal(before[key], state[key]) for key in before if key == "step")
+    for key in ("exp_avg", "exp_avg_sq"):
+        kept = state[key] != 0
+        assert torch.equal(before[key][kept], state[key][kept]) and bool((before[key][~kept].abs() < 1e-32).all())
+    assert state["exp_avg"][:3].tolist() == pytest.approx([0, 0, -1e-30])
+    once = {key: value.clone() for key, value in state.items()}
+    clear_denormals(optimizer)
+    assert all(torch.equal(once[key], state[key]) for key in once)
+    clear_denormals(torch.optim.SGD([parameter], lr=1.0, momentum=0.9))
+
+
+def test_means_and_counts_are_those_of_a_plain_loop() -> None:
+    """Names come and go, and some numbers are not finite."""
+    statistics = StepStatistics(torch.device("cpu"))
+    mean: dict[str, float] = {}
+    seen: dict[str, float] = {}
+    drawn = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)).tolist()
+    for step, (a, b, c) in enumerate(drawn):
+        values = {"a": a, **({"b": NAN if step % 3 == 0 else b} if step > 4 else {}), **({"c": c} if step % 5 == 0 else {})}
+        statistics.add({name: torch.tensor(value) for name, value in values.items()})
+        statistics.count_skipped(torch.tensor(float(step % 3 == 0 and step > 4)))
+        for name, value in values.items():
+            if value == value:
+                number = float(torch.tensor(value))
+                mean[name] = SMOOTHING * mean.get(name, 0.0) + (1 - SMOOTHING) * number
+                seen[name] = SMOOTHING * seen.get(name, 0.0) + (1 - SMOOTHING)
+    assert statistics.means() == pytest.approx({name: value / seen[name] for name, value in mean.items()}, rel=1e-12)
+    assert statistics.faults() == (12, 1, "b")
+    assert statistics.faults() == (12, 1, "")
+
+
+def test_terms_that_come_every_few_steps_are_counted_without_a_copy() -> None:
+    with pretend_cuda() as seen:
+        statistics, one = StepStatistics(CUDA), torch.ones(()).to(CUDA)
+        before = seen.uploads.total(), seen.syncs.total()
+        for step in range(6):
+            statistics.add({"a": one, **({"b": one} if step % 2 else {}), **({"c": one} if step % 3 == 0 else {})})
+        assert (seen.uploads.total(), seen.syncs.total()) == before
+        assert statistics.means() == pytest.approx({"a": 1, "b": 1, "c": 1})

@@ -1,0 +1,147 @@
+"""Match maps against the attention of single points, and their files."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_world import World
+
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, StylizerConfig
+from fprf.rendering.cameras import pixel_grid
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
+from fprf.training.loading import Trained
+from fprf.training.matches import MatchMap, clusters, match_map, match_pictures, summarize, write_pixels
+from fprf.training.restyle import Codes, Styled, apply_style
+from fprf.training.views import match_view, paint_pixels, render_view
+
+
+def styled_by(world: World, stylizer: StylizerConfig | None = None, **wishes: object) -> tuple[Trained, Styled]:
+    trained = world.load()
+    style = StyleConfig(references=world.references, clusters=3, stylizer=stylizer or RegionOtConfig())
+    return trained, apply_style(trained, StyleFile(replace(style, **wishes)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("stylizer", [AdainConfig(), LocalAdainConfig(), RegionOtConfig()], ids=lambda s: type(s).__name__)
+def test_what_is_taken_is_the_stylizers_match(world: World, stylizer: StylizerConfig) -> None:
+    trained, styled = styled_by(world, stylizer)
+    found = match_map(trained, styled, 0)
+    expected = match_view(trained.model, trained.known.cameras, 0, trained.config.render, styled.restyle.stylizer)
+    assert torch.allclose(found.taken, expected, atol=1e-5) and float(found.kept.max()) < 1e-4
+    picture = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render)
+    assert torch.allclose(found.opacity, picture.opacity)
+    assert float(found.score.abs().max()) <= 1 and bool(found.score.isfinite().all())
+
+
+def test_kept_regions_take_nothing(world: World) -> None:
+    trained, styled = styled_by(world, keep=("0",))
+    found = match_map(trained, styled, 0)
+    assert torch.allclose(found.kept, found.region[..., 0], atol=1e-4) and float(found.kept.max()) > 0.01
+    assert torch.allclose(found.taken.sum(-1) + found.kept, torch.ones(()), atol=1e-4)
+    summary = summarize(found, styled.codes)
+    assert summary["kept_share"] == pytest.approx(float((found.kept * found.opacity).sum() / found.opacity.sum()), abs=1e-5)
+
+
+def test_pinned_regions_take_from_one_reference(world: World) -> None:
+    trained, styled = styled_by(world, pin=tuple(f"{k}=snow.png" for k in range(4)))
+    found = match_map(trained, styled, 0)
+    own = styled.codes.reference == styled.codes.names.index("snow.png")
+    assert float(found.taken[..., ~own].abs().max()) == 0 and torch.allclose(
+        found.taken[..., own].sum(-1), torch.ones(()), atol=1e-4
+    )
+
+
+def test_the_score_is_the_mean_cosine_with_what_is_taken(world: World) -> None:
+    trained, styled = styled_by(world, keep=("0",))
+    found = match_map(trained, styled, 0)
+    centre, keys = styled.scene.semantic_mean.double(), styled.dictionary.keys.double()
+    there = torch.nn.functional.normalize(keys - centre, dim=1)
+
+    def of_points(semantic: torch.Tensor) -> torch.Tensor:
+        """Each code's share, and its share times its cosine, in float64."""
+        cosine = torch.nn.functional.normalize(semantic.double() - centre, dim=1) @ there.T
+        taken = styled.restyle.match(semantic).double()
+        return torch.cat([taken, taken * cosine], 1).float()
+
+    cameras = trained.known.cameras
+    values, _ = paint_pixels(trained.model, cameras, 0, pixel_grid(cameras, 0), trained.config.render, of_points)
+    taken, weighted = values.double().chunk(2, dim=1)
+    expected = (weighted.sum(1) / taken.sum(1).clamp_min(1e-10)).view(24, 32)
+    some = found.kept < 0.99
+    assert int(some.sum()) > 100 and torch.allclose(found.score.double()[some], expected[some], atol=1e-4)
+
+
+def test_two_styles_have_the_codes_of_both(world: World, tmp_path: Path) -> None:
+    from fprf.style.files import write_style
+
+    write_style(tmp_path / "other.json", StyleFile(StyleConfig(references=world.references[:1], clusters=2)))
+    trained, styled = styled_by(world, between=tmp_path / "other.json", at=0.25)
+    assert styled.codes.names[2:] == ("dusk.png",) and len(styled.codes.names) == 3
+    found = match_map(trained, styled, 0)
+    other = styled.codes.reference == 2
+    assert torch.allclose(found.taken[..., other].sum(-1), torch.full((24, 32), 0.25), atol=1e-4)
+    assert found.taken.shape[-1] == len(styled.codes.reference) == len(styled.codes.units)
+
+
+def made_up() -> tuple[MatchMap, Codes]:
+    """Two by two pixels: sure of code 0, torn between codes 1 and 2, kept, and empty."""
+    taken = torch.tensor([[[1.0, 0, 0], [0, 0.5, 0.5]], [[0, 0, 0], [0, 0, 0]]])
+    region = torch.tensor([[[1.0, 0], [0, 1]], [[0.0, 1], [0, 0]]])
+    found = MatchMap(taken, torch.tensor([[0.9, 0.2], [0.0, 0.0]]), region, torch.tensor([[1.0, 1], [1, 0]]))
+    return found, Codes(torch.tensor([0, 1, 1]), ("a.jpg", "b.jpg"), torch.eye(3))
+
+
+def test_summaries_count_what_is_there() -> None:
+    summary = summarize(*made_up())
+    assert summary["references"] == [{"name": "a.jpg", "share": 0.5}, {"name": "b.jpg", "share": 0.5}]
+    assert summary["kept_share"] == pytest.approx(1 / 3) and summary["score"] == pytest.approx(0.55)
+    assert summary["entropy_bits"] == pytest.approx(0.5)
+    assert summary["codes"][0] == {"reference": "a.jpg", "cluster": 0, "share": pytest.approx(1 / 3)}
+    assert {(c["reference"], c["cluster"]) for c in summary["codes"][1:]} == {("b.jpg", 0), ("b.jpg", 1)}
+    assert summary["regions"] == [{"region": 0, "share": pytest.approx(1 / 3)}, {"region": 1, "share": pytest.approx(2 / 3)}]
+
+
+def test_an_empty_view_has_a_summary_too() -> None:
+    found, codes = made_up()
+    nothing = MatchMap(*(torch.zeros_like(t) for t in found))
+    summary = summarize(nothing, codes)
+    assert summary["kept_share"] == summary["score"] == summary["entropy_bits"] == 0 and summary["codes"] == []
+    assert all(picture.shape == (2, 2, 3) for picture in match_pictures(nothing, codes).values())
+
+
+def test_entropy_is_in_bits() -> None:
+    found, _ = made_up()
+    assert found.entropy.tolist() == [[0.0, pytest.approx(1.0)], [0.0, 0.0]]
+
+
+def test_pictures_tell_references_doubt_kept_and_empty_apart() -> None:
+    found, codes = made_up()
+    pictures = match_pictures(found, codes)
+    match = pictures["match"].astype(int)
+    colours = {tuple(pixel) for row in match for pixel in row}
+    assert len(colours) == 4
+    assert match[1, 0].min() > 200, "kept is pale"
+    assert pictures["score"][0, 0].astype(int).sum() > pictures["score"][0, 1].astype(int).sum(), "brighter is better"
+    most = math.log2(3)
+    assert found.entropy.max() <= most and not np.array_equal(pictures["entropy"][0, 0], pictures["entropy"][0, 1])
+
+
+def test_numbers_of_pixels(tmp_path: Path) -> None:
+    found, codes = made_up()
+    write_pixels(tmp_path / "m.npz", found, codes)
+    with np.load(tmp_path / "m.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    assert arrays["names"].tolist() == ["a.jpg", "b.jpg"]
+    assert arrays["reference"].tolist() == [[0, 1], [-1, -1]] and arrays["region"].tolist() == [[0, 1], [1, -1]]
+    assert arrays["cluster"][0, 0] == 0 and arrays["cluster"][0, 1] in (0, 1) and arrays["cluster"][1].tolist() == [-1, -1]
+    assert arrays["reference"].dtype == np.int16 and arrays["score"].dtype == np.float32
+    assert np.allclose(arrays["entropy_bits"], found.entropy) and np.allclose(arrays["kept"], [[0, 0], [1, 0]])
+    assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
+
+
+def test_clusters_are_numbered_within_their_reference() -> None:
+    codes = Codes(torch.tensor([0, 0, 1, 0, 1]), ("a", "b"), torch.zeros(5, 2))
+    assert clusters(codes).tolist() == [0, 1, 0, 2, 1]

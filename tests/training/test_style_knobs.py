@@ -1,0 +1,139 @@
+"""Every field of a style: a second value changes what is rendered, so that no dead knob can be added."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_world import World
+
+from fprf.errors import ConfigError, UsageError
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
+from fprf.style.config import NO_MASK, StyleConfig
+from fprf.style.controls import luma
+from fprf.style.files import StyleFile, write_style
+from fprf.training.loading import Trained
+from fprf.training.restyle import Encoders, apply_style, open_encoders
+from fprf.training.views import render_view
+
+SECOND: dict[str, object] = {
+    "weights": (5.0, 1.0),
+    "clusters": 1,
+    "blend": 0.9,
+    "strength": 0.5,
+    "luminance": 1.0,
+    "pin": ("0=1",),
+    "forbid": ("0=0",),
+    "keep": ("0",),
+    "region_strength": ("0=0.5",),
+    "keep_below": 0.99,
+    "stylizer": RegionAdainConfig(),
+}
+"""Those of `references`, `masks`, `between` and `at` need files: see below."""
+
+STYLIZERS = [AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig()]
+
+
+class Bench:
+    """A run in memory, and pictures of its first view."""
+
+    def __init__(self, world: World) -> None:
+        self.trained: Trained = world.load()
+        self.encoders: Encoders = open_encoders(self.trained)
+        self.base = StyleConfig(references=world.references, clusters=3)
+        self.plain = self.render(None)
+        self.first = self.show(self.base)
+
+    def render(self, style: StyleConfig | None) -> torch.Tensor:
+        known, config = self.trained.known, self.trained.config.render
+        look = None if style is None else apply_style(self.trained, StyleFile(style), self.encoders).restyle
+        return render_view(self.trained.model, known.facts, known.cameras, 0, config, look).rgb
+
+    def show(self, style: StyleConfig) -> torch.Tensor:
+        return self.render(style)
+
+
+@pytest.fixture(scope="module")
+def _bench() -> dict[str, Bench]:
+    return {}
+
+
+@pytest.fixture
+def bench(world: World, _bench: dict[str, Bench]) -> Bench:
+    if not _bench:
+        _bench["it"] = Bench(world)
+    return _bench["it"]
+
+
+def test_every_field_has_a_second_value() -> None:
+    assert {field.name for field in fields(StyleConfig)} == {*SECOND, "references", "masks", "between", "at"}
+
+
+@pytest.mark.parametrize("name", SECOND)
+def test_a_second_value_changes_the_picture(bench: Bench, name: str) -> None:
+    second = bench.show(replace(bench.base, **{name: SECOND[name]}))  # type: ignore[arg-type]
+    assert bool(second.isfinite().all()) and float((second - bench.first).abs().max()) > 1e-4
+
+
+def test_references_and_masks_change_the_picture(bench: Bench, tmp_path: Path) -> None:
+    mask = np.zeros((40, 56), np.uint8)
+    mask[20:] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    assert not torch.allclose(bench.show(replace(bench.base, references=bench.base.references[:1])), bench.first, atol=1e-4)
+    masked = bench.show(replace(bench.base, masks=(tmp_path / "mask.png", NO_MASK)))
+    assert not torch.allclose(masked, bench.first, atol=1e-4)
+    assert torch.equal(bench.show(replace(bench.base, masks=(NO_MASK, NO_MASK))), bench.first)
+
+
+def test_between_two_styles(bench: Bench, tmp_path: Path) -> None:
+    other = replace(bench.base, references=bench.base.references[:1], stylizer=AdainConfig(), luminance=0.5)
+    write_style(tmp_path / "other.json", StyleFile(other))
+    mixes = [bench.show(replace(bench.base, between=tmp_path / "other.json", at=at)) for at in (0.0, 0.3, 0.7, 1.0)]
+    end = bench.show(other)
+    assert torch.equal(mixes[0], bench.first) and torch.equal(mixes[3], end)
+    away = [float((mix - bench.first).abs().mean()) for mix in mixes]
+    assert away == sorted(away) and away[1] > 0
+    assert float((mixes[2] - end).abs().mean()) < float((mixes[1] - end).abs().mean())
+
+
+def test_styles_that_lead_back_to_themselves_are_refused(bench: Bench, tmp_path: Path) -> None:
+    a, b = tmp_path / "a.json", tmp_path / "b.json"
+    b.write_text("{}")
+    for path, towards in ((a, b), (b, a)):
+        write_style(path, StyleFile(replace(bench.base, between=towards)))
+    with pytest.raises(ConfigError, match=r"a\.json: lies between styles that lead back to it"):
+        bench.show(replace(bench.base, between=a))
+
+
+@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda s: type(s).__name__)
+def test_region_controls_work_with_every_stylizer(bench: Bench, stylizer: StylizerConfig) -> None:
+    base = replace(bench.base, stylizer=stylizer)
+    first, count = bench.show(base), 4
+    for wish in ({"pin": ("0=1", "1=0")}, {"forbid": ("1=0",)}, {"keep": ("0",)}, {"region_strength": ("0=0.3",)}):
+        assert not torch.allclose(bench.show(replace(base, **wish)), first, atol=1e-5), wish  # type: ignore[arg-type]
+    everything = replace(base, keep=tuple(str(k) for k in range(count)))
+    assert torch.equal(bench.show(everything), bench.plain), "all regions kept: bit for bit"
+    one = replace(base, pin=tuple(f"{k}=1" for k in range(count)))
+    alone = bench.show(replace(base, references=base.references[1:]))
+    assert torch.allclose(bench.show(one), alone, atol=1e-5), "pinned throughout: as if it were the only reference"
+
+
+def test_kept_luminance_is_that_of_the_plain_picture(bench: Bench) -> None:
+    kept = bench.show(replace(bench.base, luminance=1.0))
+    assert torch.allclose(luma(kept), luma(bench.plain), atol=1e-4)
+    assert float((luma(bench.first) - luma(bench.plain)).abs().mean()) > 0.02
+    assert float((kept - bench.plain).abs().max()) > 0.02, "the tint is the style's"
+
+
+def test_the_order_of_references_does_not_matter_to_wishes(bench: Bench) -> None:
+    a, b = bench.base.references
+    one = replace(bench.base, pin=("0=snow.png",), forbid=("1=0",), weights=(2.0, 1.0))
+    two = replace(bench.base, references=(b, a), pin=("0=0",), forbid=("1=dusk",), weights=(1.0, 2.0))
+    assert torch.equal(bench.show(one), bench.show(two))
+
+
+def test_a_style_of_nothing_is_refused(bench: Bench) -> None:
+    with pytest.raises(UsageError, match="at least one photograph"):
+        bench.show(StyleConfig())

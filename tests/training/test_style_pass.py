@@ -1,0 +1,108 @@
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_world import World
+
+from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
+from fprf.rendering.renderer import march
+from fprf.style.scene import from_tensors
+from fprf.training.style_pass import lattice, measure_style, neighbours
+
+SIZES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=5)
+
+
+def cameras_of(sizes: list[tuple[int, int]]) -> Cameras:
+    count = len(sizes)
+    return Cameras(
+        pose=torch.eye(3, 4, dtype=torch.float64).repeat(count, 1, 1),
+        focal=torch.ones(count, 2, dtype=torch.float64),
+        centre=torch.zeros(count, 2, dtype=torch.float64),
+        size=torch.tensor(sizes),
+        distortion=torch.zeros(count, 6, dtype=torch.float64),
+        lens=torch.zeros(count, dtype=torch.int64),
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(SIZES, st.integers(1, 400), st.data())
+def test_the_lattice_covers_every_view_by_its_share(sizes: list[tuple[int, int]], rays: int, data: st.DataObject) -> None:
+    cameras = cameras_of(sizes)
+    views = torch.tensor(data.draw(st.lists(st.integers(0, len(sizes) - 1), min_size=1, max_size=5, unique=True)))
+    view, pixel = lattice(cameras, views, rays)
+    area = cameras.size[views].prod(-1)
+    count = min(rays, int(area.sum()))
+    assert len(view) == len(pixel) == count
+    low, high = pixel - 0.5, cameras.size[view] - pixel - 0.5
+    assert bool((low >= 0).all()) and bool((high >= 0).all()) and bool((low == low.round()).all())
+    assert len({(int(v), *p) for v, p in zip(view, pixel.tolist(), strict=True)}) == count, "no pixel twice"
+    for one, pixels in zip(views.tolist(), area.tolist(), strict=True):
+        assert abs(int((view == one).sum()) - count * pixels / int(area.sum())) <= 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(SIZES, st.integers(1, 100))
+def test_neighbours_lie_in_the_view(sizes: list[tuple[int, int]], pairs: int) -> None:
+    cameras = cameras_of([(24 * w, 24 * h) for w, h in sizes])
+    view, pixel = neighbours(cameras, torch.arange(len(sizes)), pairs)
+    size = cameras.size[view][:, None]
+    assert bool(((pixel > 0) & (pixel < size)).all())
+    step = (pixel[:, 1] - pixel[:, 0]).abs().sum(1)
+    assert torch.equal(step, cameras.size[view].amin(1).to(step) // 24)
+
+
+def test_all_pixels_where_there_are_fewer_than_rays() -> None:
+    cameras = cameras_of([(3, 2), (1, 4)])
+    view, pixel = lattice(cameras, torch.tensor([1, 0]), 10**6)
+    assert view.tolist() == [1] * 4 + [0] * 6
+    assert torch.equal(pixel[4:].double(), pixel_grid(cameras, 0)) and torch.equal(pixel[:4].double(), pixel_grid(cameras, 1))
+
+
+def test_statistics_do_not_depend_on_the_chunk(world: World) -> None:
+    trained, scene = world.load(), world.prepared.scene
+    whole, small = (
+        measure_style(
+            replace(world.config, render=replace(world.config.render, chunk=chunk)), trained.model, scene.cameras, scene.train
+        )
+        for chunk in (4096, 97)
+    )
+    for name, a, b in zip(whole._fields, whole, small, strict=True):
+        assert torch.allclose(a, b, rtol=1e-4, atol=1e-5), name
+
+
+def test_statistics_are_those_of_the_kept_samples(world: World) -> None:
+    trained, scene = world.load(), world.prepared.scene
+    style = measure_style(world.config, trained.model, scene.cameras, scene.train)
+    view, pixel = lattice(scene.cameras, scene.train, world.config.statistics.rays)
+    with torch.inference_mode():
+        rays = trained.model.space.rays(*rays_through(scene.cameras, view, pixel))
+        kept = march(rays, trained.model.parts, budget=world.config.render.budget).kept
+        content = trained.model.field.content(kept.latent, kept.view).double()
+        share = (kept.weight.double() / kept.weight.double().sum())[:, None]
+    mean = (content * share).sum(0)
+    covariance = (content - mean).T @ ((content - mean) * share)
+    assert torch.allclose(style.mean.double(), mean, rtol=1e-5, atol=1e-6)
+    assert torch.allclose(style.covariance.double(), covariance, rtol=1e-4, atol=1e-6)
+
+
+def test_regions_share_out_the_scene(world: World) -> None:
+    trained, scene = world.load(), world.prepared.scene
+    style = measure_style(world.config, trained.model, scene.cameras, scene.train)
+    assert 1 <= len(style.share) <= world.config.statistics.regions
+    assert float(style.share.sum()) == pytest.approx(1, abs=1e-5)
+    assert all(torch.equal(a, b) for a, b in zip(style, from_tensors(trained.run.load_tensors("style")), strict=True))
+    assert torch.allclose(style.contacts, style.contacts.T) and 0 < float(style.contacts.sum()) < 1
+    one = measure_style(
+        replace(world.config, statistics=replace(world.config.statistics, regions=1)), trained.model, scene.cameras, scene.train
+    )
+    assert len(one.share) == 1 and torch.allclose(one.mean, style.mean)
+
+
+def test_a_scene_without_semantics_is_one_region(world: World) -> None:
+    trained, scene = world.load(), world.prepared.scene
+    trained.model.semantic = None
+    style = measure_style(world.config, trained.model, scene.cameras, scene.train)
+    assert style.keys.shape == (1, 0) and len(style.share) == 1
+    assert torch.allclose(style.region_mean[0], style.mean, rtol=1e-4, atol=1e-5)

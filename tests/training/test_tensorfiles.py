@@ -1,0 +1,155 @@
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+
+from fprf.errors import CheckpointError
+from fprf.training import tensorfiles
+
+KINDS = (torch.float32, torch.float16, torch.bfloat16, torch.float64, torch.int64, torch.uint8, torch.bool)
+SHARED = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def tensors() -> dict[str, torch.Tensor]:
+    return {"a.weight": torch.randn(3, 4), "b": torch.arange(5), "scalar": torch.tensor(2.5)}
+
+
+@SHARED
+@given(
+    kind=st.sampled_from(KINDS),
+    shape=st.lists(st.integers(0, 4), max_size=3),
+    seed=st.integers(0, 99),
+)
+def test_any_tensor_comes_back_bit_for_bit(tmp_path: Path, kind: torch.dtype, shape: list[int], seed: int) -> None:
+    made = (torch.randn(shape, generator=torch.Generator().manual_seed(seed)) * 9).to(kind)
+    entry = tensorfiles.save(tmp_path / "x.safetensors", {"t": made})
+    assert entry["t"]["finite"]
+    found = tensorfiles.load(tmp_path / "x.safetensors", entry)["t"]
+    assert found.dtype == kind and found.shape == made.shape and torch.equal(found, made)
+
+
+def test_views_with_strides_are_saved_by_value(tmp_path: Path) -> None:
+    whole = torch.randn(4, 6)
+    entry = tensorfiles.save(tmp_path / "x", {"t": whole.T[1:3], "row": whole[0]})
+    found = tensorfiles.load(tmp_path / "x", entry)
+    assert torch.equal(found["t"], whole.T[1:3]) and torch.equal(found["row"], whole[0])
+
+
+@SHARED
+@given(st.data())
+def test_a_flipped_bit_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
+    torch.manual_seed(1)
+    path, made = tmp_path / "x.safetensors", tensors()
+    entry = tensorfiles.save(path, made)
+    raw = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, len(raw) - 1))
+    raw[at] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(raw)
+    try:
+        found = tensorfiles.load(path, entry)
+    except CheckpointError as error:
+        assert str(path) in str(error)
+    else:
+        assert all(torch.equal(found[name], made[name]) for name in made)
+
+
+@pytest.mark.parametrize("place", range(-48, 0, 8))
+def test_a_flipped_bit_in_a_number_is_always_found(tmp_path: Path, place: int) -> None:
+    path = tmp_path / "x.safetensors"
+    entry = tensorfiles.save(path, {"weight": torch.randn(3, 4)})
+    raw = bytearray(path.read_bytes())
+    raw[place] ^= 1
+    path.write_bytes(raw)
+    with pytest.raises(CheckpointError, match=r"tensor weight is damaged"):
+        tensorfiles.load(path, entry)
+
+
+@SHARED
+@given(st.floats(0, 1, exclude_max=True))
+def test_a_cut_file_is_found(tmp_path: Path, share: float) -> None:
+    path = tmp_path / "x.safetensors"
+    entry = tensorfiles.save(path, tensors())
+    raw = path.read_bytes()
+    path.write_bytes(raw[: int(share * len(raw))])
+    with pytest.raises(CheckpointError, match=r"x\.safetensors"):
+        tensorfiles.load(path, entry)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_what_was_not_finite_is_told_when_read(tmp_path: Path, bad: float) -> None:
+    entry = tensorfiles.save(tmp_path / "x", {"t": torch.tensor([0.0, bad])})
+    assert not entry["t"]["finite"]
+    with pytest.raises(CheckpointError, match="tensor t was not finite when saved"):
+        tensorfiles.load(tmp_path / "x", entry)
+
+
+def test_an_absent_file_and_other_names_are_told(tmp_path: Path) -> None:
+    entry = tensorfiles.save(tmp_path / "x", tensors())
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        tensorfiles.load(tmp_path / "y", entry)
+    with pytest.raises(CheckpointError, match=r"differ from its manifest \(b\)"):
+        tensorfiles.load(tmp_path / "x", {name: entry[name] for name in entry if name != "b"})
+    with pytest.raises(CheckpointError, match=r"differ from its manifest \(new\)"):
+        tensorfiles.load(tmp_path / "x", entry | {"new": entry["b"]})
+
+
+def test_a_mangled_entry_is_damage_too(tmp_path: Path) -> None:
+    entry = tensorfiles.save(tmp_path / "x", {"t": torch.ones(2)})
+    for mangled in ({}, {"crc32": "text", "finite": True}, {"crc33": entry["t"]["crc32"], "finite": True}, 3, None):
+        with pytest.raises(CheckpointError):
+            tensorfiles.load(tmp_path / "x", {"t": mangled})  # type: ignore[dict-item]
+
+
+def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="memory format"):
+        tensorfiles.save(tmp_path / "x", {"t": torch.zeros(2).to_sparse()})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sealed_file_comes_back_and_carries_its_own_checksums(tmp_path: Path) -> None:
+    made = tensors() | {"none": torch.zeros(0, 3)}
+    tensorfiles.save_sealed(tmp_path / "x", made)
+    found = tensorfiles.load_sealed(tmp_path / "x")
+    assert found.keys() == made.keys() and all(torch.equal(found[name], made[name]) for name in made)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
+    torch.manual_seed(1)
+    path, made = tmp_path / "x.safetensors", tensors()
+    tensorfiles.save_sealed(path, made)
+    raw = bytearray(path.read_bytes())
+    at = data.draw(st.integers(0, len(raw) - 1))
+    raw[at] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(raw)
+    try:
+        found = tensorfiles.load_sealed(path)
+    except CheckpointError as error:
+        assert str(path) in str(error) and "\n" not in str(error)
+    else:
+        assert all(torch.equal(found[name], made[name]) and found[name].dtype == made[name].dtype for name in made)
+
+
+def test_a_sealed_file_that_was_not_finite_is_refused(tmp_path: Path) -> None:
+    tensorfiles.save_sealed(tmp_path / "x", {"t": torch.tensor([1.0, float("inf")])})
+    with pytest.raises(CheckpointError, match="tensor t was not finite"):
+        tensorfiles.load_sealed(tmp_path / "x")
+
+
+@pytest.mark.parametrize("seal", ["", "3", "{", '{"a.weight": 3}', '{"a.weight": {}}', "[" * 9999, "{}"])
+def test_a_seal_of_nonsense_is_damage(tmp_path: Path, seal: str) -> None:
+    save_file(tensors(), tmp_path / "x", {"manifest": seal})
+    with pytest.raises(CheckpointError, match="x: "):
+        tensorfiles.load_sealed(tmp_path / "x")
+
+
+def test_files_of_before_there_were_seals_are_read(tmp_path: Path) -> None:
+    save_file(tensors(), tmp_path / "x")
+    assert tensorfiles.load_sealed(tmp_path / "x").keys() == tensors().keys()
+    save_file(tensors(), tmp_path / "y", {"format": "pt"})
+    with pytest.raises(CheckpointError, match="its checksums cannot be read"):
+        tensorfiles.load_sealed(tmp_path / "y")

@@ -1,0 +1,172 @@
+"""Renders, restyles, match maps and blocks on the pretended device: the CPU's, bit for bit, where both take plain torch."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from block_world import BlockWorld
+from pretend_cuda import CUDA, pretend_cuda
+from tiny_world import World
+
+import fprf
+from fprf.ops import backend
+from fprf.plugins.stylizers.config import (
+    AdainConfig,
+    IdentityConfig,
+    LocalAdainConfig,
+    RegionAdainConfig,
+    RegionOtConfig,
+    RegionToneConfig,
+    StylizerConfig,
+)
+from fprf.style.config import StyleConfig
+from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.files import StyleFile
+from fprf.training.cached_view import cache_view
+from fprf.training.folding import folded
+from fprf.training.loading import Trained, load_run
+from fprf.training.matches import match_map
+from fprf.training.poses import Poses
+from fprf.training.quality import QualityConfig, at_quality
+from fprf.training.restyle import Encoders, dress, encode_photograph, open_encoders
+from fprf.training.tones import Tones
+from fprf.training.views import render_view
+
+STYLIZERS = (
+    AdainConfig(colours=0.5),
+    IdentityConfig(),
+    LocalAdainConfig(),
+    LocalAdainConfig(similarity="dot"),
+    RegionAdainConfig(),
+    RegionOtConfig(),
+    RegionToneConfig(),
+)
+
+
+PLACES: tuple[tuple[str, Callable[[], Any]], ...] = (("cpu", backend.plain), (str(CUDA), pretend_cuda))
+
+
+class Here:
+    """The tiny world on a device with its encoders and a dictionary, made once."""
+
+    def __init__(self, world: World, device: str) -> None:
+        self.trained: Trained = load_run(world.run, device)
+        self.encoders: Encoders = open_encoders(self.trained)
+        read = [encode_photograph(self.trained, path, self.encoders, name=path.name) for path in world.references]
+        assert all(part.device == torch.device(device) for r in read for part in (r.content, r.semantic, r.colour))
+        self.dictionary: StyleDictionary = build_dictionary(read, clusters=3, seed=0)
+        self.paths = world.references
+
+
+@pytest.fixture(scope="module")
+def _made() -> dict[str, Here]:
+    return {}
+
+
+def here(world: World, made: dict[str, Here], device: str) -> Here:
+    """Within the device's own rules."""
+    if device not in made:
+        made[device] = Here(world, device)
+    return made[device]
+
+
+def shown(at: Here, stylizer: StylizerConfig, references: tuple[Path, ...]) -> list[torch.Tensor]:
+    """What a view shows in a look: rendered, from a cached view, folded, as a match map; and what is kept of it."""
+    trained, facts = at.trained, at.trained.known.facts
+    cameras, config = trained.known.cameras, trained.config.render
+    style = StyleConfig(references=references, stylizer=stylizer, keep=("0",), strength=0.8, luminance=0.2)
+    styled = dress(trained, StyleFile(style), at.encoders, at.dictionary)
+    view = render_view(trained.model, facts, cameras, 3, config, styled.restyle)
+    again = cache_view(trained.model, facts, cameras, 3, config).restyled(styled.restyle)
+    found = [*view[:3], again.rgb, *match_map(trained, styled, 3)]
+    bare = dress(trained, StyleFile(StyleConfig(references=references, stylizer=stylizer)), at.encoders, at.dictionary)
+    small = folded(trained.model, bare, stylizer)
+    if small is not None:
+        found.append(render_view(small.model, facts, cameras, 3, config, small.look).rgb)
+    return found
+
+
+@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda config: type(config).__name__)
+def test_every_stylizer(world: World, _made: dict[str, Here], stylizer: StylizerConfig) -> None:
+    found = []
+    for device, within in PLACES:
+        with within():
+            found.append(shown(here(world, _made, device), stylizer, world.references))
+    assert all(torch.equal(a, b) and b.device.type == "cpu" for a, b in zip(*found, strict=True))
+    ours, theirs = (_made[device].dictionary for device, _ in PLACES)
+    assert all(torch.equal(a, b) for a, b in zip(ours[:6], theirs[:6], strict=True)), "tables lie on the CPU"
+
+
+def test_a_frame_is_one_copy_whatever_its_chunks(world: World) -> None:
+    with pretend_cuda() as seen:
+        trained = load_run(world.run, str(CUDA))
+        facts, cameras = trained.known.facts, trained.known.cameras
+        render_view(trained.model, facts, cameras, 0, trained.config.render)
+        pictures = []
+        for memory, chunks in ((1 << 30, 1), (2 * 192 * 1024 * 300, 3)):
+            torch.cuda.mem_get_info = lambda device=None, free=memory: (free, free)
+            seen.syncs.clear()
+            config = replace(trained.config.render, chunk=100)
+            pictures.append(render_view(trained.model, facts, cameras, 1, config).rgb)
+            assert seen.syncs == {"aten._to_copy.default": 1, "aten.nonzero.default": chunks}
+        seen.syncs.clear()
+        at_half = replace(trained.config.render, resolution=0.5, tone=(1.0, 0.9, 0.8))
+        assert render_view(trained.model, facts, cameras, 1, at_half).rgb.shape == (24, 32, 3)
+        assert seen.syncs["aten._to_copy.default"] == 1
+        cached = cache_view(trained.model, facts, cameras, 1, trained.config.render)
+        seen.syncs.clear()
+        assert torch.equal(cached.restyled().rgb, pictures[0])
+        assert seen.syncs == {"aten._to_copy.default": 1}
+    assert torch.equal(*pictures)
+
+
+def test_a_device_without_float64(world: World, _made: dict[str, Here]) -> None:
+    found = []
+    for device, within in (PLACES[0], ("mps:0", lambda: pretend_cuda(mps=True))):
+        with within():
+            found.append(shown(here(world, _made, device), RegionToneConfig(), world.references))
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_learnt_poses_and_tones(world: World) -> None:
+    cameras = world.prepared.scene.cameras
+    draw = torch.Generator().manual_seed(5)
+    poses = Poses(cameras.pose[:, :, 3], (1,), reach=2.0, pace=0.1)
+    tones = Tones(torch.rand(len(cameras), generator=draw), (1,))
+    with torch.no_grad():
+        poses.offset.copy_(torch.rand(poses.offset.shape, generator=draw))
+        tones.gain.copy_(torch.rand(tones.gain.shape, generator=draw))
+    mixed = (0, 2), (0.25, 0.75)
+    expected = [poses.refined(cameras).pose, tones.mixed(*mixed)]
+    with pretend_cuda():
+        found = [copy.deepcopy(poses).to(CUDA).refined(cameras).pose, copy.deepcopy(tones).to(CUDA).mixed(*mixed).cpu()]
+    assert all(torch.equal(a, b) for a, b in zip(expected, found, strict=True))
+
+
+def test_the_api_and_presets(world: World) -> None:
+    found = []
+    for device, within in PLACES:
+        with within():
+            scene = fprf.load(world.run, device=device, quality="best")
+            styled = scene.stylize([world.references[0]], clusters=2)
+            shot = styled.render(scene.camera_at((0.0, 0.0, 1.6), (1.0, 1.0, 1.0), width=20, height=10))
+            draft = at_quality(scene.trained, QualityConfig(quality="draft"))
+            plain = render_view(draft.model, draft.known.facts, draft.known.cameras, 0, draft.config.render)
+            found.append([shot.rgb, shot.depth, shot.opacity, plain.rgb])
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_blocks_of_a_large_scene(block_world: BlockWorld) -> None:
+    found = []
+    for device, within in PLACES:
+        with within():
+            trained = load_run(block_world.root, device, max_memory=1.0)
+            view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render)
+            found.append(view[:3])
+    # Off the CPU points are turned into a block without a matrix product: sums of three, in another order.
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
