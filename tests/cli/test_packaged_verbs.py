@@ -72,7 +72,7 @@ def test_it_is_parsed_and_called_like_a_built_in_one(packages: Packages, capsys:
 
 
 def test_completion_knows_its_flags(packages: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.cli.VERBS", {"doctor": cli.VERBS["doctor"]})
+    monkeypatch.setattr("fprf.cli.main.VERBS", {"doctor": cli.VERBS["doctor"]})
     offer = offers()["count"]
     assert {"--step", "--folder", "--sampler", "--sampler.samples", "--help"} <= set(offer.flags)
     assert offer.summary == "of acme-count 0.2"

@@ -17,7 +17,7 @@ from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import default_output
 from fprf.datamanagers.parsers.recognise import parse_scene
 
-FAKE = Path(__file__).parents[1] / "sfm" / "fake"
+FAKE = Path(__file__).parents[1] / "reconstruction" / "fake"
 
 
 @pytest.fixture
