@@ -166,5 +166,5 @@ def test_the_worker_never_meets_opencv(photos: Path) -> None:
     code = "import sys, fprf.reconstruction.worker; print({'cv2', 'numpy', 'torch', 'PIL', 'pycolmap'} & {*sys.modules})"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     assert ended.stdout.strip() == "set()"
-    sources = [path for path in (Path(cli.__file__).parent).rglob("*.py") if "import pycolmap" in path.read_text("utf-8")]
+    sources = [path for path in Path(cli.__file__).parents[1].rglob("*.py") if "import pycolmap" in path.read_text("utf-8")]
     assert [path.name for path in sources] == ["worker.py"]
