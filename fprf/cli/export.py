@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import DataError, UsageError
-from ..export.config import ExportConfig
+from ..export.config import KINDS, ExportConfig, Plan, look_file, plan
 from ..export.looks import Look, Named, make_looks, named_styles, style_name
-from ..export.plan import KINDS, Plan, look_file, plan
 from .progress import Display
 from .style_flags import read_flags, say
 from .verbs import verbs_of
@@ -16,10 +15,9 @@ from .verbs import verbs_of
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ..export.colours import Coloured
-    from ..export.fusion import Cloud
-    from ..export.sights import Sights
-    from ..export.witness import Witnesses
+    from ..export.colours import Coloured, Witnesses
+    from ..export.depth_maps import Sights
+    from ..export.point_cloud import Cloud
     from ..style.files import StyleFile
     from ..training.loading import Trained
 
@@ -130,8 +128,7 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
     """Everything that is made of surfaces."""
     if not {"ply", "splat", "glb"} & set(what.kinds):
         return {}
-    from ..export.fusion import fuse
-    from ..export.points import origin_of
+    from ..export.point_cloud import fuse, origin_of
 
     sights = _sights(trained, config, display)
     counts: dict[str, int] = {}
@@ -160,7 +157,7 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
 
 
 def _sights(trained: "Trained", config: ExportConfig, display: Display) -> "Sights":
-    from ..export.depths import chosen, reach_of, render_sights
+    from ..export.depth_maps import chosen, reach_of, render_sights
 
     known = trained.known
     return render_sights(
@@ -178,11 +175,9 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     """Points and splats: one geometry, a colour set for each look."""
     import torch
 
-    from ..export.fusion import Cloud, joined
-    from ..export.points import write_points
-    from ..export.sky import dome
+    from ..export.colours import alone, expected_presence, witnesses
+    from ..export.point_cloud import Cloud, dome, joined, write_points
     from ..export.splats import discs, write_gaussians, write_splat
-    from ..export.witness import alone, expected_presence, witnesses
 
     kinds = place.what.kinds
     seen = witnesses(place.sights, cloud.point, cloud.normal, cloud.edge, config.witnesses)
@@ -211,8 +206,8 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
 
 def _mesh(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
     """The mesh in both formats, a file for each look."""
+    from ..export.colours import witnesses
     from ..export.mesh import build_mesh, write_mesh_glb, write_mesh_ply
-    from ..export.witness import witnesses
 
     mesh = build_mesh(
         place.sights,

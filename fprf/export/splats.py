@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..io.atomic import write_bytes
-from .fusion import Cloud
-from .ply import write_ply
+from .point_cloud import Cloud, write_ply
 
 __all__ = ["Splats", "discs", "facing", "write_gaussians", "write_splat"]
 

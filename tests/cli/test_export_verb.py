@@ -10,7 +10,7 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.export.config import ExportConfig
-from fprf.export.depths import render_sights
+from fprf.export.depth_maps import render_sights
 
 LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0"]
 """The tiny model has barely begun to agree with itself."""

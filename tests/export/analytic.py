@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from fprf.export.sights import Sights
+from fprf.export.depth_maps import Sights
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 
 __all__ = ["RADIUS", "globe", "looking", "plane_depth", "ring", "sphere_depth"]

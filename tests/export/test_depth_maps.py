@@ -6,9 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.export.colours import Coloured, seen_colours
-from fprf.export.depths import chosen, half_way, reach_of, render_sights
-from fprf.export.witness import alone
+from fprf.export.colours import Coloured, alone, seen_colours
+from fprf.export.depth_maps import chosen, half_way, reach_of, render_sights
 from fprf.rendering.cameras import pixel_grid, rays_through
 from fprf.rendering.renderer import Restyle
 from fprf.rendering.space import Space

@@ -6,9 +6,8 @@ import torch
 from analytic import RADIUS, globe
 
 from fprf.errors import DataError
-from fprf.export.fusion import Cloud, fuse, joined, partners
-from fprf.export.sights import Sights, surface
-from fprf.export.voxels import cells, keys
+from fprf.export.depth_maps import Sights, surface
+from fprf.export.point_cloud import Cloud, cells, fuse, joined, keys, partners
 
 
 def fused(sights: Sights, **changes: object) -> Cloud:

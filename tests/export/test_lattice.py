@@ -3,7 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.export.lattice import apply_lattice, fit_lattice, identity
+from fprf.export.lut import apply_lattice, fit_lattice, identity
 
 FEW = settings(deadline=None, max_examples=15)
 seeds = st.integers(0, 2**31)

@@ -6,8 +6,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.export.lattice import apply_lattice, identity
-from fprf.export.lut import Pairs, fit_quality, look_pairs, write_cube
+from fprf.export.lut import Pairs, apply_lattice, fit_quality, identity, look_pairs, write_cube
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.renderer import Restyle
 from fprf.training.loading import load_style

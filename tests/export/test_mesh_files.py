@@ -10,11 +10,19 @@ from analytic import RADIUS, globe
 from rasters import draw_points, draw_triangles, psnr
 
 from fprf.errors import DataError
-from fprf.export.fusion import fuse
-from fprf.export.glb import linear
-from fprf.export.mesh import Mesh, build_mesh, components, vertex_normals, write_mesh_glb, write_mesh_ply
-from fprf.export.surface_nets import surface_nets
-from fprf.export.tsdf import around, integrate
+from fprf.export.mesh import (
+    Mesh,
+    around,
+    build_mesh,
+    components,
+    integrate,
+    linear,
+    surface_nets,
+    vertex_normals,
+    write_mesh_glb,
+    write_mesh_ply,
+)
+from fprf.export.point_cloud import fuse
 
 ZERO = torch.zeros(3, dtype=torch.float64)
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import UsageError
-from fprf.export.plan import KINDS, look_file, plan
+from fprf.export.config import KINDS, look_file, plan
 
 
 def test_a_folder_takes_all_kinds_or_those_that_are_named(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splatter import table
 
-from fprf.export.ply import write_ply
+from fprf.export.point_cloud import write_ply
 
 KINDS = ("f4", "f8", "u1", "i4")
 

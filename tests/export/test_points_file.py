@@ -5,8 +5,7 @@ import torch
 import trimesh
 from analytic import globe
 
-from fprf.export.fusion import fuse
-from fprf.export.points import origin_of, told, write_points
+from fprf.export.point_cloud import fuse, origin_of, told, write_points
 
 
 def test_trimesh_reads_points_colours_and_normals(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from analytic import RADIUS, globe, plane_depth, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.export.sights import Sights, gaps, surface
+from fprf.export.depth_maps import Sights, gaps, surface
 from fprf.rendering.cameras import pixel_grid, rays_through
 
 angle = st.floats(-1.0, 1.0)

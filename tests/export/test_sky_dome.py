@@ -1,8 +1,7 @@
 import torch
 from analytic import globe
 
-from fprf.export.fusion import fuse
-from fprf.export.sky import dome
+from fprf.export.point_cloud import dome, fuse
 from fprf.rendering.cameras import pixel_grid, rays_through
 
 

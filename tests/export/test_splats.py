@@ -10,9 +10,8 @@ from splatter import draw, matrices, read_gaussians, read_splat, table
 
 from fprf.datamanagers.images import load_images
 from fprf.datamanagers.parsers.recognise import parse_scene
-from fprf.export.fusion import Cloud, fuse, joined
-from fprf.export.sights import Sights
-from fprf.export.sky import dome
+from fprf.export.depth_maps import Sights
+from fprf.export.point_cloud import Cloud, dome, fuse, joined
 from fprf.export.splats import discs, facing, write_gaussians, write_splat
 from fprf.rendering.cameras import project
 from fprf.town.write import read_truth, write_town

@@ -2,7 +2,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.export.voxels import LEVELS, SPAN, cells, finest_alone, keys, pooled, spacing
+from fprf.export.point_cloud import LEVELS, SPAN, cells, finest_alone, keys, pooled, spacing
 
 seeds = st.integers(0, 2**31)
 

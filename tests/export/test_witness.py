@@ -6,9 +6,8 @@ from analytic import RADIUS, globe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.export.depths import half_way
-from fprf.export.sights import gaps
-from fprf.export.witness import alone, expected_presence, witnesses
+from fprf.export.colours import alone, expected_presence, witnesses
+from fprf.export.depth_maps import gaps, half_way
 
 
 def sphere(count: int, seed: int) -> torch.Tensor:
