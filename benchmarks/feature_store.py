@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fprf.datamanagers import store_files
+from fprf.datamanagers import features as store_files
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.features import extract
 from fprf.datamanagers.images import load_image

@@ -25,8 +25,8 @@ import numpy as np
 
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import train_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.parsers.files import read_json
-from fprf.datamanagers.parsers.recognise import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.evaluation.judge import judge
 from fprf.evidence.provenance import commit

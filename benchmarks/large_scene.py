@@ -28,8 +28,7 @@ from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_image
-from fprf.datamanagers.parsers.config import TownConfig
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import TownConfig, parse_scene
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.layouts import SingleConfig, StreetConfig
 from fprf.io.images import to_uint8, write_image

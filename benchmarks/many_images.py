@@ -49,9 +49,9 @@ def part(folder: Path, cache: Path, limit: int, batches: int, held: bool) -> dic
     import torch
 
     from fprf.datamanagers import batches as module
+    from fprf.datamanagers.batches import room_for
     from fprf.datamanagers.config import RayBatchesConfig
-    from fprf.datamanagers.parsers.recognise import parse_scene
-    from fprf.datamanagers.pixel_file import room_for
+    from fprf.datamanagers.parsers.config import parse_scene
 
     scene = parse_scene(folder, 1, None)
     if held:

@@ -22,7 +22,7 @@ from town_references import town_reference
 
 from fprf.cli.parsing import parse
 from fprf.datamanagers.images import load_image
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import UsageError
 from fprf.io.atomic import write_json
 from fprf.io.images import to_uint8, write_image

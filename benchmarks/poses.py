@@ -26,7 +26,7 @@ from torch import Tensor
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.evaluation.alignment import align
 from fprf.evaluation.judge import judge
 from fprf.process import keep_memory

@@ -19,7 +19,7 @@ from torch import Tensor
 from fprf.benchmarking.report import machine
 from fprf.benchmarking.training import batch_rays
 from fprf.config import TrainConfig
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.atomic import write_json
 from fprf.ops.backend import plain
 from fprf.rendering.renderer import render_rays

@@ -15,7 +15,7 @@ from torch import Tensor
 from town_references import SETS, town_reference
 
 from fprf.datamanagers.images import load_image
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 from fprf.evaluation.consistency import consistency
 from fprf.evaluation.contest import PLAIN, STYLIZERS, Exhibit, Row, colour_baselines, judge_exhibit

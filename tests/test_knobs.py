@@ -18,7 +18,7 @@ from tiny_world import World, trained_for
 from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
 from fprf.datamanagers.batches import RayBatches
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import ConfigError
 from fprf.io.images import write_image
 from fprf.methods import fprf_lite

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from ..datamanagers.scene import Scene
-from ..datamanagers.sightings import find_sightings
+from ..datamanagers.scene import Scene, find_sightings
 from ..errors import ConfigError
 from ..fields.layouts import LayoutConfig
 from ..rendering.space import Space

@@ -9,8 +9,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..datamanagers.scene import Scene
-from ..datamanagers.sightings import Sightings
+from ..datamanagers.scene import Scene, Sightings
 from ..errors import DataError
 from ..rendering.bounds import FAR, NEAR, ROUNDING, axes
 from ..rendering.cameras import Cameras

@@ -10,8 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..datamanagers.scene import Scene
-from ..datamanagers.sightings import TILES, Sightings, tile_of
+from ..datamanagers.scene import TILES, Scene, Sightings, tile_of
 from ..rendering.cameras import rays_through
 from ..rendering.space import Space
 from ..types import Boxes

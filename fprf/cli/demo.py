@@ -46,8 +46,7 @@ def run(args: list[str]) -> int:
     config = parse(DemoConfig(), args, prog="fprf demo", description="Train, restyle and show the embedded scene.")
     start = time.perf_counter()
     from ..datamanagers.config import RayBatchesConfig
-    from ..datamanagers.parsers.config import TownConfig
-    from ..datamanagers.parsers.recognise import parse_scene
+    from ..datamanagers.parsers.config import TownConfig, parse_scene
     from ..evaluation.judge import judge
     from ..fields.config import PlanesConfig
     from ..io.atomic import write_json

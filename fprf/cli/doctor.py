@@ -203,8 +203,7 @@ def _version(package: str) -> str:
 
 def scene_folder(data: Path) -> Iterator[Finding]:
     """Format, views, sizes and splits of a scene. Raises DataError where it cannot be parsed."""
-    from ..datamanagers.parsers.config import DataParserConfig
-    from ..datamanagers.parsers.recognise import recognise
+    from ..datamanagers.parsers.config import DataParserConfig, recognise
 
     parser = recognise(data)
     yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))

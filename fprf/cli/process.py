@@ -42,11 +42,9 @@ def run(args: list[str]) -> int:
     if find_spec("pycolmap") is None:
         raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
     from ..io.atomic import write_json
-    from ..reconstruction.database import Tables
-    from ..reconstruction.gather import gather
-    from ..reconstruction.place import Place, State
-    from ..reconstruction.report import report
-    from ..reconstruction.steps import find_features, find_matches, find_poses
+    from ..reconstruction.colmap import Tables, find_features, find_matches, find_poses
+    from ..reconstruction.images import gather
+    from ..reconstruction.scene_folder import Place, State, report
 
     place = Place(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
     state = State.load(place)
@@ -67,7 +65,7 @@ def run(args: list[str]) -> int:
 
 
 def _print(content: dict[str, Any], root: Path) -> None:
-    from ..reconstruction.report import summary
+    from ..reconstruction.scene_folder import summary
 
     console = Console(highlight=False)
     images = content["images"]
@@ -90,7 +88,7 @@ def _print(content: dict[str, Any], root: Path) -> None:
 
 def _check(root: Path) -> None:
     """Read the scene as training will, and print the commands that come next. Raises DataError where it cannot be read."""
-    from ..datamanagers.parsers.recognise import parse_scene
+    from ..datamanagers.parsers.config import parse_scene
     from ..training.prepare import with_downscale
     from .train import default_output
 

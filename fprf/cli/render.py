@@ -97,8 +97,7 @@ def run(args: list[str]) -> int:
 def film(config: RenderVerbConfig, file: "StyleFile") -> None:
     """Film a run of fields."""
     from ..datamanagers.images import load_image
-    from ..io.resumed import missing
-    from ..io.video import FILMS, write_video
+    from ..io.video import FILMS, missing, write_video
     from ..training.loading import load_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
@@ -137,9 +136,8 @@ def _render(
     display: Display,
 ) -> None:
     """Render the frames that are missing, each written as soon as it is done."""
-    from ..io.exr import write_exr
-    from ..io.images import write_image
-    from ..io.panels import beside, wiped
+    from ..io.images import write_exr, write_image
+    from ..io.sheet import beside, wiped
     from ..training.footage import limits_of, panels, planes
 
     eyes = config.eyes if config.lens == "stereo" else None

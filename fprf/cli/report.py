@@ -40,8 +40,7 @@ def run(args: list[str]) -> int:
     config = parse(ReportConfig(), args, prog="fprf report", description=description, positional=("run",))
     if not config.run.is_dir():
         raise CheckpointError(f"{config.run}: no such folder; give a run folder, as `fprf train` makes it")
-    from ..io.chart import bars
-    from ..io.report_page import write_report
+    from ..io.report import bars, write_report
     from ..training.events import read_history
 
     histories = read_history(config.run)
@@ -59,7 +58,7 @@ def run(args: list[str]) -> int:
     _print(histories, parts, notes)
     print(f"charts in {output}")
     if config.tensorboard is not None:
-        from ..io.tensorboard import write_scalars
+        from ..io.report import write_scalars
 
         count = write_scalars(config.tensorboard, histories)
         print(f"{count} values in {config.tensorboard}: tensorboard --logdir {config.tensorboard}")
@@ -68,7 +67,7 @@ def run(args: list[str]) -> int:
 
 def _charts(histories: "Sequence[History]") -> list[str]:
     """PSNR, speed, and every loss."""
-    from ..io.chart import Series, lines
+    from ..io.report import Series, lines
 
     names = list(dict.fromkeys(name for history in histories for name in history.values))
     made = []
@@ -118,8 +117,8 @@ def _parts(run: Path, histories: "Sequence[History]") -> list[tuple[str, float]]
 
 
 def _print(histories: "Sequence[History]", parts: list[tuple[str, float]], notes: list[str]) -> None:
-    from ..io.chart import spark
     from ..io.figures import number
+    from ..io.report import spark
 
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
     for history in histories:

@@ -78,9 +78,8 @@ class SplatVerbs(Verbs):
         from ..datamanagers.images import load_image
         from ..io.images import to_uint8, write_image
         from ..io.maps import depth_image
-        from ..io.panels import beside
-        from ..io.resumed import missing
-        from ..io.video import write_video
+        from ..io.sheet import beside
+        from ..io.video import missing, write_video
         from ..splats.training import draw_view, load_trained
         from .render import camera_path
 

@@ -3,11 +3,16 @@
 A batch is a pure function of (seed, step): its generator is seeded by BLAKE2b of the two, so any step can be drawn without the
 ones before, a resumed run sees the same pixels, and neighbouring seeds or steps share nothing. A GPU that holds the images
 draws with a generator of its own: the same on every run there, but other pixels than on the CPU.
+
+Pixels of many images lie in a mapped file without a name, which ends with its process: the system keeps of it what memory there
+is to spare, so thousands of images need not fit.
 """
 
 import copy
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -18,17 +23,95 @@ from torch import Tensor
 
 from ..errors import DataError
 from ..interfaces import DataManager, Encoder
+from ..io.atomic import unwritable
 from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
 from .features import FeatureStore, Progress, extract
 from .images import load_image, load_images, load_mask
-from .pixel_file import room_for
-from .runs import Runs
-from .scene import Scene
-from .sightings import find_sightings
+from .scene import Scene, find_sightings
 
-__all__ = ["RayBatches", "generator_of"]
+__all__ = ["HELD", "RayBatches", "Runs", "generator_of", "room_for"]
+
+
+HELD = 512 * 2**20
+"""Bytes of pixels that are simply held in memory."""
+
+
+def room_for(pixels: int, folder: Path, held: int = HELD) -> Annotated[Tensor, "P 3"]:
+    """Space for so many pixels, uint8, to be written to; mapped from a file in `folder` above `held` bytes.
+
+    Raises DataError where the disk has no room for it.
+    """
+    size = 3 * pixels
+    if size <= held:
+        return torch.empty(pixels, 3, dtype=torch.uint8)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            _reserve(file.fileno(), size)
+            mapped = np.memmap(file, dtype=np.uint8, mode="r+", shape=(pixels, 3))
+    except OSError as error:
+        raise unwritable(folder, error, size) from error
+    return torch.from_numpy(np.asarray(mapped))
+
+
+def _reserve(file: int, size: int) -> None:
+    """Blocks for the whole file now: a write to a mapped file that the disk has no room for would end the process."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.ftruncate(file, size)
+
+
+class Runs:
+    """A set of numbers of 0 to 2^63, as K runs that neither touch nor overlap, in order."""
+
+    def __init__(self, start: Annotated[Tensor, "K"], length: Annotated[Tensor, "K"]) -> None:
+        self._start = start
+        self._after = length.cumsum(0)
+        self._before = self._after - length
+        self._count = int(self._after[-1]) if len(start) else 0
+
+    @staticmethod
+    def of(masks: Iterable[tuple[int, Annotated[Tensor, "P"]]]) -> "Runs":
+        """Of masks, each with the number of its first entry, which rise; a run may go on from one mask to the next."""
+        starts, ends = [], []
+        for first, mask in masks:
+            edge = torch.zeros(1, dtype=torch.bool)
+            change = torch.cat([edge, mask.reshape(-1), edge]).diff().nonzero()[:, 0] + first
+            starts.append(change[::2])
+            ends.append(change[1::2])
+        none = torch.zeros(0, dtype=torch.int64)
+        start, end = torch.cat([none, *starts]), torch.cat([none, *ends])
+        apart = torch.ones(len(start) + 1, dtype=torch.bool)
+        apart[1:-1] = start[1:] != end[:-1]
+        start, end = start[apart[:-1]], end[apart[1:]]
+        return Runs(start, end - start)
+
+    def __len__(self) -> int:
+        """How many numbers there are."""
+        return self._count
+
+    def to(self, device: torch.device) -> "Runs":
+        """The same set on a device."""
+        there = copy.copy(self)
+        there._start, there._after, there._before = (x.to(device) for x in (self._start, self._after, self._before))
+        return there
+
+    def pick(self, rank: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R"]:
+        """The numbers of these ranks, 0 <= rank < len: the first, second ... of the set."""
+        run = torch.searchsorted(self._after, rank, right=True)
+        return self._start[run] + rank - self._before[run]
+
+    def holds(self, number: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R"]:
+        """Which numbers are in the set."""
+        if not len(self._start):
+            return torch.zeros_like(number, dtype=torch.bool)
+        run = (torch.searchsorted(self._start, number, right=True) - 1).clamp_min(0)
+        apart = number - self._start[run]
+        return (apart >= 0) & (apart < self._after[run] - self._before[run])
+
 
 # Images decoded at a time (in threads) before they are copied together.
 DECODE = 16
@@ -80,7 +163,7 @@ class _Source(NamedTuple):
 class RayBatches(DataManager):
     """Pixels drawn uniformly, with replacement, from all pixels of the training views.
 
-    Images are held as uint8, one after the other, in a mapped file where they are many (`pixel_file`); feature coefficients
+    Images are held as uint8, one after the other, in a mapped file where they are many; feature coefficients
     stay in mapped files under `cache`. Pixels that a capture's masks leave out are never drawn. Transparent ones show the
     background, white by default. `progress(done, total, what)` is told how far features are.
     """

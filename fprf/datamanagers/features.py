@@ -1,34 +1,186 @@
 """Feature targets of every view of a scene, at any pixel, for a few megabytes an image.
 
-Extraction runs the encoder once a view at the image's own size and keeps guided-filter coefficients (`ops.guided`) in files
-(`store_files`); `FeatureStore.at` reads the cells around the pixels of a batch and applies them. Full-size feature maps
+Extraction runs the encoder once a view at the image's own size and keeps guided-filter coefficients (`ops.guided`) in half
+precision in files; `FeatureStore.at` reads the cells around the pixels of a batch and applies them. Full-size feature maps
 never exist. Semantic features are projected on principal components of the training views before they are kept.
+
+A file is named by the hash of everything that it was made from, holds a checksum of what it should contain, and appears
+under its name only when it is whole. So whatever an interrupted run, a second writer or a bad disk leaves behind is either
+right or made again; nothing is ever found by position.
+
+Half precision keeps 11 bits of each number, so numbers are made small first: b is taken at mid-grey (colours are then in
+[-0.5, 0.5]) and relative to its mean, and each channel is divided by its largest coefficient.
 """
 
+import contextlib
 import copy
+import hashlib
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+import os
+import time
+import zlib
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
+import safetensors
+import safetensors.torch
 import torch
+import torch.nn.functional as F
+from safetensors import SafetensorError
 from torch import Tensor
 
 from ..errors import DataError, NumericsError, PluginError
 from ..interfaces import Encoder
-from ..io.atomic import write_json
+from ..io.atomic import atomic_path, write_json
 from ..ops import guided
-from . import store_files
 from .basis import Basis, fit_basis
 from .config import GuidedConfig
-from .store_files import Entry
 
 if TYPE_CHECKING:
     from ..ops.guided_kernels import ViewTable
 
-__all__ = ["FeatureStore", "Progress", "extract"]
+__all__ = [
+    "GREY",
+    "LANES",
+    "Entry",
+    "FeatureStore",
+    "Progress",
+    "digest",
+    "extract",
+    "keep_within",
+    "pack",
+    "read_entry",
+    "read_tensors",
+    "remove_stale",
+    "write_entry",
+    "write_tensors",
+]
+
+
+GREY = 0.5
+LANES = 8
+# Part of every key: raise it when the same inputs give other files.
+FORMAT = "fprf-features-1"
+# Stored numbers stay within +-TOP: far from half precision's 65504, and its 24 bits below 1 are left for the small ones.
+TOP = 4096.0
+
+
+class Entry(NamedTuple):
+    """A view's features: F = scale (A (I - GREY) + b) + centre, with A and b interpolated over s x t cells."""
+
+    coefs: Annotated[Tensor, "s t 4 P"]
+    """float16: A for red, green, blue, then b; P is C rounded up to a multiple of LANES, zeros beyond C."""
+    scale: Annotated[Tensor, "C"]
+    centre: Annotated[Tensor, "C"]
+    size: Annotated[Tensor, "2"]
+    """Height, width of the image in pixels, int64."""
+    moments: Annotated[Tensor, "2 C"]
+    """Mean and variance of the features over the view's pixels, float64."""
+
+    def plain(self) -> Annotated[Tensor, "s t C 4"]:
+        """The coefficients as `ops.guided.coefficients` gives them, float32."""
+        channels = len(self.scale)
+        coefs = self.coefs[..., :channels].float() * self.scale
+        coefs[..., 3, :] += self.centre - GREY * coefs[..., :3, :].sum(2)
+        return coefs.transpose(2, 3)
+
+
+def pack(coefs: Annotated[Tensor, "s t C 4"], size: tuple[int, int]) -> Entry:
+    """Coefficients of `ops.guided` in storage form; moments are zero until somebody measures them."""
+    channels = coefs.shape[2]
+    runs = coefs.detach().cpu().float().transpose(2, 3).clone()
+    runs[..., 3, :] += GREY * runs[..., :3, :].sum(2)
+    centre = runs[..., 3, :].mean((0, 1))
+    runs[..., 3, :] -= centre
+    scale = runs.abs().amax((0, 1, 2)) / TOP
+    scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+    halves = F.pad(runs / scale, (0, -channels % LANES)).half()
+    return Entry(halves, scale, centre, torch.tensor(size), torch.zeros(2, channels, dtype=torch.float64))
+
+
+def digest(*parts: str | bytes) -> str:
+    """SHA-256 of the parts and the format, as 32 hexadecimal digits; parts cannot run into each other."""
+    state = hashlib.sha256(FORMAT.encode())
+    for part in parts:
+        data = part.encode() if isinstance(part, str) else part
+        state.update(len(data).to_bytes(8, "little"))
+        state.update(data)
+    return state.hexdigest()[:32]
+
+
+def write_entry(folder: Path, key: str, entry: Entry) -> None:
+    """Keep an entry under its key, whole or not at all."""
+    write_tensors(folder, key, entry._asdict())
+
+
+def read_entry(folder: Path, key: str) -> Entry | None:
+    """The memory-mapped entry of a key; None where it is absent or not what it should be."""
+    tensors = read_tensors(folder, key)
+    return Entry(**tensors) if tensors is not None and tensors.keys() == set(Entry._fields) else None
+
+
+def write_tensors(folder: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
+    """Named tensors in FOLDER/KEY.safetensors with key and checksum."""
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with atomic_path(folder / f"{key}.safetensors") as temporary:
+        safetensors.torch.save_file(plain, temporary, metadata={"key": key, "crc32": str(_checksum(plain))})
+
+
+def read_tensors(folder: Path, key: str) -> dict[str, Tensor] | None:
+    """What `write_tensors` wrote under the key; None where it is absent, damaged or of another key."""
+    path = folder / f"{key}.safetensors"
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError):
+        return None
+    with contextlib.suppress(OSError):  # a cache that is only read; its order of use is then not known
+        os.utime(path)
+    right = metadata.get("key") == key and metadata.get("crc32") == str(_checksum(tensors))
+    return tensors if right else None
+
+
+def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
+    """Delete the files that were used longest ago until at most `size` bytes are left, but none whose key is in `used`.
+
+    Whoever has one mapped keeps it on POSIX; on Windows it stays.
+    """
+    files = []
+    for path in folder.glob("[!.]*.safetensors"):
+        with contextlib.suppress(OSError):  # another process was first
+            files.append((path.stat().st_mtime, path.stat().st_size, path))
+    total = sum(bytes_of for _, bytes_of, _ in files)
+    for _, bytes_of, path in sorted(files):
+        if total <= size:
+            return
+        if path.stem not in used:
+            with contextlib.suppress(OSError):
+                path.unlink()
+                total -= bytes_of
+
+
+def remove_stale(folder: Path, hours: float = 1.0) -> None:
+    """Delete unfinished files of processes that died; younger ones may belong to a living writer."""
+    for path in folder.glob(".*.safetensors"):
+        try:
+            if time.time() - path.stat().st_mtime > 3600 * hours:
+                path.unlink()
+        except OSError:  # another process was first
+            continue
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> int:
+    result = 0
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        result = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), result)
+        result = zlib.crc32(tensor.reshape(-1).view(torch.uint8).numpy().data, result)
+    return result
+
 
 Progress = Callable[[int, int, str], None]
 """Told (done, total, what)."""
@@ -101,7 +253,7 @@ class FeatureStore:
         checked, since the host would wait.
         """
         if self._packed is not None and view.device == self._numbers.device:
-            return guided.apply_packed(self._packed, self._numbers[view], pixel, rgb, grey=store_files.GREY)
+            return guided.apply_packed(self._packed, self._numbers[view], pixel, rgb, grey=GREY)
         views, found = np.unique(view.detach().cpu().numpy(), return_inverse=True)
         missing = [v for v in views.tolist() if v not in self._slots]
         if missing:
@@ -116,7 +268,7 @@ class FeatureStore:
         from ..ops.guided_kernels import gather_views
 
         assert self._table is not None
-        gather_views(self._table, slot.numpy(), pixel.numpy(), (rgb - store_files.GREY).numpy(), out.numpy())
+        gather_views(self._table, slot.numpy(), pixel.numpy(), (rgb - GREY).numpy(), out.numpy())
 
     def _plain(self, slot: Tensor, pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
         for number, entry in enumerate(self._entries.values()):
@@ -143,12 +295,12 @@ def extract(
     NumericsError where the encoder's features are not finite, PluginError where they are not of the shape it promises.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    store_files.remove_stale(folder)
+    remove_stale(folder)
     prints = {view: _fingerprint(image(view)) for view in views}
     remembered: dict[int, Tensor] = {}
     if basis is None and dim is not None:
         basis = _basis(folder, prints, image, encoder, dim, remembered)
-    projection = store_files.digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
+    projection = digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
     entries: dict[int, Entry] = {}
     keys = {}
     for done, view in enumerate(views):
@@ -157,18 +309,18 @@ def extract(
         pixels = image(view)
         radius, stride = _window(config, pixels.shape)
         settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
-        keys[view] = key = store_files.digest(prints[view], encoder.identity, settings, projection)
-        entry = store_files.read(folder, key)
+        keys[view] = key = digest(prints[view], encoder.identity, settings, projection)
+        entry = read_entry(folder, key)
         if entry is None:
             features = remembered.get(view)
             features = _encode(encoder, pixels, view) if features is None else features
             made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)
-            store_files.write(folder, key, made)
+            write_entry(folder, key, made)
             # Read back: what trains is what lies on disk, mapped rather than held in memory.
-            entry = store_files.read(folder, key) or made
+            entry = read_entry(folder, key) or made
         remembered.pop(view, None)
         entries[view] = entry
-    store_files.keep_within(folder, CACHED_BYTES, set(keys.values()))
+    keep_within(folder, CACHED_BYTES, set(keys.values()))
     if progress is not None:
         progress(len(views), len(views), f"features of {encoder.identity}")
     store = FeatureStore(entries, basis)
@@ -181,7 +333,7 @@ def extract(
         "energy": basis.energy if basis is not None else 1.0,
         "files": {str(view): key for view, key in keys.items()},
     }
-    write_json(folder / f"manifest-{store_files.digest(*keys.values())}.json", manifest)
+    write_json(folder / f"manifest-{digest(*keys.values())}.json", manifest)
     return store
 
 
@@ -192,7 +344,7 @@ def _window(config: GuidedConfig, shape: Sequence[int]) -> tuple[int, int]:
 
 
 def _fingerprint(pixels: Annotated[Tensor, "H W 3"]) -> str:
-    return store_files.digest(str(tuple(pixels.shape)), pixels.contiguous().numpy().tobytes())
+    return digest(str(tuple(pixels.shape)), pixels.contiguous().numpy().tobytes())
 
 
 @torch.no_grad()
@@ -216,7 +368,7 @@ def _make(features: Tensor, pixels: Tensor, basis: Basis | None, *, radius: int,
         features = basis.project(features.movedim(0, -1)).movedim(-1, 0)
     guide = pixels.float() / 255
     size = (int(pixels.shape[0]), int(pixels.shape[1]))
-    entry = store_files.pack(guided.coefficients(features, guide, radius=radius, eps=eps, stride=stride), size)
+    entry = pack(guided.coefficients(features, guide, radius=radius, eps=eps, stride=stride), size)
     at = torch.randint(size[0] * size[1], (MOMENT_PIXELS,), generator=torch.Generator().manual_seed(0))
     pixel = torch.stack([at % size[1], at // size[1]], 1) + 0.5
     values = guided.apply(entry.plain(), pixel, guide.reshape(-1, 3)[at], size).double()
@@ -234,8 +386,8 @@ def _basis(
     """Fitted on cells drawn from up to BASIS_VIEWS views, spread evenly; kept in a file of its own."""
     views = list(prints)
     chosen = views[:: max(1, -(-len(views) // BASIS_VIEWS))]
-    key = store_files.digest("basis", str(dim), str(BASIS_CELLS), encoder.identity, *(prints[view] for view in chosen))
-    kept = store_files.read_tensors(folder, key)
+    key = digest("basis", str(dim), str(BASIS_CELLS), encoder.identity, *(prints[view] for view in chosen))
+    kept = read_tensors(folder, key)
     if kept is not None:
         return Basis.from_tensors(kept)
     generator = torch.Generator().manual_seed(0)
@@ -249,7 +401,7 @@ def _basis(
         count = min(len(cells), max(1, BASIS_CELLS // len(chosen)))
         samples.append(cells[torch.randperm(len(cells), generator=generator)[:count]])
     basis = fit_basis(torch.cat(samples), dim)
-    store_files.write_tensors(folder, key, basis.tensors())
+    write_tensors(folder, key, basis.tensors())
     return basis
 
 

@@ -1,14 +1,24 @@
-"""A parsed scene: where its images lie, how they were taken, what is for training. No image is decoded yet."""
+"""A parsed scene: where its images lie, how they were taken, what is for training, which sparse points its views see.
 
-from dataclasses import dataclass
+Reconstructions say which views see a point. Where one does not, points are projected and only the nearest layer counts: in each
+tile of an image those no farther than LAYER times the nearest. It takes the wall before the street behind it.
+
+Exposure is measured where several views see the same point. A sighting's brightness is b = g(view) + a(point) in the logarithm
+of sRGB; least squares gives both, twice: the second time without outliers (highlights, points that something hides).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
+import torch
 from torch import Tensor
 
-from ..rendering.cameras import Cameras
+from ..rendering.cameras import Cameras, project
 
-__all__ = ["Scene"]
+__all__ = ["DIFFERENT", "GAMMA", "Scene", "Sightings", "differ", "find_sightings", "tile_of", "with_exposure"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,3 +47,170 @@ class Scene:
     """The same of sky, which is white."""
     alpha: bool = False
     """Images carry transparency."""
+
+
+TILES = 16
+"""Tiles across the longer side of an image."""
+LAYER = 1.15
+"""Points up to so many times the nearest distance in their tile are seen."""
+PROJECTIONS = 1 << 26
+"""Points are thinned so that no more projections than these are made."""
+
+
+class Sightings(NamedTuple):
+    """O sightings of points by training views, in the order of the views; float64."""
+
+    view: Annotated[Tensor, "O"]
+    """int64 index of the view in the scene."""
+    point: Annotated[Tensor, "O 3"]
+    """In the world."""
+    pixel: Annotated[Tensor, "O 2"]
+    """x, y, inside the image."""
+    distance: Annotated[Tensor, "O"]
+    """World distance from the camera, along the ray."""
+
+
+def find_sightings(scene: Scene) -> Sightings | None:
+    """The sightings of the training views; None without sparse points or where none is in any view."""
+    if scene.points is None or not len(scene.points):
+        return None
+    if scene.seen is not None:
+        members = torch.zeros(len(scene.cameras), dtype=torch.bool)
+        members[scene.train] = True
+        kept = scene.seen[members[scene.seen[:, 0]]]
+        kept = kept[kept[:, 0].argsort(stable=True)]
+        found = _sighted(scene.cameras, kept[:, 0], scene.points[kept[:, 1]])
+    else:
+        points = scene.points[:: max(1, len(scene.points) * len(scene.train) // PROJECTIONS)]
+        parts = [_nearest(scene.cameras, view, points) for view in scene.train.tolist()]
+        found = Sightings(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    return found if len(found.view) else None
+
+
+def tile_of(cameras: Cameras, view: Annotated[Tensor, "O"], pixel: Annotated[Tensor, "O 2"]) -> Annotated[Tensor, "O 2"]:
+    """Column and row of the tile that a pixel lies in: TILES along the longer side, square."""
+    size = cameras.size[view]
+    side = size.amax(-1, keepdim=True).double() / TILES
+    return torch.minimum((pixel / side).long(), ((size.double() / side).ceil().long() - 1)).clamp_min(0)
+
+
+def _sighted(cameras: Cameras, view: Tensor, points: Tensor) -> Sightings:
+    """Those of the pairs whose point falls into its image."""
+    pixel, depth = project(cameras, view, points)
+    size = cameras.size[view].to(pixel)
+    inside = (depth > 0) & ((pixel >= 0) & (pixel < size)).all(1)  # NaN is never inside
+    distance = (points - cameras.pose[view, :, 3]).norm(dim=-1)
+    return Sightings(view[inside], points[inside], pixel[inside], distance[inside])
+
+
+def _nearest(cameras: Cameras, view: int, points: Tensor) -> Sightings:
+    """The nearest layer of all points in a view."""
+    found = _sighted(cameras, torch.full((len(points),), view), points)
+    column, row = tile_of(cameras, found.view, found.pixel).unbind(1)
+    tile = row * TILES + column
+    least = found.distance.new_full((TILES * TILES,), torch.inf).scatter_reduce(0, tile, found.distance, "amin")
+    front = found.distance <= LAYER * least[tile]
+    return Sightings(*(x[front] for x in found))
+
+
+GAMMA = 1 / 2.2
+"""Light is in proportion to exposure, sRGB to about this power of light."""
+DIFFERENT = 0.08
+"""Standard deviation of the views' brightness, in the logarithm of sRGB, above which exposures differ."""
+LEAST = 16
+"""Sightings of a view that its exposure is measured from, at least."""
+MOST = 1 << 19
+"""Pairs of a view and a point that are looked at, about."""
+DARK, BRIGHT = 0.03, 0.97
+"""sRGB outside of which a pixel says nothing: noise, or clipped."""
+
+
+def differ(exposure: Annotated[Tensor, "V"] | None) -> bool:
+    """Whether views were taken so differently that each needs a factor of its own; not where nothing is known."""
+    return exposure is not None and len(exposure) > 1 and GAMMA * float(exposure.log().std()) > DIFFERENT
+
+
+def with_exposure(scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]]) -> Scene:
+    """The scene with the exposure of its views, measured where the capture does not say it; unchanged without points.
+
+    `image(view)` is a training view, in [0, 1]. Held-out views take the mean of their neighbours in the order of names, as far
+    as training views resemble theirs: pictures taken one after the other do, those of a collection do not.
+    """
+    if scene.exposure is not None or len(scene.train) < 2:
+        return scene
+    sightings = find_sightings(_sparser(scene))
+    gain = None if sightings is None else _gains(sightings, scene, image)
+    if gain is None:
+        return scene
+    train = scene.train.sort().values
+    gain[train] -= gain[train].mean()
+    # Correlation of neighbours, from the squares of their differences: 0 where the order says nothing.
+    alike = (1 - gain[train].diff().square().mean() / (2 * gain[train].var()).clamp_min(1e-12)).clamp(0, 1)
+    after = torch.searchsorted(train, scene.test)
+    before, after = train[(after - 1).clamp_min(0)], train[after.clamp_max(len(train) - 1)]
+    gain[scene.test] = alike * (gain[before] + gain[after]) / 2
+    return replace(scene, exposure=(gain / GAMMA).exp())
+
+
+def _sparser(scene: Scene) -> Scene:
+    """The scene with every n-th point, so that about MOST pairs are left."""
+    if scene.points is None:
+        return scene
+    step = -(-(len(scene.points) * len(scene.train) if scene.seen is None else len(scene.seen)) // MOST) or 1
+    seen = scene.seen
+    if seen is not None:
+        seen = seen[seen[:, 1] % step == 0] // torch.tensor([1, step])
+    return replace(scene, points=scene.points[::step], seen=seen)
+
+
+def _gains(
+    sightings: Sightings, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]]
+) -> Annotated[Tensor, "V"] | None:
+    """g of the training views, 0 of those that too few sightings tell of; None where none is left. float64."""
+    rgb = torch.full((len(sightings.view), 3), torch.nan, dtype=torch.float64)
+    for view in scene.train.tolist():
+        at = (sightings.view == view).nonzero()[:, 0]
+        x, y = sightings.pixel[at].long().unbind(1)
+        rgb[at] = image(view)[y, x].double()
+    kept = ((rgb >= DARK) & (rgb <= BRIGHT)).all(1)
+    view, bright = sightings.view[kept], rgb[kept].log().mean(1)
+    point = torch.unique(sightings.point[kept], dim=0, return_inverse=True)[1]
+    gain = None
+    for _ in range(2):
+        known = torch.bincount(view, minlength=len(scene.paths))[view] >= LEAST
+        shared = torch.bincount(point)[point] >= 2
+        view, point, bright = (x[known & shared] for x in (view, point, bright))
+        if not len(view):
+            break
+        gain, error = _solve(view, point, bright, len(scene.paths))
+        inlier = error.abs() <= 3 * error.abs().median() / 0.6745  # of a normal error three standard deviations
+        view, point, bright = view[inlier], point[inlier], bright[inlier]
+    return gain
+
+
+def _solve(
+    view: Annotated[Tensor, "O"], point: Annotated[Tensor, "O"], bright: Annotated[Tensor, "O"], views: int
+) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "O"]]:
+    """g of the views and what it leaves of each sighting, by conjugate gradients on the equations without the points."""
+    seen = torch.bincount(point).clamp_min(1).double()
+
+    def centred(values: Tensor) -> Tensor:
+        """Less their mean at each point."""
+        return values - (values.new_zeros(len(seen)).index_add(0, point, values) / seen)[point]
+
+    def gathered(values: Tensor) -> Tensor:
+        return values.new_zeros(views).index_add(0, view, values)
+
+    gain = bright.new_zeros(views)
+    residual = gathered(centred(bright))
+    direction, power = residual, float(residual @ residual)
+    limit = 1e-12 * power
+    for _ in range(min(views, 200)):
+        if power <= limit or not math.isfinite(power):
+            break
+        moved = gathered(centred(direction[view]))
+        length = power / float(direction @ moved)
+        gain, residual = gain + length * direction, residual - length * moved
+        last, power = power, float(residual @ residual)
+        direction = residual + power / last * direction
+    return gain, centred(bright - gain[view])

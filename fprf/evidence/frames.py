@@ -8,10 +8,8 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from ..datamanagers.image_header import IMAGE_SUFFIXES
-from ..datamanagers.images import load_image
-from ..datamanagers.parsers.files import read_bytes, read_json, read_npy, read_npz
-from ..datamanagers.parsers.record import Record, record_of
+from ..datamanagers.images import IMAGE_SUFFIXES, load_image
+from ..datamanagers.parsers.files import Record, read_bytes, read_json, read_npy, read_npz, record_of
 from ..datamanagers.parsers.views import rigid
 from ..errors import DataError
 from ..rendering.cameras import Cameras, pixel_grid, rays_through

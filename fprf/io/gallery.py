@@ -8,17 +8,231 @@ from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from string import Template
+from types import MappingProxyType
+from typing import NamedTuple
 from urllib.parse import quote
 
 from ..errors import DataError
 from .atomic import write_text
 from .figures import Metrics, figures, number
-from .gallery_compare import compare
-from .gallery_pieces import Reference, Style, cards_of
-from .gallery_styles import overview, styles_section
-from .images import Picture
+from .images import Picture, data_uri, shrink, to_uint8
+from .maps import palette
 
-__all__ = ["Reference", "Style", "write_gallery"]
+__all__ = [
+    "MAP_SIDE",
+    "SMALL_SIDE",
+    "TINY_SIDE",
+    "VIEW_SIDE",
+    "Reference",
+    "Style",
+    "cards_of",
+    "compare",
+    "img",
+    "overview",
+    "ratio",
+    "styles_section",
+    "write_gallery",
+]
+
+
+VIEW_SIDE, MAP_SIDE, SMALL_SIDE, TINY_SIDE = 1024, 512, 224, 80
+"""Longest sides in pixels of embedded views, of maps and references, of the overview, and of thumbnails."""
+
+
+class Reference(NamedTuple):
+    """A photograph that a style was taken from."""
+
+    name: str
+    image: Picture
+
+
+class Style(NamedTuple):
+    """A restyled scene: one picture per view, in the order of the originals."""
+
+    name: str
+    views: Sequence[Picture]
+    references: Sequence[str] = ()
+    """Names of its references, in dictionary order."""
+    shares: Sequence[float] = ()
+    """How much of the scene each of them styled (`maps.match_summary`); none where that was not measured."""
+    matches: Sequence[Picture] = ()
+    """Match maps (`maps.match_image`), one per view or fewer."""
+    metrics: "Metrics" = MappingProxyType({})
+    """What was measured of this style alone."""
+
+
+def img(picture: Picture, side: int, alt: str, *, eager: bool = False, of: str = "") -> str:
+    """A picture as part of the page, its longest side at most `side` pixels; `of` is its class."""
+    small = shrink(picture, side)
+    height, width = small.shape[:2]
+    lazy = "" if eager else ' loading="lazy"'
+    kind = f' class="{of}"' if of else ""
+    # width and height hold the place while the picture is decoded; data-* survive CSS for the script.
+    return (
+        f'<img{kind} src="{data_uri(small)}" alt="{escape(alt)}" width="{width}" height="{height}" '
+        f'data-width="{width}" data-height="{height}" decoding="async"{lazy}>'
+    )
+
+
+def ratio(picture: Picture) -> str:
+    """Width by height, for the style sheet."""
+    return f"{picture.shape[1] / picture.shape[0]:.5f}"
+
+
+def cards_of(pictures: Sequence[Picture], view_names: Sequence[str], what: str, style: int | None = None) -> str:
+    """Small pictures of views with their names; the script finds match maps by their style."""
+    cards = "\n".join(
+        f'<figure class="card" data-match="{"" if style is None else style}-{view}" style="--ratio:{ratio(picture)}">'
+        f"{img(picture, MAP_SIDE, f'View {name}, {what}')}<figcaption>{escape(name)}</figcaption></figure>"
+        for view, (name, picture) in enumerate(zip(view_names, pictures, strict=False))
+    )
+    return f'<div class="grid small">\n{cards}\n</div>'
+
+
+_LEAST, _MOST = 760, 2.6
+"""Width in pixels up to which any view is shown, and how often larger than it is otherwise."""
+
+
+def compare(
+    view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style], known: Mapping[str, Reference]
+) -> str:
+    """The stage with its choices: what lies left and right of the wipe, and of which view; nothing without styles."""
+    if not styles:
+        return ""
+    first = originals[0]
+    most = max(_LEAST, _MOST * min(VIEW_SIDE, first.shape[1]))
+    picks = "\n".join(
+        f'<button class="pick" type="button" data-style="{index}" aria-pressed="{str(index == 0).lower()}">'
+        f"{_stack(style, known)}<span>{escape(style.name)}</span></button>"
+        for index, style in enumerate(styles)
+    )
+    film = "\n".join(
+        f'<button type="button" data-view="{index}" aria-pressed="{str(index == 0).lower()}" title="{escape(name)}">'
+        f"{img(picture, VIEW_SIDE, f'View {name}, original', eager=True)}</button>"
+        for index, (name, picture) in enumerate(zip(view_names, originals, strict=True))
+    )
+    return f"""<section class="compare" id="compare" aria-label="Compare">
+<div class="stage">
+<figure class="wipe" style="--at:50%;--ratio:{ratio(first)};--most:{most:.0f}px">
+{img(styles[0].views[0], VIEW_SIDE, f"View {view_names[0]}, {styles[0].name}", eager=True, of="after")}
+{img(first, VIEW_SIDE, f"View {view_names[0]}, original", eager=True, of="before")}
+<span class="tag one">Original</span><span class="tag two">{escape(styles[0].name)}</span>
+<input type="range" min="0" max="100" step="any" value="50" aria-label="How much of the original is shown">
+<span class="seam"></span>
+</figure>
+</div>
+<div class="choose">
+<div class="against"><label for="left">Left side</label>
+<select id="left">
+{_left(styles)}
+</select></div>
+<div><h2 id="pick-style">Right side</h2>
+<div class="picks" role="group" aria-labelledby="pick-style">
+{picks}
+</div></div>
+<div><h2 id="pick-view">View</h2>
+<div class="film" role="group" aria-labelledby="pick-view">
+{film}
+</div></div>
+</div>
+</section>"""
+
+
+def _left(styles: Sequence[Style]) -> str:
+    """What the restyled view can be compared with."""
+    options = [("original", "Original")]
+    if any(style.matches for style in styles):
+        options.append(("match", "Which reference is where"))
+    options += [(str(index), style.name) for index, style in enumerate(styles)] if len(styles) > 1 else []
+    return "\n".join(f'<option value="{value}">{escape(name)}</option>' for value, name in options)
+
+
+def _stack(style: Style, known: Mapping[str, Reference]) -> str:
+    small = [img(known[name].image, TINY_SIDE, "", eager=True) for name in style.references[:3]]
+    return f'<span class="stack">{"".join(small)}</span>' if small else ""
+
+
+def overview(view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style]) -> str:
+    """A table of thumbnails, views by styles; each goes to the stage. Nothing where it would repeat what is seen anyway."""
+    if len(styles) < 2 or len(view_names) < 2:
+        return ""
+    heads = "".join(f'<th scope="col">{escape(name)}</th>' for name in ("Original", *(style.name for style in styles)))
+    rows = []
+    for view, (name, original) in enumerate(zip(view_names, originals, strict=True)):
+        cells = [_cell(original, f"View {name}, original", f"-{view}")]
+        cells += [
+            _cell(style.views[view], f"View {name}, {style.name}", f"{index}-{view}") for index, style in enumerate(styles)
+        ]
+        rows.append(f'<tr><th scope="row">{escape(name)}</th>{"".join(cells)}</tr>')
+    body = "\n".join(rows)
+    return f"""<section id="overview">
+<h2>Overview</h2>
+<p class="lead">Every view in every style. Choose one to compare it above.</p>
+<div class="scroller" tabindex="0" role="region" aria-label="Every view in every style">
+<table class="matrix" style="--pictures:{len(styles) + 1}">
+<thead><tr><th scope="col">View</th>{heads}</tr></thead>
+<tbody>
+{body}
+</tbody>
+</table></div>
+</section>"""
+
+
+def _cell(picture: Picture, what: str, goes: str) -> str:
+    shown = img(picture, SMALL_SIDE, what)
+    return f'<td><button type="button" data-go="{goes}" style="--ratio:{ratio(picture)}">{shown}</button></td>'
+
+
+def styles_section(view_names: Sequence[str], styles: Sequence[Style], known: Mapping[str, Reference]) -> str:
+    """Each style with its references and figures beside its views, its match maps below."""
+    if not styles:
+        return ""
+    blocks = "\n".join(_style(index, style, view_names, known) for index, style in enumerate(styles))
+    return f"""<section class="styles" id="styles">
+<h2>Styles</h2>
+<p class="lead">The same trained scene, restyled by photographs. Choose a view to compare it above.</p>
+{blocks}
+</section>"""
+
+
+def _style(index: int, style: Style, view_names: Sequence[str], known: Mapping[str, Reference]) -> str:
+    cards = "\n".join(
+        f'<button class="card" type="button" data-shot="{index}-{view}" style="--ratio:{ratio(picture)}">'
+        f"{img(picture, VIEW_SIDE, f'View {name}, {style.name}')}<span>{escape(name)}</span></button>"
+        for view, (name, picture) in enumerate(zip(view_names, style.views, strict=True))
+    )
+    matches = ""
+    if style.matches:
+        maps = cards_of(style.matches, view_names, "reference of every place", index)
+        matches = f'\n<div class="under"><p class="label">Which reference each place took its style from</p>\n{maps}\n</div>'
+    return f"""<article class="style">
+<div><h3>{escape(style.name)}</h3>
+{_sources(style, known)}{_measured(style)}</div>
+<div><div class="grid">
+{cards}
+</div>{matches}</div>
+</article>"""
+
+
+def _measured(style: Style) -> str:
+    rows = "".join(
+        f"<div><dt>{escape(row.label)}</dt><dd>{escape(row.value)} <small>{escape(row.unit)}</small></dd></div>"
+        for row in figures(style.metrics)
+    )
+    return f'<dl class="measured">{rows}</dl>' if rows else ""
+
+
+def _sources(style: Style, known: Mapping[str, Reference]) -> str:
+    """The references of a style: with the colours of its match maps and with shares, where there are any."""
+    rows = []
+    colours = to_uint8(palette(len(style.references))[None])[0] if style.references else []
+    for place, name in enumerate(style.references):
+        chip = f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>' if style.matches else ""
+        share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>' if style.shares else ""
+        image = img(known[name].image, MAP_SIDE, f"Reference {name}")
+        rows.append(f'<figure class="source">{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>')
+    return f'<div class="sources">{"".join(rows)}</div>' if rows else ""
+
 
 _EMBEDDED_VIDEO = 8 * 2**20
 """Bytes up to which a film is put into the page."""

@@ -1,6 +1,7 @@
 """Frames to a film or to numbered pictures, one frame in memory at a time; to an animated picture, all of them."""
 
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import chain, pairwise
 from pathlib import Path
@@ -10,13 +11,14 @@ import cv2
 import numpy as np
 
 from ..errors import DataError, UsageError
-from .atomic import atomic_path, write_bytes
+from .atomic import atomic_path, write_bytes, write_json
 from .images import Picture, checked, write_image
 
 if TYPE_CHECKING:
     from types import ModuleType
 
-__all__ = ["FILMS", "write_frames", "write_video"]
+__all__ = ["FILMS", "missing", "write_frames", "write_video"]
+
 
 Codec = Literal["h264", "mp4v", "gif", "webp", "apng"]
 _ANIMATIONS: dict[str, tuple[Codec, str, list[int]]] = {
@@ -144,3 +146,24 @@ def write_frames(folder: Path, names: Iterable[str], frames: Iterable[Picture]) 
         write_image(path, frame)
         written.append(path)
     return written
+
+
+_RECORD = ".render.json"
+
+
+def missing(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
+    """Which of the frames are not there yet; all, where the folder was rendered from something else than `key` says.
+
+    The key is written down at once, so that what is rendered from now on counts. Frames are whole or absent.
+    """
+    record = folder / _RECORD
+    try:
+        known = json.loads(record.read_text("utf-8")).get("key")
+    except (OSError, ValueError, AttributeError):
+        known = None
+    if known == key:
+        return [path for path in paths if not path.is_file()]
+    for path in paths:
+        path.unlink(missing_ok=True)
+    write_json(record, {"key": key})
+    return list(paths)

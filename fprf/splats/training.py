@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.images import load_images
-from ..datamanagers.parsers.recognise import parse_scene
+from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..ops.rasterise import Pinhole, rasterise

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from ..datamanagers.images import load_image
-from ..datamanagers.parsers.checksum import crc32c, masked
-from ..datamanagers.parsers.colmap_model import read_model
+from ..datamanagers.parsers.blocknerf import crc32c, masked, read_examples
+from ..datamanagers.parsers.colmap import read_model
 from ..datamanagers.parsers.config import (
     ColmapConfig,
     LlffConfig,
@@ -25,7 +25,6 @@ from ..datamanagers.parsers.config import (
 )
 from ..datamanagers.parsers.files import read_npz
 from ..datamanagers.parsers.phototourism import read_list
-from ..datamanagers.parsers.tfrecord import read_examples
 from ..plugins.codec import load_config
 from ..rendering.camera_path import read_camera_path
 from ..splats.files import read_capture, write_gaussians

@@ -12,7 +12,7 @@ import torch
 
 from ..blocks.plan import Plan
 from ..config import TrainConfig
-from ..datamanagers.pixel_file import HELD
+from ..datamanagers.batches import HELD
 from ..datamanagers.scene import Scene
 from ..interfaces import DataManager
 from ..types import Batch

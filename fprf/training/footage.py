@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..config import RenderConfig
-from ..io.exr import linear
-from ..io.images import Picture, to_uint8
+from ..io.images import Picture, linear, to_uint8
 from ..io.maps import depth_image, depth_limits
 from ..rendering.cameras import Cameras
 from ..rendering.normals import normals

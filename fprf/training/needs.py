@@ -1,7 +1,7 @@
 """What training with a config lacks on this machine, all of it at once, each with what cures it."""
 
 from ..config import TrainConfig
-from ..datamanagers.parsers.recognise import recognise
+from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, PluginError, WeightsError
 from ..plugins.config import Need
 from ..plugins.decoders.remedy import pretrain_line

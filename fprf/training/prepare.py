@@ -12,11 +12,9 @@ from torch import Tensor
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.batches import WHITE
-from ..datamanagers.exposure import differ, with_exposure
 from ..datamanagers.features import FeatureStore
-from ..datamanagers.parsers.recognise import parse_scene
-from ..datamanagers.scene import Scene
-from ..datamanagers.sightings import find_sightings
+from ..datamanagers.parsers.config import parse_scene
+from ..datamanagers.scene import Scene, differ, find_sightings, with_exposure
 from ..errors import PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..rendering.bounds import find_space

@@ -13,7 +13,7 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
-from ..datamanagers.exposure import GAMMA
+from ..datamanagers.scene import GAMMA
 from ..types import Rendered
 
 __all__ = ["Tones", "relative", "toned"]

@@ -14,8 +14,7 @@ import threading
 from pathlib import Path
 from queue import Empty, Queue
 
-from ..datamanagers.image_header import header_of
-from ..datamanagers.images import MAX_PIXELS
+from ..datamanagers.images import MAX_PIXELS, header_of
 from ..errors import DataError
 
 __all__ = ["LARGEST", "Intake", "check_photograph", "shown_name"]

@@ -10,8 +10,7 @@ from torch import Tensor
 from fprf.blocks.region import REACH, bounds, within
 from fprf.blocks.space import open_space, site_of
 from fprf.blocks.windows import shares
-from fprf.datamanagers.scene import Scene
-from fprf.datamanagers.sightings import find_sightings
+from fprf.datamanagers.scene import Scene, find_sightings
 from fprf.errors import ConfigError
 from fprf.fields.layouts import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig, StreetConfig
 from fprf.types import Boxes, Site

@@ -8,7 +8,7 @@ import trimesh
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.export.config import ExportConfig
 from fprf.export.depth_maps import render_sights
 

@@ -15,7 +15,7 @@ import pytest
 from fprf.cli import main as cli
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import default_output
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 
 FAKE = Path(__file__).parents[1] / "reconstruction" / "fake"
 

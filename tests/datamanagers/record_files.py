@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fprf.datamanagers.parsers.checksum import crc32c, masked
+from fprf.datamanagers.parsers.blocknerf import crc32c, masked
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.town.layout import build_town
 from fprf.town.palettes import palette

@@ -8,9 +8,7 @@ import torch
 from tiny_world import World
 from torch import Tensor
 
-from fprf.datamanagers.exposure import GAMMA, differ, with_exposure
-from fprf.datamanagers.scene import Scene
-from fprf.datamanagers.sightings import find_sightings
+from fprf.datamanagers.scene import GAMMA, Scene, differ, find_sightings, with_exposure
 
 VIEWS = 10
 

@@ -15,9 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from photo_files import HEIC, turned_jpeg
 
-from fprf.datamanagers.image_header import header_of, read_header
-from fprf.datamanagers.images import load_image, load_images, photographs
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.images import header_of, load_image, load_images, photographs, read_header
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 
 FUZZ = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

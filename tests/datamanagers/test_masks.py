@@ -14,7 +14,7 @@ from test_batches import SIZES, make, make_scene
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_mask
 from fprf.datamanagers.parsers.config import ColmapConfig, PhotoTourismConfig, TransformsConfig
-from fprf.datamanagers.parsers.masks import masks_beside
+from fprf.datamanagers.parsers.views import masks_beside
 from fprf.errors import DataError
 
 

@@ -12,8 +12,7 @@ import torch
 from record_files import example, record, town_records
 
 from fprf.datamanagers.images import load_image
-from fprf.datamanagers.parsers.config import BlockNerfConfig
-from fprf.datamanagers.parsers.recognise import parse_scene, recognise
+from fprf.datamanagers.parsers.config import BlockNerfConfig, parse_scene, recognise
 from fprf.errors import ConfigError, DataError
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 

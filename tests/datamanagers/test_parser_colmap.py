@@ -9,8 +9,7 @@ from capture_files import Capture, write_colmap
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.colmap import model_folder
-from fprf.datamanagers.parsers.colmap_model import MODELS, read_model
+from fprf.datamanagers.parsers.colmap import MODELS, model_folder, read_model
 from fprf.datamanagers.parsers.config import ColmapConfig
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError

@@ -14,9 +14,8 @@ from capture_files import write_image
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.files import image_names, inside, read_bytes, read_json, read_npy, read_npz
-from fprf.datamanagers.parsers.record import record_of
-from fprf.datamanagers.parsers.split import every_eighth, indices
+from fprf.datamanagers.parsers.files import image_names, inside, read_bytes, read_json, read_npy, read_npz, record_of
+from fprf.datamanagers.parsers.views import every_eighth, indices
 from fprf.errors import DataError
 
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

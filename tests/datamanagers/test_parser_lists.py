@@ -7,9 +7,8 @@ import pytest
 import torch
 from capture_files import Capture, write_colmap, write_image
 
-from fprf.datamanagers.parsers.config import ColmapConfig, MegaNerfConfig, PhotoTourismConfig
+from fprf.datamanagers.parsers.config import ColmapConfig, MegaNerfConfig, PhotoTourismConfig, parse_scene, recognise
 from fprf.datamanagers.parsers.phototourism import read_list
-from fprf.datamanagers.parsers.recognise import parse_scene, recognise
 from fprf.errors import DataError
 
 

@@ -9,8 +9,7 @@ import torch
 from capture_files import Capture, write_image, write_transforms
 from phone_files import write_odm, write_polycam, write_record3d
 
-from fprf.datamanagers.parsers.config import OdmConfig, PolycamConfig, Record3DConfig
-from fprf.datamanagers.parsers.recognise import parse_scene, recognise
+from fprf.datamanagers.parsers.config import OdmConfig, PolycamConfig, Record3DConfig, parse_scene, recognise
 from fprf.datamanagers.scene import Scene
 from fprf.errors import ConfigError, DataError
 from fprf.rendering.cameras import project

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from fprf.datamanagers import pixel_file
-from fprf.datamanagers.pixel_file import room_for
+from fprf.datamanagers import batches as pixel_file
+from fprf.datamanagers.batches import room_for
 from fprf.errors import DataError
 
 

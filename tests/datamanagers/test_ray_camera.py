@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.ray_camera import fit_camera
+from fprf.datamanagers.parsers.blocknerf import fit_camera
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 
 number = st.floats(-1, 1)

@@ -8,8 +8,15 @@ import torch
 from capture_files import Capture, write_colmap, write_llff, write_transforms
 from fake_packages import packages_in
 
-from fprf.datamanagers.parsers.config import ColmapConfig, DataParserConfig, LlffConfig, TownConfig, TransformsConfig
-from fprf.datamanagers.parsers.recognise import parse_scene, recognise
+from fprf.datamanagers.parsers.config import (
+    ColmapConfig,
+    DataParserConfig,
+    LlffConfig,
+    TownConfig,
+    TransformsConfig,
+    parse_scene,
+    recognise,
+)
 from fprf.datamanagers.scene import Scene
 from fprf.errors import ConfigError, DataError
 from fprf.rendering.cameras import project, rays_through

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fprf.datamanagers.runs import Runs
+from fprf.datamanagers.batches import Runs
 
 MASKS = st.lists(st.lists(st.booleans(), min_size=1, max_size=12), max_size=5)
 

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers import store_files
+from fprf.datamanagers import features as store_files
 
 
 @settings(max_examples=25, deadline=None)
@@ -43,13 +43,13 @@ def test_constant_and_zero_features() -> None:
 def make(folder: Path) -> tuple[str, store_files.Entry]:
     entry = store_files.pack(torch.randn(3, 4, 5, 4), (30, 40))
     key = store_files.digest("some", "inputs")
-    store_files.write(folder, key, entry)
+    store_files.write_entry(folder, key, entry)
     return key, entry
 
 
 def test_through_a_file_and_back(tmp_path: Path) -> None:
     key, entry = make(tmp_path)
-    again = store_files.read(tmp_path, key)
+    again = store_files.read_entry(tmp_path, key)
     assert again is not None
     assert all(torch.equal(a, b) for a, b in zip(entry, again, strict=True))
     assert [p.name for p in tmp_path.iterdir()] == [f"{key}.safetensors"]
@@ -62,24 +62,24 @@ def test_a_flipped_bit_or_a_lost_end_makes_the_entry_absent(tmp_path: Path, shar
     data = path.read_bytes()
     at = int(share * len(data))
     path.write_bytes(data[:at] + bytes([data[at] ^ 16]) + data[at + 1 :])
-    assert store_files.read(tmp_path, key) is None
+    assert store_files.read_entry(tmp_path, key) is None
     path.write_bytes(data[:at])
-    assert store_files.read(tmp_path, key) is None
+    assert store_files.read_entry(tmp_path, key) is None
     path.write_bytes(data)
-    assert store_files.read(tmp_path, key) is not None
+    assert store_files.read_entry(tmp_path, key) is not None
 
 
 def test_a_file_under_another_name_is_not_believed(tmp_path: Path) -> None:
     key, _ = make(tmp_path)
     other = store_files.digest("other inputs")
     (tmp_path / f"{key}.safetensors").rename(tmp_path / f"{other}.safetensors")
-    assert store_files.read(tmp_path, key) is None
-    assert store_files.read(tmp_path, other) is None
+    assert store_files.read_entry(tmp_path, key) is None
+    assert store_files.read_entry(tmp_path, other) is None
 
 
 def test_tensors_that_are_no_entry_are_absent(tmp_path: Path) -> None:
     store_files.write_tensors(tmp_path, "key", {"coefs": torch.zeros(2)})
-    assert store_files.read(tmp_path, "key") is None
+    assert store_files.read_entry(tmp_path, "key") is None
     assert store_files.read_tensors(tmp_path, "key") is not None
 
 

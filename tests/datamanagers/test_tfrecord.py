@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from record_files import example, record, varint
 
-from fprf.datamanagers.parsers.checksum import crc32c, masked
-from fprf.datamanagers.parsers.tfrecord import read_examples, read_records
+from fprf.datamanagers.parsers.blocknerf import crc32c, masked, read_examples, read_records
 from fprf.errors import DataError
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from splatter import draw, matrices, read_gaussians, read_splat, table
 
 from fprf.datamanagers.images import load_images
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.export.depth_maps import Sights
 from fprf.export.point_cloud import Cloud, dome, fuse, joined
 from fprf.export.splats import discs, facing, write_gaussians, write_splat

@@ -8,7 +8,7 @@ import pytest
 import torch
 from analytic import ring
 
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.export.transforms import transforms
 from fprf.rendering.cameras import Cameras
 

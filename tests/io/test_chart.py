@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.io.chart import Series, bars, lines, spark, ticks
+from fprf.io.report import Series, bars, lines, spark, ticks
 
 EVIL = """<script>"'&"""
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fprf.errors import DataError
-from fprf.io.exr import linear, write_exr
+from fprf.io.images import linear, write_exr
 
 
 def read(path: Path) -> dict[str, np.ndarray]:

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError
-from fprf.io.panels import beside, seams, wiped
-from fprf.io.resumed import missing
+from fprf.io.sheet import beside, seams, wiped
+from fprf.io.video import missing
 
 
 def flat(value: int, width: int = 40, height: int = 6) -> np.ndarray:

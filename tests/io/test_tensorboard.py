@@ -8,7 +8,7 @@ from tiny_world import World
 
 from fprf.cli import main as cli
 from fprf.errors import UsageError
-from fprf.io.tensorboard import write_scalars
+from fprf.io.report import write_scalars
 from fprf.training.events import History, read_history
 
 HISTORY = History("", [10, 20], [1.5, 3.0], {"psnr": [12.0, None], "colour": [0.5, 0.25]}, {}, [])

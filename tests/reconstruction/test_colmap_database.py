@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fprf.reconstruction.database import Tables, counts, descriptors
+from fprf.reconstruction.colmap import Tables, counts, descriptors
 
 MOST = 2147483647
 

@@ -1,6 +1,6 @@
 from typing import Any
 
-from fprf.reconstruction.report import Drop, dropped, report, summary
+from fprf.reconstruction.scene_folder import Drop, dropped, report, summary
 
 
 class Matches:

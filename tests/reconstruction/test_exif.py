@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.reconstruction.exif import Lens, lens_of, read_lens
+from fprf.reconstruction.images import Lens, lens_of, read_lens
 
 
 def tiff(order: str, model: bytes = b"Phone 9\0", focal: tuple[int, int] = (425, 100), short: int = 26) -> bytes:

@@ -12,8 +12,8 @@ from fprf.datamanagers.images import load_image
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
-from fprf.reconstruction.gather import gather, in_order
-from fprf.reconstruction.place import Place, State, key_of
+from fprf.reconstruction.images import gather, in_order
+from fprf.reconstruction.scene_folder import Place, State, key_of
 
 
 def photo(path: Path, seed: int = 0, size: tuple[int, int] = (24, 16)) -> Path:

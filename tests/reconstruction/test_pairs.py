@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.reconstruction.pairs import exhaustive, merged, sequential, similar
+from fprf.reconstruction.colmap import exhaustive, merged, sequential, similar
 
 
 def proper(pairs: list[tuple[int, int]], count: int) -> bool:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.reconstruction.sharpness import choose, sharpness
+from fprf.reconstruction.images import choose, sharpness
 
 
 def noise(height: int = 60, width: int = 80, seed: int = 0) -> np.ndarray:

@@ -12,7 +12,7 @@ import pytest
 from alignment import align, misses
 
 from fprf.cli import main as cli
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
 from fprf.town.write import write_town
 from fprf.training.budget import outcome

@@ -6,8 +6,7 @@ import pytest
 
 from fprf.errors import DataError
 from fprf.io.video import write_video
-from fprf.reconstruction.sharpness import sharpness
-from fprf.reconstruction.video import frame_name, frame_scores, save_frames
+from fprf.reconstruction.images import frame_name, frame_scores, save_frames, sharpness
 
 BLURRED = (1, 2, 5)
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from fprf.reconstruction.pairs import similar
-from fprf.reconstruction.vocabulary import vectors, words
+from fprf.reconstruction.colmap import similar, vectors, words
 
 
 def places(count: int, views: int, seed: int = 0) -> list[np.ndarray]:

@@ -12,7 +12,7 @@ import torch
 
 from fprf.cli.main import main
 from fprf.datamanagers.images import load_images
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image

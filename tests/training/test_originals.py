@@ -9,7 +9,7 @@ import pytest
 from tiny_world import World
 
 from fprf.cli.train import train_scene
-from fprf.datamanagers.parsers.recognise import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
 from fprf.training import checkpoint
 from fprf.training.originals import FLAG, NAME, fingerprints, keep, refuse_others

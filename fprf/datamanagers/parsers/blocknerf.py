@@ -1,17 +1,27 @@
 """San Francisco Mission Bay (Block-NeRF): TFRecord files of images with an origin and a direction for each pixel.
 
 Files whose name holds `val` or `test` are held out. Each record keeps `image` (PNG), `cam_idx`, `image_hash`, `height`,
-`width`, `equivalent_exposure`, `ray_origins` and `ray_dirs`. Images are taken out once, into the user's cache, and a camera is
-fitted to each image's rays; what lies in a complete cache is not read again.
+`width`, `equivalent_exposure`, `ray_origins` and `ray_dirs`. Images are taken out once, into the user's cache; what lies in a
+complete cache is not read again.
+
+A file is a row of records: length (8 bytes), its masked CRC-32C, the bytes, their masked CRC-32C, all little-endian. An Example
+is a protobuf message, read without TensorFlow: features (field 1) map a name to a list of bytes (1), floats (2) or ints (3).
+
+A camera is fitted to each image's rays: a pose, focal lengths, a principal point and OpenCV's k1 k2 p1 p2, to a lattice of the
+rays, by damped least squares on pixels. What is left is told: a rolling shutter's rays come from many places, and one pose is
+only their mean.
 """
 
 import hashlib
 import json
 import re
+import struct
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
@@ -19,13 +29,390 @@ from ...io.atomic import atomic_path, write_json
 from ...rendering.lens import OPENCV
 from ..scene import Scene
 from .config import BlockNerfConfig
-from .ray_camera import fit_camera
-from .split import indices
-from .tfrecord import Example, read_examples
 from .town import cache_folder
-from .views import View, assemble, rigid
+from .views import View, assemble, indices, rigid
 
-__all__ = ["BlockNerfParser", "is_record", "record_files"]
+__all__ = [
+    "BlockNerfParser",
+    "Example",
+    "Feature",
+    "RayCamera",
+    "crc32c",
+    "fit_camera",
+    "is_record",
+    "masked",
+    "read_examples",
+    "read_records",
+    "record_files",
+]
+
+
+_POLYNOMIAL = 0x82F63B78
+_ROWS = 4096
+"""Chunks that are taken together."""
+_SMALL = 1 << 14
+"""Bytes below which one byte after the other is quicker."""
+_MASK = 0xA282EAD8
+
+Table = NDArray[np.uint32]
+
+
+def _make_table() -> Table:
+    table = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = np.where(table & 1, (table >> 1) ^ np.uint32(_POLYNOMIAL), table >> 1).astype(np.uint32)
+    return table
+
+
+_TABLE = _make_table()
+_LIST: list[int] = [int(value) for value in _TABLE]
+
+
+def crc32c(data: bytes) -> int:
+    """The checksum of some bytes, in [0, 2**32)."""
+    if len(data) < _SMALL:
+        return _plain(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
+    length = len(data) // _ROWS
+    body = np.frombuffer(data, np.uint8, _ROWS * length).reshape(_ROWS, length)
+    state = np.zeros(_ROWS, np.uint32)
+    state[0] = 0xFFFFFFFF
+    for column in np.ascontiguousarray(body.T):
+        state = _TABLE[(state ^ column) & 0xFF] ^ (state >> np.uint32(8))
+    shift = _shift(length)
+    total = int(state[0])
+    for own in state[1:].tolist():
+        total = shift[0][total & 0xFF] ^ shift[1][total >> 8 & 0xFF] ^ shift[2][total >> 16 & 0xFF] ^ shift[3][total >> 24]
+        total ^= own
+    return _plain(data[_ROWS * length :], total) ^ 0xFFFFFFFF
+
+
+def masked(checksum: int) -> int:
+    """As TFRecord files keep it: turned and offset, so that a checksum of checksums stays one."""
+    return ((checksum >> 15 | checksum << 17) + _MASK) & 0xFFFFFFFF
+
+
+def _plain(data: bytes, state: int) -> int:
+    for byte in data:
+        state = _LIST[(state ^ byte) & 0xFF] ^ state >> 8
+    return state
+
+
+def _shift(zeros: int) -> list[list[int]]:
+    """Tables, a byte of the state each, of what so many zero bytes make of a state."""
+    # Columns: the image of each bit. Squaring doubles the number of zeros.
+    bits = [1 << k for k in range(32)]
+    power = [_plain(b"\0", bit) for bit in bits]
+    result = bits
+    while zeros:
+        if zeros & 1:
+            result = [_through(power, value) for value in result]
+        power = [_through(power, value) for value in power]
+        zeros >>= 1
+    return [[_through(result, byte << 8 * place) for byte in range(256)] for place in range(4)]
+
+
+def _through(columns: list[int], value: int) -> int:
+    total = 0
+    for column in columns:
+        if value & 1:
+            total ^= column
+        value >>= 1
+    return total
+
+
+LONGEST = 1 << 30
+"""Bytes that one record may claim."""
+_VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
+
+Feature: TypeAlias = "list[bytes] | NDArray[np.float32] | NDArray[np.int64]"
+
+
+class Example(NamedTuple):
+    """One record, taken apart."""
+
+    where: str
+    """File and number of the record, to open messages with."""
+    features: dict[str, Feature]
+
+    def blob(self, name: str) -> bytes:
+        """The one byte string of a feature. Raises DataError."""
+        value = self.features.get(name)
+        if not isinstance(value, list) or len(value) != 1:
+            raise self._wrong(name, "one byte string")
+        return value[0]
+
+    def integer(self, name: str) -> int:
+        """The one integer of a feature. Raises DataError."""
+        value = self.features.get(name)
+        if isinstance(value, list) or value is None or value.dtype != np.int64 or len(value) != 1:
+            raise self._wrong(name, "one integer")
+        return int(value[0])
+
+    def numbers(self, name: str, count: int | None = None) -> NDArray[np.float32]:
+        """The floats of a feature, so many of them. Raises DataError, also where one is not finite."""
+        value = self.features.get(name)
+        if isinstance(value, list) or value is None or value.dtype != np.float32:
+            raise self._wrong(name, "floats")
+        if (count is not None and len(value) != count) or not np.isfinite(value).all():
+            raise self._wrong(name, f"{'some' if count is None else count} finite floats")
+        return value.astype(np.float32)
+
+    def _wrong(self, name: str, wanted: str) -> DataError:
+        value = self.features.get(name)
+        found = "nothing" if value is None else f"{len(value)} {'byte strings' if isinstance(value, list) else value.dtype}"
+        return DataError(f"{self.where}: {name} holds {found}, {wanted} is needed; download the file again")
+
+
+def read_records(path: Path) -> Iterator[bytes]:
+    """The records of a file, checksums verified. Raises DataError."""
+    try:
+        with path.open("rb") as file:
+            number = 0
+            while head := file.read(12):
+                where = f"{path}: record {number}"
+                if len(head) < 12:
+                    raise DataError(f"{where}: the file ends within its head; download it again")
+                length, check = struct.unpack("<QI", head)
+                if masked(crc32c(head[:8])) != check:
+                    raise DataError(f"{where}: the checksum of its length is wrong; download the file again")
+                if length > LONGEST:
+                    raise DataError(f"{where}: claims {length} bytes, at most {LONGEST} are read; split the file")
+                data, tail = file.read(length), file.read(4)
+                if len(data) < length or len(tail) < 4:
+                    raise DataError(
+                        f"{where}: the file ends {length + 4 - len(data) - len(tail)} bytes early; download it again"
+                    )
+                if masked(crc32c(data)) != struct.unpack("<I", tail)[0]:
+                    raise DataError(f"{where}: its checksum is wrong; download the file again")
+                yield data
+                number += 1
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+
+
+def read_examples(path: Path) -> Iterator[Example]:
+    """The records of a file as Examples. Raises DataError."""
+    for number, data in enumerate(read_records(path)):
+        where = f"{path}: record {number}"
+        try:
+            yield Example(where, _example(memoryview(data)))
+        except ValueError as error:
+            raise DataError(f"{where}: no tf.train.Example ({error}); convert the capture again") from error
+
+
+def _example(data: memoryview) -> dict[str, Feature]:
+    found: dict[str, Feature] = {}
+    for features in _children(data, 1):
+        for entry in _children(features, 1):
+            names, values = list(_children(entry, 1)), list(_children(entry, 2))
+            if len(names) != 1:
+                raise ValueError("a feature without a name")
+            name = bytes(names[0]).decode("utf-8")
+            found[name] = _feature(values[-1]) if values else []
+    return found
+
+
+def _feature(data: memoryview) -> Feature:
+    for number, kind, value, _ in _fields(data):
+        if kind != _BYTES:
+            raise ValueError(f"a feature of wire type {kind}")
+        if number == 1:
+            return [bytes(each) for each in _children(value, 1)]
+        if number == 2:
+            return _floats(value)
+        if number == 3:
+            return _integers(value)
+    return []
+
+
+def _floats(data: memoryview) -> NDArray[np.float32]:
+    parts = []
+    for number, kind, value, _ in _fields(data):
+        if number == 1 and kind in (_BYTES, _FOUR):
+            if len(value) % 4:
+                raise ValueError(f"packed floats of {len(value)} bytes")
+            parts.append(np.frombuffer(value, "<f4"))
+    return np.concatenate(parts).astype(np.float32) if parts else np.zeros(0, np.float32)
+
+
+def _integers(data: memoryview) -> NDArray[np.int64]:
+    found = []
+    for number, kind, value, whole in _fields(data):
+        if number == 1 and kind == _VARINT:
+            found.append(whole)
+        elif number == 1 and kind == _BYTES:
+            at = 0
+            while at < len(value):
+                whole, at = _varint(value, at)
+                found.append(whole)
+    return np.array(found, dtype=np.uint64).astype(np.int64)
+
+
+def _children(data: memoryview, number: int) -> Iterator[memoryview]:
+    """Length-delimited fields of a number."""
+    for own, kind, value, _ in _fields(data):
+        if own == number and kind == _BYTES:
+            yield value
+
+
+def _fields(data: memoryview) -> Iterator[tuple[int, int, memoryview, int]]:
+    """Number, wire type, bytes and (of a varint) value of each field of a message."""
+    at, none = 0, data[:0]
+    while at < len(data):
+        key, at = _varint(data, at)
+        number, kind = key >> 3, key & 7
+        if kind == _VARINT:
+            whole, at = _varint(data, at)
+            yield number, kind, none, whole
+            continue
+        if kind == _BYTES:
+            size, at = _varint(data, at)
+        elif kind in (_EIGHT, _FOUR):
+            size = 8 if kind == _EIGHT else 4
+        else:
+            raise ValueError(f"wire type {kind} at byte {at}")
+        if size > len(data) - at:
+            raise ValueError(f"a field of {size} bytes where {len(data) - at} are left")
+        yield number, kind, data[at : at + size], 0
+        at += size
+
+
+def _varint(data: memoryview, at: int) -> tuple[int, int]:
+    value = 0
+    for place in range(10):
+        if at >= len(data):
+            raise ValueError("it ends within a number")
+        byte = data[at]
+        at += 1
+        value |= (byte & 0x7F) << (7 * place)
+        if byte < 0x80:
+            return value & 0xFFFFFFFFFFFFFFFF, at
+    raise ValueError("a number of more than ten bytes")
+
+
+Array = NDArray[np.float64]
+_LATTICE = 24
+"""Rays along each side that are looked at."""
+_ROUNDS = 30
+
+
+class RayCamera(NamedTuple):
+    """A fitted camera; axes are OpenGL's."""
+
+    pose: Array
+    """Camera to world [3 4]."""
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, float, float, float, float, float]
+    """k1 k2 0 0 p1 p2."""
+    error: float
+    """Root mean square distance of the fitted pixels from the true ones."""
+    drift: float
+    """Largest distance of a ray's origin from the pose's."""
+
+
+def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> RayCamera:
+    """The camera of rays [H W 3] through pixel centres. Raises ValueError where they are not those of any lens."""
+    height, width = origin.shape[:2]
+    rows = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
+    columns = np.unique(np.linspace(0, width - 1, min(_LATTICE, width)).round().astype(np.int64))
+    grid = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    ray = direction[grid[:, 1], grid[:, 0]].astype(np.float64)
+    long = np.linalg.norm(ray, axis=1, keepdims=True)
+    if not (long > 1e-9).all() or len(grid) < 16:
+        raise ValueError("rays without a direction, or too few of them")
+    ray /= long
+    pixel = grid.astype(np.float64) + 0.5
+    turn = _axes(ray, grid)
+    local = ray @ turn.T
+    if not (local[:, 2] > 0.02).all():
+        raise ValueError("rays that look backwards: more than a half space in one image")
+    plane = local[:, :2] / local[:, 2:]
+    # Straight lines first: focal lengths and centre of a pinhole.
+    (fx, cx), (fy, cy) = (np.polyfit(plane[:, a], pixel[:, a], 1) for a in range(2))
+    if not (fx > 0 and fy > 0):
+        raise ValueError("rays of a mirrored image")
+    best = _refine(ray, pixel, turn, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
+    turned = _rotation(best[:3]) @ turn
+    residual = _project(ray @ turned.T, best) - pixel
+    place = origin.reshape(-1, 3).astype(np.float64)
+    middle = place.mean(0)
+    axes = np.stack([turned[0], -turned[1], -turned[2]], 1)
+    return RayCamera(
+        np.concatenate([axes, middle[:, None]], 1),
+        (float(best[3]), float(best[4])),
+        (float(best[5]), float(best[6])),
+        (float(best[7]), float(best[8]), 0.0, 0.0, float(best[9]), float(best[10])),
+        float(np.sqrt((residual**2).sum(1).mean())),
+        float(np.linalg.norm(place - middle, axis=1).max()),
+    )
+
+
+def _axes(ray: Array, grid: NDArray[np.int64]) -> Array:
+    """Rows: right, down and forward, as the corners of the lattice say."""
+    x, y = grid[:, 0], grid[:, 1]
+    left, right = ray[x == x.min()].mean(0), ray[x == x.max()].mean(0)
+    above, below = ray[y == y.min()].mean(0), ray[y == y.max()].mean(0)
+    ahead = np.cross(right - left, below - above)
+    if np.linalg.norm(ahead) < 1e-9:
+        raise ValueError("rays that span no image")
+    ahead /= np.linalg.norm(ahead)
+    if ahead @ ray.mean(0) < 0:
+        raise ValueError("rays of a mirrored image")
+    across = (right - left) - ((right - left) @ ahead) * ahead
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(ahead, across), ahead])
+
+
+def _refine(ray: Array, pixel: Array, turn: Array, start: Array) -> Array:
+    """Levenberg and Marquardt's steps with differences for slopes: eleven numbers, a few hundred rays."""
+
+    def miss(value: Array) -> Array:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            out = (_project(ray @ (_rotation(value[:3]) @ turn).T, value) - pixel).reshape(-1)
+        return np.nan_to_num(out, nan=1e6, posinf=1e6, neginf=-1e6)
+
+    value, damping = start, 1e-3
+    error = miss(value)
+    scale = np.array([1e-6] * 3 + [1e-3 * start[3] / 1e3] * 4 + [1e-6] * 4)
+    for _ in range(_ROUNDS):
+        slope = np.stack([(miss(value + np.eye(11)[k] * scale[k]) - error) / scale[k] for k in range(11)], 1)
+        normal = slope.T @ slope
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(11), -slope.T @ error)
+        tried = miss(value + step)
+        if (tried**2).sum() < (error**2).sum():
+            gained = 1 - (tried**2).sum() / max((error**2).sum(), 1e-300)
+            value, error, damping = value + step, tried, damping / 10
+            if gained < 1e-9:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    return value
+
+
+def _project(local: Array, value: Array) -> Array:
+    """Pixels of rays in OpenCV's camera axes, by fx fy cx cy k1 k2 p1 p2 from the fourth number on."""
+    fx, fy, cx, cy, k1, k2, p1, p2 = value[3:]
+    x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2 * r2
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([fx * u + cx, fy * v + cy], 1)
+
+
+def _rotation(vector: Array) -> Array:
+    """Rodrigues' formula."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < 1e-12:
+        return np.asarray(np.eye(3) + cross)
+    s, c = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + s * cross + c * (cross @ cross))
+
 
 _FORMAT = 1
 

@@ -1,4 +1,4 @@
-"""Untrusted files of a scene folder: strict JSON, paths that stay inside, NumPy arrays without pickle.
+"""Untrusted files of a scene folder: strict JSON and its records, paths that stay inside, NumPy arrays without pickle.
 
 Whatever the bytes, the outcome is a value or a DataError of one line; nothing is allocated on a file's word alone.
 Links inside the folder are followed: only what a file *says* must stay inside.
@@ -10,6 +10,7 @@ import os
 import re
 import zipfile
 import zlib
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TypeAlias
 
@@ -17,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..image_header import IMAGE_SUFFIXES
+from ..images import IMAGE_SUFFIXES
 
-__all__ = ["Json", "image_names", "inside", "name_of", "read_bytes", "read_json", "read_npy", "read_npz"]
+__all__ = ["Json", "Record", "image_names", "inside", "name_of", "read_bytes", "read_json", "read_npy", "read_npz", "record_of"]
+
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 
@@ -149,3 +151,83 @@ def read_npz(path: Path, key: str) -> NDArray[np.float64]:
     except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, OverflowError) as error:
         raise DataError(f"{path}: no readable .npz archive ({error}); write it again with numpy.savez") from error
     return read_npy(f"{path}: {key}", data)
+
+
+_Object: TypeAlias = dict[str, Json]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One JSON object; what it lacks is looked up in `common`."""
+
+    where: str
+    """File and place, the start of every message."""
+    own: _Object
+    common: _Object
+
+    def get(self, key: str) -> Json:
+        """The value, or None where it is absent or null."""
+        value = self.own.get(key)
+        return self.common.get(key) if value is None else value
+
+    def number(self, key: str) -> float | None:
+        """A number, or None where it is absent."""
+        value = self.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e300:
+            raise DataError(f"{self.where}: {key} is {_short(value)}, not a number; correct it")
+        return float(value)
+
+    def text(self, key: str) -> str | None:
+        """A string, or None where it is absent."""
+        value = self.get(key)
+        if value is not None and not isinstance(value, str):
+            raise DataError(f"{self.where}: {key} is {_short(value)}, not a string; correct it")
+        return value
+
+    def texts(self, key: str) -> list[str] | None:
+        """A list of strings, or None where it is absent."""
+        value = self.get(key)
+        if value is None:
+            return None
+        if not isinstance(value, list):
+            raise DataError(f"{self.where}: {key} is {_short(value)}, not a list of strings; correct it")
+        found = [item for item in value if isinstance(item, str)]
+        if len(found) != len(value):
+            raise DataError(f"{self.where}: {key} holds something that is not a string; correct it")
+        return found
+
+    def matrix(self, key: str) -> NDArray[np.float64]:
+        """A list of 3 or 4 rows of 4 numbers."""
+        value = self.get(key)
+        rows = value if isinstance(value, list) else []
+        numbers: list[float] = []
+        for row in rows:
+            cells = row if isinstance(row, list) else []
+            real = [c for c in cells if isinstance(c, int | float) and not isinstance(c, bool) and abs(c) < 1e300]
+            numbers += [float(c) for c in real] if len(real) == len(cells) == 4 else [np.nan]
+        if len(numbers) not in (12, 16) or len(numbers) != 4 * len(rows) or not np.isfinite(numbers).all():
+            raise DataError(f"{self.where}: {key} is {_short(value)}, not 3 or 4 rows of 4 numbers; correct it")
+        return np.array(numbers, dtype=np.float64).reshape(-1, 4)
+
+    def records(self, key: str) -> "list[Record]":
+        """A list of objects, each falling back to this one."""
+        value = self.own.get(key)
+        if not isinstance(value, list) or not value:
+            raise DataError(f"{self.where}: no list of {key}, or an empty one; an entry for each image is needed")
+        return [record_of(f"{self.where}: {key}[{k}]", item, self.own) for k, item in enumerate(value)]
+
+
+def record_of(where: str | Path, value: Json, common: _Object | None = None) -> Record:
+    """A record of a JSON value, which must be an object."""
+    if not isinstance(value, dict):
+        raise DataError(f"{where}: {_short(value)} instead of an object in braces; correct it")
+    return Record(str(where), value, common or {})
+
+
+def _short(value: Json) -> str:
+    if value is None:
+        return "missing"
+    text = repr(value) if not isinstance(value, dict | list) else "a list" if isinstance(value, list) else "an object"
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -13,12 +13,11 @@ import torch
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ..image_header import IMAGE_SUFFIXES
+from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
 from .config import MegaNerfConfig
 from .files import name_of
-from .split import indices
-from .views import View, assemble, rigid
+from .views import View, assemble, indices, rigid
 
 __all__ = ["MegaNerfParser"]
 

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...interfaces import DataParser
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
-from ..image_header import read_header
+from ..images import read_header
 from ..scene import Scene
 from .config import OdmConfig
-from .files import Json, inside, read_json
-from .record import Record, record_of
+from .files import Json, Record, inside, read_json, record_of
 from .views import View, assemble, found, rigid
 
 __all__ = ["OdmParser", "project_file"]

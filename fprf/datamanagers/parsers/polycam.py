@@ -13,8 +13,7 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
 from .config import PolycamConfig
-from .files import image_names, read_json
-from .record import Record, record_of
+from .files import Record, image_names, read_json, record_of
 from .views import View, assemble, rigid
 
 __all__ = ["PolycamParser", "keyframes"]

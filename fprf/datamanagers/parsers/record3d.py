@@ -17,8 +17,7 @@ from ...interfaces import DataParser
 from ...rendering.splines import rotations
 from ..scene import Scene
 from .config import Record3DConfig
-from .files import Json, image_names, read_json
-from .record import record_of
+from .files import Json, image_names, read_json, record_of
 from .views import View, assemble, rigid
 
 __all__ = ["Record3DParser", "recording"]

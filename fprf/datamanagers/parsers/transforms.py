@@ -18,14 +18,12 @@ from torch import Tensor
 from ...errors import DataError
 from ...interfaces import DataParser
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
-from ..image_header import read_header
+from ..images import read_header
 from ..scene import Scene
+from .colmap import beside, read_cloud
 from .config import TransformsConfig
-from .files import inside, read_json
-from .record import Record, record_of
-from .seen import beside, read_cloud
-from .split import indices
-from .views import View, assemble, found, rigid
+from .files import Record, inside, read_json, record_of
+from .views import View, assemble, found, indices, rigid
 
 __all__ = ["TransformsParser"]
 

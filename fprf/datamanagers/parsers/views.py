@@ -1,4 +1,9 @@
-"""From what a capture says of each view to a `Scene`: poses made exact, sizes and images checked against the files."""
+"""From what a capture says of each view to a `Scene`: poses made exact, sizes and images checked against files, masks found.
+
+`masks/` says what is used (black is left out: people, cars, the capture's own shadow), `sky_masks/` what is sky (white). A mask
+of images/a/0001.jpg is masks/a/0001.jpg.png (as COLMAP has it), masks/a/0001.png or masks/a/0001.jpg. Images without one are
+used whole; a folder in which no mask carries an image's name is none.
+"""
 
 import os
 from collections.abc import Sequence
@@ -12,13 +17,54 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...rendering.cameras import Cameras
-from ..image_header import read_header
+from ..images import read_header
 from ..scene import Scene
 from .files import name_of
-from .masks import MASKS, SKY_MASKS, masks_beside
-from .split import every_eighth
 
-__all__ = ["View", "assemble", "found", "rigid"]
+__all__ = ["MASKS", "SKY_MASKS", "View", "assemble", "every_eighth", "found", "indices", "masks_beside", "rigid"]
+
+
+MASKS, SKY_MASKS = "masks", "sky_masks"
+"""Names of the folders."""
+
+
+def masks_beside(data: Path, images: Sequence[Path], name: str) -> tuple[Path | None, ...]:
+    """The mask of each image, None where there is none; nothing at all where the capture has none of that name."""
+    known: dict[Path, bool] = {}
+    found = tuple(_mask(data, image, name, known) for image in images)
+    return found if any(mask is not None for mask in found) else ()
+
+
+def _mask(data: Path, image: Path, name: str, known: dict[Path, bool]) -> Path | None:
+    """Beside the image's folder, or beside a folder around that, up to the scene's."""
+    for above in image.parents[1:]:
+        folder = above / name
+        if folder not in known:
+            known[folder] = folder.is_dir()
+        if known[folder]:
+            inner = folder.joinpath(*image.relative_to(above).parts[1:])
+            for path in (inner.with_name(inner.name + ".png"), inner.with_suffix(".png"), inner):
+                if path.is_file():
+                    return path
+        if above == data or not above.is_relative_to(data):
+            return None
+    return None
+
+
+def every_eighth(count: int) -> tuple[Tensor, Tensor]:
+    """Indices (train, test), int64, of `count` views sorted by name: every 8th, from the first on, is test (LLFF).
+
+    A single view is for training, so that there is something to learn from.
+    """
+    index = torch.arange(count)
+    test = (index % 8 == 0) & (count > 1)
+    return index[~test], index[test]
+
+
+def indices(members: Sequence[bool]) -> Tensor:
+    """The int64 positions of the members."""
+    return torch.tensor([k for k, member in enumerate(members) if member], dtype=torch.int64)
+
 
 _LOOSE = 1e-3
 """Largest deviation of RᵀR from 1 that counts as rounding and is repaired."""

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...datamanagers.image_header import header_of
+from ...datamanagers.images import header_of
 from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians
 from .base import Bools, Capture, Floats, assembled, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four

@@ -98,7 +98,7 @@ class Database:
 def extract_features(database, images, *, image_names, camera_mode, reader_options, extraction_options, device):
     import numpy as np
 
-    from fprf.datamanagers.image_header import read_header
+    from fprf.datamanagers.images import read_header
 
     assert camera_mode is CameraMode.SINGLE and isinstance(device, Device)
     _told(database, "features", reader_options.camera_model, extraction_options.max_image_size, *image_names)

@@ -1,13 +1,22 @@
-"""Curves and bars as SVG text, coloured by the page's own style: a chart is data, so nothing has to be installed to draw it."""
+"""How training went: charts as SVG text in the colours of the page, the page of a run's report, TensorBoard's event files."""
 
 import math
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from html import escape
-from typing import NamedTuple
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
+from ..errors import UsageError
+from .atomic import write_text
 from .figures import number
 
-__all__ = ["Series", "bars", "lines", "spark", "ticks"]
+if TYPE_CHECKING:
+    from ..training.events import History
+
+__all__ = ["Series", "bars", "lines", "spark", "ticks", "write_report", "write_scalars"]
+
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 560, 260, 58, 12, 12, 34
 _COLOURS = ("#2f6fd0", "#d9730d", "#2e8b57", "#b0417e", "#8a6d1d", "#5b5bd6", "#00838f", "#a33b2f")
@@ -112,3 +121,76 @@ def _legend(drawn: Sequence[tuple[str, object]]) -> str:
         f'<li><i style="background:{_COLOURS[k % len(_COLOURS)]}"></i>{escape(name)}</li>' for k, (name, _) in enumerate(drawn)
     )
     return f'<ul class="legend">{items}</ul>'
+
+
+def write_report(
+    path: Path,
+    *,
+    title: str,
+    facts: Mapping[str, str | int | float],
+    charts: Sequence[str],
+    parts: str,
+    notes: Sequence[str],
+) -> None:
+    """Write the page, whole or not at all. `charts` and `parts` are HTML of `lines` and `bars`; all else is shown as text."""
+    shown = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(number(fact))}</dd></div>" for name, fact in facts.items())
+    sections = [f'<section class="opening"><h1>{escape(title)}</h1><dl class="facts">{shown}</dl></section>']
+    if charts:
+        sections.append(f'<section><h2>Training</h2><div class="charts">{"".join(charts)}</div></section>')
+    if parts:
+        sections.append(f"<section><h2>Where the time went</h2>{parts}</section>")
+    if notes:
+        listed = "".join(f"<li>{escape(note)}</li>" for note in notes)
+        sections.append(f'<section><h2>What happened on the way</h2><ul class="notes">{listed}</ul></section>')
+    here = files(__package__)
+    css = (here / "gallery.css").read_text("utf-8") + (here / "report.css").read_text("utf-8")
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    write_text(
+        path,
+        f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<title>{escape(title)}</title>
+<link rel="icon" href="data:,">
+<style>
+{css}</style>
+</head>
+<body>
+<header class="bar"><span class="mark" aria-hidden="true">fprf</span></header>
+<main>
+{"".join(sections)}
+</main>
+<footer><p>Made with fprf. This page is one file: it loads nothing and can be sent as it is.</p></footer>
+</body>
+</html>
+""",
+    )
+
+
+def write_scalars(folder: Path, histories: Sequence["History"]) -> int:
+    """One run of TensorBoard for the training and each block, replaced if it is there; how many values were written.
+
+    Times are those of training, so that a resumed run has no gap. Raises UsageError without the package `tensorboard`.
+    """
+    try:
+        from torch.utils.tensorboard.writer import SummaryWriter
+    except ImportError as fault:
+        raise UsageError("--tensorboard: the package tensorboard is not installed; pip install 'fprf[tensorboard]'") from fault
+    written = 0
+    for history in histories:
+        place = folder / (history.name or "training")
+        shutil.rmtree(place, ignore_errors=True)
+        writer = SummaryWriter(str(place))
+        try:
+            for name, values in history.values.items():
+                for step, seconds, value in zip(history.step, history.seconds, values, strict=True):
+                    if value is not None:
+                        writer.add_scalar(name, value, step, walltime=seconds)
+                        written += 1
+        finally:
+            writer.close()
+    return written

@@ -1,0 +1,354 @@
+"""The steps of COLMAP, one process each. A step that was done from the same images and settings is not done again.
+
+Features and matches go into a database as they are found: a step that was cut off goes on where it stood. The database, an
+SQLite file, is only read here, while COLMAP may be writing it.
+
+Which images look alike is told before they are matched by one vector each (VLAD, Jégou et al., 2010), from a vocabulary of the
+scene's own features: descriptors are assigned to visual words, k-means centres of a sample of all; the differences to the
+centres are summed word by word, tamed by a square root and scaled to length 1, word by word and altogether.
+"""
+
+import contextlib
+import json
+import shutil
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError, UsageError
+from ..io.atomic import write_json, write_text
+from .config import SfmConfig
+from .scene_folder import Place, State, key_of
+from .worker import ABSENT, NOTHING
+
+__all__ = [
+    "Pair",
+    "Tables",
+    "counts",
+    "descriptors",
+    "exhaustive",
+    "find_features",
+    "find_matches",
+    "find_poses",
+    "merged",
+    "sequential",
+    "similar",
+    "vectors",
+    "words",
+]
+
+
+_MAX_IMAGES = 2147483647
+"""A pair of images is stored as _MAX_IMAGES * smaller id + larger id."""
+
+
+class Tables:
+    """What a database says of images, by their names. Raises sqlite3.Error for what is no database of COLMAP's."""
+
+    def __init__(self, path: Path) -> None:
+        with _reading(path) as base:
+            self.ids: dict[str, int] = dict(base.execute("SELECT name, image_id FROM images"))
+            self.features: dict[int, int] = dict(base.execute("SELECT image_id, rows FROM keypoints"))
+            rows = base.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
+        names = {id_: name for name, id_ in self.ids.items()}
+        self.matches: dict[tuple[str, str], int] = {}
+        for pair, count in rows:
+            a, b = divmod(pair, _MAX_IMAGES)
+            if a in names and b in names:
+                self.matches[names[a], names[b]] = count
+
+    def features_of(self, name: str) -> int:
+        """Features found in an image; 0 for one that is not there."""
+        return self.features.get(self.ids.get(name, -1), 0)
+
+    def partners(self, name: str, least: int) -> int:
+        """Images that share at least `least` verified matches with an image."""
+        return sum(count >= least for pair, count in self.matches.items() if name in pair)
+
+
+def counts(path: Path) -> tuple[int, int]:
+    """Images with features and pairs that were tried so far; zeros while the database cannot be read."""
+    with contextlib.suppress(sqlite3.Error, OSError), _reading(path) as base:
+        features = base.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0]
+        return int(features), int(base.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
+    return 0, 0
+
+
+def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
+    """SIFT descriptors [N 128] of an image; none for an image without."""
+    with _reading(path) as base:
+        row = base.execute(
+            "SELECT rows, cols, data FROM descriptors JOIN images USING (image_id) WHERE name = ?", (name,)
+        ).fetchone()
+    if row is None or not row[0]:
+        return np.zeros((0, 128), np.uint8)
+    return np.frombuffer(row[2], np.uint8).reshape(row[0], row[1])
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[sqlite3.Connection]:
+    base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
+    try:
+        yield base
+    finally:
+        base.close()
+
+
+Pair: TypeAlias = tuple[int, int]
+
+
+def exhaustive(count: int) -> list[Pair]:
+    """All with all: count (count - 1) / 2."""
+    return [(a, b) for a in range(count) for b in range(a + 1, count)]
+
+
+def sequential(count: int, overlap: int) -> list[Pair]:
+    """Each with the next `overlap` ones, and with those at distances 2, 4, 8, ... up to 2 ** overlap."""
+    steps = sorted({*range(1, overlap + 1), *(2**k for k in range(overlap + 1))})
+    return [(a, a + step) for a in range(count) for step in steps if a + step < count]
+
+
+def similar(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
+    """Each with those whose unit vectors are most like its own, by cosine; an image without a vector (all 0) with none."""
+    likeness = vectors @ vectors.T
+    empty = ~vectors.any(axis=1)
+    likeness[empty] = likeness[:, empty] = -np.inf
+    np.fill_diagonal(likeness, -np.inf)
+    count = min(nearest, max(0, len(vectors) - 1))
+    best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
+    found = {(min(a, b), max(a, b)) for a, row in enumerate(best.tolist()) for b in row if np.isfinite(likeness[a, b])}
+    return sorted(found)
+
+
+def merged(*parts: Sequence[Pair]) -> list[Pair]:
+    """Pairs of any of the parts."""
+    return sorted({pair for part in parts for pair in part})
+
+
+_SAMPLE = 40_000
+"""Descriptors that the words are made of, at most."""
+_MOST = 2000
+"""Descriptors of an image that its vector is made of, at most; taken evenly."""
+_ROUNDS = 12
+
+Descriptors = Annotated[NDArray[np.uint8], "N 128"]
+Words = Annotated[NDArray[np.float32], "W 128"]
+Reader = Callable[[int], Descriptors]
+
+
+def words(read: Reader, count: int, number: int, seed: int = 0) -> Words:
+    """`number` visual words, or fewer where there are fewer descriptors; `read(i)` gives those of image i of `count`."""
+    rng = np.random.default_rng(seed)
+    each = max(1, _SAMPLE // max(1, count))
+    parts = []
+    for image in range(count):
+        found = read(image)
+        parts.append(found[rng.permutation(len(found))[:each]])
+    sample = np.concatenate(parts).astype(np.float32) if parts else np.zeros((0, 128), np.float32)
+    if len(sample) <= number:
+        return sample
+    stop = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, _ROUNDS, 1e-3)
+    cv2.setRNGSeed(seed)
+    start = rng.permutation(len(sample))[:number]
+    labels = np.argmax(-_distances(sample, sample[start]), axis=1).astype(np.int32)[:, None]
+    centres = cv2.kmeans(sample, number, labels, stop, 1, cv2.KMEANS_USE_INITIAL_LABELS)[2]
+    return np.asarray(centres, dtype=np.float32)
+
+
+def vectors(read: Reader, count: int, vocabulary: Words) -> Annotated[NDArray[np.float32], "V X"]:
+    """A unit vector an image; 0 for an image without descriptors."""
+    result = np.zeros((count, vocabulary.size), np.float32)
+    for image in range(count):
+        found = read(image)
+        some = found[:: -(-len(found) // _MOST) or 1].astype(np.float32)
+        if len(some) and len(vocabulary):
+            result[image] = _vlad(some, vocabulary)
+    return result
+
+
+def _vlad(found: NDArray[np.float32], vocabulary: NDArray[np.float32]) -> NDArray[np.float32]:
+    nearest = np.argmin(_distances(found, vocabulary), axis=1)
+    sums = np.zeros_like(vocabulary)
+    np.add.at(sums, nearest, found - vocabulary[nearest])
+    sums = np.sign(sums) * np.sqrt(np.abs(sums))
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
+    flat: NDArray[np.float32] = sums.reshape(-1)
+    return flat / max(float(np.linalg.norm(flat)), 1e-12)
+
+
+def _distances(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Squared distances less a constant of each row."""
+    distances: NDArray[np.float32] = (b * b).sum(1)[None] - 2 * (a @ b.T)
+    return distances
+
+
+_ALL_PAIRS = 120
+"""Images up to which `auto` matches all with all."""
+_WORDS = 64
+_POLL = 0.2
+"""Seconds between looks at a running step."""
+_COMMAND = (sys.executable, "-m", "fprf.reconstruction.worker")
+
+Progress = Callable[[int, int, str], None]
+
+
+def find_features(place: Place, state: State, config: SfmConfig, progress: Progress) -> None:
+    """Features of every image; those of an image that has changed or gone take all others with them."""
+    settings = [config.lens, config.cameras, config.features, config.side, config.seed]
+    hashes = {name: image["sha256"] for name, image in state.images.items()}
+    before = _read(place.work / "features.json")
+    grown = before.get("settings") == settings and before.get("hashes", {}).items() <= hashes.items()
+    if not grown:
+        for old in place.work.glob("database.db*"):
+            old.unlink()
+        write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
+    key = key_of(settings, hashes)
+    if state.done.get("features") == key and place.database.is_file():
+        return
+    write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
+    groups: dict[str, list[str]] = {}
+    for name, image in state.images.items():
+        alike = [image["width"], image["height"], image["lens"]] if config.cameras == "shared" else name
+        groups.setdefault(json.dumps(alike), []).append(name)
+    job = {
+        "step": "features",
+        "groups": list(groups.values()),
+        "lens": config.lens.upper().replace("-", "_"),
+        "features": config.features,
+        "side": config.side,
+    }
+    _run(place, state, config, job, _Watch(lambda: counts(place.database)[0], len(state.images), "finding features", progress))
+    state.done["features"] = key
+    state.save(place)
+
+
+def find_matches(place: Place, state: State, config: SfmConfig, progress: Progress) -> str:
+    """Matches of the pairs that `matching` says. Returns what it was decided to be."""
+    names, video = list(state.images), "frames" in state.done
+    kind = config.matching
+    if kind == "auto":
+        kind = "exhaustive" if len(names) <= _ALL_PAIRS else "similar"
+    key = key_of(state.done["features"], kind, config.overlap, config.neighbours)
+    if state.done.get("matches") == key and place.database.is_file():
+        return kind
+    if kind == "exhaustive":
+        chosen = exhaustive(len(names))
+    elif kind == "sequential":
+        chosen = sequential(len(names), config.overlap)
+    else:
+        # Neighbours by name help where things look alike everywhere; in a video they are neighbours for certain.
+        near = sequential(len(names), config.overlap if video else 2)
+        chosen = merged(near, _alike(place, names, config))
+    listed = place.work / "pairs.txt"
+    write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
+    job = {"step": "matches", "pairs": str(listed)}
+    _run(place, state, config, job, _Watch(lambda: counts(place.database)[1], len(chosen), "matching", progress))
+    state.done["matches"] = key
+    state.save(place)
+    return kind
+
+
+def find_poses(place: Place, state: State, config: SfmConfig, progress: Progress) -> list[dict[str, Any]]:
+    """The largest model in `sparse/0`; all of them described. Raises DataError where no two images fit together."""
+    key = key_of(state.done["matches"], "mapping")
+    described = place.work / "models" / "models.json"
+    if state.done.get("mapping") == key and (place.model / "images.bin").is_file() and described.is_file():
+        return list(json.loads(described.read_text(encoding="utf-8")))
+    shutil.rmtree(described.parent, ignore_errors=True)
+    job = {"step": "mapping", "models": str(described.parent)}
+    _run(place, state, config, job, _Watch(lambda: _registered(place), len(state.images), "finding poses", progress))
+    fresh = place.root / "sparse" / ".fresh"
+    shutil.rmtree(fresh, ignore_errors=True)
+    shutil.copytree(described.parent / "best", fresh)
+    shutil.rmtree(place.model, ignore_errors=True)
+    fresh.rename(place.model)
+    state.done["mapping"] = key
+    state.save(place)
+    return list(json.loads(described.read_text(encoding="utf-8")))
+
+
+def _alike(place: Place, names: Sequence[str], config: SfmConfig) -> list[Pair]:
+    """Pairs of images that look alike."""
+
+    def read(image: int) -> Any:
+        return descriptors(place.database, names[image])
+
+    vocabulary = words(read, len(names), _WORDS, config.seed)
+    return similar(vectors(read, len(names), vocabulary), config.neighbours)
+
+
+class _Watch(NamedTuple):
+    """How a step is seen from outside."""
+
+    seen: Callable[[], int]
+    total: int
+    what: str
+    progress: Progress
+
+
+def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], watch: _Watch) -> None:
+    """One step in its process. Raises UsageError where pycolmap is absent, DataError where COLMAP fails."""
+    name, start = job["step"], time.perf_counter()
+    path = place.work / f"{name}.job.json"
+    common = {
+        "database": str(place.database),
+        "images": str(place.images),
+        "threads": -1 if config.threads is None else config.threads,
+        "cpu": not config.gpu,
+        "seed": config.seed,
+    }
+    write_json(path, {**common, **job})
+    with place.log.open("ab") as log, _progress_file(place).open("wb") as out:
+        process = subprocess.Popen([*_COMMAND, str(path)], stdout=out, stderr=log, stdin=subprocess.DEVNULL)
+        try:
+            while process.poll() is None:
+                watch.progress(max(0, min(watch.total - 1, watch.seen())), watch.total, watch.what)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_POLL)
+        finally:
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
+    code = process.returncode
+    if code == ABSENT:
+        raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'fprf[sfm]'")
+    if code == NOTHING:
+        raise DataError(
+            f"{place.root}: no two images fit together; take more views with more overlap, of places with texture "
+            f"({place.log} has COLMAP's words)"
+        )
+    if code:
+        raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {_last(place.log)}; {place.log} has the rest")
+    watch.progress(watch.total, watch.total, watch.what)
+    state.seconds[name] = round(time.perf_counter() - start, 2)
+
+
+def _progress_file(place: Place) -> Path:
+    return place.work / "progress.jsonl"
+
+
+def _registered(place: Place) -> int:
+    """Images with a pose so far."""
+    lines = [line for line in _progress_file(place).read_text(encoding="utf-8").splitlines() if line.startswith("{")]
+    return len(lines) + 1 if lines else 0
+
+
+def _last(log: Path) -> str:
+    lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    return lines[-1][-200:] if lines else "nothing was said"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

@@ -1,0 +1,374 @@
+"""The images of a scene: copied from a folder, or taken from a video where it is sharp, with what their EXIF says of the lens.
+
+The sharpness of an image is the variance of its Laplacian on grey levels in [0, 255]: blur takes the fine edges first. It
+depends on what is shown, so frames are compared with their neighbours only.
+"""
+
+import hashlib
+import re
+import shutil
+import struct
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image
+from ..errors import DataError, UsageError
+from ..io.atomic import atomic_path, write_bytes
+from .config import SfmConfig
+from .scene_folder import Place, State, key_of
+
+__all__ = [
+    "VIDEO_SUFFIXES",
+    "Choice",
+    "Lens",
+    "choose",
+    "frame_name",
+    "frame_scores",
+    "gather",
+    "heic_exif",
+    "in_order",
+    "lens_of",
+    "read_lens",
+    "save_frames",
+    "sharpness",
+]
+
+
+_SIDE = 960
+"""Longest side at which sharpness is measured: finer detail is mostly noise, and larger images take long."""
+_NEIGHBOURS = 2
+"""Windows on each side that a window's best frame is compared with."""
+
+
+class Choice(NamedTuple):
+    """One frame of each window, and what became of the others."""
+
+    chosen: list[int]
+    """Frames, in their order."""
+    dropped: dict[int, str]
+    """The other frames with the reason."""
+
+
+def sharpness(image: Image) -> float:
+    """Variance of the Laplacian of an RGB image [H W 3]; 0 for an even one."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    scale = _SIDE / max(grey.shape)
+    if scale < 1:
+        grey = np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+
+
+def choose(scores: Sequence[float], count: int, least: float) -> Choice:
+    """The sharpest frame of each of `count` windows of equal length; the first of equally sharp ones.
+
+    A window whose best frame has less than `least` times the median sharpness of the windows around it gives none: all of
+    it is blurred, as in a quick turn. `least` lies in [0, 1). With `count` frames or fewer every frame is a window.
+    """
+    windows = min(count, len(scores))
+    edges = [round(k * len(scores) / windows) for k in range(windows + 1)] if windows else [0]
+    best = [max(range(low, high), key=lambda i: (scores[i], -i)) for low, high in pairwise(edges)]
+    dropped = {}
+    for (low, high), top in zip(pairwise(edges), best, strict=True):
+        for frame in range(low, high):
+            if frame != top:
+                dropped[frame] = f"less sharp than frame {top} ({scores[frame]:.0f} < {scores[top]:.0f})"
+    chosen = []
+    for k, top in enumerate(best):
+        around = [scores[best[j]] for j in range(max(0, k - _NEIGHBOURS), min(windows, k + _NEIGHBOURS + 1)) if j != k]
+        usual = float(np.median(around)) if around else 0.0
+        if scores[top] < least * usual:
+            dropped[top] = f"blurred, like all frames around it (sharpness {scores[top]:.0f}, usual there is {usual:.0f})"
+        else:
+            chosen.append(top)
+    return Choice(chosen, dict(sorted(dropped.items())))
+
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
+"""What is taken for a video, in lower case."""
+
+_QUALITY = 95
+
+Progress = Callable[[int, int, str], None]
+
+
+def frame_name(frame: int) -> str:
+    """The file of a frame."""
+    return f"frame_{frame:06d}.jpg"
+
+
+def frame_scores(video: Path, progress: Progress) -> list[float]:
+    """Sharpness of every frame, in their order. Raises DataError where the file holds no frames."""
+    with _opened(video) as (reader, expected):
+        scores: list[float] = []
+        for frame in _frames(reader):
+            progress(len(scores), max(expected, len(scores) + 1), "looking for sharp frames")
+            scores.append(sharpness(frame))
+    if not scores:
+        raise DataError(f"{video}: no frame can be decoded; convert it to H.264 in an .mp4, or give a folder of images")
+    progress(len(scores), len(scores), "looking for sharp frames")
+    return scores
+
+
+def save_frames(video: Path, frames: Sequence[int], folder: Path, progress: Progress) -> None:
+    """Write some of the frames, as JPEG (95), each whole or not at all; those that are there stay."""
+    wanted = {frame for frame in frames if not (folder / frame_name(frame)).is_file()}
+    if not wanted:
+        return
+    last, done = max(wanted), 0
+    with _opened(video) as (reader, _):
+        for index, image in enumerate(_frames(reader, wanted)):
+            if index in wanted:
+                coded, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+                assert coded
+                write_bytes(folder / frame_name(index), data.tobytes())
+                done += 1
+                progress(done, len(wanted), "writing frames")
+            if index == last:
+                return
+    raise DataError(f"{video}: frame {last} was there before and is not now; keep the video as it is while it is processed")
+
+
+@contextmanager
+def _opened(video: Path) -> Iterator[tuple[cv2.VideoCapture, int]]:
+    """The reader of a video and the number of frames that it claims to have."""
+    reader = cv2.VideoCapture(str(video))
+    try:
+        if not reader.isOpened():
+            raise DataError(f"{video}: no video that can be opened; convert it to H.264 in an .mp4, or give a folder of images")
+        yield reader, max(0, int(reader.get(cv2.CAP_PROP_FRAME_COUNT)))
+    finally:
+        reader.release()
+
+
+def _frames(reader: cv2.VideoCapture, wanted: set[int] | None = None) -> Iterator[Image]:
+    """Frames one by one; those that are not wanted come empty and are not decoded to pixels."""
+    index = 0
+    while reader.grab():
+        if wanted is None or index in wanted:
+            done, frame = reader.retrieve()
+            if not done:
+                return
+            yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        else:
+            yield np.empty((0, 0, 3), dtype=np.uint8)
+        index += 1
+
+
+_HEAD = 1 << 17
+"""EXIF lies within the first 64 KiB of a JPEG."""
+_MODEL, _EXIF, _FOCAL, _FOCAL_35 = 0x0110, 0x8769, 0x920A, 0xA405
+_SIZES = {2: 1, 3: 2, 4: 4, 5: 8}
+"""Bytes of a value by type: text, short, long, fraction."""
+
+
+class Lens(NamedTuple):
+    """Two photographs of equal size and equal lens are taken with one camera."""
+
+    model: str = ""
+    focal: float = 0.0
+    """Millimetres; 0 where the file does not say."""
+    focal_35: int = 0
+    """The same as on 35 mm film."""
+
+
+def read_lens(path: Path) -> Lens:
+    """The lens of a photograph; an empty one where its file says nothing, or nothing that can be understood."""
+    try:
+        with path.open("rb") as file:
+            return lens_of(file.read(_HEAD))
+    except OSError:
+        return Lens()
+
+
+def heic_exif(path: Path) -> bytes:
+    """The EXIF block of a HEIC file that can be decoded, for a JPEG of its pixels: without orientation, which these have had.
+
+    Empty where there is none, it is longer than a JPEG takes, or the file is none.
+    """
+    if not find_spec("pillow_heif"):
+        return b""
+    import pillow_heif
+
+    if not pillow_heif.is_supported(path):
+        return b""
+    info = pillow_heif.open_heif(path).info
+    pillow_heif.set_orientation(info)
+    block: bytes = info.get("exif") or b""
+    return block if len(block) < (1 << 16) - 2 else b""
+
+
+def lens_of(data: bytes) -> Lens:
+    """The lens of a photograph by the first bytes of its file."""
+    try:
+        return _lens(_tiff(data))
+    except (struct.error, IndexError, ValueError):
+        return Lens()
+
+
+def _tiff(data: bytes) -> bytes:
+    """The TIFF structure within a JPEG's EXIF segment; empty without one."""
+    at = 2
+    while data.startswith(b"\xff\xd8") and at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
+            return data[at + 10 : at + 2 + length]
+        at += 2 + length
+    return b""
+
+
+def _lens(tiff: bytes) -> Lens:
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None:
+        return Lens()
+    first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
+    inner = _entries(tiff, order, int.from_bytes(first[_EXIF], "little" if order == "<" else "big")) if _EXIF in first else {}
+    focal, short = inner.get(_FOCAL, b""), inner.get(_FOCAL_35, b"")
+    top, bottom = struct.unpack(order + "II", focal) if len(focal) == 8 else (0, 1)
+    model = first.get(_MODEL, b"").split(b"\0")[0].decode("ascii", "replace").strip()
+    return Lens(model, top / bottom if bottom else 0.0, struct.unpack(order + "H", short)[0] if len(short) == 2 else 0)
+
+
+def _entries(tiff: bytes, order: str, at: int) -> dict[int, bytes]:
+    """Values of a directory by tag, of the types that are read."""
+    found = {}
+    (count,) = struct.unpack_from(order + "H", tiff, at)
+    for k in range(min(count, 256)):
+        tag, kind, number = struct.unpack_from(order + "HHI", tiff, at + 2 + 12 * k)
+        size, place = _SIZES.get(kind, 0) * number, at + 10 + 12 * k
+        if 0 < size <= 4096:
+            start = place if size <= 4 else struct.unpack_from(order + "I", tiff, place)[0]
+            found[tag] = tiff[start : start + size]
+    return found
+
+
+_FEWEST = 3
+"""Images that a scene needs at least."""
+_FOREIGN = frozenset({".heic", ".heif", ".hif", ".avif"})
+"""Endings of formats that COLMAP does not read."""
+
+
+def gather(source: Path, place: Place, state: State, config: SfmConfig, progress: Progress) -> None:
+    """Bring images into the folder, and describe them and what was dropped in `state`.
+
+    Raises UsageError for a source that is neither a folder of images nor a video, or not the one that the folder was
+    begun with; DataError for too few images.
+    """
+    here = str(source.resolve())
+    if state.source not in ("", here):
+        raise UsageError(f"--output {place.root}: was begun with {state.source}; go on with that, or name another folder")
+    if source.is_dir():
+        found = _from_folder(source, place, state, progress)
+    elif source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
+        found = _from_video(source, place, state, config, progress)
+    else:
+        kinds = " ".join(sorted(VIDEO_SUFFIXES))
+        raise UsageError(f"{source}: neither a folder of images nor a video ({kinds}); check the path")
+    if len(found) < _FEWEST:
+        why = next((f"{name}: {reason}" for name, reason in state.dropped.items()), _holds(source))
+        raise DataError(f"{source}: {len(found)} usable images, at least {_FEWEST} are needed; {why}")
+    for name in set(state.images) - set(found):
+        if place.images.resolve() != source.resolve():
+            (place.images / name).unlink(missing_ok=True)
+    state.source, state.images = here, {name: found[name] for name in in_order(found)}
+    state.save(place)
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Names as people number them: 2 before 10."""
+    return sorted(names, key=lambda name: [_rank(part) for part in _PARTS.findall(name)])
+
+
+_PARTS = re.compile(r"[0-9]+|[^0-9]+")
+
+
+def _rank(part: str) -> tuple[bool, int, str]:
+    """Numbers by their value, before words."""
+    number = "0" <= part[0] <= "9"
+    return not number, int(part) if number else 0, part
+
+
+def _from_folder(source: Path, place: Place, state: State, progress: Progress) -> dict[str, dict[str, Any]]:
+    """Every image below the folder that can be decoded, under its relative name without blanks.
+
+    Formats that COLMAP does not read become JPEGs: IMG_1.heic is IMG_1.heic.jpg in the scene.
+    """
+    inplace = place.images.resolve() == source.resolve()
+    files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(source).parts)]
+    found: dict[str, dict[str, Any]] = {}
+    state.dropped = {}
+    for i, path in enumerate(files):
+        progress(i, len(files), "reading images")
+        given = path.relative_to(source).as_posix()
+        name = re.sub(r"\s", "_", given)
+        if name in found or (inplace and name != given):
+            raise UsageError(f"{path}: COLMAP takes no blanks in names; rename the image, so that no other is called {name}")
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        foreign = path.suffix.lower() in _FOREIGN
+        name = f"{name}.jpg" if foreign else name
+        known = state.images.get(name, {})
+        if known.get("sha256") != digest or not (place.images / name).is_file():
+            try:
+                if foreign and inplace:
+                    raise DataError(f"{path}: COLMAP reads no {path.suffix} files: name another --output, where JPEGs are made")
+                if foreign:
+                    _write_jpeg(path, place.images / name)
+                known = _described(place.images / name if foreign else path, digest)
+            except DataError as fault:
+                state.dropped[given] = str(fault).removeprefix(f"{path}: ").partition(";")[0]
+                continue
+            if not (inplace or foreign):
+                with atomic_path(place.images / name) as temporary:
+                    shutil.copyfile(path, temporary)
+        found[name] = known
+    progress(len(files), len(files), "reading images")
+    return found
+
+
+def _from_video(source: Path, place: Place, state: State, config: SfmConfig, progress: Progress) -> dict[str, dict[str, Any]]:
+    """Sharp frames, evenly over time."""
+    about = source.stat()
+    key = key_of("frames", about.st_size, about.st_mtime_ns, config.frames, config.blurred)
+    if state.done.get("frames") == key and all((place.images / name).is_file() for name in state.images):
+        return state.images
+    choice = choose(frame_scores(source, progress), config.frames, config.blurred)
+    save_frames(source, choice.chosen, place.images, progress)
+    state.dropped = {f"frame {frame}": reason for frame, reason in choice.dropped.items()}
+    state.done["frames"] = key
+    found = {}
+    for frame in choice.chosen:
+        path = place.images / frame_name(frame)
+        found[path.name] = _described(path, hashlib.sha256(path.read_bytes()).hexdigest())
+    return found
+
+
+def _write_jpeg(path: Path, target: Path) -> None:
+    """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be decoded."""
+    pixels = cv2.cvtColor(load_image(path, upright=True), cv2.COLOR_RGB2BGR)
+    options = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    data, exif = cv2.imencode(".jpg", pixels, options)[1].tobytes(), heic_exif(path)
+    if exif:
+        data = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+    write_bytes(target, data)
+
+
+def _holds(source: Path) -> str:
+    """What a folder holds instead of images."""
+    if not source.is_dir():
+        return "the video holds no more"
+    endings = sorted({path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix})
+    there = f"it holds {' '.join(endings)} files" if endings else "it holds no files"
+    return f"{there}, and what is read is {' '.join(sorted(IMAGE_SUFFIXES))}: convert the images to JPEG"
+
+
+def _described(path: Path, digest: str) -> dict[str, Any]:
+    """Size and lens of an image. Raises DataError where it cannot be decoded."""
+    height, width = load_image(path).shape[:2]
+    return {"sha256": digest, "width": width, "height": height, "lens": list(read_lens(path))}
