@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UsageError
-from .beside import VIEW, linger, open_view, take_view
 from .blocks import train_blocks
 from .event_log import EventLog
+from .live_view import VIEW, linger, open_view, take_view
 from .parsing import LIST_FLAGS, load_method, methods, parse
 
 if TYPE_CHECKING:

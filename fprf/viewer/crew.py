@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 from ..errors import FprfError
 from ..io.images import Picture
 from ..io.video import write_video
+from .cameras import Eye
 from .film import FilmPlan, frames_of_film, lay_film, new_folder, path_of, taken
 from .keys import between_keys
-from .stage import Eye
 from .state import Film
 
 if TYPE_CHECKING:
-    from .desk import Desk
-    from .eyes import Glance
+    from .render_worker import Desk
+    from .renderer import Glance
     from .session import Session
 
 __all__ = ["Crew"]

@@ -24,9 +24,9 @@ from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
 from ..training.cached_view import view_parts
 from ..training.loading import Trained
-from .eyes import CHUNK
+from .cameras import Eye, Stage
 from .looks import Look, settled, style_of
-from .stage import Eye, Stage
+from .renderer import CHUNK
 
 __all__ = ["FilmPlan", "Key", "Thumbnail", "frames_of_film", "lay_film", "new_folder", "path_of", "taken"]
 

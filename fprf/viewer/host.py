@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from .access import Access, is_loopback
-from .gate import Answer, Gate, Request
+from .server import Answer, Gate, Request
 
 if TYPE_CHECKING:
     from ..training.loading import Trained
+    from .restyler import Opener
     from .session import Session
-    from .studio import Opener
 
 __all__ = ["Host"]
 
@@ -75,8 +75,8 @@ class Host:
         Raises what `load` raises, and DataError for an unreadable photograph.
         """
         trained = load()
+        from .frontend import Server, built_index, check_bytes
         from .page import Page
-        from .server import Server, built_index, check_bytes
         from .session import Session
         from .state import Landing, State
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from ..rendering.cameras import Cameras
 from ..rendering.space import Space
 from ..types import Boxes
-from .stage import Stage
+from .cameras import Stage
 
 __all__ = ["Segments", "box_lines", "camera_lines", "path_lines"]
 

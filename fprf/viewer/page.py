@@ -17,9 +17,9 @@ from typing import Any
 from ..errors import UsageError
 from ..io.images import encode
 from ..io.maps import palette
-from .gate import Answer, Request
 from .keys import chosen, shifted, without
 from .looks import Card, Verb, only, ordered, weighed
+from .server import Answer, Request
 from .session import Session
 from .state import State, removed
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 from ..style.presets import PRESETS, preset_flags
+from .cameras import Eye, fitted
 from .film import FilmPlan, Key, path_of
 from .keys import added, at_key, replaced
 from .looks import preset
 from .painter import MAPS, Map
 from .session import Session
-from .stage import Eye, fitted
 from .state import LEAST, MOST, Film, Landing, State, kept
 
 if TYPE_CHECKING:

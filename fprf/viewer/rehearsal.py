@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from ..io.images import encode
-from .eyes import Glance, Sight
+from .cameras import Stage
 from .looks import only
-from .stage import Stage
+from .renderer import Glance, Sight
+from .restyler import Studio
 from .state import State
-from .studio import Studio
 
 __all__ = ["rehearsal"]
 

@@ -1,215 +1,256 @@
-"""viser, kept behind the gate: the scene's picture behind its canvas, lines over it, cameras and clicks from it."""
+"""The one door of the viewer: an HTTP server that checks who comes, serves the page, takes photographs, and passes checked
+WebSocket messages on to viser, which itself listens where no other page can find it.
 
+One request a connection. Whatever a client does wrong ends its own connection and nothing else.
+"""
+
+import asyncio
 import contextlib
-import ipaddress
-import os
-import secrets
-import socket
-import sys
 import threading
-from collections.abc import Hashable
-from pathlib import Path
-from typing import Any
+from collections.abc import Awaitable, Callable, Mapping
+from http import HTTPStatus
+from typing import NamedTuple
+from urllib.parse import parse_qs, urlsplit
 
-import msgspec
-import numpy as np
-import torch
-import viser
+from ..errors import FprfError, UsageError
+from .access import COOKIE, Access
+from .wire import Inbox
 
-from ..errors import FprfError
-from ..rendering.cameras import pixel_grid
-from ..training.lay_out import load_boxes
-from .eyes import Frame
-from .film import path_of
-from .lines import box_lines, camera_lines, path_lines
-from .manners import check_message
-from .page import Page, built_page
-from .panel import Panel
-from .session import Face, Session
-from .stage import Eye, checked_eye
-from .state import State
+__all__ = ["Answer", "Gate", "Request"]
 
-__all__ = ["Server", "built_index", "check_bytes"]
+_HEAD = 16 << 10
+"""Bytes of a request's head."""
+_PATIENCE = 15.0
+"""Seconds within which a head must be there, and within which each piece of a body must follow."""
+_CONNECTIONS = 64
+_BODIES = 4
+"""Bodies that are taken in at once: bounds the memory."""
+_PIECE = 1 << 16
 
-_FRESH, _FINAL = 70, 92
-"""JPEG qualities of pictures on the way and of those that stay."""
-
-
-_ORBIT = 0.5
-"""Page units from a camera to the point that a drag turns it about."""
+_SAFE = {
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
 
 
-class _Server(viser.ViserServer):  # type: ignore[misc]  # viser is not there where types are checked
-    """Never asks a service elsewhere to share the scene, whatever a page says."""
+class Request(NamedTuple):
+    """What a client asks."""
 
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """No."""
-        return None
+    method: str
+    path: str
+    query: Mapping[str, str]
+    headers: Mapping[str, str]
+    body: bytes = b""
 
 
-class Server(Face):
-    """Starts viser for a session and puts the page together."""
+class Answer(NamedTuple):
+    """What it gets."""
 
-    def __init__(self, session: Session, page: Page) -> None:
-        self._session, self._page = session, page
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):  # it prints an address that is not ours
-            self._viser = _Server(host=_hidden_host(), port=0, verbose=False)
-        self.inner = (self._viser.get_host(), self._viser.get_port())
-        self._viser.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
-        self._viser.gui.set_panel_label(session.trained.known.name)
-        self._viser.scene.set_up_direction(session.stage.up)
-        self._viser.scene.world_axes.visible = False
-        self._home = self._start_here()
-        self._lock = threading.Lock()
-        self.panel = Panel(self._viser.gui, session, self._fly, self._eye_of, self._draw)
-        self._viser.on_client_connect(self._arrived)
-        self._viser.on_client_disconnect(self._gone)
-        session.meet(self)
+    status: int
+    kind: str
+    body: bytes
+    headers: Mapping[str, str] = {}
+
+
+class _Refused(Exception):
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+Handler = Callable[[Request], Awaitable[Answer]]
+
+
+class Gate:
+    """Listens in a thread of its own. `routes` are by method and path; `lead` changes them, and says where viser listens."""
+
+    def __init__(
+        self,
+        access: Access,
+        port: int,
+        routes: Mapping[tuple[str, str], Handler],
+        *,
+        largest: int,
+    ) -> None:
+        self.access, self.port = access, port
+        self._routes, self._largest = routes, largest
+        self._inner: tuple[tuple[str, int], Callable[[bytes], None]] | None = None
+        self._loop = asyncio.new_event_loop()
+        self._server: asyncio.Server | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._bodies = asyncio.Semaphore(_BODIES)
+        self._thread = threading.Thread(target=self._loop.run_forever, name="fprf-gate", daemon=True)
+
+    def open(self) -> None:
+        """Listen. Raises UsageError where the address or the port cannot be had; `port` 0 takes a free one and becomes it."""
+        self._thread.start()
+        try:
+            self._server = asyncio.run_coroutine_threadsafe(
+                asyncio.start_server(self._meet, self.access.host, self.port, limit=_HEAD), self._loop
+            ).result()
+        except OSError as error:
+            self.close()
+            raise UsageError(
+                f"--host {self.access.host} --port {self.port}: cannot listen there ({error.strerror}); choose another port"
+            ) from error
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    def lead(self, routes: Mapping[tuple[str, str], Handler], inner: tuple[str, int], check: Callable[[bytes], None]) -> None:
+        """From now on to these pages, and over WebSockets to `inner`; `check` raises for messages that are not passed on."""
+        self._routes, self._inner = routes, (inner, check)
 
     def close(self) -> None:
-        """Hang up."""
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-            self._viser.stop()
+        """Hang up on everybody."""
+        if self._thread.is_alive():
+            asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(5)
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join(5)
+            self._loop.close()
 
-    def show(self, client: Hashable, frame: Frame) -> None:
-        """Put a picture behind a client's canvas; with its depth, where lines are to disappear behind things."""
-        handle = self._viser.get_clients().get(client) if isinstance(client, int) else None
-        if handle is None:
-            return
-        lined = self.panel.cameras or self.panel.blocks or bool(self._session.state.keys)
-        handle.scene.set_background_image(
-            frame.picture,
-            format="jpeg",
-            jpeg_quality=_FINAL if frame.final else _FRESH,
-            depth=self._page_depth(frame) if lined else None,
-        )
-        handle.flush()
+    async def _end(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        tasks = list(self._tasks)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
-    def changed(self, before: State, now: State) -> None:
-        """Controls and page follow."""
-        with self._lock:
-            self.panel.follow(before, now)
-            if now.picking != before.picking:
-                self._clicks(now.picking)
-        self._page.wake()
-
-    def say(self, text: str, client: Hashable | None = None) -> None:
-        """On all pages: a client's own mistake is nothing to hide."""
-        self._page.say(text)
-
-    async def _arrived(self, client: viser.ClientHandle) -> None:
-        async def moved(camera: viser.CameraHandle) -> None:
-            with contextlib.suppress(FprfError):  # a camera that is none shows nothing new
-                self._session.see(client.client_id, self._eye_of(client))
-
-        client.camera.on_update(moved)
-        self._fly(client, self._home)
-        self._session.see(client.client_id, self._home._replace(aspect=self._eye_of(client).aspect))
-
-    async def _gone(self, client: viser.ClientHandle) -> None:
-        self._session.leave(client.client_id)
-
-    def _eye_of(self, client: viser.ClientHandle) -> Eye:
-        camera = client.camera
-        size = (camera.image_width, camera.image_height)
-        return checked_eye(camera.wxyz.tolist(), camera.position.tolist(), camera.fov, *size)
-
-    def _clicks(self, on: bool) -> None:
-        scene = self._viser.scene
-        if not on:
-            scene.remove_click_callback()
-            return
-
-        def clicked(event: viser.SceneClickEvent) -> None:
-            x, y = event.screen_pos
-            self._session.pick(event.client_id, (float(x), float(y)))
-
-        scene.on_click()(clicked)
-
-    def _fly(self, client: viser.ClientHandle, eye: Eye) -> None:
-        camera = self._session.stage.cameras([eye], (16, 16))
-        ahead = -camera.pose[0, :, 2].numpy()
-        with client.atomic():
-            client.camera.position = np.asarray(eye.position)
-            client.camera.look_at = np.asarray(eye.position) + _ORBIT * ahead
-            client.camera.up_direction = np.asarray(self._session.stage.up)
-            client.camera.fov = eye.fov
-        client.flush()
-
-    def _start_here(self) -> Eye:
-        """New clients begin at a captured view, the middle one of those that training did not see."""
-        known, stage = self._session.trained.known, self._session.stage
-        views = known.test or known.train
-        eye = stage.eye(known.cameras, views[len(views) // 2])
-        camera = self._viser.initial_camera  # where "reset view" leads
-        camera.position = np.asarray(eye.position)
-        camera.look_at = np.asarray(eye.position) - known.cameras.pose[views[len(views) // 2], :, 2].numpy() * _ORBIT
-        camera.up = np.asarray(stage.up)
-        camera.fov = eye.fov
-        return eye
-
-    def _draw(self, panel: Panel) -> None:
-        """Lines over the scene, as the controls say."""
-        session = self._session
-        known, stage = session.trained.known, session.stage
-        cameras = known.cameras.select(torch.tensor(known.train)) if panel.cameras else None
-        self._lines("cameras", None if cameras is None else camera_lines(stage, cameras, 0.04), (94, 161, 255))
-        boxes = None
-        if panel.blocks and known.facts.space.kind == "open":
-            boxes = box_lines(stage, known.facts.space, load_boxes(session.trained.run.root))
-        elif panel.blocks:
-            self.say("this scene is not cut into blocks")
-        self._lines("blocks", boxes, (255, 196, 80))
-        keys = () if session.state.playing else session.state.keys  # in a flight they would be in the way
-        path = path_lines(stage, path_of(stage, panel.plan)) if len(keys) > 1 else None
-        self._lines("film", path, (255, 110, 150))
-        places = camera_lines(stage, stage.cameras([key.eye for key in keys], (160, 90)), 0.08, behind=True) if keys else None
-        self._lines("keys", places, (255, 110, 150))
-        for client in self._viser.get_clients().values():  # depth is sent where there is something to hide, or no more
-            with contextlib.suppress(FprfError):
-                session.see(client.client_id, self._eye_of(client))
-
-    def _lines(self, name: str, lines: Any, colour: tuple[int, int, int]) -> None:
-        if lines is None or not len(lines):
-            self._viser.scene.remove_by_name(f"/{name}")
-            return
-        self._viser.scene.add_line_segments(f"/{name}", lines, colour, thickness=2.0, thickness_units="screen")
-
-    def _page_depth(self, frame: Frame) -> Any:
-        """Depth along the view's axis in page units."""
-        height, width = frame.layers.depth.shape
-        cameras = self._session.stage.cameras([frame.eye], (width, height))
-        plane = (pixel_grid(cameras, 0) - cameras.centre[0]) / cameras.focal[0]
-        along = (1 + plane.square().sum(-1)).rsqrt().view(height, width)
-        return (frame.layers.depth * along * self._session.stage.scale).clamp(max=160).float().numpy()
-
-
-def built_index(name: str) -> bytes:
-    """The page of a scene."""
-    index = Path(viser.__file__).parent / "client" / "build" / "index.html"
-    return built_page(index.read_text("utf-8"), f"{name} - fprf")
-
-
-def check_bytes(payload: bytes) -> None:
-    """`check_message` of a WebSocket message. Raises DataError."""
-    try:
-        message = msgspec.msgpack.decode(payload)
-    except (msgspec.DecodeError, ValueError, RecursionError):
-        message = None
-    check_message(message)
-
-
-def _hidden_host() -> str:
-    """A loopback address that nobody can guess, so that only the gate leads to viser; 127.0.0.1 where there is but one.
-
-    viser asks no one who they are. Another site's page in the same browser cannot try 2^24 addresses with all their ports.
-    """
-    host = str(ipaddress.IPv4Address((127 << 24) + secrets.randbelow((1 << 24) - 2) + 1))
-    if not sys.platform.startswith("linux"):
-        return "127.0.0.1"
-    with contextlib.closing(socket.socket()) as probe:
+    async def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
         try:
-            probe.bind((host, 0))
-        except OSError:
-            return "127.0.0.1"
-    return host
+            await self._serve(reader, writer)
+        except _Refused as refused:
+            with contextlib.suppress(OSError):
+                await _send(writer, Answer(refused.status, "text/plain; charset=utf-8", f"{refused}\n".encode()))
+        except (OSError, EOFError, TimeoutError, FprfError):
+            pass  # the client has gone, is too slow, or talks nonsense
+        except asyncio.CancelledError:
+            pass
+        finally:
+            self._tasks.discard(task)
+            writer.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._tasks) > _CONNECTIONS:
+            raise _Refused(503, "too many connections")
+        head = await _head(reader)
+        request = _parsed(head)
+        given = request.query.get("token")
+        refusal = self.access.refusal(request.headers, given)
+        if refusal is not None:
+            raise _Refused(403, refusal)
+        if given is not None and request.method == "GET":
+            # Out of the address bar and its history; the cookie goes to this very server alone.
+            cookie = f"{COOKIE}={given}; Path=/; HttpOnly; SameSite=Strict"
+            await _send(writer, Answer(303, "text/plain", b"", {"location": request.path, "set-cookie": cookie}))
+            return
+        if request.headers.get("upgrade", "").lower() == "websocket":
+            await self._pass_on(head, reader, writer)
+            return
+        handler = self._routes.get((request.method, request.path))
+        if handler is None:
+            known = any(path == request.path for _, path in self._routes)
+            raise _Refused(405 if known else 404, "no such page")
+        if request.method == "POST":
+            async with self._bodies:
+                answer = await _answered(handler, request._replace(body=await self._body(reader, request)))
+        else:
+            answer = await _answered(handler, request)
+        await _send(writer, answer)
+
+    async def _body(self, reader: asyncio.StreamReader, request: Request) -> bytes:
+        text = request.headers.get("content-length", "")
+        if not (text.isascii() and text.isdigit()) or len(text) > 15:
+            raise _Refused(411, "say how long it is")
+        size = int(text)
+        if size > self._largest:
+            raise _Refused(413, f"{size} bytes; at most {self._largest} are taken: make the photograph smaller")
+        body = bytearray()
+        while len(body) < size:
+            piece = await asyncio.wait_for(reader.read(min(_PIECE, size - len(body))), _PATIENCE)
+            if not piece:
+                raise EOFError
+            body += piece
+        return bytes(body)
+
+    async def _pass_on(self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Be the wire between the page and viser; what the page says is looked at first."""
+        if self._inner is None:
+            raise _Refused(503, "still starting; try again")
+        (host, port), check = self._inner
+        there, back = await asyncio.open_connection(host, port)
+        try:
+            back.write(head)
+            ways = [asyncio.create_task(_up(reader, back, check)), asyncio.create_task(_down(there, writer))]
+            _, rest = await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+            for way in rest:
+                way.cancel()
+            await asyncio.gather(*ways, return_exceptions=True)
+        finally:
+            back.close()
+
+
+async def _up(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, check: Callable[[bytes], None]) -> None:
+    inbox = Inbox()
+    while data := await reader.read(_PIECE):
+        for message in inbox.feed(data):
+            if message.payload is not None:
+                check(message.payload)
+            writer.write(message.raw)
+        await writer.drain()
+
+
+async def _answered(handler: Handler, request: Request) -> Answer:
+    try:
+        return await handler(request)
+    except FprfError as error:
+        return Answer(400, "text/plain; charset=utf-8", f"{error}\n".encode())
+
+
+async def _down(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    while data := await reader.read(_PIECE):
+        writer.write(data)
+        await writer.drain()
+
+
+async def _head(reader: asyncio.StreamReader) -> bytes:
+    try:
+        return await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _PATIENCE)
+    except asyncio.LimitOverrunError:
+        raise _Refused(431, "the request's head is too long") from None
+
+
+def _parsed(head: bytes) -> Request:
+    lines = head.decode("latin-1").split("\r\n")
+    words = lines[0].split(" ")
+    if len(words) != 3 or not words[2].startswith("HTTP/1."):
+        raise _Refused(400, "not an HTTP/1 request")
+    headers: dict[str, str] = {}
+    for line in lines[1:]:
+        name, colon, value = line.partition(":")
+        name = name.lower()
+        if line and (not colon or (name in headers and name in ("host", "origin", "content-length"))):
+            raise _Refused(400, "a header that is none, or comes twice")
+        headers.setdefault(name, value.strip())
+    try:
+        target = urlsplit(words[1])
+        query = {key: values[0] for key, values in parse_qs(target.query, max_num_fields=16).items()}
+    except ValueError:
+        raise _Refused(400, "an address that is none") from None
+    return Request(words[0], target.path, query, headers)
+
+
+async def _send(writer: asyncio.StreamWriter, answer: Answer) -> None:
+    fields = {"content-type": answer.kind, "content-length": str(len(answer.body)), "connection": "close", **_SAFE}
+    lines = [
+        f"HTTP/1.1 {answer.status} {HTTPStatus(answer.status).phrase}",
+        *(f"{k}: {v}" for k, v in (fields | dict(answer.headers)).items()),
+    ]
+    writer.write("\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + answer.body)
+    await asyncio.wait_for(writer.drain(), _PATIENCE)

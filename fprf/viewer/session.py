@@ -13,18 +13,18 @@ from pathlib import Path
 from ..errors import FprfError, UsageError
 from ..io.images import Picture, shrink
 from ..training.loading import Trained
+from .cameras import Eye, Stage, stage_of
 from .crew import Crew
-from .desk import Desk
-from .eyes import Frame, Glance, Sight
 from .film import FilmPlan, Thumbnail
-from .intake import Intake, shown_name
 from .looks import Card, Look
 from .moment import likest
 from .painter import Shown
 from .rehearsal import rehearsal
-from .stage import Eye, Stage, stage_of
+from .render_worker import Desk
+from .renderer import Frame, Glance, Sight
+from .restyler import Opener, Studio
 from .state import State, dropped, renumbered
-from .studio import Opener, Studio
+from .uploads import Intake, shown_name
 
 __all__ = ["Face", "Session"]
 

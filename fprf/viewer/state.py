@@ -10,7 +10,7 @@ from ..errors import UsageError
 from .film import Key
 from .looks import Card, Look, moved, only, weighed
 from .painter import MAPS, Map, Shown
-from .studio import Picked
+from .restyler import Picked
 from .training import Training
 
 __all__ = ["LEAST", "MOST", "SHELF", "Film", "Landing", "State", "dropped", "kept", "removed", "renumbered"]

@@ -8,7 +8,7 @@ from tiny_world import World, flags, parameters
 
 from fprf.cli import main as cli
 from fprf.cli import train
-from fprf.cli.beside import open_view, take_view
+from fprf.cli.live_view import open_view, take_view
 from fprf.errors import UsageError
 from fprf.training import trainer
 from fprf.training.run import Run

@@ -3,7 +3,7 @@
 from tiny_world import World
 
 from fprf.viewer.looks import Card
-from fprf.viewer.studio import Studio
+from fprf.viewer.restyler import Studio
 
 __all__ = ["cards_of"]
 

@@ -12,10 +12,10 @@ from tiny_world import World
 
 from fprf.training.loading import load_run
 from fprf.viewer import crew
+from fprf.viewer.cameras import Eye
 from fprf.viewer.film import FilmPlan, Key
 from fprf.viewer.looks import Look
 from fprf.viewer.session import Session
-from fprf.viewer.stage import Eye
 from fprf.viewer.state import State
 
 

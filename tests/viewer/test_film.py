@@ -13,10 +13,10 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.errors import ConfigError, UsageError
 from fprf.io.images import Picture
+from fprf.viewer.cameras import stage_of
 from fprf.viewer.film import FilmPlan, Key, frames_of_film, lay_film, new_folder, path_of, taken
 from fprf.viewer.looks import Look, ordered
-from fprf.viewer.stage import stage_of
-from fprf.viewer.studio import Studio
+from fprf.viewer.restyler import Studio
 
 
 def plan_of(studio: Studio, looks: list[Look], seconds: float = 0.1, fps: float = 30.0) -> FilmPlan:

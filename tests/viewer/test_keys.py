@@ -3,13 +3,13 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_viewer_looks import A, B
+from test_state import A, B
 
 from fprf.errors import UsageError
+from fprf.viewer.cameras import Eye
 from fprf.viewer.film import Key
 from fprf.viewer.keys import added, at_key, between_keys, chosen, replaced, shifted, without
 from fprf.viewer.looks import Look
-from fprf.viewer.stage import Eye
 from fprf.viewer.state import State
 
 PLAIN, ONE, TWO = Look(), Look(mix=((A, 1.0),)), Look(mix=((B, 1.0),), strength=0.5)

@@ -5,8 +5,8 @@ from tiny_world import World
 
 from fprf.rendering.space import Space
 from fprf.types import Boxes
+from fprf.viewer.cameras import Stage, stage_of
 from fprf.viewer.lines import box_lines, camera_lines, path_lines
-from fprf.viewer.stage import Stage, stage_of
 
 
 def test_pyramids_stand_where_the_cameras_are_and_look_their_way(world: World) -> None:

@@ -16,9 +16,9 @@ from fprf.training.loading import Trained
 from fprf.viewer import live
 from fprf.viewer.host import Host
 from fprf.viewer.live import Follower, main
+from fprf.viewer.restyler import Opener
 from fprf.viewer.session import Session
 from fprf.viewer.state import State
-from fprf.viewer.studio import Opener
 from fprf.viewer.training import Training
 
 

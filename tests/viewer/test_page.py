@@ -10,14 +10,14 @@ import pytest
 from tiny_world import World
 
 from fprf.errors import DataError, UsageError
+from fprf.viewer.cameras import Eye
 from fprf.viewer.film import Key, Thumbnail
-from fprf.viewer.gate import Answer, Request
 from fprf.viewer.looks import Card, Look
 from fprf.viewer.page import Page, built_page, described
+from fprf.viewer.restyler import Picked
+from fprf.viewer.server import Answer, Request
 from fprf.viewer.session import Session
-from fprf.viewer.stage import Eye
 from fprf.viewer.state import State
-from fprf.viewer.studio import Picked
 from fprf.viewer.training import Training
 
 

@@ -13,7 +13,7 @@ from fprf.training.matches import match_map
 from fprf.training.views import render_view
 from fprf.viewer.looks import Look, ordered
 from fprf.viewer.painter import Layers, Painter, Shown, compose
-from fprf.viewer.studio import Studio
+from fprf.viewer.restyler import Studio
 
 
 def painted(studio: Studio, shown: Shown, chunk: int = 100) -> Layers:

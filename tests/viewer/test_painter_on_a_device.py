@@ -14,7 +14,7 @@ from fprf.training.cached_view import view_parts
 from fprf.training.loading import load_run
 from fprf.viewer.looks import Look, ordered
 from fprf.viewer.painter import MAPS, Painter, Shown
-from fprf.viewer.studio import Studio
+from fprf.viewer.restyler import Studio
 
 
 def painted(world: World, device: str) -> dict[str, Any]:

@@ -16,10 +16,10 @@ from fprf.style.config import StyleConfig
 from fprf.style.presets import with_preset
 from fprf.training.loading import load_run
 from fprf.viewer import crew
+from fprf.viewer.cameras import Eye
 from fprf.viewer.looks import style_of
 from fprf.viewer.panel import Panel
 from fprf.viewer.session import Session
-from fprf.viewer.stage import Eye
 from fprf.viewer.state import Film, State
 
 

@@ -9,9 +9,9 @@ from tiny_world import World
 
 from fprf.errors import DataError, UsageError
 from fprf.training.loading import load_run
-from fprf.viewer.eyes import Frame
 from fprf.viewer.film import FilmPlan, Key
 from fprf.viewer.looks import Look
+from fprf.viewer.renderer import Frame
 from fprf.viewer.session import Face, Session
 from fprf.viewer.state import SHELF, State
 

@@ -8,12 +8,12 @@ from tiny_world import World
 
 from fprf.io.images import to_uint8
 from fprf.training.views import render_view
-from fprf.viewer import eyes
-from fprf.viewer.eyes import Frame, Glance, Sight
+from fprf.viewer import renderer as eyes
+from fprf.viewer.cameras import stage_of
 from fprf.viewer.looks import Look
 from fprf.viewer.painter import Shown
-from fprf.viewer.stage import stage_of
-from fprf.viewer.studio import Studio
+from fprf.viewer.renderer import Frame, Glance, Sight
+from fprf.viewer.restyler import Studio
 
 
 class Watched:

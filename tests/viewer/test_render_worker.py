@@ -4,7 +4,7 @@ from collections.abc import Callable, Hashable, Iterator
 
 import pytest
 
-from fprf.viewer.desk import Desk
+from fprf.viewer.render_worker import Desk
 
 Told = list[tuple[Hashable | None, str]]
 

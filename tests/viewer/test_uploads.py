@@ -15,7 +15,7 @@ from photo_files import HEIC, turned_jpeg
 
 from fprf.errors import DataError
 from fprf.viewer import decode
-from fprf.viewer.intake import LARGEST, SIDE, Intake, check_photograph, shown_name
+from fprf.viewer.uploads import LARGEST, SIDE, Intake, check_photograph, shown_name
 
 
 def png(width: int, height: int) -> bytes:

@@ -13,10 +13,10 @@ from typing import NamedTuple
 from ..io.images import Picture
 from ..training.cached_view import Part, view_parts
 from ..training.loading import Trained
+from .cameras import Eye, Stage, fitted
 from .ladder import Speed, rungs
 from .painter import Layers, Painter, Shown, compose
-from .stage import Eye, Stage, fitted
-from .studio import Studio
+from .restyler import Studio
 
 __all__ = ["Frame", "Glance", "Sight"]
 

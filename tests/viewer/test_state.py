@@ -7,11 +7,11 @@ import torch
 
 from fprf.errors import ConfigError, UsageError
 from fprf.style.dictionary import Reference
+from fprf.viewer.cameras import Eye
 from fprf.viewer.film import Key
 from fprf.viewer.looks import Card, Look, only, ordered, settled, style_of, weighed
-from fprf.viewer.stage import Eye
+from fprf.viewer.restyler import Picked
 from fprf.viewer.state import SHELF, State, dropped, kept, removed
-from fprf.viewer.studio import Picked
 
 
 def card(number: int) -> Card:

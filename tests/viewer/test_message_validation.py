@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError
-from fprf.viewer.manners import check_message
+from fprf.viewer.message_validation import check_message
 
 CAMERA = {
     "type": "ViewerCameraMessage",

@@ -14,7 +14,7 @@ from fprf.training.regions import membership_view
 from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
 from fprf.viewer.looks import Look, ordered, style_of
-from fprf.viewer.studio import Studio, joined, names_of
+from fprf.viewer.restyler import Studio, joined, names_of
 
 
 def seen(studio: Studio, restyle: Restyle | None) -> torch.Tensor:

@@ -9,7 +9,7 @@ from tiny_world import World
 
 from fprf.errors import UsageError
 from fprf.rendering.cameras import Cameras, project
-from fprf.viewer.stage import Eye, checked_eye, fitted, stage_of
+from fprf.viewer.cameras import Eye, checked_eye, fitted, stage_of
 
 
 def test_a_captured_camera_goes_to_the_page_and_back(world: World) -> None:
