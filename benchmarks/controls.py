@@ -24,10 +24,11 @@ from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionO
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
+from fprf.style.references import Encoders
 from fprf.training.explain import explain
 from fprf.training.loading import Trained, load_run
 from fprf.training.matches import match_map
-from fprf.training.restyle import Encoders, Styled, apply_style, open_encoders
+from fprf.training.restyle import Styled, apply_style
 from fprf.training.views import render_view
 
 Row = dict[str, str | float | None]
@@ -63,7 +64,7 @@ def start_seconds() -> float:
 
 def resized(trained: Trained) -> Trained:
     cameras = trained.known.cameras
-    return trained._replace(known=replace(trained.known, cameras=cameras.resized(torch.tensor([SIZE]).expand(len(cameras), 2))))
+    return replace(trained, known=replace(trained.known, cameras=cameras.resized(torch.tensor([SIZE]).expand(len(cameras), 2))))
 
 
 def looks(trained: Trained, encoders: Encoders, base: StyleConfig, plain: Styled) -> dict[str, tuple[str, Restyle | None]]:
@@ -98,8 +99,8 @@ def main() -> None:
     known, render = trained.known, trained.config.render
     base = StyleConfig(references=tuple(given.references))
     loading = spent(lambda: load_run(given.run, "cpu"))
-    opening = spent(lambda: open_encoders(trained))
-    encoders = open_encoders(trained)
+    opening = spent(lambda: trained.encoders())
+    encoders = trained.encoders()
     one = StyleFile(replace(base, references=base.references[:1]))
     first_style = spent(lambda: apply_style(trained, one, encoders))
     plain = apply_style(trained, StyleFile(base), encoders)

@@ -28,7 +28,7 @@ from fprf.style.files import StyleFile
 from fprf.style.presets import PRESETS, with_preset
 from fprf.training.cached_view import cache_view
 from fprf.training.loading import load_run
-from fprf.training.restyle import apply_style, open_encoders
+from fprf.training.restyle import apply_style
 
 HERE = Path(__file__).resolve().parents[1]
 BASE = StyleConfig()
@@ -52,7 +52,7 @@ def main() -> None:
     scenes = []
     for root in asked.runs:
         trained = load_run(root, "cpu")
-        known, encoders = trained.known, open_encoders(trained)
+        known, encoders = trained.known, trained.encoders()
         cameras = known.cameras.scaled(max(1.0, float(known.cameras.size.amax()) / asked.longest))
         chosen = [(2 * i + 1) * len(cameras) // (2 * asked.views) for i in range(asked.views)]
         views = [cache_view(trained.model, known.facts, cameras, view, trained.config.render) for view in chosen]

@@ -99,7 +99,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     from fprf.splats.scene import look_at_capture
     from fprf.style.config import StyleConfig
     from fprf.style.files import StyleFile
-    from fprf.training.restyle_gaussians import restyle_gaussians, restyled_harmonics
+    from fprf.training.restyle import apply_style
 
     torch.set_num_threads(1)
     start = time.process_time()
@@ -116,7 +116,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     for reference in references:
         start = time.process_time()
         style = StyleConfig(references=(reference,), stylizer=RegionToneConfig(centred=False))
-        new = restyled_harmonics(scene, restyle_gaussians(scene, StyleFile(style), encoder).restyle)
+        new = scene.restyled(apply_style(scene, StyleFile(style)).restyle).shown.harmonics
         with tempfile.TemporaryDirectory() as folder:
             write_capture(Path(folder) / path.name, capture, new)
         seconds.append(time.process_time() - start)
@@ -145,7 +145,7 @@ def standing_out(scene: Any, harmonics: Any, view: int) -> tuple[float, float]:
     from fprf.style.controls import luma
 
     gaussians = scene.gaussians if harmonics is None else scene.gaussians.recoloured(harmonics)
-    drawn = draw(gaussians, camera_of(scene.cameras, view), background=0.5)
+    drawn = draw(gaussians, camera_of(scene.cameras, view), background=(0.5, 0.5, 0.5))
     level = luma(drawn.image.flatten(0, 1)).view(drawn.opacity.shape).numpy()
     above = np.maximum(level - cv2.GaussianBlur(level, (0, 0), 3), 0)
     solid = drawn.opacity.numpy() > 0.9

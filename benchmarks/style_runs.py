@@ -28,7 +28,7 @@ from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.town.write import read_truth
 from fprf.training.loading import Trained, load_run
-from fprf.training.restyle import apply_style, open_encoders
+from fprf.training.restyle import apply_style
 
 SINGLE, SEVERAL = 4, 2
 """References of a scene: so many alone, so many sets of several."""
@@ -76,7 +76,7 @@ def contests(
     truth is known; `views` are those in the middle of the capture, or these ones.
     """
     trained = load_run(root, "cpu")
-    scene, encoders, truth = trained.known.name, open_encoders(trained), town_folder(trained)
+    scene, encoders, truth = trained.known.name, trained.encoders(), town_folder(trained)
     cameras = trained.known.cameras
     cameras = cameras.scaled(max(1.0, float(cameras.size.amax()) / longest))
     chosen = _middle(len(cameras), views) if isinstance(views, int) else list(views)

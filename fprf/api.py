@@ -20,6 +20,7 @@ from torch import Tensor
 
 from .checks import at_least, between
 from .errors import UsageError
+from .interfaces import Scene
 from .io.images import Picture, to_uint8, write_image
 from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
@@ -30,11 +31,11 @@ from .style.config import StyleConfig
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
 from .style.presets import with_preset
-from .training.loading import Trained, load_run
+from .style.references import Encoders
+from .training.loading import LoadedRun, open_run
 from .training.matches import MatchMap, match_map
-from .training.quality import Name, QualityConfig, at_quality
-from .training.restyle import Encoders, Styled, apply_style, mixed, open_encoders
-from .training.views import render_view
+from .training.quality import Name, QualityConfig
+from .training.restyle import Styled, apply_style, mixed
 
 __all__ = ["Shot", "TrainedScene", "open_scene"]
 
@@ -66,20 +67,20 @@ class Shot:
 class _Opened:
     """Encoders of a run, loaded at the first style and kept for the next."""
 
-    def __init__(self, trained: Trained) -> None:
-        self.trained = trained
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
 
     @cached_property
     def encoders(self) -> Encoders:
-        return open_encoders(self.trained)
+        return self.scene.encoders()
 
 
 @dataclass(frozen=True)
 class TrainedScene:
     """A scene, as it was captured or in a style. Make one with `fprf.load`."""
 
-    trained: Trained
-    """Model, cameras and config, for what this class does not offer."""
+    trained: LoadedRun[Scene]
+    """Scene, cameras and run folder, for what this class does not offer."""
     styled: Styled | None = None
     """The style with its dictionary and codes; None = as it was captured."""
     opened: _Opened = field(kw_only=True, repr=False)
@@ -169,11 +170,11 @@ class TrainedScene:
     def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
         """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as `stylize`."""
         if isinstance(style, StyleConfig):
-            return replace(self, styled=apply_style(self.trained, StyleFile(style), self.opened.encoders))
+            return replace(self, styled=apply_style(self.trained.scene, StyleFile(style), self.opened.encoders))
         path = Path(style)
         file = read_style(path)
         check_photographs(path, file)
-        return replace(self, styled=apply_style(self.trained, file, self.opened.encoders, (path.resolve(),)))
+        return replace(self, styled=apply_style(self.trained.scene, file, self.opened.encoders, (path.resolve(),)))
 
     def towards(self, other: "TrainedScene", at: float) -> "TrainedScene":
         """On the way from this style (0) to that of `other` (1), point by point. Raises UsageError without two styles."""
@@ -198,16 +199,15 @@ class TrainedScene:
 
     def film(self, cameras: Cameras) -> Iterator[Shot]:
         """Views of many cameras, one after the other, each when it is asked for."""
-        trained, look = self.trained, self.restyle
+        scene = self.trained.scene.restyled(self.restyle)
         for view in range(len(cameras)):
-            made = render_view(trained.model, trained.known.facts, cameras, view, trained.config.render, look)
+            made = scene.render(cameras, view)
             yield Shot(made.rgb, made.depth, made.opacity)
 
     def matches(self, camera: Cameras | int | str) -> MatchMap:
         """Which style codes each pixel of a view takes; `styled.codes` names them. Raises UsageError without a style."""
         styled, one = self._style("matches"), self._single("matches", camera)
-        known = replace(self.trained.known, cameras=one)
-        return match_map(self.trained._replace(known=known), styled, 0)
+        return match_map(self.trained.scene, styled, 0, one)
 
     @property
     def restyle(self) -> Restyle | None:
@@ -237,5 +237,5 @@ class TrainedScene:
 
 def open_scene(run: PathLike, *, device: str = "auto", quality: Name | None = None) -> TrainedScene:
     """A run folder as a scene: see `fprf.load`."""
-    trained = at_quality(load_run(Path(run), device), QualityConfig(quality=quality))
-    return TrainedScene(trained, opened=_Opened(trained))
+    trained = open_run(Path(run), device, QualityConfig(quality=quality))
+    return TrainedScene(trained, opened=_Opened(trained.scene))

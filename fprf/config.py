@@ -17,6 +17,9 @@ from .plugins.samplers.config import ProposalConfig, SamplerConfig
 
 if TYPE_CHECKING:
     from .cli.verbs import Verbs
+    from .interfaces import Scene
+    from .training.loading import LoadedRun
+    from .training.quality import QualityConfig
 
 __all__ = [
     "RESUMABLE",
@@ -223,11 +226,17 @@ class RunConfig:
         """How a run of this kind is trained, judged, filmed and exported; imports its implementation."""
         raise ConfigError(f"{type(self).__name__} does not say how it is trained; its method has to give a config that does")
 
+    def load(self, run: Path, device: str, quality: "QualityConfig") -> "LoadedRun[Scene]":
+        """Read a run of this config. Raises CheckpointError with what is missing, UsageError for what it cannot do."""
+        raise ConfigError(
+            f"{type(self).__name__} does not say how its runs are read; its method has to give a config that does"
+        )
+
     def fields_only(self, run: Path) -> "TrainConfig":
         """This config where the run is of fields. Raises UsageError, with the way out, where it is of another kind."""
         raise UsageError(
-            f"{run}: is of Gaussians, which `train`, `eval`, `render` and `export` know; for anything else write them with "
-            f"`fprf export {run} ply` and go on with `fprf restyle`"
+            f"{run}: is of Gaussians, and this is for runs of fields alone; `fprf stylize`, `gallery`, `render`, `eval` and "
+            "`export` know both"
         )
 
 
@@ -280,6 +289,12 @@ class TrainConfig(RunConfig):
         from .cli.fields import FieldVerbs
 
         return FieldVerbs(self)
+
+    def load(self, run: Path, device: str, quality: "QualityConfig") -> "LoadedRun[Scene]":
+        """Rebuild the model."""
+        from .training.loading import open_fields
+
+        return open_fields(run, device, quality)
 
     def fields_only(self, run: Path) -> "TrainConfig":
         """This config."""

@@ -12,13 +12,21 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .types import Batch, Boxes, FieldSample, Rays, Rendered, Sampled, Site, Want
+from .types import Batch, Boxes, FieldSample, Rays, Rendered, Sampled, Site, View, Want
 
 if TYPE_CHECKING:
+    from .datamanagers.basis import Basis
     from .datamanagers.features import FeatureStore
-    from .datamanagers.scene import Scene
+    from .datamanagers.scene import Scene as ParsedScene
+    from .plugins.stylizers.config import StylizerConfig
+    from .rendering.cameras import Cameras
     from .rendering.renderer import Parts
     from .rendering.space import Space
+    from .style.colours import ColourMaps
+    from .style.dictionary import StyleDictionary
+    from .style.look import Restyle
+    from .style.references import Encoders
+    from .style.scene import SceneStyle
 
 __all__ = [
     "BlockLayout",
@@ -30,6 +38,7 @@ __all__ = [
     "Executor",
     "LossTerm",
     "Sampler",
+    "Scene",
     "SemanticField",
     "Stylizer",
 ]
@@ -179,6 +188,84 @@ class Stylizer(nn.Module, ABC):
         """Attention of each point to each style code; rows sum to 1."""
 
 
+class Scene(ABC):
+    """A trained representation of any kind with its views: all that verbs, styles and viewers need of it.
+
+    It is never changed: `restyled` returns another scene, which shares everything that a style does not touch. Views are
+    rows of any `Cameras`; results are on the CPU.
+    """
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names of the scene's own views."""
+
+    @property
+    @abstractmethod
+    def cameras(self) -> "Cameras":
+        """The scene's own views."""
+
+    @property
+    @abstractmethod
+    def device(self) -> torch.device:
+        """Device of its parameters, on which stylizers act."""
+
+    @property
+    @abstractmethod
+    def semantic_encoder(self) -> str:
+        """Identity of the encoder of its semantics; empty where it has none."""
+
+    @abstractmethod
+    def render(self, cameras: "Cameras", view: int, *, resolution: float | None = None) -> View:
+        """One view in the scene's look.
+
+        `resolution` is the share of its width and height that is rendered, in (0, 1], before it is enlarged; None = as the
+        scene is set.
+        """
+
+    @abstractmethod
+    def paint(
+        self,
+        cameras: "Cameras",
+        view: int,
+        pixel: Annotated[Tensor, "R 2"],
+        values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+        *,
+        semantic: bool = True,
+    ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
+        """Means over what each pixel sees of anything that follows from semantics, and the opacity.
+
+        Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
+        `semantic` is false.
+        """
+
+    @abstractmethod
+    def restyled(self, look: "Restyle | None") -> "Scene":
+        """The scene in a look; None = as it was captured."""
+
+    @abstractmethod
+    def measured(self) -> "tuple[SceneStyle, Basis | None]":
+        """Statistics and regions of the scene as it was captured, and the basis of its semantics (None without any)."""
+
+    @abstractmethod
+    def encoders(self) -> "Encoders":
+        """What brings photographs into the terms of `measured`. Raises WeightsError where the encoders at hand are others."""
+
+    @abstractmethod
+    def colour_maps(
+        self,
+        stylizer: Stylizer,
+        dictionary: "StyleDictionary",
+        style: "SceneStyle",
+        config: "StylizerConfig",
+        allowed: Annotated[Tensor, "K references"],
+    ) -> "ColourMaps | None":
+        """What a stylizer does to colours behind its change of features; None where that is nothing.
+
+        `allowed` says which references each region may take from, bool.
+        """
+
+
 class LossTerm(ABC):
     """A training term beside the built-in ones. Without parameters: nothing of it is saved.
 
@@ -211,10 +298,10 @@ class BlockLayout(ABC):
 
 
 class DataParser(ABC):
-    """A scene folder to a `Scene`. Decodes no image."""
+    """A scene folder to a `datamanagers.scene.Scene`. Decodes no image."""
 
     @abstractmethod
-    def parse(self, data: Path, downscale: int) -> "Scene":
+    def parse(self, data: Path, downscale: int) -> "ParsedScene":
         """The scene at 1/downscale of the delivered size. Raises DataError with file, finding and remedy."""
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 
 from torch import Tensor
 
-__all__ = ["Batch", "Boxes", "FieldSample", "Level", "Rays", "Rendered", "Sampled", "Site", "Want"]
+__all__ = ["Batch", "Boxes", "FieldSample", "Level", "Rays", "Rendered", "Sampled", "Site", "View", "Want"]
 
 
 class Want(Flag):
@@ -120,3 +120,14 @@ class Rendered(NamedTuple):
     """How many samples were placed, kept, decoded: what was skipped can be read off."""
     unaided: Annotated[Tensor, "R 3"] | None = None
     """In training: the colour without the decoder's parameters that are the scene's own, if it has any."""
+
+
+class View(NamedTuple):
+    """One rendered view, on the CPU."""
+
+    rgb: Annotated[Tensor, "H W 3"]
+    depth: Annotated[Tensor, "H W"]
+    """Distance along the unit ray in world units."""
+    opacity: Annotated[Tensor, "H W"]
+    kept: float
+    """Share of the samples that were decoded; 1 where there are none."""

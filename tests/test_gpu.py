@@ -25,7 +25,8 @@ from fprf.training.prepare import prepare
 from fprf.training.restyle import restyle
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
-from fprf.training.views import View, render_view
+from fprf.training.views import render_view
+from fprf.types import View
 
 LEVEL = 1 / 255
 

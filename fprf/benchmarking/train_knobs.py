@@ -65,7 +65,7 @@ def trained_points(
         run.root.mkdir(parents=True)
         last: list[Report] = []
         model = train(variant, prepared, run, last.append).requires_grad_(False).eval()
-        trained = subject.trained._replace(config=variant, model=model)
+        trained = replace(subject.trained, config=variant, model=model)
         (point,) = measure([as_rendered("trained", f"{name} ({last[-1].step} steps)", trained)], scenes, watch)
         found.append(replace(point, train_seconds=last[-1].seconds))
     progress(len(chosen), len(chosen), "training variants")

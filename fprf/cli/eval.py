@@ -16,7 +16,7 @@ from .verbs import verbs_of
 
 if TYPE_CHECKING:
     from ..training.run import Known
-    from ..training.views import View
+    from ..types import View
 
 __all__ = ["EvalConfig", "evaluate_fields", "run", "store"]
 

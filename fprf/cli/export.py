@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import DataError, UsageError
 from ..export.config import KINDS, ExportConfig, Plan, look_file, plan
-from ..export.looks import Look, Named, make_looks, named_styles, style_name
+from ..export.looks import Look, make_looks, styles_of
 from .progress import Display
 from .style_flags import read_flags, say
 from .verbs import verbs_of
@@ -45,9 +45,7 @@ def run(args: list[str]) -> int:
 def export_fields(config: ExportConfig, file: "StyleFile") -> None:
     """Write a run of fields."""
     what = plan(config.kinds, config.output or config.run / "exports")
-    styles = named_styles(config.styles, file, say)
-    if config.references:
-        styles.insert(0, Named(style_name(config.references, config.style), file))
+    styles = styles_of(config, file, say)
     if config.kinds and "lut" in what.kinds and not styles:
         raise UsageError("fprf export: a lut is the way into a style; name one with --references, --style or --styles")
     if what.single is not None and len(styles) > 1:

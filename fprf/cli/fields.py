@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from ..style.files import StyleFile
     from ..viewer.aside import Aside
     from .eval import EvalConfig
-    from .render import RenderVerbConfig
 
 __all__ = ["FieldVerbs"]
 
@@ -50,12 +49,6 @@ class FieldVerbs(Verbs):
         from .eval import evaluate_fields
 
         return evaluate_fields(config)
-
-    def render(self, config: "RenderVerbConfig", file: "StyleFile") -> None:
-        """Film a model, plain or restyled."""
-        from .render import film
-
-        film(config, file)
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
         """Fuse rendered depths, colour them, write the files."""

@@ -11,7 +11,7 @@ from ..plugins.registry import nearest
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
-from ..training.quality import QualityConfig, at_quality
+from ..training.quality import QualityConfig
 from .parsing import parse
 from .progress import Display
 from .render import RenderVerbConfig, camera_path, frames_of
@@ -19,7 +19,7 @@ from .showcase import restyled, write_page
 from .style_flags import read_preset, say, with_presets_named
 
 if TYPE_CHECKING:
-    from ..training.loading import Trained
+    from ..training.run import Known
 
 __all__ = ["GalleryConfig", "run"]
 
@@ -86,35 +86,34 @@ def run(args: list[str]) -> int:
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
     from ..datamanagers.images import photographs as find_photographs
     from ..io.video import write_video
-    from ..training.loading import load_run
-    from ..training.views import render_view
+    from ..training.loading import open_run
 
     photographs = find_photographs(config.references, say)
-    trained = at_quality(load_run(config.run, config.device), config)
-    views, known = _views(trained, config), trained.known
+    opened = open_run(config.run, config.device, config)
+    views, known, scene = _views(opened.known, config), opened.known, opened.scene
     chosen = _chosen(config, photographs)
     film = None
     with Display() as display:
         originals = []
         for i, view in enumerate(views):
             display.count(i, len(views), "rendering")
-            originals.append(render_view(trained.model, known.facts, known.cameras, view, trained.config.render))
-        shown = restyled(trained, chosen, views, display)
+            originals.append(scene.render(scene.cameras, view))
+        shown = restyled(scene, chosen, views, display)
         if config.frames:
             film = output.with_suffix(".mp4")
-            flight = camera_path(trained.known, RenderVerbConfig(path=config.path, frames=config.frames))[0]
-            write_video(film, frames_of(trained, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
+            flight = camera_path(known, RenderVerbConfig(path=config.path, frames=config.frames))[0]
+            write_video(film, frames_of(scene, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
     width, height = (int(v) for v in known.cameras.size[views[0]])
     write_page(
         output,
-        trained,
+        scene,
         title=config.title or known.name,
         facts={
             "Photographs": len(known.names),
             "Size": f"{width} × {height}",
-            "Method": trained.method,
+            "Method": opened.method,
             "Styles": len(shown),
-            "Trained for": f"{trained.seconds / 60:.1f} min",
+            "Trained for": f"{opened.seconds / 60:.1f} min",
         },
         views=views,
         originals=originals,
@@ -168,15 +167,15 @@ def _named(first: Sequence[Path], more: Sequence[Path]) -> dict[str, Path]:
     return named
 
 
-def _views(trained: "Trained", config: GalleryConfig) -> list[int]:
+def _views(known: "Known", config: GalleryConfig) -> list[int]:
     """The views to show. Raises UsageError for a name that the run does not hold, or an empty split."""
-    names = list(trained.known.names)
+    names = list(known.names)
     for name in config.views:
         if name not in names:
             raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
     if config.views:
         return [names.index(name) for name in config.views]
-    all_ = trained.known.split(config.split)
+    all_ = known.split(config.split)
     if not all_:
         raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
     count = min(config.most, len(all_))

@@ -14,8 +14,8 @@ from ..errors import ConfigError
 from ..plugins.codec import from_json, read_json
 
 if TYPE_CHECKING:
+    from ..interfaces import Scene
     from ..style.look import Restyle
-    from ..training.loading import Trained
 
 __all__ = ["Key", "fade", "keyed_looks", "read_keyframes"]
 
@@ -55,18 +55,18 @@ def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:
     return after - 1, after, way * way * (3 - 2 * way)
 
 
-def keyed_looks(trained: "Trained", keys: Sequence[Key]) -> "Callable[[int], Restyle | None]":
+def keyed_looks(scene: "Scene", keys: Sequence[Key]) -> "Callable[[int], Restyle | None]":
     """The look of each frame; every style is built once, before the first frame."""
     from ..style.files import check_photographs, read_style
-    from ..training.restyle import apply_style, open_encoders
+    from ..training.restyle import apply_style
 
-    encoders = open_encoders(trained)
+    encoders = scene.encoders()
     looks: dict[Path | None, Restyle | None] = {None: None}
     for key in keys:
         if key.style is not None and key.style not in looks:
             file = read_style(key.style)
             check_photographs(key.style, file)
-            styled = apply_style(trained, file, encoders, (key.style.resolve(),))
+            styled = apply_style(scene, file, encoders, (key.style.resolve(),))
             looks[key.style] = styled.restyle
             for note in styled.orders.notes:
                 print(f"{key.style}: {note}")

@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Literal
 from ..checks import at_least, positive
 from ..errors import ConfigError, UsageError
 from ..style.config import StyleConfig
-from ..training.quality import QualityConfig, at_quality
+from ..training.quality import QualityConfig
 from .keyframes import keyed_looks, read_keyframes
 from .progress import Display
 from .style_flags import read_flags, say
-from .verbs import verbs_of
 
 if TYPE_CHECKING:
+    from ..interfaces import Scene
     from ..io.images import Picture
     from ..rendering.cameras import Cameras
     from ..style.files import StyleFile
     from ..style.look import Restyle
     from ..training.footage import Take
-    from ..training.loading import Trained
+    from ..training.loading import LoadedRun
     from ..training.run import Known
 
-__all__ = ["RenderVerbConfig", "camera_path", "film", "frames_of", "run"]
+__all__ = ["RenderVerbConfig", "camera_path", "frames_of", "run"]
 
 
 _NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
@@ -90,33 +90,27 @@ def run(args: list[str]) -> int:
     """Make the path, render it, write the film or the frames."""
     description = "Fly through a trained scene, plain or restyled, to a film or frames."
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
-    verbs_of(config.run).render(config, file)
-    return 0
-
-
-def film(config: RenderVerbConfig, file: "StyleFile") -> None:
-    """Film a run of fields."""
     from ..datamanagers.images import load_image
     from ..io.video import FILMS, missing, write_video
-    from ..training.loading import load_run
+    from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
         raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
-    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
-    cameras, names = camera_path(trained.known, config)
+    opened = open_run(config.run, config.device, config)
+    cameras, names = camera_path(opened.known, config)
     if config.lens != "own":
-        cameras = _all_round(trained, config, cameras)
-    takes = _takes(trained, config, file)
+        cameras = _all_round(opened, config, cameras)
+    takes = _takes(opened.scene, config, file)
     whole = config.output.suffix.lower() in FILMS
     folder = config.output.with_suffix(".frames") if whole else config.output
     paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
-    key = _key(trained, config, cameras)
+    key = _key(opened, config, cameras)
     todo = missing(folder, key, paths)
     if len(todo) < len(paths):
         print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
     start = time.perf_counter()
     with Display() as display:
-        _render(trained, config, cameras, takes, dict(zip(paths, range(len(paths)), strict=True)), todo, display)
+        _render(opened.scene, config, cameras, takes, dict(zip(paths, range(len(paths)), strict=True)), todo, display)
         made = str(config.output)
         if whole:
             codec = write_video(config.output, (load_image(path) for path in paths), config.fps)
@@ -124,10 +118,11 @@ def film(config: RenderVerbConfig, file: "StyleFile") -> None:
             shutil.rmtree(folder)
     seconds = time.perf_counter() - start
     print(f"{len(cameras)} frames in {made}, {seconds / max(1, len(todo)):.2f} s each")
+    return 0
 
 
 def _render(
-    trained: "Trained",
+    scene: "Scene",
     config: RenderVerbConfig,
     cameras: "Cameras",
     takes: "list[Take]",
@@ -141,35 +136,35 @@ def _render(
     from ..training.footage import limits_of, panels, planes
 
     eyes = config.eyes if config.lens == "stereo" else None
-    limits = limits_of(trained, cameras) if "depth" in config.show and todo else None
+    limits = limits_of(scene, cameras) if "depth" in config.show and todo else None
     start = time.perf_counter()
     for done, path in enumerate(todo):
         each = (time.perf_counter() - start) / done if done else None
         display.count(done, len(todo), "rendering", seconds_left=None if each is None else each * (len(todo) - done))
         frame = numbers[path]
         if path.suffix == ".exr":
-            write_exr(path, planes(trained, cameras, frame, takes, eyes))
+            write_exr(path, planes(cameras, frame, takes, eyes))
             continue
-        shown = panels(trained, cameras, frame, takes, config.show, limits, eyes)
+        shown = panels(scene, cameras, frame, takes, config.show, limits, eyes)
         write_image(path, wiped(shown, frame / len(cameras)) if config.layout == "wipe" else beside(shown))
     display.count(len(todo), len(todo), "rendering")
 
 
-def _all_round(trained: "Trained", config: RenderVerbConfig, cameras: "Cameras") -> "Cameras":
+def _all_round(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras") -> "Cameras":
     """Panoramas in place of the path's cameras. Raises UsageError where the scene lies in front of its cameras alone."""
     from ..rendering.motions import upwards
     from ..rendering.panorama import panoramas
 
-    if trained.known.facts.space.kind == "ndc":
+    if opened.known.facts.space.kind == "ndc":
         raise UsageError(f"--lens {config.lens}: this scene was captured from one side (space ndc); there is nothing all round")
-    return panoramas(cameras, config.across, upwards(trained.known.cameras))
+    return panoramas(cameras, config.across, upwards(opened.known.cameras))
 
 
-def _key(trained: "Trained", config: RenderVerbConfig, cameras: "Cameras") -> str:
+def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras") -> str:
     """A hash of all that frames depend on: the run's state, the path, every setting, and every file that they name."""
-    digest = hashlib.sha256(f"{trained.run.root.resolve()} {trained.step} {trained.seconds}".encode())
+    digest = hashlib.sha256(f"{opened.run.root.resolve()} {opened.step} {opened.seconds}".encode())
     settings = {name: value for name, value in vars(config).items() if name not in ("output", "device", "fps", "run")}
-    digest.update(repr(sorted(settings.items())).encode() + repr(trained.config.render).encode())
+    digest.update(repr(sorted(settings.items())).encode() + (opened.run.root / "config.json").read_bytes())
     for tensor in (cameras.pose, cameras.focal, cameras.centre, cameras.size, cameras.distortion, cameras.lens):
         digest.update(tensor.numpy().tobytes())
     named = [*config.references, *config.masks, config.style, config.between, config.keyframes]
@@ -183,36 +178,38 @@ def _key(trained: "Trained", config: RenderVerbConfig, cameras: "Cameras") -> st
     return digest.hexdigest()
 
 
-def _takes(trained: "Trained", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
+def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
     """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
     from ..export.looks import named_styles
     from ..training.footage import Take
 
     takes = []
     if config.keyframes is not None:
-        takes.append(Take("keyframes", keyed_looks(trained, read_keyframes(config.keyframes))))
+        look = keyed_looks(scene, read_keyframes(config.keyframes))
+        takes.append(Take("keyframes", lambda frame: scene.restyled(look(frame))))
     elif config.references:
-        takes.append(_styled_take(trained, "style", file))
+        takes.append(_styled_take(scene, "style", file))
     for text in config.styles:
         if text == "plain":
-            takes.append(Take("plain", lambda frame: None))
+            takes.append(Take("plain", lambda frame: scene))
         else:
             ((name, named),) = named_styles([text], file, say)
-            takes.append(_styled_take(trained, name, named))
-    takes = takes or [Take("plain", lambda frame: None)]
+            takes.append(_styled_take(scene, name, named))
+    takes = takes or [Take("plain", lambda frame: scene)]
     if "match" in config.show and not any(take.styled is not None for take in takes):
         raise UsageError("--show match: needs a style that holds throughout; name one with --references, --style or --styles")
     return takes
 
 
-def _styled_take(trained: "Trained", name: str, file: "StyleFile") -> "Take":
+def _styled_take(scene: "Scene", name: str, file: "StyleFile") -> "Take":
     from ..training.footage import Take
     from ..training.restyle import apply_style
 
-    styled = apply_style(trained, file)
+    styled = apply_style(scene, file)
     for note in styled.orders.notes:
         print(note)
-    return Take(name, lambda frame: styled.restyle, styled)
+    restyled = scene.restyled(styled.restyle)
+    return Take(name, lambda frame: restyled, styled)
 
 
 def camera_path(known: "Known", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
@@ -227,13 +224,15 @@ def camera_path(known: "Known", config: RenderVerbConfig) -> tuple["Cameras", li
 
 
 def frames_of(
-    trained: "Trained", cameras: "Cameras", looks: "Callable[[int], Restyle | None]", display: Display
+    scene: "Scene", cameras: "Cameras", looks: "Callable[[int], Restyle | None]", display: Display
 ) -> Iterator["Picture"]:
     """Colours of a flight one by one, each frame in its own look."""
     from ..io.images import to_uint8
-    from ..training.footage import shoot
 
+    before, shown = None, scene
     for i in range(len(cameras)):
         display.count(i, len(cameras), "rendering")
-        yield to_uint8(shoot(trained, cameras, i, looks(i)).rgb)
+        if (look := looks(i)) is not before:
+            before, shown = look, scene.restyled(look)
+        yield to_uint8(shown.render(cameras, i).rgb)
     display.count(len(cameras), len(cameras), "rendering")

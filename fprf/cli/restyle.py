@@ -77,7 +77,8 @@ def run(args: list[str]) -> int:
     from ..io.images import write_image
     from ..plugins.encoders.config import BundledSemanticConfig
     from ..splats.files import read_capture, write_capture
-    from ..training.restyle_gaussians import restyle_gaussians, restyled_harmonics, splat_regions
+    from ..training.regions import Regions
+    from ..training.restyle import apply_style
 
     begun = time.perf_counter()
     capture, encoder = read_capture(config.capture), BundledSemanticConfig().build()
@@ -85,21 +86,21 @@ def run(args: list[str]) -> int:
     with Display() as display:
         scene = _known(capture, finite, encoder, config, display)
         looked = time.perf_counter() - begun
-        named, made = _styles(config, file), []
+        named, made, encoders = _styles(config, file), [], scene.encoders()
         for i, (name, each) in enumerate(named):
             display.count(i, len(named), "restyling")
             start = time.perf_counter()
-            styled = restyle_gaussians(scene, each, encoder)
-            new = restyled_harmonics(scene, styled.restyle)
+            styled = apply_style(scene, each, encoders)
+            shown = scene.restyled(styled.restyle)
             if config.output is not None:
                 harmonics = capture.gaussians.harmonics
                 if not styled.restyle.idle:
-                    harmonics = torch.zeros_like(harmonics).index_copy_(0, finite.nonzero()[:, 0], new)
+                    harmonics = torch.zeros_like(harmonics).index_copy_(0, finite.nonzero()[:, 0], shown.shown.harmonics)
                     harmonics = torch.where(finite[:, None, None], harmonics, capture.gaussians.harmonics)
                 output = _named(config.output, name)
                 write_capture(output, capture, harmonics)
                 write_style(_beside(output, "style.json"), styled.orders.saved)
-            made.append((name, styled, new, time.perf_counter() - start))
+            made.append((name, styled, shown, time.perf_counter() - start))
         display.count(len(named), len(named), "restyling")
     for note in dict.fromkeys(note for _, styled, _, _ in made for note in styled.orders.notes):
         print(note)
@@ -108,9 +109,9 @@ def run(args: list[str]) -> int:
         for name, styled, _, _ in made:
             print_explained(folder / name if name else folder, styled.orders.regions, styled)
         if not made:
-            print_explained(folder, splat_regions(scene, file), None)
+            print_explained(folder, Regions(scene, *scene.measured(), file.regions, file.semantic_encoder), None)
     if config.sheet is not None or config.page is not None:
-        pictures = _pictures(scene, [new for _, _, new, _ in made], config.shown)
+        pictures = _pictures(scene, [shown for _, _, shown, _ in made], config.shown)
         if config.sheet is not None:
             write_image(config.sheet, _sheet(pictures, [name for name, _, _, _ in made]))
         if config.page is not None:
@@ -167,7 +168,7 @@ def _known(capture: "Capture", finite: "Tensor", encoder: "Encoder", config: Res
     gaussians = capture.gaussians if bool(finite.all()) else capture.gaussians.select(finite)
     if path.is_file():
         try:
-            scene = load_scene(load_sealed(path), gaussians, capture.antialiased, encoder.identity)
+            scene = load_scene(load_sealed(path), gaussians, capture.antialiased)
         except CheckpointError as error:
             display.say(f"looking again: {error}")
         else:
@@ -197,17 +198,14 @@ def _beside(output: Path, what: str) -> Path:
     return output.with_name(what if output.name.lower() == "meta.json" else f"{output.name.partition('.')[0]}.{what}")
 
 
-def _pictures(scene: "SplatScene", styles: "Sequence[Tensor]", shown: int) -> "list[tuple[str, list[Picture]]]":
+def _pictures(scene: "SplatScene", styles: "Sequence[SplatScene]", shown: int) -> "list[tuple[str, list[Picture]]]":
     """Views, evenly taken from the nearer half, with their pictures: as it is, then in each style."""
-    from ..training.restyle_gaussians import SplatViews
+    from ..io.images import to_uint8
 
-    views, count = SplatViews(scene), max(min(shown, len(scene.names)), len(scene.names) // 2)
+    count = max(min(shown, len(scene.names)), len(scene.names) // 2)
     cameras = scene.cameras.scaled(0.5)
     chosen = sorted({round((k + 0.5) * count / min(shown, count) - 0.5) for k in range(min(shown, count))})
-    return [
-        (scene.names[view], [views.picture(cameras, view), *(views.picture(cameras, view, new) for new in styles)])
-        for view in chosen
-    ]
+    return [(scene.names[view], [to_uint8(each.render(cameras, view).rgb) for each in (scene, *styles)]) for view in chosen]
 
 
 def _sheet(pictures: "list[tuple[str, list[Picture]]]", names: list[str]) -> "Picture":
@@ -221,7 +219,7 @@ def _sheet(pictures: "list[tuple[str, list[Picture]]]", names: list[str]) -> "Pi
 def _write_page(
     config: RestyleConfig,
     scene: "SplatScene",
-    made: "list[tuple[str, Styled, Tensor, float]]",
+    made: "list[tuple[str, Styled, SplatScene, float]]",
     pictures: "list[tuple[str, list[Picture]]]",
 ) -> None:
     from ..datamanagers.images import load_image
@@ -249,7 +247,7 @@ def _write_page(
     write_gallery(
         config.page,
         title=config.capture.resolve().name.partition(".")[0] or "capture",
-        scene={"Gaussians": len(scene.gaussians), "Regions": len(scene.style.share), "Styles": len(styles)},
+        scene={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
         view_names=[view for view, _ in pictures],
         originals=[row[0] for _, row in pictures],
         references=[Reference(label, load_image(path)) for label, path in called.items()],

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .progress import Display
 
 if TYPE_CHECKING:
+    from ..interfaces import Scene
     from ..io.images import Picture
     from ..style.files import StyleFile
-    from ..training.loading import Trained
     from ..training.restyle import Styled
-    from ..training.views import View
+    from ..types import View
 
 __all__ = ["Shown", "restyled", "write_page"]
 
@@ -36,25 +36,22 @@ class Shown(NamedTuple):
     """What is shown beside the style."""
 
 
-def restyled(
-    trained: "Trained", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display
-) -> list[Shown]:
+def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display) -> list[Shown]:
     """Each style on the views, with match maps and how well the views agree with each other."""
     from ..style.wishes import labels
     from ..training.matches import match_map, match_pictures, summarize
-    from ..training.restyle import apply_style, open_encoders
-    from ..training.views import render_view
+    from ..training.restyle import apply_style
 
-    known, config = trained.known, trained.config.render
-    encoders, shown = open_encoders(trained), []
+    encoders, shown = scene.encoders(), []
     for i, (name, file) in enumerate(chosen):
         display.count(i, len(chosen), "restyling")
         start = time.perf_counter()
-        styled = apply_style(trained, file, encoders)
+        styled = apply_style(scene, file, encoders)
         built = time.perf_counter()
-        pictures = [render_view(trained.model, known.facts, known.cameras, view, config, styled.restyle) for view in views]
+        look = scene.restyled(styled.restyle)
+        pictures = [look.render(scene.cameras, view) for view in views]
         done = time.perf_counter()
-        found = [match_map(trained, styled, view) for view in views]
+        found = [match_map(scene, styled, view) for view in views]
         summaries = [summarize(each, styled.codes) for each in found]
         called = dict(zip(labels(file.style.references), file.style.references, strict=True))
         shown.append(
@@ -70,7 +67,7 @@ def restyled(
                 {
                     "match_score": _mean([row["score"] for row in summaries]),
                     "match_entropy_bits": _mean([row["entropy_bits"] for row in summaries]),
-                    "warp_error": _warped(trained, views, pictures),
+                    "warp_error": _warped(scene, views, pictures),
                     "new_style_seconds": built - start,
                     "each_view_seconds": (done - built) / max(1, len(views)),
                 },
@@ -82,7 +79,7 @@ def restyled(
 
 def write_page(
     path: Path,
-    trained: "Trained",
+    scene: "Scene",
     *,
     title: str,
     facts: Mapping[str, str | int | float],
@@ -106,7 +103,7 @@ def write_page(
         path,
         title=title,
         scene=facts,
-        view_names=[trained.known.names[view] for view in views],
+        view_names=[scene.names[view] for view in views],
         originals=[to_uint8(view.rgb) for view in originals],
         references=[Reference(name, load_image(path, upright=True)) for name, path in references.items()],
         styles=[
@@ -126,13 +123,13 @@ def write_page(
     )
 
 
-def _warped(trained: "Trained", views: Sequence[int], pictures: "Sequence[View]") -> float | None:
+def _warped(scene: "Scene", views: Sequence[int], pictures: "Sequence[View]") -> float | None:
     """RMSE of each view against the next one, warped onto it; None where none sees what the next one sees."""
     import torch
 
     from ..evaluation.consistency import consistency
 
-    cameras = trained.known.cameras.select(torch.tensor(list(views), dtype=torch.int64))
+    cameras = scene.cameras.select(torch.tensor(list(views), dtype=torch.int64))
     pairs = [(i, i + 1) for i in range(len(views) - 1)]
     found = consistency([view.rgb for view in pictures], [view.depth for view in pictures], cameras, pairs)
     rmse = found["rmse"]

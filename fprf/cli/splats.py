@@ -1,7 +1,5 @@
 """Runs of 3D Gaussians on the command line."""
 
-import hashlib
-import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,16 +18,15 @@ if TYPE_CHECKING:
     from ..training.trainer import Report
     from ..viewer.aside import Aside
     from .eval import EvalConfig
-    from .render import RenderVerbConfig
 
 __all__ = ["SplatVerbs"]
 
-_KINDS = {"ply": "splats.ply", "splat": "splats.splat"}
-"""Kinds of `fprf export`, by the file that each makes."""
+_KINDS = ("ply", "splat")
+"""Kinds of `fprf export`."""
 
 
 class SplatVerbs(Verbs):
-    """Training from photographs, measuring, films and files of the plain scene; styles are for `fprf restyle`."""
+    """Training from photographs, measuring, and files of Gaussians."""
 
     def __init__(self, config: "GaussiansConfig") -> None:
         self.config = config
@@ -51,91 +48,53 @@ class SplatVerbs(Verbs):
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Judge renders, lenses included, as those of fields are judged."""
         from ..evaluation.judge import judge_views
-        from ..splats.training import draw_view, load_trained, scene_of
+        from ..splats.training import open_gaussians, scene_of
         from ..training.run import view_names
         from .eval import store
 
         if config.fit_poses:
             raise UsageError("--fit-poses: is for runs of fields; leave it out")
-        trained = load_trained(config.run, self.config)
-        data = config.data or trained.config.data
-        scene = scene_of(replace(trained.config, data=data))
-        if tuple(view_names(scene.paths)) != trained.known.names:
+        opened = open_gaussians(config.run, self.config, config)
+        data, known = config.data or self.config.data, opened.known
+        scene = scene_of(replace(self.config, data=data))
+        if tuple(view_names(scene.paths)) != known.names:
             raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
-        views = trained.known.split(config.split)
+        views = known.split(config.split)
         if not views:
             raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
-        cameras, masks = trained.known.cameras, trained.config.masks
+        shown = opened.scene
         with Display() as display:
             found, renders = judge_views(
-                trained.known, scene, views, lambda view: draw_view(trained, cameras, view), display.count, masks=masks
+                known, scene, views, lambda view: shown.render(known.cameras, view), display.count, masks=self.config.masks
             )
-        found |= {"train_seconds": trained.seconds, "train_steps": trained.step, "gaussians": len(trained.gaussians)}
-        return store(config, trained.known, trained.method, views, found, renders)
-
-    def render(self, config: "RenderVerbConfig", file: "StyleFile") -> None:
-        """Film the plain scene."""
-        from ..datamanagers.images import load_image
-        from ..io.images import to_uint8, write_image
-        from ..io.maps import depth_image
-        from ..io.sheet import beside
-        from ..io.video import missing, write_video
-        from ..splats.training import draw_view, load_trained
-        from .render import camera_path
-
-        _refuse_styles(config.run, config.references, config.style, config.styles, config.keyframes)
-        if config.lens != "own" or {"normals", "match"} & {*config.show} or config.format == "exr":
-            raise UsageError("fprf render: Gaussians are shown in colour and depth, through the path's own lens, as png or jpg")
-        trained = load_trained(config.run, self.config)
-        cameras, names = camera_path(trained.known, config)
-        film = config.output.suffix.lower() == ".mp4"
-        folder = config.output.with_suffix(".frames") if film else config.output
-        paths = [folder / f"{name}.{'png' if film else config.format}" for name in names]
-        digest = hashlib.sha256(f"{trained.run.root.resolve()} {trained.step} {trained.seconds} {config.show}".encode())
-        for tensor in (cameras.pose, cameras.focal, cameras.centre, cameras.size, cameras.distortion, cameras.lens):
-            digest.update(tensor.numpy().tobytes())
-        todo = {*missing(folder, digest.hexdigest(), paths)}
-        start = time.perf_counter()
-        with Display() as display:
-            for frame, path in enumerate(paths):
-                display.count(frame, len(paths), "rendering")
-                if path not in todo:
-                    continue
-                view = draw_view(trained, cameras, frame)
-                shown = {"colour": lambda v=view: to_uint8(v.rgb), "depth": lambda v=view: depth_image(v.depth, v.opacity)}
-                write_image(path, beside([shown[channel]() for channel in config.show]))
-            display.count(len(paths), len(paths), "rendering")
-            made = str(config.output)
-            if film:
-                made += f" ({write_video(config.output, (load_image(path) for path in paths), config.fps)})"
-                shutil.rmtree(folder)
-        print(f"{len(paths)} frames in {made}, {(time.perf_counter() - start) / max(1, len(todo)):.2f} s each")
+        found |= {"train_seconds": opened.seconds, "train_steps": opened.step, "gaussians": len(shown.gaussians)}
+        return store(config, known, opened.method, views, found, renders)
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
-        """Write files of Gaussians."""
+        """Write files of Gaussians, as they are and in every style."""
+        from ..export.looks import make_looks, styles_of
+        from ..export.config import look_file
         from ..splats.files import ENDINGS, write_gaussians
-        from ..splats.training import load_trained
+        from ..splats.training import open_gaussians
+        from ..training.quality import QualityConfig
+        from .style_flags import say
 
-        _refuse_styles(config.run, config.references, config.style, config.styles)
         for kind in config.kinds:
             if kind not in _KINDS:
                 raise UsageError(f"fprf export: of Gaussians there are {' and '.join(_KINDS)}, not {kind}")
         output = config.output or config.run / "exports"
         single = output.name.lower().endswith(ENDINGS) and not output.is_dir()
-        trained = load_trained(config.run, self.config)
-        paths = [output] if single else [output / _KINDS[kind] for kind in dict.fromkeys(config.kinds or _KINDS)]
-        for path in paths:
-            write_gaussians(path, trained.gaussians, antialiased=True)
-        print(f"{len(trained.gaussians)} Gaussians in {', '.join(str(path) for path in paths)}")
-
-
-def _refuse_styles(run: Path, *styles: object) -> None:
-    """Raise UsageError where a style is asked for."""
-    if any(styles):
-        raise UsageError(
-            f"{run}: a run of Gaussians is restyled as a file: `fprf export {run} ply`, then `fprf restyle` "
-            f"{run / 'exports' / _KINDS['ply']}"
-        )
+        styles = styles_of(config, file, say)
+        if single and len(styles) > 1:
+            raise UsageError(f"--output {output}: one file holds one style, {len(styles)} are asked for; name a folder")
+        scene = open_gaussians(config.run, self.config, QualityConfig()).scene
+        paths = []
+        for look in make_looks(scene, styles)[-1 if single else 0 :]:
+            shown = scene.restyled(look.restyle).shown
+            for kind in dict.fromkeys(config.kinds or _KINDS):
+                paths.append(output if single else output / look_file("splats", look.name, f".{kind}"))
+                write_gaussians(paths[-1], shown, antialiased=True)
+        print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}")
 
 
 def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) -> Path:

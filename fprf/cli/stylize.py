@@ -9,15 +9,16 @@ from ..errors import UsageError
 from ..plugins.registry import nearest
 from ..style.config import StyleConfig
 from ..style.files import write_style
-from ..training.quality import QualityConfig, at_quality
+from ..training.quality import QualityConfig
 from .progress import Display
 from .style_flags import read_flags
 
 if TYPE_CHECKING:
+    from ..interfaces import Scene
     from ..training.explain import Region
-    from ..training.loading import Trained
     from ..training.regions import Regions
     from ..training.restyle import Styled
+    from ..training.run import Known
 
 __all__ = ["StylizeConfig", "print_explained", "run"]
 
@@ -70,57 +71,56 @@ def run(args: list[str]) -> int:
     config, file = read_flags(StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",))
     from ..style.dictionary import save_dictionary
     from ..style.statistics import dead_channels
-    from ..training.loading import load_run, load_style
-    from ..training.regions import Regions, TrainedViews
+    from ..training.loading import open_run
+    from ..training.regions import Regions
     from ..training.restyle import apply_style
 
-    trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
-    views, output = _views(trained, config), config.output or config.run / "styles" / _name(config)
+    opened = open_run(config.run, config.device, config)
+    scene = opened.scene
+    views, output = _views(opened.known, config), config.output or config.run / "styles" / _name(config)
     if config.explain and not config.references:
-        print_explained(output, Regions(TrainedViews(trained), *load_style(trained.run)), None)
+        print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
     start = time.perf_counter()
-    styled = apply_style(trained, file)
-    seconds, scene = time.perf_counter() - start, styled.scene
+    styled = apply_style(scene, file)
+    seconds, own = time.perf_counter() - start, styled.scene
     made: dict[str, Any] = {
         "dictionary_seconds": seconds,
         "codes": len(styled.codes.reference),
-        "dead_channels": dead_channels(scene.mean, scene.covariance.diagonal()).nonzero().flatten().tolist(),
+        "dead_channels": dead_channels(own.mean, own.covariance.diagonal()).nonzero().flatten().tolist(),
     }
     for note in styled.orders.notes:
         print(note)
     if config.explain:
         print_explained(output, styled.orders.regions, styled)
     if config.match_only or not config.explain:
-        made |= _make(trained, output, styled, views, config)
+        made |= _make(scene, output, styled, views, config)
     save_dictionary(output / "dictionary.safetensors", styled.dictionary)
     write_style(output / "style.json", styled.orders.saved, made)
     return 0
 
 
-def _make(trained: "Trained", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
+def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
     """Pictures and match maps of the views; what was matched and how long it took."""
     from ..io.images import to_uint8, write_image
-    from ..training.folding import Folded, folded
     from ..training.matches import match_map, match_pictures, summarize, write_pixels
-    from ..training.views import render_view
 
-    known, render, shown = trained.known, trained.config.render, not config.match_only
+    shown = not config.match_only
     maps = ("match", "score", "entropy") if config.match_only else ("match",) if config.matches else ()
     made: dict[str, Any] = {}
     rendering, matching, summaries = 0.0, 0.0, {}
-    drawn = folded(trained.model, styled, config.stylizer) or Folded(trained.model, styled.restyle)
+    restyled = scene.restyled(styled.restyle) if shown else scene
     with Display() as display:
         for i, view in enumerate(views):
             display.count(i, len(views), "restyling" if shown else "matching")
-            start, name = time.perf_counter(), known.names[view]
+            start, name = time.perf_counter(), scene.names[view]
             if shown:
-                picture = render_view(drawn.model, known.facts, known.cameras, view, render, drawn.look)
+                picture = restyled.render(scene.cameras, view)
                 rendering += time.perf_counter() - start
                 write_image(output / f"{name}.png", to_uint8(picture.rgb))
             if maps or config.pixels:
                 start = time.perf_counter()
-                found = match_map(trained, styled, view)
+                found = match_map(scene, styled, view)
                 matching += time.perf_counter() - start
                 summaries[name] = summarize(found, styled.codes)
                 pictures = match_pictures(found, styled.codes)
@@ -169,13 +169,13 @@ def _print_table(rows: list[tuple[str, ...]]) -> None:
         print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-def _views(trained: "Trained", config: StylizeConfig) -> list[int]:
+def _views(known: "Known", config: StylizeConfig) -> list[int]:
     """The views asked for. Raises UsageError for a name that the run does not hold."""
-    names = list(trained.known.names)
+    names = list(known.names)
     for name in config.views:
         if name not in names:
             raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
-    return [names.index(name) for name in config.views] or list(trained.known.split(config.split))
+    return [names.index(name) for name in config.views] or list(known.split(config.split))
 
 
 def _name(config: StylizeConfig) -> str:

@@ -10,13 +10,12 @@ if TYPE_CHECKING:
     from ..style.files import StyleFile
     from ..viewer.aside import Aside
     from .eval import EvalConfig
-    from .render import RenderVerbConfig
 
 __all__ = ["Verbs", "verbs_of"]
 
 
 class Verbs(ABC):
-    """`train`, `eval`, `render` and `export` for a config of one kind, which a run to be measured was trained with.
+    """`train`, `eval` and `export` for a config of one kind, which a run to be measured was trained with.
 
     Each raises UsageError for flags that the kind does not know.
     """
@@ -39,10 +38,6 @@ class Verbs(ABC):
     @abstractmethod
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Measure a run, write metrics.json and renders, and return the metrics."""
-
-    @abstractmethod
-    def render(self, config: "RenderVerbConfig", file: "StyleFile") -> None:
-        """Film a run."""
 
     @abstractmethod
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:

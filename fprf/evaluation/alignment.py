@@ -59,7 +59,7 @@ def align(
         moves[view] = align_view(trained, cameras, view, truth, reach, config or AlignmentConfig(), where)
         pose[view] = moved(pose[view][None], moves[view][None, :3], moves[view][None, 3:])[0]
     progress(len(views), len(views), "fitting poses")
-    return trained._replace(known=replace(trained.known, cameras=replace(cameras, pose=pose))), moves
+    return replace(trained, known=replace(trained.known, cameras=replace(cameras, pose=pose))), moves
 
 
 def described(move: Annotated[Tensor, "6"]) -> dict[str, float]:

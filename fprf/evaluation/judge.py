@@ -11,7 +11,8 @@ from ..datamanagers.scene import Scene
 from ..memory import peak
 from ..training.loading import Trained
 from ..training.run import Known
-from ..training.views import View, render_view
+from ..training.views import render_view
+from ..types import View
 from .consistency import consistency
 from .metrics import image_metrics, mean_metrics
 

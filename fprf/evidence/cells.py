@@ -9,9 +9,9 @@ from torch import Tensor
 from ..errors import DataError
 from ..evaluation.flat import encoded
 from ..style.dictionary import BLEND, StyleDictionary, blend_codes
+from ..style.references import Encoders
 from ..style.statistics import covariance, group_moments, moments
 from ..training.loading import Trained
-from ..training.restyle import Encoders
 
 __all__ = ["CELL", "cell_dictionary", "cells"]
 

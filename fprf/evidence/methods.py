@@ -17,10 +17,11 @@ from ..style.config import StyleConfig
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
+from ..style.references import Encoders, encode_photograph
 from ..style.wishes import labels
 from ..training.cached_view import CachedView
 from ..training.loading import Trained
-from ..training.restyle import Encoders, dress, encode_photograph
+from ..training.restyle import dress
 from ..types import Want
 
 __all__ = ["FLAT", "GLOBAL", "PLAIN", "Shown", "dictionary_of", "in_scene", "lineup", "nothing", "one_by_one", "transfers"]
@@ -61,9 +62,7 @@ def dictionary_of(
 ) -> tuple[StyleDictionary, float]:
     """The style dictionary of photographs on a scene, and the seconds it took."""
     start = time.perf_counter()
-    found = [
-        encode_photograph(trained, path, encoders, name=name) for path, name in zip(paths, labels(tuple(paths)), strict=True)
-    ]
+    found = [encode_photograph(path, encoders, name=name) for path, name in zip(paths, labels(tuple(paths)), strict=True)]
     made = build_dictionary(found, clusters=clusters, blend=blend, seed=trained.config.seed)
     return made, time.perf_counter() - start
 

@@ -19,9 +19,9 @@ from ..errors import UsageError
 from ..evaluation.metrics import image_metrics, mean_metrics
 from ..plugins.decoders.config import ResidualDecoderConfig
 from ..plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
-from ..training.loading import Trained, load_run
+from ..style.references import Encoders
+from ..training.loading import Trained, encoders_of, load_run
 from ..training.prepare import prepare, scene_of
-from ..training.restyle import Encoders, encoders_of, open_encoders
 from ..training.run import Run
 from ..training.style_pass import measure_style
 from ..training.trainer import Report, train
@@ -164,7 +164,7 @@ def _styled(bench: Bench) -> Row:
 def _finished(root: Path, device: str) -> Short:
     """A run that is trained already."""
     trained = load_run(root, device)
-    return Short(trained, open_encoders(trained), trained.seconds)
+    return Short(trained, trained.encoders(), trained.seconds)
 
 
 def _held_out(trained: Trained, views: int) -> Row:

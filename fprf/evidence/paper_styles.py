@@ -25,10 +25,11 @@ from ..style.config import StyleConfig
 from ..style.dictionary import StyleDictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
+from ..style.references import Encoders
 from ..style.scene import scene_style
 from ..training.cached_view import CachedView
 from ..training.loading import Trained
-from ..training.restyle import Encoders, apply_style
+from ..training.restyle import apply_style
 from .cells import cell_dictionary
 from .codes import code_classes, match_rates, winners
 from .config import PaperConfig

@@ -10,8 +10,8 @@ from torch import Tensor
 from ..errors import UsageError
 from ..evaluation.steadiness import steadiness
 from ..io.images import Picture, to_uint8, write_image
+from ..style.references import Encoders
 from ..training.loading import load_run
-from ..training.restyle import Encoders, open_encoders
 from .codes import Matched, code_classes, match_rates, winners
 from .config import RestyleConfig
 from .contact import contact_sheet
@@ -58,7 +58,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
     """The document and the cases. `folder` takes the references' files."""
     trained = load_run(root, config.device)
     stage = set_stage(trained, views=config.views, frames=config.frames, longest=config.longest)
-    found = cases(config, stage, open_encoders(trained), folder, progress)
+    found = cases(config, stage, trained.encoders(), folder, progress)
     sets = sorted({case.set for case in found}, key=[case.set for case in found].index)
     means = {name: mean_rows([case.rows for case in found if case.set == name]) for name in sets}
     best = list(lineup(config.stylizer))[-1]

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..errors import UsageError
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
+from .config import ExportConfig
 
 if TYPE_CHECKING:
+    from ..interfaces import Scene
     from ..rendering.renderer import Restyle
-    from ..training.loading import Trained
 
-__all__ = ["Look", "Named", "make_looks", "named_styles", "style_name"]
+__all__ = ["Look", "Named", "make_looks", "named_styles", "style_name", "styles_of"]
 
 _LONGEST = 60
 """Characters of a name, which file names carry."""
@@ -65,16 +66,24 @@ def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], 
     return found
 
 
-def make_looks(trained: "Trained", styles: Sequence[Named]) -> list[Look]:
+def styles_of(config: ExportConfig, base: StyleFile, report: Callable[[str], None] = warnings.warn) -> list[Named]:
+    """The styles that an export names: that of its photographs or style file first. Raises as `named_styles`."""
+    styles = named_styles(config.styles, base, report)
+    if config.references:
+        styles.insert(0, Named(style_name(config.references, config.style), base))
+    return styles
+
+
+def make_looks(scene: "Scene", styles: Sequence[Named]) -> list[Look]:
     """The scene as it is, and each style. Raises UsageError for two of one name, and what `apply_style` raises."""
-    from ..training.restyle import apply_style, open_encoders
+    from ..training.restyle import apply_style
 
     names = [style.name for style in styles]
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"--styles {name}: two styles of this name; give each its own")
-    encoders = open_encoders(trained) if styles else None
-    return [Look("", None), *(Look(s.name, apply_style(trained, s.file, encoders).restyle) for s in styles)]
+    encoders = scene.encoders() if styles else None
+    return [Look("", None), *(Look(s.name, apply_style(scene, s.file, encoders).restyle) for s in styles)]
 
 
 def _with(style: StyleConfig, references: tuple[Path, ...]) -> StyleConfig:

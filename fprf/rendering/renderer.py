@@ -13,17 +13,18 @@ number of samples in each step. Geometry stays in full precision under autocast:
 from typing import Annotated, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
 from ..ops import march as compiled
 from ..ops.precision import full_precision
 from ..style.look import Restyle
-from ..types import Rays, Rendered, Sampled, Want
+from ..types import Rays, Rendered, Sampled, View, Want
 from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
 
-__all__ = ["VEIL", "Kept", "Parts", "Restyle", "march", "render_rays"]
+__all__ = ["VEIL", "Kept", "Parts", "Restyle", "enlarged", "march", "render_rays"]
 
 
 VEIL = 4.0
@@ -217,3 +218,12 @@ def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: in
     points = rays.origin[:count, None] + rays.direction[:count, None] * t[..., None]
     features: Tensor = parts.semantic(parts.space.locate(points.reshape(-1, 3)))
     return (features.view(count, s, features.shape[-1]) * (heaviest * scale)[..., None]).sum(1)
+
+
+def enlarged(small: View, size: list[int]) -> View:
+    """Resize a view to a width and height. Depths stay what they are: between near and far there is nothing."""
+    target = size[::-1]
+    rgb = F.interpolate(small.rgb.permute(2, 0, 1)[None], target, mode="bicubic")[0].permute(1, 2, 0)
+    depth = F.interpolate(small.depth[None, None], target, mode="nearest-exact")[0, 0]
+    opacity = F.interpolate(small.opacity[None, None], target, mode="bilinear")[0, 0]
+    return View(rgb.clamp(0, 1).contiguous(), depth, opacity, small.kept)

@@ -1,6 +1,7 @@
 """What a run of 3D Gaussians is made of. Imports no torch."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, between, positive
@@ -10,6 +11,9 @@ from ..errors import ConfigError
 
 if TYPE_CHECKING:
     from ..cli.verbs import Verbs
+    from ..training.loading import LoadedRun
+    from ..training.quality import QualityConfig
+    from .scene import SplatScene
 
 __all__ = ["GaussiansConfig"]
 
@@ -57,6 +61,12 @@ class GaussiansConfig(RunConfig):
         positive("rate", self.rate)
         for part in self.background:
             between("background", part, 0.0, 1.0)
+
+    def load(self, run: Path, device: str, quality: "QualityConfig") -> "LoadedRun[SplatScene]":
+        """Read the Gaussians; they are drawn on the CPU, whatever the device."""
+        from .training import open_gaussians
+
+        return open_gaussians(run, self, quality)
 
     def verbs(self) -> "Verbs":
         """How such a run is trained, judged, filmed and exported."""

@@ -8,26 +8,47 @@ themselves have less contrast (deviation 0.13 against 0.17 on a plant), since wh
 
 import hashlib
 from collections.abc import Callable
-from typing import Annotated
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..datamanagers.basis import Basis, fit_basis
 from ..datamanagers.config import GuidedConfig
-from ..errors import CheckpointError, DataError
-from ..interfaces import Encoder
+from ..errors import CheckpointError, DataError, WeightsError
+from ..interfaces import Encoder, Scene, Stylizer
 from ..ops.guided import upsample
-from ..ops.rasterise import lift
+from ..ops.rasterise import Pinhole, lift
+from ..plugins.encoders.config import BundledSemanticConfig
+from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
+from ..rendering.renderer import enlarged
+from ..style.colours import ColourMaps
+from ..style.dictionary import StyleDictionary
+from ..style.look import Restyle
+from ..style.references import Encoders
 from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
+from ..types import View
 from .gaussians import Gaussians
 from .look_config import LookConfig
+from .photographs import cover, distorted
+from .restyle import Colours, region_maps, restyled_harmonics
 from .views import camera_of, draw, find_views
 
-__all__ = ["SplatScene", "cache_name", "load_scene", "look_at_capture", "scene_tensors"]
+__all__ = [
+    "Semantics",
+    "SplatScene",
+    "cache_name",
+    "find_semantics",
+    "load_scene",
+    "load_semantics",
+    "look_at_capture",
+    "scene_tensors",
+    "semantics_tensors",
+]
 
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
@@ -46,25 +67,128 @@ _NEIGHBOURS, _LEVELS, _REACH = 1.0, 8, 0.02
 nearest one, as a share of the spread of the positions."""
 
 
-class SplatScene:
-    """Gaussians, views of them, and what the views showed. All on the CPU."""
+class Semantics(NamedTuple):
+    """What views of N Gaussians showed."""
 
-    def __init__(
+    style: SceneStyle
+    basis: Basis
+    features: Annotated[Tensor, "N D"]
+    encoder: str
+    """Identity of the encoder."""
+
+
+@dataclass(frozen=True, eq=False)
+class SplatScene(Scene):
+    """Gaussians with views of them, all on the CPU."""
+
+    gaussians: Gaussians
+    """As they were captured; all finite."""
+    antialiased: bool
+    views: Cameras
+    view_names: tuple[str, ...]
+    found: Callable[[], Semantics]
+    """What the views showed: asked when it is first needed."""
+    longest: int
+    """Longest side in pixels at which that was looked at."""
+    near: float = 0.01
+    """Nothing is drawn nearer to a camera, along z."""
+    background: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    resolution: float = 1.0
+    """Share of a view's width and height that is rendered."""
+    harmonics: Annotated[Tensor, "N K 3"] | None = None
+    """Those of a look; None = as captured."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the views."""
+        return self.view_names
+
+    @property
+    def cameras(self) -> Cameras:
+        """Of the views."""
+        return self.views
+
+    @property
+    def device(self) -> torch.device:
+        """The CPU."""
+        return torch.device("cpu")
+
+    @property
+    def semantic_encoder(self) -> str:
+        """Identity of the encoder of the Gaussians' semantics."""
+        return self.found().encoder
+
+    @property
+    def shown(self) -> Gaussians:
+        """The Gaussians in the scene's look."""
+        return self.gaussians if self.harmonics is None else self.gaussians.recoloured(self.harmonics)
+
+    @torch.inference_mode()
+    def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
+        """Draw a view, its lens included. Raises DataError for a panorama."""
+        share = self.resolution if resolution is None else resolution
+        if share < 1:
+            small = cameras.select(torch.tensor([view])).scaled(1 / share)
+            return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
+        camera, place = cover(cameras, view, self.near)
+        drawn = draw(self.shown, camera, antialiased=self.antialiased, background=self.background)
+        layers = torch.cat([drawn.image, (drawn.depth * _ray_lengths(camera))[..., None], drawn.opacity[..., None]], -1)
+        if place is not None:
+            layers = torch.cat([distorted(layers[..., :3], place), distorted(layers[..., 3:].contiguous(), place)], -1)
+        return View(layers[..., :3].clamp(0, 1), layers[..., 3], layers[..., 4], 1.0)
+
+    @torch.inference_mode()
+    def paint(
         self,
-        gaussians: Gaussians,
-        antialiased: bool,
         cameras: Cameras,
+        view: int,
+        pixel: Annotated[Tensor, "R 2"],
+        values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+        *,
+        semantic: bool = True,
+    ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
+        """Values of the Gaussians, drawn."""
+        camera, place = cover(cameras, view, self.near)
+        features = self.found().features
+        drawn = draw(
+            self.gaussians, camera, antialiased=self.antialiased, features=values(features[:, : None if semantic else 0])
+        )
+        x, y = pixel.long().unbind(1)
+        if place is not None:
+            x, y = place[y, x].long().unbind(1)
+        at = y.clamp(0, camera.height - 1) * camera.width + x.clamp(0, camera.width - 1)
+        opacity = drawn.opacity.flatten()[at]
+        return drawn.features.flatten(0, 1)[at] / opacity.clamp_min(1e-10)[:, None], opacity
+
+    def restyled(self, look: Restyle | None) -> "SplatScene":
+        """The same Gaussians in other colours."""
+        if look is None or look.idle:
+            return replace(self, harmonics=None)
+        return replace(self, harmonics=restyled_harmonics(self.gaussians.harmonics, self.found().features, look))
+
+    def measured(self) -> tuple[SceneStyle, Basis | None]:
+        """Statistics of pixels, and the basis."""
+        return self.found().style, self.found().basis
+
+    def encoders(self) -> Encoders:
+        """Colours in the place of content, and the bundled semantic encoder. Raises WeightsError where that is another one."""
+        found, encoder = self.found(), BundledSemanticConfig().build()
+        if encoder.identity != found.encoder:
+            raise WeightsError(f"semantic encoder: the scene was seen with {found.encoder}, this is {encoder.identity}")
+        return Encoders(Colours(), encoder, found.basis, found.style, longest=self.longest)
+
+    def colour_maps(
+        self,
+        stylizer: Stylizer,
+        dictionary: StyleDictionary,
         style: SceneStyle,
-        basis: Basis,
-        semantic: Annotated[Tensor, "N D"],
-        encoder: str,
-    ) -> None:
-        self.gaussians, self.antialiased, self.cameras = gaussians, antialiased, cameras
-        self.style, self.basis, self.semantic, self.encoder = style, basis, semantic, encoder
-        self.names = tuple(f"{view:02d}" for view in range(len(cameras)))
+        config: StylizerConfig,
+        allowed: Annotated[Tensor, "K references"],
+    ) -> ColourMaps | None:
+        """From region to codes; the stylizer knows what is allowed."""
+        return region_maps(stylizer, dictionary, style, config)
 
 
-@torch.inference_mode()
 def look_at_capture(
     gaussians: Gaussians,
     antialiased: bool,
@@ -72,16 +196,41 @@ def look_at_capture(
     config: LookConfig,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SplatScene:
-    """Find views of Gaussians that are all finite, encode them, carry the features back, and find the regions."""
+    """Find views of Gaussians that are all finite, and what they show. Raises DataError where nothing can be seen."""
     up = torch.tensor(config.up)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
     cameras = find_views(gaussians, count=config.views, size=config.size, up=up, inside=config.inside, antialiased=antialiased)
+    found = find_semantics(gaussians, antialiased, encoder, cameras, config.regions, progress=progress)
+    return captured(gaussians, antialiased, cameras, found)
+
+
+def captured(gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Semantics) -> SplatScene:
+    """The scene of a capture; its views are numbered."""
+    names = tuple(f"{view:02d}" for view in range(len(cameras)))
+    return SplatScene(gaussians, antialiased, cameras, names, lambda: found, int(cameras.size.amax()))
+
+
+@torch.inference_mode()
+def find_semantics(
+    gaussians: Gaussians,
+    antialiased: bool,
+    encoder: Encoder,
+    cameras: Cameras,
+    regions: int,
+    *,
+    near: float = 0.01,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Semantics:
+    """Encode views of Gaussians, carry the features back, and find the regions. Lenses are left out.
+
+    Raises DataError where nothing is opaque enough to be seen.
+    """
     total = 2 * len(cameras)
     pictures, cells, solid = [], [], []
     for view in range(len(cameras)):
         progress(view, total)
-        drawn = draw(gaussians, camera_of(cameras, view), antialiased=antialiased)
+        drawn = draw(gaussians, camera_of(cameras, view, near), antialiased=antialiased)
         pictures.append((drawn.image, drawn.opacity))
         behind = (1 - drawn.opacity)[..., None]
         filled = torch.stack([drawn.image + behind * grey for grey in _BACKDROPS]).clamp(0, 1)
@@ -105,7 +254,7 @@ def look_at_capture(
         trust = coarse[..., 3:] ** _TRUST
         parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
         pixels = torch.cat([fine * trust, trust], 2)
-        found = lift(*parts, camera_of(small, 0), pixels, antialiased=antialiased).features
+        found = lift(*parts, camera_of(small, 0, near), pixels, antialiased=antialiased).features
         sums += found[:, :dim]
         weights += found[:, dim]
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
@@ -120,43 +269,58 @@ def look_at_capture(
         pairs.append(torch.stack([shown[:, :-1].flatten(0, 1)[pair], shown[:, 1:].flatten(0, 1)[pair]], 1))
     progress(total, total)
     colour, semantic, seen = (torch.cat(each) for each in zip(*samples, strict=True))
-    style = scene_style(colour, semantic, seen, None, config.regions, seed=0)
+    style = scene_style(colour, semantic, seen, None, regions, seed=0)
     ends = torch.cat(pairs)
     if len(style.share) > 1:
         style = style._replace(contacts=region_contacts(style, ends[..., 3:], ends[..., :3]))
     features = _spread(gaussians.means, sums * _COARSER**2, weights * _COARSER**2, style.semantic_mean)
     # Half precision is what a cache holds: a capture seen again must give the same colours.
-    return SplatScene(gaussians, antialiased, cameras, style, basis, features.half().float(), encoder.identity)
+    return Semantics(style, basis, features.half().float(), encoder.identity)
+
+
+def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
+    """What views showed, for a file of tensors."""
+    parts = {"style": style_tensors(found.style), "basis": found.basis.tensors()}
+    named = {f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()}
+    return {**named, "semantic": found.features.half(), "encoder": torch.tensor([*found.encoder.encode()], dtype=torch.uint8)}
+
+
+def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
+    """What `semantics_tensors` holds. Raises CheckpointError where it is not of as many Gaussians."""
+    features = tensors.get("semantic", torch.zeros(0, 0))
+    try:
+        basis = Basis.from_tensors(_group(tensors, "basis"))
+        encoder = bytes(tensors["encoder"].tolist()).decode()
+    except (KeyError, ValueError, DataError) as error:
+        raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
+    if features.shape != (count, basis.matrix.shape[1]):
+        raise CheckpointError(f"what is known of a capture has features {tuple(features.shape)}; it is of another one")
+    return Semantics(style_from(_group(tensors, "style")), basis, features.float(), encoder)
 
 
 def scene_tensors(scene: SplatScene) -> dict[str, Tensor]:
-    """What was found out about the Gaussians, without themselves: for a file of tensors."""
-    cameras = {name: getattr(scene.cameras, name) for name in ("pose", "focal", "centre", "size", "distortion", "lens")}
-    parts = {"camera": cameras, "style": style_tensors(scene.style), "basis": scene.basis.tensors()}
-    named = {f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()}
-    return {**named, "semantic": scene.semantic.half()}
+    """What was found out about a capture, without its Gaussians: for a file of tensors."""
+    cameras = {f"camera.{field.name}": getattr(scene.views, field.name) for field in fields(Cameras)}
+    return {**cameras, **semantics_tensors(scene.found())}
 
 
-def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bool, encoder: str) -> SplatScene:
+def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bool) -> SplatScene:
     """The scene of `scene_tensors`. Raises CheckpointError where they are not those of the Gaussians."""
-
-    def group(name: str) -> dict[str, Tensor]:
-        return {key.partition(".")[2]: tensor for key, tensor in tensors.items() if key.startswith(f"{name}.")}
-
-    semantic = tensors.get("semantic", torch.zeros(0, 0))
     try:
-        cameras, basis = Cameras(**group("camera")), Basis.from_tensors(group("basis"))
-    except (TypeError, DataError) as error:
+        cameras = Cameras(**_group(tensors, "camera"))
+    except TypeError as error:
         raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
-    if semantic.shape != (len(gaussians), basis.matrix.shape[1]):
-        raise CheckpointError(f"what is known of a capture has features {tuple(semantic.shape)}; it is of another one")
-    return SplatScene(gaussians, antialiased, cameras, style_from(group("style")), basis, semantic.float(), encoder)
+    return captured(gaussians, antialiased, cameras, load_semantics(tensors, len(gaussians)))
+
+
+def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    return {key.partition(".")[2]: tensor for key, tensor in tensors.items() if key.startswith(f"{name}.")}
 
 
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"2 {encoder} {config}".encode())
+    digest.update(f"3 {encoder} {config}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 
@@ -192,3 +356,11 @@ def _spread(
         share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)
         out, trust = out + (total * share[:, None])[box], trust + (weight * share)[box]
     return torch.where(trust[:, None] > 1e-6, out / trust.clamp_min(1e-12)[:, None], none)
+
+
+def _ray_lengths(camera: Pinhole) -> Tensor:
+    """Length of the ray to each pixel where z is 1."""
+    inverse = camera.intrinsics.inverse().float()
+    x = (torch.arange(camera.width) + 0.5) * inverse[0, 0] + inverse[0, 2]
+    y = (torch.arange(camera.height) + 0.5) * inverse[1, 1] + inverse[1, 2]
+    return (x.square() + y.square()[:, None] + 1).sqrt()

@@ -4,39 +4,40 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from ..config import StatisticsConfig
 from ..datamanagers.images import load_images
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, NumericsError, UsageError
-from ..ops.rasterise import Pinhole, rasterise
+from ..plugins.encoders.config import BundledSemanticConfig
 from ..rendering.bounds import find_space
-from ..rendering.cameras import Cameras, project
+from ..rendering.cameras import project
 from ..training import checkpoint
 from ..training.interrupts import held_back
+from ..training.loading import LoadedRun
 from ..training.model import Facts
+from ..training.quality import PRESETS, QualityConfig
 from ..training.run import Known, Run
 from ..training.schedule import progress
 from ..training.trainer import REPORT_SECONDS, Report
-from ..training.views import View
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points
 from .learner import Learner, Step
-from .photographs import cover, distorted, make_levels
+from .photographs import make_levels
+from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
 
 __all__ = [
     "Prepared",
-    "TrainedGaussians",
-    "draw_view",
     "facts_of",
-    "load_trained",
+    "open_gaussians",
     "prepare",
     "scene_of",
     "train",
@@ -46,6 +47,8 @@ __all__ = [
 _PATIENCE = 3
 """Steps in a row without a finite loss after which training gives up."""
 _SMOOTHING = 0.95
+_VIEWS, _SEEN = 32, 400
+"""Training views that semantics are found in, at most, and their longest side in pixels."""
 _PIXELS = 200_000
 """Of an image, where nobody says how far to reduce them."""
 _NEAR = 0.25
@@ -60,20 +63,6 @@ class Prepared(NamedTuple):
     near: float
     origin: str
     """Where the first Gaussians are from."""
-
-
-class TrainedGaussians(NamedTuple):
-    """A run of Gaussians in memory."""
-
-    run: Run
-    config: GaussiansConfig
-    method: str
-    known: Known
-    gaussians: Gaussians
-    near: float
-    step: int
-    seconds: float
-    """How long it was trained."""
 
 
 def scene_of(config: GaussiansConfig) -> Scene:
@@ -212,44 +201,50 @@ def _gaussians(saved: checkpoint.Saved) -> Gaussians:
         raise CheckpointError(f"checkpoint of step {saved.step}: holds no {error}, so it is not of Gaussians") from error
 
 
-def load_trained(root: Path, config: GaussiansConfig) -> TrainedGaussians:
-    """A run's Gaussians from its folder alone; `config` is its own. Raises CheckpointError with what is missing."""
+def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) -> LoadedRun[SplatScene]:
+    """A run's Gaussians from its folder alone; `config` is its own.
+
+    Raises CheckpointError with what is missing, UsageError for qualities other than a resolution.
+    """
+    for name in ("samples", "budget", "chunk", "tone", "max_memory"):
+        if getattr(quality, name):
+            raise UsageError(f"--{name.replace('_', '-')}: is for runs of fields; leave it out")
     run = Run(root)
     saved, _ = checkpoint.load_latest(run.checkpoints)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
+    known, gaussians = run.load_known(), _gaussians(saved)
     near = float(saved.model.get("near", torch.tensor(0.01)))
-    return TrainedGaussians(
-        run, config, run.load_config()[1], run.load_known(), _gaussians(saved), near, saved.step, saved.seconds
+    preset = PRESETS[quality.quality].resolution if quality.quality is not None else 1.0
+    scene = SplatScene(
+        gaussians,
+        True,
+        known.cameras,
+        known.names,
+        cache(lambda: _semantics(run, saved.step, known, gaussians, near)),
+        min(_SEEN, int(known.cameras.size.amax())),
+        near,
+        config.background,
+        preset if quality.resolution is None else quality.resolution,
     )
+    return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
 
 
-def draw_view(trained: TrainedGaussians, cameras: Cameras, view: int) -> View:
-    """Render a view, its lens included."""
-    camera, place = cover(cameras, view, trained.near)
-    found = trained.gaussians
-    seen = rasterise(
-        found.means,
-        found.quaternions,
-        found.log_scales,
-        found.logits,
-        found.harmonics,
-        camera,
-        background=torch.tensor(trained.config.background),
-        antialiased=True,
-    )
-    layers = torch.cat([seen.image, (seen.depth * _ray_lengths(camera))[..., None], seen.opacity[..., None]], -1)
-    if place is not None:
-        layers = torch.cat([distorted(layers[..., :3], place), distorted(layers[..., 3:].contiguous(), place)], -1)
-    return View(layers[..., :3].clamp(0, 1), layers[..., 3], layers[..., 4], 1.0)
-
-
-def _ray_lengths(camera: Pinhole) -> Tensor:
-    """Length of the ray to each pixel where z is 1."""
-    inverse = camera.intrinsics.inverse().float()
-    x = (torch.arange(camera.width) + 0.5) * inverse[0, 0] + inverse[0, 2]
-    y = (torch.arange(camera.height) + 0.5) * inverse[1, 1] + inverse[1, 2]
-    return (x.square() + y.square()[:, None] + 1).sqrt()
+def _semantics(run: Run, step: int, known: Known, gaussians: Gaussians, near: float) -> Semantics:
+    """What training views show, from the run folder; found out and kept there where training has gone on since."""
+    encoder = BundledSemanticConfig().build()
+    if (run.root / "style.safetensors").is_file():
+        tensors = run.load_tensors("style")
+        if int(tensors.pop("step", torch.tensor(-1))) == step:
+            kept = load_semantics(tensors, len(gaussians))
+            if kept.encoder == encoder.identity:
+                return kept
+    every = torch.tensor(known.train)
+    views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
+    views = views.scaled(max(1.0, float(views.size.amax()) / _SEEN))
+    found = find_semantics(gaussians, True, encoder, views, StatisticsConfig().regions, near=near)
+    run.save_tensors("style", {**semantics_tensors(found), "step": torch.tensor(step)})
+    return found
 
 
 def _near(scene: Scene, points: Points) -> float:

@@ -43,15 +43,15 @@ _NEAR = 3.0
 """What a pixel with something close before the camera costs, in filled ones."""
 
 
-def camera_of(cameras: Cameras, view: int) -> Pinhole:
-    """A view as the rasteriser takes it: OpenCV's axes, world to camera."""
+def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
+    """A view without its lens as the rasteriser takes it: OpenCV's axes, world to camera."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = cameras.pose[view]
     pose[:3, 1:3] *= -1
     (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
     intrinsics = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     width, height = (int(v) for v in cameras.size[view])
-    return Pinhole(intrinsics, torch.linalg.inv(pose), width, height)
+    return Pinhole(intrinsics, torch.linalg.inv(pose), width, height, near)
 
 
 def draw(
@@ -60,11 +60,11 @@ def draw(
     *,
     antialiased: bool = False,
     features: Annotated[Tensor, "N C"] | None = None,
-    background: float = 0.0,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Rasterised:
     """A view of Gaussians; harmonics above degree 3, which files may hold, are not drawn."""
     parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits, gaussians.harmonics[:, :16])
-    behind = torch.full((3,), background) if background else None
+    behind = torch.tensor(background)
     return rasterise(*parts, camera, features=features, background=behind, antialiased=antialiased)
 
 

@@ -7,7 +7,7 @@ is how many pixels are looked at: every third and coarser filter cells change th
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,12 +24,15 @@ from .dictionary import Reference
 
 if TYPE_CHECKING:
     from ..datamanagers.basis import Basis
+    from .scene import SceneStyle
 
-__all__ = ["read_reference"]
+__all__ = ["SHORTEST_REFERENCE", "Encoders", "encode_photograph", "read_reference"]
 
 _SAMPLES = 20_000
 """Pixels that are looked at, about, on a regular grid."""
 
+SHORTEST_REFERENCE = 128
+"""References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
 _SHORTEST = 64
 """No side is encoded smaller: deep encoders have nothing to pad with on a photograph of a few pixels."""
 
@@ -41,6 +44,40 @@ _CELL = 16
 
 _ROWS = 4096
 """Pixels filtered at a time: bounds the memory."""
+
+
+class Encoders(NamedTuple):
+    """What brings references into a scene's terms: loaded once for any number of styles."""
+
+    content: Encoder
+    semantic: Encoder | None
+    basis: "Basis | None"
+    scene: "SceneStyle"
+    device: torch.device = torch.device("cpu")
+    """Device of the encoders."""
+    longest: int = 512
+    """Longest side in pixels at which photographs are encoded: that of the scene's own views."""
+    guided: GuidedConfig = GuidedConfig()
+    """The filter that features of the scene's own images passed."""
+    seed: int = 0
+    """Of the clusters of a style dictionary."""
+
+
+@torch.inference_mode()
+def encode_photograph(path: Path, encoders: Encoders, *, name: str, weight: float = 1.0, mask: Path | None = None) -> Reference:
+    """One photograph as samples in the scene's terms. Raises what `read_reference` raises."""
+    return read_reference(
+        path,
+        content=encoders.content,
+        semantic=encoders.semantic,
+        basis=encoders.basis,
+        longest=max(encoders.longest, SHORTEST_REFERENCE),
+        weight=weight,
+        guided=encoders.guided,
+        mask=mask,
+        name=name,
+        device=encoders.device,
+    )
 
 
 @torch.no_grad()

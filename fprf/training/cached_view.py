@@ -17,9 +17,9 @@ from ..interfaces import Decoder
 from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras
 from ..rendering.renderer import Kept, Restyle, composite, march
-from ..types import Rays, Want
+from ..types import Rays, View, Want
 from .model import Facts, Model, background_of
-from .views import View, on_host, view_rays
+from .views import on_host, view_rays
 
 __all__ = ["CachedView", "Part", "cache_view", "view_parts"]
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..io.images import Picture
+from ..io.images import Picture, to_uint8
 from ..io.sheet import Tile, highlight
 from .regions import Regions, membership_view, shrunk
 from .restyle import Styled
@@ -108,7 +108,7 @@ def _mass(regions: Regions, view: int) -> Annotated[Tensor, "K"]:
 def _seen(regions: Regions, view: int) -> tuple[Picture, Annotated[Tensor, "H W K"]]:
     """A view as it is, small, and where its regions are."""
     share, opacity = membership_view(regions, view, _FINE)
-    return regions.views.picture(shrunk(regions.views.cameras, view, _FINE), 0), share * opacity[..., None]
+    return to_uint8(regions.views.render(shrunk(regions.views.cameras, view, _FINE), 0).rgb), share * opacity[..., None]
 
 
 def _middle(share: Annotated[Tensor, "H W"], size: tuple[int, int]) -> tuple[int, int]:

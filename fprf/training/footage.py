@@ -1,24 +1,21 @@
 """One frame of a flight in all that is asked for: several looks, depth, normals, match maps; for one eye or two."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..config import RenderConfig
+from ..interfaces import Scene
 from ..io.images import Picture, linear, to_uint8
 from ..io.maps import depth_image, depth_limits
 from ..rendering.cameras import Cameras
 from ..rendering.normals import normals
 from ..rendering.panorama import eye_strips
-from ..style.look import Restyle
-from .loading import Trained
+from ..types import View
 from .matches import match_map, match_pictures
 from .restyle import Styled
-from .views import View, render_view
 
 __all__ = ["Channel", "Take", "limits_of", "panels", "planes", "shoot"]
 
@@ -32,34 +29,31 @@ class Take(NamedTuple):
     """A look of the scene along a flight."""
 
     name: str
-    look: Callable[[int], Restyle | None]
-    """Of each frame; None = as it was captured."""
+    scene: Callable[[int], Scene]
+    """In its look of each frame."""
     styled: Styled | None = None
     """Where it is one style throughout: what match maps speak of."""
 
 
-def shoot(trained: Trained, cameras: Cameras, frame: int, look: Restyle | None, eyes: float | None = None) -> View:
+def shoot(scene: Scene, cameras: Cameras, frame: int, eyes: float | None = None) -> View:
     """One frame. With `eyes`, their distance in world units, of a stereo panorama: the left eye above the right one."""
-    model, facts, config = trained.model, trained.known.facts, trained.config.render
     if eyes is None:
-        return render_view(model, facts, cameras, frame, config, look)
+        return scene.render(cameras, frame)
     one = cameras.select(torch.tensor([frame]))
-    config = replace(config, resolution=1.0)  # strips of a few columns cannot be reduced
-    left, right = (_eye(trained, eye_strips(one, offset), config, look) for offset in (-eyes / 2, eyes / 2))
+    left, right = (_eye(scene, eye_strips(one, offset)) for offset in (-eyes / 2, eyes / 2))
     rgb, depth, opacity = (torch.cat(pair, 0) for pair in zip(left[:3], right[:3], strict=True))
     return View(rgb, depth, opacity, (left.kept + right.kept) / 2)
 
 
-def limits_of(trained: Trained, cameras: Cameras) -> tuple[float, float]:
+def limits_of(scene: Scene, cameras: Cameras) -> tuple[float, float]:
     """The range of depth colours, from a few small frames."""
-    small = replace(trained.config.render, resolution=_PROBE_RESOLUTION)
     some = sorted({k * (len(cameras) - 1) // max(1, _PROBES - 1) for k in range(_PROBES)})
-    probes = [render_view(trained.model, trained.known.facts, cameras, k, small) for k in some]
+    probes = [scene.render(cameras, k, resolution=_PROBE_RESOLUTION) for k in some]
     return depth_limits([view.depth for view in probes], [view.opacity for view in probes])
 
 
 def panels(
-    trained: Trained,
+    scene: Scene,
     cameras: Cameras,
     frame: int,
     takes: Sequence[Take],
@@ -68,8 +62,8 @@ def panels(
     eyes: float | None = None,
 ) -> list[Picture]:
     """What is to be shown, in its order: colour and match maps once for each take, geometry once for all."""
-    views = [shoot(trained, cameras, frame, take.look(frame), eyes) for take in takes] if "colour" in show else []
-    geometry = views[0] if views else shoot(trained, cameras, frame, None, eyes)
+    views = [shoot(take.scene(frame), cameras, frame, eyes) for take in takes] if "colour" in show else []
+    geometry = views[0] if views else shoot(scene, cameras, frame, eyes)
     shown: list[Picture] = []
     for channel in show:
         if channel == "colour":
@@ -79,16 +73,13 @@ def panels(
         elif channel == "normals":
             shown.append(_normals_picture(cameras, frame, geometry))
         else:
-            here = trained._replace(known=replace(trained.known, cameras=cameras))
             for take in takes:
                 if take.styled is not None:
-                    shown.append(match_pictures(match_map(here, take.styled, frame), take.styled.codes)["match"])
+                    shown.append(match_pictures(match_map(scene, take.styled, frame, cameras), take.styled.codes)["match"])
     return shown
 
 
-def planes(
-    trained: Trained, cameras: Cameras, frame: int, takes: Sequence[Take], eyes: float | None = None
-) -> dict[str, NDArray[np.float32]]:
+def planes(cameras: Cameras, frame: int, takes: Sequence[Take], eyes: float | None = None) -> dict[str, NDArray[np.float32]]:
     """Everything of a frame as numbers: linear R G B (of each take as NAME.R ..., where there are several), A, Z, N.X N.Y N.Z.
 
     Z is the distance along the ray in world units, 0 where nothing is; normals are in world axes and absent in stereo.
@@ -96,7 +87,7 @@ def planes(
     found: dict[str, NDArray[np.float32]] = {}
     view = None
     for take in takes:
-        view = shoot(trained, cameras, frame, take.look(frame), eyes)
+        view = shoot(take.scene(frame), cameras, frame, eyes)
         layer = "" if len(takes) == 1 else f"{take.name}."
         light = linear(view.rgb.numpy())
         found |= {f"{layer}{name}": light[..., k] for k, name in enumerate("RGB")}
@@ -109,8 +100,9 @@ def planes(
     return found
 
 
-def _eye(trained: Trained, strips: Cameras, config: RenderConfig, look: Restyle | None) -> View:
-    parts = [render_view(trained.model, trained.known.facts, strips, k, config, look) for k in range(len(strips))]
+def _eye(scene: Scene, strips: Cameras) -> View:
+    # Strips of a few columns cannot be reduced.
+    parts = [scene.render(strips, k, resolution=1.0) for k in range(len(strips))]
     joined = [torch.cat(columns, 1) for columns in zip(*(part[:3] for part in parts), strict=True)]
     return View(joined[0], joined[1], joined[2], sum(part.kept for part in parts) / len(parts))
 

@@ -1,32 +1,60 @@
 """A trained run, ready to render."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Generic, NamedTuple, TypeVar
 
 import torch
+from torch import Tensor
 
 from ..blocks.routing import Blend
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
-from ..errors import CheckpointError
+from ..errors import CheckpointError, WeightsError
+from ..interfaces import Scene, Stylizer
+from ..plugins.stylizers.config import StylizerConfig
+from ..rendering.cameras import Cameras
+from ..style.colours import ColourMaps, colour_maps
+from ..style.dictionary import StyleDictionary
+from ..style.look import Restyle
+from ..style.references import Encoders
 from ..style.scene import SceneStyle, from_tensors
+from ..types import View
 from . import checkpoint
 from .blocks import SURROUNDINGS, assemble, folder_of, load_finished, read_done, restore, surroundings
 from .lay_out import load_boxes
 from .model import Model, build_model
 from .prepare import device_of
+from .quality import QualityConfig, at_quality
 from .run import Known, Run
 from .shelf import Shelf
+from .views import paint_pixels, render_view
 
-__all__ = ["Trained", "load_run", "load_style"]
+__all__ = ["LoadedRun", "Trained", "encoders_of", "load_run", "load_style", "open_fields", "open_run"]
 
 
 _MIB = 1 << 20
 
 
-class Trained(NamedTuple):
-    """One run in memory."""
+S = TypeVar("S", bound=Scene, covariant=True)
+
+
+class LoadedRun(NamedTuple, Generic[S]):
+    """A run in memory, whatever its scene is made of."""
+
+    run: Run
+    method: str
+    known: Known
+    step: int
+    seconds: float
+    """How long it was trained."""
+    scene: S
+
+
+@dataclass(frozen=True, eq=False)
+class Trained(Scene):
+    """A run of fields in memory."""
 
     run: Run
     config: TrainConfig
@@ -38,6 +66,100 @@ class Trained(NamedTuple):
     """How long it was trained."""
     damaged: tuple[str, ...] = ()
     """A line for each newer checkpoint that could not be used."""
+    look: Restyle | None = None
+    """What it is rendered in; None = as it was captured."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the captured views."""
+        return self.known.names
+
+    @property
+    def cameras(self) -> Cameras:
+        """Of the captured views, where training has put them."""
+        return self.known.cameras
+
+    @property
+    def device(self) -> torch.device:
+        """The model's."""
+        return self.model.device
+
+    @property
+    def semantic_encoder(self) -> str:
+        """Identity of the encoder that the run was trained with."""
+        return self.known.facts.semantic_encoder
+
+    def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
+        """Render as the run's config says."""
+        config = self.config.render if resolution is None else replace(self.config.render, resolution=resolution)
+        return render_view(self.model, self.known.facts, cameras, view, config, self.look)
+
+    def paint(
+        self,
+        cameras: Cameras,
+        view: int,
+        pixel: Annotated[Tensor, "R 2"],
+        values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+        *,
+        semantic: bool = True,
+    ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
+        """March; neither content nor colour is computed."""
+        return paint_pixels(self.model, cameras, view, pixel, self.config.render, values, semantic=semantic)
+
+    def restyled(self, look: Restyle | None) -> "Trained":
+        """The same model in a look."""
+        return replace(self, look=look)
+
+    def measured(self) -> tuple[SceneStyle, Basis | None]:
+        """What training measured."""
+        return load_style(self.run)
+
+    @torch.inference_mode()
+    def encoders(self) -> Encoders:
+        """The encoders that the scene was trained with. Raises WeightsError where those at hand are others."""
+        return encoders_of(self, *self.measured())
+
+    def colour_maps(
+        self,
+        stylizer: Stylizer,
+        dictionary: StyleDictionary,
+        style: SceneStyle,
+        config: StylizerConfig,
+        allowed: Annotated[Tensor, "K references"],
+    ) -> ColourMaps | None:
+        """Those behind the scene's decoder."""
+        decoder, smoothing = self.model.decoder, config.smoothing(style, allowed)
+        return colour_maps(
+            stylizer, dictionary, style, decoder, features=config.features, share=config.colours, smoothing=smoothing
+        )
+
+
+def open_run(root: Path, device: str = "auto", quality: QualityConfig | None = None) -> LoadedRun[Scene]:
+    """A run of any kind. Raises CheckpointError with what is missing, and UsageError for qualities that it does not know."""
+    return Run(root).load_config()[0].load(root, device, QualityConfig() if quality is None else quality)
+
+
+def open_fields(root: Path, device: str, quality: QualityConfig) -> LoadedRun[Trained]:
+    """A run of fields."""
+    trained = at_quality(load_run(root, device, quality.max_memory), quality)
+    return LoadedRun(trained.run, trained.method, trained.known, trained.step, trained.seconds, trained)
+
+
+@torch.inference_mode()
+def encoders_of(trained: Trained, scene: SceneStyle, basis: Basis | None) -> Encoders:
+    """Encoders with a style and a basis that are at hand. Raises WeightsError where they are not those of the training."""
+    config, facts = trained.config, trained.known.facts
+    content = config.content.encoder.build()
+    semantic = config.semantic.encoder.build() if config.semantic.encoder is not None and basis is not None else None
+    for name, encoder, known in (("content", content, facts.content_encoder), ("semantic", semantic, facts.semantic_encoder)):
+        if encoder is not None and encoder.identity != known:
+            raise WeightsError(
+                f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
+                "use the same weights, or train the scene again"
+            )
+    device, longest = trained.model.device, int(trained.known.cameras.size.amax())
+    moved = None if semantic is None else semantic.to(device)
+    return Encoders(content.to(device), moved, basis, scene, device, longest, config.datamanager.guided, config.seed)
 
 
 def load_run(root: Path, device: str = "auto", max_memory: float | None = None) -> Trained:

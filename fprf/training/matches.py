@@ -10,15 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..interfaces import Scene
 from ..io.atomic import write_bytes
 from ..io.images import Picture
 from ..io.maps import match_image, match_summary, scale_image
-from ..rendering.cameras import pixel_grid
+from ..rendering.cameras import Cameras, pixel_grid
 from ..style.matching import unit
 from ..style.regional import RegionWeight
-from .loading import Trained
 from .restyle import Codes, Styled
-from .views import paint_pixels
 
 __all__ = ["MatchMap", "match_map", "match_pictures", "summarize", "write_pixels"]
 
@@ -55,10 +54,10 @@ class MatchMap(NamedTuple):
 
 
 @torch.inference_mode()
-def match_map(trained: Trained, styled: Styled, view: int) -> MatchMap:
-    """Matches of a view: geometry and semantics alone are computed."""
-    cameras, scene, look = trained.known.cameras, styled.scene, styled.restyle
-    device = trained.model.device
+def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = None) -> MatchMap:
+    """Matches of one of the scene's own views, or of `cameras`: geometry and semantics alone are computed."""
+    cameras, scene, look = here.cameras if cameras is None else cameras, styled.scene, styled.restyle
+    device = here.device
     belongs = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
     centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
@@ -68,7 +67,7 @@ def match_map(trained: Trained, styled: Styled, view: int) -> MatchMap:
         return torch.cat([taken, (taken * near).sum(1, keepdim=True), belongs(semantic)], 1)
 
     pixel = pixel_grid(cameras, view)
-    found, opacity = paint_pixels(trained.model, cameras, view, pixel, trained.config.render, values, semantic=belongs.divided)
+    found, opacity = here.paint(cameras, view, pixel, values, semantic=belongs.divided)
     width, height = (int(v) for v in cameras.size[view])
     found = found.view(height, width, -1)
     taken = found[..., :codes]

@@ -89,8 +89,8 @@ def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
         render = replace(render, tone=_tone(trained, quality.tone))
     config = replace(trained.config, render=render)
     if samples == 1:
-        return trained._replace(config=config)
-    return _resampled(trained._replace(config=config), samples)
+        return replace(trained, config=config)
+    return _resampled(replace(trained, config=config), samples)
 
 
 def _tone(trained: "Trained", texts: tuple[str, ...]) -> tuple[float, float, float]:
@@ -135,7 +135,7 @@ def _resampled(trained: "Trained", samples: float) -> "Trained":
         routed = BlockedSampler(sampler, old.members, old.router).requires_grad_(False)
         parts = trained.model.parts._replace(sampler=routed.to(trained.model.device))
         model = Model(parts, trained.model.tones)
-        return trained._replace(config=replace(trained.config, sampler=scaled), model=model.eval())
+        return replace(trained, config=replace(trained.config, sampler=scaled), model=model.eval())
     state, own = old.state_dict(), sampler.state_dict()
     if state.keys() != own.keys() or any(state[name].shape != own[name].shape for name in own):
         raise UsageError("samples: this run's sampler has learnt for its own number of samples; leave --samples at 1")
@@ -143,4 +143,4 @@ def _resampled(trained: "Trained", samples: float) -> "Trained":
     sampler.requires_grad_(False)
     parts = trained.model.parts._replace(sampler=sampler.to(trained.model.device))
     model = Model(parts, trained.model.tones)
-    return trained._replace(config=replace(trained.config, sampler=scaled), model=model.eval())
+    return replace(trained, config=replace(trained.config, sampler=scaled), model=model.eval())

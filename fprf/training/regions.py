@@ -1,8 +1,8 @@
 """Which regions of a scene are meant: by number, by name in a style file, by a pixel of a view, by a mask over one."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, NamedTuple, Protocol
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,17 +10,15 @@ from torch import Tensor
 from ..datamanagers.basis import Basis
 from ..datamanagers.images import load_image
 from ..errors import UsageError
-from ..io.images import Picture, to_uint8
+from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
 from ..style.files import Key
 from ..style.matching import scores, unit
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..style.wishes import Pixel, pixel_of
-from .loading import Trained
-from .views import paint_pixels, render_view
 
-__all__ = ["ALIKE", "Found", "RegionViews", "Regions", "TrainedViews", "find_regions", "key_of", "membership_view"]
+__all__ = ["ALIKE", "Found", "Regions", "find_regions", "key_of", "membership_view", "memberships"]
 
 ALIKE = 0.5
 """Least cosine of a region with a key from elsewhere: below, the scene has no such region.
@@ -36,78 +34,10 @@ _SOLID = 0.01
 """Less opacity is nothing to point at."""
 
 
-class RegionViews(Protocol):
-    """Views of a scene of any kind, in which its regions are shown and pointed at."""
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Of the views."""
-
-    @property
-    def cameras(self) -> Cameras:
-        """Of the views."""
-
-    @property
-    def semantic_encoder(self) -> str:
-        """Its identity; empty where the scene has no semantics."""
-
-    @property
-    def device(self) -> torch.device:
-        """Of stylizers on the scene."""
-
-    def membership(
-        self, scene: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
-    ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
-        """How much of what pixels (centres) see belongs to each region, and their opacity."""
-
-    def picture(self, cameras: Cameras, view: int) -> Picture:
-        """The scene as it is."""
-
-
-class TrainedViews(NamedTuple):
-    """Those of a run."""
-
-    trained: Trained
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Of the views."""
-        return self.trained.known.names
-
-    @property
-    def cameras(self) -> Cameras:
-        """Of the views."""
-        return self.trained.known.cameras
-
-    @property
-    def semantic_encoder(self) -> str:
-        """Identity of the encoder that the run was trained with."""
-        return self.trained.known.facts.semantic_encoder
-
-    @property
-    def device(self) -> torch.device:
-        """The model's."""
-        return self.trained.model.device
-
-    def membership(
-        self, scene: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
-    ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
-        """By marching: colours are not computed."""
-        model, config = self.trained.model, self.trained.config.render
-        weight = RegionWeight(scene, torch.eye(len(scene.share))).to(model.device)
-        return paint_pixels(model, cameras, view, pixel, config, weight, semantic=weight.divided)
-
-    def picture(self, cameras: Cameras, view: int) -> Picture:
-        """Rendered as the run's config says."""
-        return to_uint8(
-            render_view(self.trained.model, self.trained.known.facts, cameras, view, self.trained.config.render).rgb
-        )
-
-
 class Regions(NamedTuple):
     """A scene's regions, and what is needed to find them."""
 
-    views: RegionViews
+    views: Scene
     scene: SceneStyle
     basis: Basis | None
     keys: Mapping[str, Key] = {}
@@ -158,10 +88,18 @@ def find_regions(regions: Regions, text: str) -> list[Found]:
     )
 
 
+def memberships(
+    scene: Scene, style: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
+) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
+    """How much of what pixels (centres) see belongs to each region of a scene's style, and their opacity."""
+    weight = RegionWeight(style, torch.eye(len(style.share))).to(scene.device)
+    return scene.paint(cameras, view, pixel, weight, semantic=weight.divided)
+
+
 def membership_view(regions: Regions, view: int, size: int) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:
     """How much of each pixel belongs to each region, and its opacity, with the longest side at most `size` pixels."""
     cameras = shrunk(regions.views.cameras, view, size)
-    share, opacity = regions.views.membership(regions.scene, cameras, 0, pixel_grid(cameras, 0))
+    share, opacity = memberships(regions.views, regions.scene, cameras, 0, pixel_grid(cameras, 0))
     width, height = (int(v) for v in cameras.size[0])
     return share.view(height, width, -1), opacity.view(height, width)
 
@@ -196,7 +134,7 @@ def _at(regions: Regions, view: int, pixel: Pixel) -> list[int]:
             f"{name}:{pixel.x:g},{pixel.y:g}: outside of the view; x goes from 0 to {width - 1}, y from 0 to {height - 1}"
         )
     centre = torch.tensor([[int(pixel.x) + 0.5, int(pixel.y) + 0.5]], dtype=torch.float64)
-    share, opacity = regions.views.membership(regions.scene, cameras, view, centre)
+    share, opacity = memberships(regions.views, regions.scene, cameras, view, centre)
     if float(opacity[0]) < _SOLID:
         raise UsageError(f"{name}:{pixel.x:g},{pixel.y:g}: there is nothing at that pixel; choose another")
     return [int(share[0].argmax())]

@@ -7,51 +7,30 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from ..datamanagers.basis import Basis
-from ..errors import ConfigError, UsageError, WeightsError
-from ..interfaces import Encoder
+from ..errors import ConfigError, UsageError
+from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
-from ..style.colours import colour_maps
 from ..style.config import NO_MASK, StyleConfig
-from ..style.dictionary import BLEND, CLUSTERS, Reference, StyleDictionary, build_dictionary
+from ..style.dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
 from ..style.files import StyleFile, check_photographs, read_style
 from ..style.look import Restyle
 from ..style.matching import unit
-from ..style.references import read_reference
+from ..style.references import Encoders, encode_photograph
 from ..style.regional import RegionWeight, regional
 from ..style.scene import SceneStyle
 from ..style.wishes import labels
 from .first_use import check_stylizer
-from .loading import Trained, load_style
 from .orders import Orders, take_orders
-from .regions import Regions, TrainedViews
+from .regions import Regions
 
 __all__ = [
     "Codes",
-    "Encoders",
     "Styled",
     "apply_style",
     "dress",
-    "encode_photograph",
-    "encoders_of",
     "mixed",
-    "open_encoders",
     "restyle",
 ]
-
-_SHORTEST = 128
-"""References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
-
-
-class Encoders(NamedTuple):
-    """What brings references into a scene's terms: loaded once for any number of styles."""
-
-    content: Encoder
-    semantic: Encoder | None
-    basis: Basis | None
-    scene: SceneStyle
-    device: torch.device = torch.device("cpu")
-    """Device of the encoders."""
 
 
 class Codes(NamedTuple):
@@ -74,29 +53,7 @@ class Styled(NamedTuple):
 
 
 @torch.inference_mode()
-def open_encoders(trained: Trained) -> Encoders:
-    """The encoders that a scene was trained with. Raises WeightsError where those at hand are others."""
-    return encoders_of(trained, *load_style(trained.run))
-
-
-@torch.inference_mode()
-def encoders_of(trained: Trained, scene: SceneStyle, basis: Basis | None) -> Encoders:
-    """The same for a style and a basis that are at hand."""
-    config, facts = trained.config, trained.known.facts
-    content = config.content.encoder.build()
-    semantic = config.semantic.encoder.build() if config.semantic.encoder is not None and basis is not None else None
-    for name, encoder, known in (("content", content, facts.content_encoder), ("semantic", semantic, facts.semantic_encoder)):
-        if encoder is not None and encoder.identity != known:
-            raise WeightsError(
-                f"{name} encoder: the scene was trained with {known}, this is {encoder.identity}; "
-                "use the same weights, or train the scene again"
-            )
-    device = trained.model.device
-    return Encoders(content.to(device), None if semantic is None else semantic.to(device), basis, scene, device)
-
-
-@torch.inference_mode()
-def apply_style(trained: Trained, file: StyleFile, encoders: Encoders | None = None, trail: tuple[Path, ...] = ()) -> Styled:
+def apply_style(here: Scene, file: StyleFile, encoders: Encoders | None = None, trail: tuple[Path, ...] = ()) -> Styled:
     """Build the dictionary of a style's references and its stylizer on the scene; mix in the style that it goes towards.
 
     `trail` are the style files that led here. Raises UsageError for no references and wishes that the scene does not know,
@@ -105,8 +62,8 @@ def apply_style(trained: Trained, file: StyleFile, encoders: Encoders | None = N
     style = file.style
     if not style.references:
         raise UsageError("--references: at least one photograph is needed, for example --references autumn.jpg night.jpg")
-    encoders = open_encoders(trained) if encoders is None else encoders
-    styled = dress(trained, file, encoders, _dictionary(trained, style, encoders))
+    encoders = here.encoders() if encoders is None else encoders
+    styled = dress(here, file, encoders, _dictionary(style, encoders))
     if style.between is None or style.at == 0:
         return styled
     path = style.between.resolve()
@@ -114,11 +71,11 @@ def apply_style(trained: Trained, file: StyleFile, encoders: Encoders | None = N
         raise ConfigError(f"{style.between}: lies between styles that lead back to it; end the circle")
     other = read_style(style.between)
     check_photographs(style.between, other)
-    return mixed(styled, apply_style(trained, other, encoders, (*trail, path)), style.at)
+    return mixed(styled, apply_style(here, other, encoders, (*trail, path)), style.at)
 
 
 @torch.inference_mode()
-def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
+def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDictionary) -> Styled:
     """A style whose dictionary is built already, on the scene. `between` is not heeded.
 
     The dictionary's names are the labels of the style's references. Raises UsageError for wishes that the scene does not know.
@@ -126,23 +83,15 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
     style, scene, basis = file.style, encoders.scene, encoders.basis
     if basis is not None:
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
-    regions = Regions(TrainedViews(trained), scene, basis, file.regions, file.semantic_encoder)
+    regions = Regions(here, scene, basis, file.regions, file.semantic_encoder)
     orders = take_orders(regions, dictionary, style)
     chosen = style.stylizer
     stylizer = regional(dictionary, scene, orders.allowed, chosen)
     partly = bool((orders.strength != 1).any())
     check_stylizer(chosen, stylizer, dictionary, scene)
-    device = trained.model.device
+    device = here.device
     stylizer = stylizer.to(device)
-    colours = colour_maps(
-        stylizer,
-        dictionary,
-        scene,
-        trained.model.decoder,
-        features=chosen.features,
-        share=chosen.colours,
-        smoothing=chosen.smoothing(scene, orders.allowed),
-    )
+    colours = here.colour_maps(stylizer, dictionary, scene, chosen, orders.allowed)
     mine = Restyle(
         stylizer,
         style.strength,
@@ -156,7 +105,7 @@ def dress(trained: Trained, file: StyleFile, encoders: Encoders, dictionary: Sty
 
 
 def restyle(
-    trained: Trained,
+    here: Scene,
     references: Sequence[Path],
     stylizer: StylizerConfig,
     *,
@@ -174,32 +123,12 @@ def restyle(
         clusters=clusters,
         blend=blend,
     )
-    return apply_style(trained, StyleFile(style))
+    return apply_style(here, StyleFile(style))
 
 
-@torch.inference_mode()
-def encode_photograph(
-    trained: Trained, path: Path, encoders: Encoders, *, name: str, weight: float = 1.0, mask: Path | None = None
-) -> Reference:
-    """One photograph as samples in the scene's terms, at the size of the scene's own views."""
-    return read_reference(
-        path,
-        content=encoders.content,
-        semantic=encoders.semantic,
-        basis=encoders.basis,
-        longest=max(int(trained.known.cameras.size.amax()), _SHORTEST),
-        weight=weight,
-        guided=trained.config.datamanager.guided,
-        mask=mask,
-        name=name,
-        device=encoders.device,
-    )
-
-
-def _dictionary(trained: Trained, style: StyleConfig, encoders: Encoders) -> StyleDictionary:
+def _dictionary(style: StyleConfig, encoders: Encoders) -> StyleDictionary:
     references = [
         encode_photograph(
-            trained,
             path,
             encoders,
             name=name,
@@ -208,7 +137,7 @@ def _dictionary(trained: Trained, style: StyleConfig, encoders: Encoders) -> Sty
         )
         for i, (path, name) in enumerate(zip(style.references, labels(style.references), strict=True))
     ]
-    return build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=trained.config.seed)
+    return build_dictionary(references, clusters=style.clusters, blend=style.blend, seed=encoders.seed)
 
 
 def mixed(a: Styled, b: Styled, at: float) -> Styled:

@@ -1,10 +1,9 @@
 """Whole images from a trained model."""
 
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ..config import RenderConfig
@@ -13,22 +12,11 @@ from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
 from ..rendering.pixel_rays import grid_rays
-from ..rendering.renderer import Restyle, composite, march, render_rays
-from ..types import Rays, Rendered, Want
+from ..rendering.renderer import Restyle, composite, enlarged, march, render_rays
+from ..types import Rays, Rendered, View, Want
 from .model import Facts, Model, background_of
 
-__all__ = ["View", "match_view", "on_host", "paint_pixels", "render_view", "view_rays"]
-
-
-class View(NamedTuple):
-    """One rendered view, on the CPU."""
-
-    rgb: Annotated[Tensor, "H W 3"]
-    depth: Annotated[Tensor, "H W"]
-    """Distance along the unit ray in world units."""
-    opacity: Annotated[Tensor, "H W"]
-    kept: float
-    """Share of the samples that met the content network."""
+__all__ = ["match_view", "on_host", "paint_pixels", "render_view", "view_rays"]
 
 
 def view_rays(
@@ -76,7 +64,7 @@ def render_view(
         factor = torch.tensor(config.tone)
     if config.resolution < 1:
         small = cameras.select(torch.tensor([view])).scaled(1 / config.resolution)
-        shown = _enlarged(_rendered(model, facts, small, 0, config, restyle, factor), cameras.size[view].tolist())
+        shown = enlarged(_rendered(model, facts, small, 0, config, restyle, factor), cameras.size[view].tolist())
     else:
         shown = _rendered(model, facts, cameras, view, config, restyle, factor)
     rgb, depth, opacity = on_host(shown.rgb, shown.depth, shown.opacity)
@@ -113,15 +101,6 @@ def _rendered(
     metric = model.space.metric(origin, direction, torch.cat(depth).to(origin.device)).to(colour.device)
     shape = (height, width)
     return View(colour.view(*shape, 3), metric.view(shape), torch.cat(opacity).view(shape), kept / max(1, samples))
-
-
-def _enlarged(small: View, size: list[int]) -> View:
-    """The view at another width and height. Depths stay what they are: between near and far there is nothing."""
-    target = size[::-1]
-    rgb = F.interpolate(small.rgb.permute(2, 0, 1)[None], target, mode="bicubic")[0].permute(1, 2, 0)
-    depth = F.interpolate(small.depth[None, None], target, mode="nearest-exact")[0, 0]
-    opacity = F.interpolate(small.opacity[None, None], target, mode="bilinear")[0, 0]
-    return View(rgb.clamp(0, 1).contiguous(), depth, opacity, small.kept)
 
 
 @torch.inference_mode()

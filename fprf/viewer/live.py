@@ -117,10 +117,9 @@ class Follower:
         if self._session is None or self._run is None:
             return
         from ..training.loading import load_run
-        from ..training.restyle import open_encoders
 
         last = load_run(self._run.root, self._run.device)
-        self._session.renew(lambda: last, lambda trained, before: open_encoders(trained))
+        self._session.renew(lambda: last, lambda trained, before: trained.encoders())
         self._say_how(Training(last.step, 1.0))
 
     def _say_how(self, training: Training) -> None:

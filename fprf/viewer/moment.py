@@ -11,15 +11,15 @@ from torch import Tensor
 from ..datamanagers.basis import Basis
 from ..errors import CheckpointError
 from ..style.matching import unit
+from ..style.references import Encoders
 from ..style.scene import SceneStyle
 from ..training import tensorfiles
 from ..training.block_task import built_block
 from ..training.blocks import folder_of
 from ..training.lay_out import RAYS, load_boxes
-from ..training.loading import Trained
+from ..training.loading import Trained, encoders_of
 from ..training.model import build_model
 from ..training.prepare import device_of
-from ..training.restyle import Encoders, encoders_of
 from ..training.run import Run
 from ..training.style_pass import measure_style
 

@@ -20,11 +20,12 @@ from ..rendering.cameras import Cameras
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
+from ..style.references import Encoders, encode_photograph
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..style.wishes import labels
 from ..training.loading import Trained
-from ..training.restyle import Encoders, Styled, dress, encode_photograph, mixed, open_encoders
+from ..training.restyle import Styled, dress, mixed
 from ..training.views import paint_pixels
 from .looks import Card, Look, settled, style_of
 
@@ -56,7 +57,7 @@ class Studio:
 
     def __init__(self, trained: Trained, opened: Opener | None = None) -> None:
         self.trained = trained
-        self._opened: Opener = opened or (lambda trained, before: open_encoders(trained))
+        self._opened: Opener = opened or (lambda trained, before: trained.encoders())
         self._encoders: Encoders | None = None
         self._stale = False
         self._cards = 0
@@ -85,7 +86,7 @@ class Studio:
 
     def card(self, path: Path, name: str) -> Card:
         """Encode a photograph. Raises DataError for an unreadable one."""
-        reference = encode_photograph(self.trained, path, self.encoders, name=name)
+        reference = encode_photograph(path, self.encoders, name=name)
         self._cards += 1
         return Card(self._cards, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference)
 

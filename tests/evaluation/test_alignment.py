@@ -26,7 +26,7 @@ def test_a_turned_view_comes_back(world: World, tmp_path: Path) -> None:
     turn = torch.tensor([[0.0, 0.0, 0.03]], dtype=torch.float64)
     for axis in range(3):
         pose[view, :, axis] = rotated(pose[view, :, axis][None], turn)[0]
-    wrong = trained._replace(known=replace(trained.known, cameras=replace(cameras, pose=pose)))
+    wrong = replace(trained, known=replace(trained.known, cameras=replace(cameras, pose=pose)))
     before = {name: t.clone() for name, t in trained.model.state_dict().items()}
     found, moves = align(wrong, replace(world.prepared.scene, paths=tuple(paths)), [view], config=AlignmentConfig(steps=60))
     assert list(moves) == [view] and moves[view].shape == (6,)

@@ -33,7 +33,7 @@ def test_images_are_compared_on_the_scenes_background(world: World) -> None:
     trained, scene = world.load(), world.prepared.scene
     facts = replace(trained.known.facts, background=(1.0, 1.0, 1.0))
     metrics, _ = judge(
-        trained._replace(known=replace(trained.known, facts=facts)), scene, trained.known.test[:1], lambda *of: None
+        replace(trained, known=replace(trained.known, facts=facts)), scene, trained.known.test[:1], lambda *of: None
     )
     assert metrics["views"] == 1 and metrics["consistency"]["rmse"] is None
 

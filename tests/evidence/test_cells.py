@@ -10,7 +10,7 @@ from fprf.errors import DataError
 from fprf.evaluation.flat import encoded
 from fprf.evidence.cells import CELL, cell_dictionary, cells
 from fprf.style.dictionary import StyleDictionary, whole_style
-from fprf.training.restyle import Encoders, open_encoders
+from fprf.style.references import Encoders
 
 
 def image(height: int, width: int, seed: int = 0) -> torch.Tensor:
@@ -19,7 +19,7 @@ def image(height: int, width: int, seed: int = 0) -> torch.Tensor:
 
 @pytest.fixture
 def encoders(world: World) -> Encoders:
-    return open_encoders(world.load())
+    return world.load().encoders()
 
 
 def made(world: World, encoders: Encoders, blend: float = 0.1, **images: torch.Tensor) -> StyleDictionary:

@@ -9,7 +9,6 @@ from fprf.evidence.references import Reference, photograph, places
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
 from fprf.town.classes import CAR, CLASSES, FACADE, SKY, WINDOW
-from fprf.training.restyle import open_encoders
 
 
 def reference(classes: torch.Tensor) -> Reference:
@@ -55,7 +54,7 @@ def test_the_winner_is_the_largest_share() -> None:
 
 def test_codes_are_of_the_class_that_they_were_made_of(world: World) -> None:
     trained = world.load()
-    encoders = open_encoders(trained)
+    encoders = trained.encoders()
     assert encoders.semantic is not None
     guided = trained.config.datamanager.guided
     shown = photograph(places((7, 11, 13), (96, 72))["one"][0], "autumn")

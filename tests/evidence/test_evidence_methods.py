@@ -12,9 +12,10 @@ from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdai
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.files import StyleFile
+from fprf.style.references import Encoders
 from fprf.training.cached_view import CachedView, cache_view
 from fprf.training.loading import Trained
-from fprf.training.restyle import Encoders, apply_style, open_encoders
+from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
 
 
@@ -23,7 +24,7 @@ class Stand:
 
     def __init__(self, world: World) -> None:
         self.trained: Trained = world.load()
-        self.encoders: Encoders = open_encoders(self.trained)
+        self.encoders: Encoders = self.trained.encoders()
         known, render = self.trained.known, self.trained.config.render
         self.views: list[CachedView] = [
             cache_view(self.trained.model, known.facts, known.cameras, view, render) for view in (0, 4)

@@ -19,13 +19,12 @@ from fprf.evidence.references import Reference
 from fprf.ops import backend
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from fprf.training.loading import load_run
-from fprf.training.restyle import open_encoders
 
 
 def measured(world: World, device: str, folder: Path) -> list[Any]:
     """Pictures and matches of every way to restyle, and whose class codes are."""
     trained = load_run(world.run, device)
-    encoders = open_encoders(trained)
+    encoders = trained.encoders()
     bench = set_up(trained, encoders, PaperConfig(table="time", views=1), folder)
     paths, tone = world.references[:1], RegionToneConfig()
     dictionary = dictionary_of(trained, paths, encoders, clusters=3, blend=0.1)[0]

@@ -11,14 +11,13 @@ from fprf.evidence.config import PaperConfig
 from fprf.evidence.paper_styles import ONE_TRAINING, Bench, restyled, set_up, style_rows
 from fprf.evidence.scores import Row
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig
-from fprf.training.restyle import open_encoders
 
 CONFIG = PaperConfig(table="multi-reference", views=2, palettes=("night",), device="cpu", codes=4)
 
 
 def bench(world: World, folder: Path, config: PaperConfig = CONFIG, *, path: bool = False) -> Bench:
     trained = world.load()
-    return set_up(trained, open_encoders(trained), config, folder, path=path)
+    return set_up(trained, trained.encoders(), config, folder, path=path)
 
 
 def untimed(row: Row) -> Row:
@@ -89,6 +88,6 @@ def test_every_table_of_one_training_is_a_choice(world: World) -> None:
 def test_small_pictures_have_no_structure(world: World, tmp_path: Path) -> None:
     here = bench(world, tmp_path)
     known = replace(here.trained.known, cameras=here.trained.known.cameras.scaled(4.0))
-    trained = here.trained._replace(known=known)
+    trained = replace(here.trained, known=known)
     row = restyled(set_up(trained, here.encoders, CONFIG, tmp_path), AdainConfig(), "one")
     assert "structure" not in row and torch.isfinite(torch.tensor(row["styled_psnr"]))

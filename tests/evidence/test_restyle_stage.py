@@ -60,7 +60,7 @@ def test_runs_of_other_scenes_are_refused(world: World, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(world.town, folder)
     trained = world.load()
-    moved = trained._replace(config=replace(trained.config, data=folder))
+    moved = replace(trained, config=replace(trained.config, data=folder))
     assert town_settings(moved) == town_settings(trained)
     (folder / "town.json").write_text(json.dumps({"settings": {"seed": 1}}))
     with pytest.raises(DataError, match=r"town\.json"):

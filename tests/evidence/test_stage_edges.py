@@ -26,7 +26,7 @@ def test_more_views_than_were_held_out_are_all_of_them(world: World) -> None:
 
 def test_views_are_spread_over_what_was_held_out(world: World) -> None:
     trained = world.load()
-    every = trained._replace(known=replace(trained.known, test=(1, 3, 5, 7, 9)))
+    every = replace(trained, known=replace(trained.known, test=(1, 3, 5, 7, 9)))
     stage = set_stage(every, views=2, frames=8, longest=16)
     assert torch.equal(stage.views.pose, trained.known.cameras.pose[[1, 5]])
     assert torch.equal(stage.path.pose[0], stage.views.pose[1]), "the path begins in the middle"
@@ -34,7 +34,7 @@ def test_views_are_spread_over_what_was_held_out(world: World) -> None:
 
 def test_runs_that_held_nothing_out_are_judged_on_what_they_learnt(world: World) -> None:
     trained = world.load()
-    none = trained._replace(known=replace(trained.known, test=()))
+    none = replace(trained, known=replace(trained.known, test=()))
     stage = set_stage(none, views=1, frames=0, longest=16)
     assert torch.equal(stage.views.pose[0], trained.known.cameras.pose[trained.known.train[0]])
 

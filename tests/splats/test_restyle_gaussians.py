@@ -18,12 +18,14 @@ from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionO
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.look_config import LookConfig
+from fprf.splats.restyle import as_drawn
 from fprf.splats.scene import SplatScene, load_scene, look_at_capture, scene_tensors
 from fprf.splats.views import camera_of, draw, find_views
 from fprf.style.config import StyleConfig
 from fprf.style.controls import luma
 from fprf.style.files import StyleFile, write_style
-from fprf.training.restyle_gaussians import as_drawn, restyle_gaussians, restyled_harmonics, splat_regions
+from fprf.training.regions import memberships
+from fprf.training.restyle import apply_style
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
 TONE = RegionToneConfig(centred=False)
@@ -50,21 +52,19 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-def styled(
-    scene: SplatScene, encoder: Encoder, *photos: Path, stylizer: StylizerConfig = TONE, **wishes: object
-) -> torch.Tensor:
+def styled(scene: SplatScene, *photos: Path, stylizer: StylizerConfig = TONE, **wishes: object) -> torch.Tensor:
     style = StyleConfig(references=photos, stylizer=stylizer, **wishes)  # type: ignore[arg-type]
-    return restyled_harmonics(scene, restyle_gaussians(scene, StyleFile(style), encoder).restyle)
+    return scene.restyled(apply_style(scene, StyleFile(style)).restyle).shown.harmonics
 
 
 @pytest.mark.parametrize(
     "stylizer", [TONE, RegionOtConfig(), AdainConfig(), LocalAdainConfig()], ids=lambda s: type(s).__name__
 )
 def test_a_style_is_one_affine_map_of_what_is_seen(
-    scene: SplatScene, encoder: Encoder, photographs: list[Path], stylizer: StylizerConfig
+    scene: SplatScene, photographs: list[Path], stylizer: StylizerConfig
 ) -> None:
     """Seen from anywhere, the new colour of a Gaussian is an affine function of its old one."""
-    new = styled(scene, encoder, *photographs, stylizer=stylizer)
+    new = styled(scene, *photographs, stylizer=stylizer)
     before = as_drawn(scene.gaussians.harmonics)
     around = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     basis = functions(around, 2)
@@ -77,52 +77,49 @@ def test_a_style_is_one_affine_map_of_what_is_seen(
         assert left.abs().max() < 1e-4 and (now[k] - old[k]).abs().max() > 1e-3
 
 
-def test_at_strength_0_and_in_kept_regions_nothing_changes(
-    scene: SplatScene, encoder: Encoder, photographs: list[Path]
-) -> None:
+def test_at_strength_0_and_in_kept_regions_nothing_changes(scene: SplatScene, photographs: list[Path]) -> None:
     before = scene.gaussians.harmonics
-    assert torch.equal(styled(scene, encoder, photographs[0], strength=0.0), before)
-    everything = tuple(str(k) for k in range(len(scene.style.share)))
-    assert torch.equal(styled(scene, encoder, photographs[0], keep=everything), before)
-    full, half = (styled(scene, encoder, photographs[0], strength=s) for s in (1.0, 0.5))
+    assert torch.equal(styled(scene, photographs[0], strength=0.0), before)
+    everything = tuple(str(k) for k in range(len(scene.measured()[0].share)))
+    assert torch.equal(styled(scene, photographs[0], keep=everything), before)
+    full, half = (styled(scene, photographs[0], strength=s) for s in (1.0, 0.5))
     free = (0.2820948 * full[:, 0]).abs().amax(1) < 0.499  # nothing was cut
     assert int(free.sum()) > 50 and torch.allclose(half[free], (full + as_drawn(before))[free] / 2, atol=1e-5)
-    one = styled(scene, encoder, photographs[0], keep=everything[1:])
+    one = styled(scene, photographs[0], keep=everything[1:])
     changed = (one != before).flatten(1).any(1)
     assert changed.any() and not changed.all() and not torch.equal(one, full)
 
 
-def test_pinned_regions_take_one_photograph_alone(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
-    everything = tuple(f"{k}=snow.png" for k in range(len(scene.style.share)))
-    pinned, alone = styled(scene, encoder, *photographs, pin=everything), styled(scene, encoder, photographs[1])
+def test_pinned_regions_take_one_photograph_alone(scene: SplatScene, photographs: list[Path]) -> None:
+    everything = tuple(f"{k}=snow.png" for k in range(len(scene.measured()[0].share)))
+    pinned, alone = styled(scene, *photographs, pin=everything), styled(scene, photographs[1])
     assert torch.allclose(pinned, alone, atol=1e-4)
-    assert (styled(scene, encoder, *photographs) - alone).abs().max() > 0.01
+    assert (styled(scene, *photographs) - alone).abs().max() > 0.01
     with pytest.raises(UsageError, match="region 9"):
-        styled(scene, encoder, photographs[0], keep=("9",))
+        styled(scene, photographs[0], keep=("9",))
 
 
-def test_a_pixel_names_the_region_that_is_seen_there(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
-    regions = splat_regions(scene, StyleFile(StyleConfig()))
+def test_a_pixel_names_the_region_that_is_seen_there(scene: SplatScene, photographs: list[Path]) -> None:
     drawn = draw(scene.gaussians, camera_of(scene.cameras, 2))
     y, x = divmod(int(drawn.opacity.argmax()), drawn.opacity.shape[1])
-    share, opacity = regions.views.membership(scene.style, scene.cameras, 2, torch.tensor([[x + 0.5, y + 0.5]]))
+    share, opacity = memberships(scene, scene.measured()[0], scene.cameras, 2, torch.tensor([[x + 0.5, y + 0.5]]))
     assert opacity[0] > 0.9 and float(share.sum()) == pytest.approx(1, abs=1e-4)
     number = str(int(share[0].argmax()))
-    by_pixel, by_number = (styled(scene, encoder, photographs[0], keep=(text,)) for text in (f"02:{x},{y}", number))
+    by_pixel, by_number = (styled(scene, photographs[0], keep=(text,)) for text in (f"02:{x},{y}", number))
     assert torch.equal(by_pixel, by_number)
 
 
-def test_luminance_is_kept_and_styles_mix(scene: SplatScene, encoder: Encoder, photographs: list[Path], tmp_path: Path) -> None:
+def test_luminance_is_kept_and_styles_mix(scene: SplatScene, photographs: list[Path], tmp_path: Path) -> None:
     def colours(harmonics: torch.Tensor) -> torch.Tensor:
         return 0.5 + 0.28209479 * harmonics[:, 0]
 
     before = colours(as_drawn(scene.gaussians.harmonics))
-    tinted = colours(styled(scene, encoder, photographs[0], luminance=1.0))
+    tinted = colours(styled(scene, photographs[0], luminance=1.0))
     free = ((tinted > 1e-4) & (tinted < 1 - 1e-4)).all(1)
     assert int(free.sum()) > 100 and (luma(tinted) - luma(before))[free].abs().max() < 1e-4
     write_style(tmp_path / "style.json", StyleFile(StyleConfig(references=(photographs[1],), stylizer=TONE)))
-    a, b = (styled(scene, encoder, photo) for photo in photographs)
-    mixed = styled(scene, encoder, photographs[0], between=tmp_path / "style.json", at=0.25)
+    a, b = (styled(scene, photo) for photo in photographs)
+    mixed = styled(scene, photographs[0], between=tmp_path / "style.json", at=0.25)
     free = ((colours(mixed) > 1e-3) & (colours(mixed) < 1 - 1e-3) & (colours(b) > 1e-3) & (colours(b) < 1 - 1e-3)).all(1)
     free &= ((colours(a) > 1e-3) & (colours(a) < 1 - 1e-3)).all(1)
     assert int(free.sum()) > 50 and torch.allclose(mixed[free], (0.75 * a + 0.25 * b)[free], atol=1e-4)
@@ -142,11 +139,11 @@ def test_harmonics_become_those_of_colours_as_they_are_drawn() -> None:
     assert (fitted - cut).square().mean() < 0.4 * (plain - cut).square().mean()
 
 
-def test_a_scene_that_was_kept_gives_the_same_colours(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
-    again = load_scene(scene_tensors(scene), scene.gaussians, False, scene.encoder)
-    assert torch.equal(styled(again, encoder, photographs[0]), styled(scene, encoder, photographs[0]))
+def test_a_scene_that_was_kept_gives_the_same_colours(scene: SplatScene, photographs: list[Path]) -> None:
+    again = load_scene(scene_tensors(scene), scene.gaussians, False)
+    assert torch.equal(styled(again, photographs[0]), styled(scene, photographs[0]))
     with pytest.raises(CheckpointError, match="of another one"):
-        load_scene(scene_tensors(scene), ball(10), False, scene.encoder)
+        load_scene(scene_tensors(scene), ball(10), False)
 
 
 def test_objects_are_seen_from_around_and_rooms_from_within() -> None:

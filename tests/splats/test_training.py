@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+import fprf
 from fprf.cli.main import main
-from fprf.datamanagers.images import load_images
+from fprf.datamanagers.images import load_image, load_images
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene
 from fprf.evaluation.metrics import psnr
@@ -131,14 +132,47 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     assert (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
 
 
+def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, colour in (("dusk", (40, 30, 120)), ("snow", (230, 235, 240))):
+        noise = np.random.default_rng(0).integers(-20, 20, (96, 128, 3))
+        write_image(tmp_path / f"{name}.png", (np.array(colour) + noise).clip(0, 255).astype(np.uint8))
+    dusk, snow = (str(tmp_path / f"{name}.png") for name in ("dusk", "snow"))
+    words = ["stylize", str(run), "--references", dusk, snow, "--split", "test"]
+    assert main([*words, "--output", str(tmp_path / "both")]) == 0
+    names = {path.name for path in (tmp_path / "both").iterdir()}
+    view = json.loads((run / "scene.json").read_text())["names"][json.loads((run / "scene.json").read_text())["test"][0]]
+    assert {f"{view}.png", f"{view}-match.png", "style.json", "dictionary.safetensors"} <= names
+    kept = (run / "style.safetensors").read_bytes()
+    # A style file on the same scene is the same style, pins and all; strength 0 is the scene itself.
+    assert main([*words, "--pin", "0=snow.png", "--output", str(tmp_path / "pinned")]) == 0
+    again = ["--style", str(tmp_path / "pinned" / "style.json"), "--split", "test", "--output", str(tmp_path / "again")]
+    assert main(["stylize", str(run), *again]) == 0
+    assert (run / "style.safetensors").read_bytes() == kept
+    images = {name: load_image(tmp_path / name / f"{view}.png") for name in ("both", "pinned", "again")}
+    assert np.array_equal(images["pinned"], images["again"]) and not np.array_equal(images["both"], images["pinned"])
+    film = ["render", str(run), "--path", "dataset", "--split", "test", "--show", "colour", "match", "--output"]
+    assert main([*film, str(tmp_path / "film"), "--references", dusk, snow, "--styles", "plain"]) == 0
+    assert np.array_equal(load_image(tmp_path / "film" / f"{view}.png")[:, : images["both"].shape[1]], images["both"])
+    assert main([*words, "--explain", "true", "--output", str(tmp_path / "explained")]) == 0
+    assert "seen best at" in capsys.readouterr().out and (tmp_path / "explained" / "explain.png").is_file()
+    assert main(["gallery", str(run), "--references", dusk, snow, "--output", str(tmp_path / "page.html")]) == 0
+    keys = [{"frame": 0, "style": None}, {"frame": 3, "style": str(tmp_path / "both" / "style.json")}]
+    (tmp_path / "keys.json").write_text(json.dumps({"format": 1, "keyframes": keys}))
+    assert main([*film[:-3], "colour", "--keyframes", str(tmp_path / "keys.json"), "--output", str(tmp_path / "keyed")]) == 0
+    assert main(["export", str(run), "ply", "--references", snow, "--output", str(tmp_path / "files")]) == 0
+    plain, styled = (read_capture(tmp_path / "files" / f"splats{name}.ply").gaussians for name in ("", ".snow"))
+    assert torch.equal(plain.means, styled.means) and styled.colours.mean() > plain.colours.mean() + 0.05
+    scene = fprf.load(run)
+    shot = scene.stylize([dusk, snow]).render(view)
+    assert np.array_equal(shot.pixels, images["both"])
+
+
 @pytest.mark.parametrize(
     "line",
     [
-        "stylize RUN --references a.png",
-        "gallery RUN --references .",
         "export RUN glb",
-        "export RUN --references a.png",
-        "render RUN --show normals",
+        "render RUN --lens panorama",
+        "stylize RUN --references a.png --samples 2",
         "train fprf-splats --plan",
         "bench speed RUN",
         "train fprf-splats --degree 4",

@@ -11,13 +11,13 @@ from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.training.explain import explain, region_row, region_tile
 from fprf.training.loading import load_style
-from fprf.training.regions import Regions, TrainedViews, find_regions, membership_view
+from fprf.training.regions import Regions, find_regions, membership_view
 from fprf.training.restyle import apply_style
 
 
 def test_regions_are_listed_without_a_style(world: World) -> None:
     trained = world.load()
-    regions = Regions(TrainedViews(trained), *load_style(trained.run))
+    regions = Regions(trained, *load_style(trained.run))
     found = explain(regions)
     assert [each.number for each in found] == list(range(len(regions.scene.share)))
     assert sum(each.share for each in found) == pytest.approx(1, abs=1e-4)
@@ -30,7 +30,7 @@ def test_regions_are_listed_without_a_style(world: World) -> None:
 
 def test_the_place_of_a_region_is_in_the_view_that_shows_most_of_it(world: World) -> None:
     trained = world.load()
-    regions = Regions(TrainedViews(trained), *load_style(trained.run))
+    regions = Regions(trained, *load_style(trained.run))
     shares = [membership_view(regions, v, 32) for v in range(len(trained.known.names))]
     mass = torch.stack([(share * opacity[..., None]).mean((0, 1)) for share, opacity in shares])
     for each in explain(regions):
@@ -75,5 +75,5 @@ def test_a_scene_without_semantics_is_one_region(world: World) -> None:
         share=torch.ones(1),
         semantic_mean=scene.semantic_mean[:0],
     )
-    (found,) = explain(Regions(TrainedViews(trained), one, None))
+    (found,) = explain(Regions(trained, one, None))
     assert found.share == 1.0 and found.picture.shape == (24, 32, 3)

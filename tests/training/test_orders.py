@@ -13,7 +13,7 @@ from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.training.orders import Orders, region_scores, take_orders
 from fprf.training.regions import Regions
-from fprf.training.restyle import Styled, apply_style, open_encoders
+from fprf.training.restyle import Styled, apply_style
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_photographs_of_one_name_are_told_apart(world: World, tmp_path: Path) ->
         copies.append(tmp_path / folder / "same.png")
         copies[-1].write_bytes(path.read_bytes())
     trained = world.load()
-    encoders = open_encoders(trained)
+    encoders = trained.encoders()
     style = replace(style_of(copies), pin=("0=1",))
     styled = apply_style(trained, StyleFile(style), encoders)
     assert set(styled.dictionary.names) == {"a/same.png", "b/same.png"}

@@ -63,7 +63,7 @@ def test_what_is_given_goes_before_the_preset(world: World) -> None:
 def test_a_runs_own_budget_holds_where_no_quality_is_asked(world: World) -> None:
     trained = world.load()
     config = replace(trained.config, render=replace(trained.config.render, budget=0.125))
-    assert at_quality(trained._replace(config=config), QualityConfig(samples=2.0)).config.render.budget == 0.125
+    assert at_quality(replace(trained, config=config), QualityConfig(samples=2.0)).config.render.budget == 0.125
 
 
 def test_trained_parameters_are_kept_and_the_first_model_is_not_touched(world: World) -> None:
@@ -88,15 +88,15 @@ def test_a_sampler_that_does_not_scale(world: World) -> None:
     trained = world.load()
     config = replace(trained.config, sampler=SamplerConfig())
     with pytest.raises(PluginError, match=r"samples: SamplerConfig does not scale; leave --samples at 1"):
-        at_quality(trained._replace(config=config), QualityConfig(quality="best"))
-    assert at_quality(trained._replace(config=config), QualityConfig(quality="standard")).model is trained.model
+        at_quality(replace(trained, config=config), QualityConfig(quality="best"))
+    assert at_quality(replace(trained, config=config), QualityConfig(quality="standard")).model is trained.model
 
 
 def test_a_sampler_that_learns_for_its_number_of_samples(world: World) -> None:
     trained = world.load()
     config = replace(trained.config, sampler=ProposalConfig(samples=(16,), final=8, resolutions=(4,)))
     with pytest.raises(UsageError, match="has learnt for its own number of samples"):
-        at_quality(trained._replace(config=config), QualityConfig(samples=2.0))
+        at_quality(replace(trained, config=config), QualityConfig(samples=2.0))
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_render_and_stylize_take_it(world: World, tmp_path: Path) -> None:
             assert a.shape == b.shape and (a != b).any()
 
 
-def test_a_reduced_view_is_the_small_one_enlarged(world: World) -> None:
+def test_a_reduced_view_is_the_small_oneenlarged(world: World) -> None:
     trained = world.load()
     known, render = trained.known, trained.config.render
     whole, half = (render_view(trained.model, known.facts, known.cameras, 2, replace(render, resolution=r)) for r in (1.0, 0.5))
@@ -156,8 +156,9 @@ def test_a_reduced_view_is_the_small_one_enlarged(world: World) -> None:
 
 
 def test_infinite_depths_are_enlarged_too(world: World) -> None:
-    from fprf.training.views import View, _enlarged
+    from fprf.rendering.renderer import enlarged
+    from fprf.types import View
 
     depth = torch.tensor([[1.0, torch.inf]])
-    found = _enlarged(View(torch.rand(1, 2, 3), depth, torch.ones(1, 2), 1.0), [4, 2])
+    found = enlarged(View(torch.rand(1, 2, 3), depth, torch.ones(1, 2), 1.0), [4, 2])
     assert found.depth.tolist() == [[1.0, 1.0, torch.inf, torch.inf]] * 2

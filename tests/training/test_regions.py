@@ -11,17 +11,17 @@ from tiny_world import World
 from fprf.errors import DataError, UsageError
 from fprf.style.files import Key
 from fprf.training.loading import Trained, load_style
-from fprf.training.regions import ALIKE, Found, Regions, TrainedViews, find_regions, key_of, membership_view
+from fprf.training.regions import ALIKE, Found, Regions, find_regions, key_of, membership_view
 
 
 def regions_of(world: World, keys: dict[str, Key] | None = None) -> Regions:
     trained = world.load()
-    return Regions(TrainedViews(trained), *load_style(trained.run), keys or {})
+    return Regions(trained, *load_style(trained.run), keys or {})
 
 
 def trained_of(regions: Regions) -> Trained:
-    assert isinstance(regions.views, TrainedViews)
-    return regions.views.trained
+    assert isinstance(regions.views, Trained)
+    return regions.views
 
 
 def test_numbers_are_the_scenes(world: World) -> None:
@@ -157,6 +157,6 @@ def test_names_of_views_may_be_parts_of_each_other(world: World) -> None:
     trained = trained_of(regions)
     known = trained.known
     names = ("a", "a:1", *known.names[2:])
-    renamed = regions._replace(views=TrainedViews(trained._replace(known=replace(known, names=names))))
+    renamed = regions._replace(views=replace(trained, known=replace(known, names=names)))
     share, _ = membership_view(regions, 1, 32)
     assert find_regions(renamed, "a:1:5,6")[0].number == int(share[6, 5].argmax())

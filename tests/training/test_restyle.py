@@ -11,7 +11,7 @@ from fprf.io.images import write_image
 from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.files import StyleFile
-from fprf.training.restyle import apply_style, open_encoders, restyle
+from fprf.training.restyle import apply_style, restyle
 from fprf.training.views import render_view
 from fprf.types import Want
 
@@ -64,7 +64,7 @@ def test_other_encoders_than_the_scenes_are_refused(world: World, which: str) ->
     changed = {f"{which}_encoder": f"bundled-{which}:000000000000"}
     facts = replace(trained.known.facts, **changed)  # type: ignore[arg-type]
     with pytest.raises(WeightsError, match=f"{which} encoder: the scene was trained with bundled-{which}:000000000000"):
-        restyle(trained._replace(known=replace(trained.known, facts=facts)), world.references, RegionOtConfig())
+        restyle(replace(trained, known=replace(trained.known, facts=facts)), world.references, RegionOtConfig())
 
 
 def paint(path: Path, pixels: np.ndarray) -> Path:
@@ -83,7 +83,7 @@ def test_degenerate_photographs_give_finite_pictures(
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3))
     path = paint(tmp_path / "x.png", noise if colour is None else np.broadcast_to(colour, (height, width, 3)))
     trained = world.load()
-    encoders, known = open_encoders(trained), trained.known
+    encoders, known = trained.encoders(), trained.known
     for clusters in (1, 13):
         for stylizer in (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig()):
             style = StyleConfig(references=(path,), clusters=clusters, stylizer=stylizer, keep_below=-0.5, luminance=0.5)
@@ -95,7 +95,7 @@ def test_degenerate_photographs_give_finite_pictures(
 
 def test_masks_belong_to_their_references_in_any_order(world: World, tmp_path: Path) -> None:
     trained = world.load()
-    encoders = open_encoders(trained)
+    encoders = trained.encoders()
     white = np.zeros((40, 56, 3))
     white[:20] = 255
     mask, (a, b) = paint(tmp_path / "m.png", white), world.references
@@ -114,7 +114,7 @@ def test_a_hundred_photographs_in_any_order(world: World, tmp_path: Path) -> Non
     drawn = np.random.default_rng(0)
     paths = tuple(paint(tmp_path / f"{i}.png", drawn.integers(0, 256, (24, 32, 3))) for i in range(100))
     trained = world.load()
-    encoders = open_encoders(trained)
+    encoders = trained.encoders()
     one, two = (
         apply_style(trained, StyleFile(StyleConfig(references=order, clusters=3)), encoders)
         for order in (paths, tuple(paths[i] for i in drawn.permutation(100)))

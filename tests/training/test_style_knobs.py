@@ -14,8 +14,9 @@ from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionA
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.controls import luma
 from fprf.style.files import StyleFile, write_style
+from fprf.style.references import Encoders
 from fprf.training.loading import Trained
-from fprf.training.restyle import Encoders, apply_style, open_encoders
+from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
 
 SECOND: dict[str, object] = {
@@ -41,7 +42,7 @@ class Bench:
 
     def __init__(self, world: World) -> None:
         self.trained: Trained = world.load()
-        self.encoders: Encoders = open_encoders(self.trained)
+        self.encoders: Encoders = self.trained.encoders()
         self.base = StyleConfig(references=world.references, clusters=3)
         self.plain = self.render(None)
         self.first = self.show(self.base)

@@ -23,7 +23,7 @@ def lit(world: World) -> Trained:
     tones = Tones(torch.linspace(-0.5, 0.5, len(known.names)), known.test)
     with torch.no_grad():
         tones.gain.copy_(0.2 * torch.randn(len(known.names), 3, generator=torch.Generator().manual_seed(0)))
-    return trained._replace(model=Model(trained.model.parts, tones))
+    return replace(trained, model=Model(trained.model.parts, tones))
 
 
 def shown(trained: Trained, *tone: str) -> tuple[torch.Tensor, torch.Tensor]:

@@ -26,13 +26,13 @@ from fprf.plugins.stylizers.config import (
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary, build_dictionary
 from fprf.style.files import StyleFile
+from fprf.style.references import Encoders, encode_photograph
 from fprf.training.cached_view import cache_view
 from fprf.training.folding import folded
 from fprf.training.loading import Trained, load_run
 from fprf.training.matches import match_map
 from fprf.training.poses import Poses
-from fprf.training.quality import QualityConfig, at_quality
-from fprf.training.restyle import Encoders, dress, encode_photograph, open_encoders
+from fprf.training.restyle import dress
 from fprf.training.tones import Tones
 from fprf.training.views import render_view
 
@@ -55,8 +55,8 @@ class Here:
 
     def __init__(self, world: World, device: str) -> None:
         self.trained: Trained = load_run(world.run, device)
-        self.encoders: Encoders = open_encoders(self.trained)
-        read = [encode_photograph(self.trained, path, self.encoders, name=path.name) for path in world.references]
+        self.encoders: Encoders = self.trained.encoders()
+        read = [encode_photograph(path, self.encoders, name=path.name) for path in world.references]
         assert all(part.device == torch.device(device) for r in read for part in (r.content, r.semantic, r.colour))
         self.dictionary: StyleDictionary = build_dictionary(read, clusters=3, seed=0)
         self.paths = world.references
@@ -154,8 +154,8 @@ def test_the_api_and_presets(world: World) -> None:
             scene = fprf.load(world.run, device=device, quality="best")
             styled = scene.stylize([world.references[0]], clusters=2)
             shot = styled.render(scene.camera_at((0.0, 0.0, 1.6), (1.0, 1.0, 1.0), width=20, height=10))
-            draft = at_quality(scene.trained, QualityConfig(quality="draft"))
-            plain = render_view(draft.model, draft.known.facts, draft.known.cameras, 0, draft.config.render)
+            draft = fprf.load(world.run, device=device, quality="draft")
+            plain = draft.render(0)
             found.append([shot.rgb, shot.depth, shot.opacity, plain.rgb])
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 

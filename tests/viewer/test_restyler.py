@@ -82,9 +82,9 @@ def test_a_click_finds_the_region_that_is_there(world: World) -> None:
     trained = studio.trained
     _, *_ = cards_of(studio, world)
     cameras = trained.known.cameras.select(torch.tensor([2]))
-    from fprf.training.regions import Regions, TrainedViews
+    from fprf.training.regions import Regions
 
-    share, _ = membership_view(Regions(TrainedViews(trained), studio.encoders.scene, studio.encoders.basis), 2, 1000)
+    share, _ = membership_view(Regions(trained, studio.encoders.scene, studio.encoders.basis), 2, 1000)
     for x, y in ((3, 4), (20, 18), (31, 23)):
         assert studio.region_at(cameras, (x + 0.5, y + 0.5)) == int(share[y, x].argmax())
     with pytest.raises(UsageError, match="outside"):

@@ -1,0 +1,136 @@
+"""A style on a scene of Gaussians: harmonics in, harmonics out.
+
+    colour' = colour A + b,   0.5 + C0 dc' = (0.5 + C0 dc) A + b,   higher harmonics' = harmonics A
+
+so an affine map of colours is exact, from every direction. Stylizers whose config says `colours` carry the colours of each
+region over as a whole, and nothing else: content features and a decoder would add nothing, since single Gaussians have
+colours that no photograph has. Others move the colours in the place of features. Luminance is kept as an affine map too.
+"""
+
+import math
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from ..fields.harmonics import harmonics as harmonic_functions
+from ..interfaces import Encoder, Stylizer
+from ..plugins.stylizers.config import StylizerConfig
+from ..style.colours import ColourMaps, carried_colours
+from ..style.controls import luma
+from ..style.dictionary import StyleDictionary
+from ..style.look import Restyle
+from ..style.scene import SceneStyle, membership, own_style
+from ..style.statistics import double
+from .gaussians import HARMONIC
+
+__all__ = ["Colours", "as_drawn", "region_maps", "restyled_harmonics"]
+
+_DIRECTIONS = 48
+"""In which harmonics are evaluated to find where renderers cut their colours."""
+_ROWS = 1 << 15
+"""Gaussians at a time: bounds the memory."""
+
+
+class Colours(Encoder):
+    """Colours as content features."""
+
+    @property
+    def identity(self) -> str:
+        """They have no weights."""
+        return "colours"
+
+    @property
+    def channels(self) -> int:
+        """Red, green and blue."""
+        return 3
+
+    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B 3 H W"]:
+        """The image itself."""
+        return image
+
+
+@torch.inference_mode()
+def restyled_harmonics(
+    before: Annotated[Tensor, "N K 3"], semantic: Annotated[Tensor, "N D"], look: Restyle
+) -> Annotated[Tensor, "N K 3"]:
+    """Harmonics in a look, of Gaussians with these semantics. Those that it leaves alone (strength 0) stay, bit for bit."""
+    out = []
+    if look.idle:
+        return before
+    kept = sum(part.share * part.luminance for part in look.parts)
+    for start in range(0, len(before), _ROWS):
+        rows = before[start : start + _ROWS]
+        matrix, bias, weight = _change(look, semantic[start : start + _ROWS])
+        matrix = matrix + torch.eye(3)
+        if kept > 0:  # what the map adds to luma is taken back from all channels alike
+            ones = torch.ones(1, 3)
+            matrix = matrix + kept * (luma(torch.eye(3)) - luma(matrix)) * ones
+            bias = bias - kept * luma(bias) * ones
+        drawn = as_drawn(rows)
+        colour = 0.5 + HARMONIC * drawn[:, 0]
+        moved = torch.einsum("nc,ncd->nd", colour, matrix) + bias
+        # Within the range of colours, but for those that were outside: what is brighter than white would glow at soft edges.
+        moved = moved.maximum(colour.clamp_max(0)).minimum(colour.clamp_min(1))
+        new = torch.einsum("nkc,ncd->nkd", drawn, matrix)
+        new[:, 0] = (moved - 0.5) / HARMONIC
+        out.append(torch.where((weight > 0)[:, None, None], new, rows))
+    return torch.cat(out)
+
+
+def as_drawn(harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N K 3"]:
+    """Harmonics of the colours that renderers show, which are cut at 0: a map would lift what was hidden below.
+
+    Where some direction is cut, the cut colours of directions all around are fitted again, in least squares, by the harmonics
+    up to degree 3.
+    """
+    at = torch.arange(_DIRECTIONS) + 0.5
+    height, turn = 1 - 2 * at / _DIRECTIONS, at * (math.pi * (5**0.5 - 1))
+    flat = (1 - height.square()).sqrt()
+    around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
+    count = min(harmonics.shape[1], 16)
+    basis = harmonic_functions(around, math.isqrt(count))
+    colour = 0.5 + torch.einsum("db,nbc->ndc", basis, harmonics[:, :count])
+    cut = (colour < 0).any(1).any(1)
+    out = harmonics.clone()
+    out[cut, :count] = torch.einsum("bd,ndc->nbc", torch.linalg.pinv(basis), colour[cut].clamp_min(0) - 0.5)
+    return out
+
+
+def _change(
+    look: Restyle, semantic: Annotated[Tensor, "N D"]
+) -> tuple[Annotated[Tensor, "N 3 3"], Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
+    """What a look adds to the identity: A and b of each Gaussian, c' = c + c A + b, and how strongly it acts."""
+    matrix, bias, weight = semantic.new_zeros(len(semantic), 3, 3), semantic.new_zeros(len(semantic), 3), semantic.new_zeros(())
+    for part in look.parts:
+        if part.share == 0 or part.strength == 0:
+            continue
+        acts = (
+            part.share
+            * part.strength
+            * (semantic.new_ones(len(semantic), 1) if part.regions is None else part.regions(semantic))
+        )
+        if part.colours is not None:
+            maps = part.colours
+            belongs = membership(semantic, maps.semantic_mean, maps.units, maps.softness)
+            added = torch.einsum("nk,kcd->ncd", belongs, maps.matrix), belongs @ maps.bias
+        else:  # an affine stylizer is known by what it makes of black and of each channel alone
+            black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
+            rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black for axis in torch.eye(3)]
+            added = part.features * (torch.stack(rows, 1) - torch.eye(3)), part.features * black
+        matrix, bias, weight = matrix + acts[..., None] * added[0], bias + acts * added[1], weight + acts[:, 0]
+    return matrix, bias, weight
+
+
+def region_maps(
+    stylizer: Stylizer, dictionary: StyleDictionary, style: SceneStyle, config: StylizerConfig
+) -> ColourMaps | None:
+    """Carry the colours of each region over to those of the codes that it takes; None where the config asks for none."""
+    if config.colours <= 0:
+        return None
+    # Matched with itself as with the photographs, the scene keeps its colours.
+    mine = own_style(style, dictionary.blend)._replace(origin=dictionary.origin)
+    table = double(config.build(dictionary=mine, scene=style).match(style.keys))
+    mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
+    taken = double(stylizer.match(style.keys))
+    return ColourMaps(style, *carried_colours(mean, covariances, taken, dictionary), config.colours)
