@@ -1,0 +1,197 @@
+"""What each compiled kernel of `fprf.ops` brings, end to end: steps and views with one at a time switched to plain torch.
+
+    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python benchmarks/kernels.py RUN [--data DIR] [--repeats 7] [--output FILE.json]
+
+Every form does the same work on the same model in one process, in turn, by the processor's clock. The fastest of all rounds
+counts, which other programs on the machine disturb least.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+from fprf.benchmarking.config import SpeedConfig
+from fprf.benchmarking.report import machine
+from fprf.benchmarking.speed import STYLES
+from fprf.benchmarking.subject import Subject, find, fresh_model, test_view
+from fprf.benchmarking.timing import Watch
+from fprf.benchmarking.training import loop_of, stepper
+from fprf.config import RenderConfig
+from fprf.datamanagers.features import FeatureStore
+from fprf.fields.content import PlanesField
+from fprf.fields.density import density
+from fprf.fields.planes import Planes
+from fprf.io.atomic import write_json
+from fprf.ops import backend, dense, march, mixture, triplane, triplane_numba
+from fprf.plugins.samplers import proposal
+from fprf.rendering import renderer, space
+from fprf.rendering.cameras import Cameras
+from fprf.style import matching
+from fprf.style.look import Restyle
+from fprf.training.restyle import restyle
+from fprf.training.views import render_view
+from fprf.types import FieldSample
+
+Patches = Sequence[tuple[object, str, object]]
+
+
+def never(*tensors: object) -> bool:
+    """No kernel applies."""
+    return False
+
+
+def fit_without_gradients(x: Tensor) -> bool:
+    """As `dense.usable`."""
+    return march.fit(x) and not torch.is_grad_enabled()
+
+
+def network_without_gradients(x: Tensor, weights: Any, biases: Any, **options: Any) -> Tensor:
+    """Kernels where nobody learns."""
+    return (dense.network_reference if torch.is_grad_enabled() else network)(x, weights, biases, **options)
+
+
+def planes_then_network(self: Planes, points: Tensor, weights: Any, biases: Any, **options: Any) -> Tensor:
+    """The planes' features are written in between."""
+    return dense.network(self(points), weights, biases, **options)
+
+
+def planes_then_density(self: Planes, points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """The planes' features are written in between."""
+    latent = self(points)
+    return density(latent @ weight), latent
+
+
+def kept_features(self: PlanesField, points: Tensor) -> FieldSample:
+    """The features of every sample are kept for the network."""
+    return FieldSample(*self.planes.density(points, self.to_density.weight[0]))
+
+
+def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
+    """Guided features by `guided.apply_packed`."""
+    *asked, out = given
+    there = packed.setdefault(id(store), store.to(torch.device("cpu")))
+    slots = torch.tensor(list(store._slots))
+    out.copy_(there.at(slots[asked[0]], asked[1], asked[2]))
+
+
+packed: dict[int, FeatureStore] = {}
+network = dense.network
+no_march = SimpleNamespace(fit=never, still=march.still)
+SWITCHES: dict[str, Patches] = {
+    "tri-planes": [(triplane_numba, "usable", never)],
+    "tri-planes: density in one pass, training": [(Planes, "density", planes_then_density)],
+    "tri-planes: density in one pass, views": [(PlanesField, "density", kept_features)],
+    "tri-planes: network in one pass": [(Planes, "network", planes_then_network)],
+    "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
+    "networks": [
+        (dense, "_fit", never),
+        (mixture, "usable", fit_without_gradients),
+        (matching, "usable", fit_without_gradients),
+    ],
+    "networks: gradients": [(dense, "network", network_without_gradients)],
+    "marching": [(march, "fit", never)],
+    "marching: proposals": [(proposal, "march", no_march)],
+    "marching: weights and sums": [(renderer, "compiled", no_march), (space, "march", no_march)],
+    "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
+    "styles at points: matching": [(matching, "usable", never)],
+    "styles at points: maps": [(mixture, "usable", never)],
+    "guided features": [(FeatureStore, "_compiled", plain_lookups)],
+}
+SWITCHES["all that bring less than 1.3x"] = [
+    *SWITCHES["tri-planes: density in one pass, training"],
+    *SWITCHES["tri-planes: density in one pass, views"],
+    *SWITCHES["tri-planes: network in one pass"],
+    *SWITCHES["tri-planes: total variation"],
+    *SWITCHES["networks: gradients"],
+    *SWITCHES["marching"],
+    *SWITCHES["guided features"],
+]
+"""What is replaced where a kernel is off."""
+
+
+@contextmanager
+def without(name: str) -> Iterator[None]:
+    """One kernel off; "all" asks for the plain forms everywhere, "" for none."""
+    with ExitStack() as stack:
+        if name == "all":
+            stack.enter_context(backend.plain())
+        for patch in SWITCHES.get(name, ()):
+            stack.enter_context(mock.patch.object(*patch))
+        yield
+
+
+def switched(name: str, call: Callable[[], object]) -> Callable[[], object]:
+    """The call with a kernel off."""
+
+    def run() -> object:
+        with without(name):
+            return call()
+
+    return run
+
+
+def tasks(subject: Subject, config: SpeedConfig) -> dict[str, Callable[[], object]]:
+    """A training step, a plain view and a view in each style."""
+    trained = subject.trained
+    loop = loop_of(trained.config, subject.prepare(trained.config), fresh_model(trained))
+    camera, render = test_view(config, trained), trained.config.render
+    take, every = stepper(loop, trained.step), trained.config.loss.penalty_every
+
+    def steps() -> None:  # one of them has penalties
+        for _ in range(every):
+            take()
+
+    calls: dict[str, Callable[[], object]] = {f"{every} training steps": steps}
+    looks = {"view": None} | {
+        f"view, {name}": restyle(trained, subject.references, stylizer, clusters=config.clusters).restyle
+        for name, stylizer in STYLES.items()
+    }
+    for name, look in looks.items():
+        calls[name] = partial(drawn, subject, camera, render, look)
+    return calls
+
+
+def drawn(subject: Subject, camera: Cameras, render: RenderConfig, look: Restyle | None) -> Tensor:
+    """Colours of the view."""
+    trained = subject.trained
+    return render_view(trained.model, trained.known.facts, camera, 0, render, look).rgb
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/kernels.json"))
+    args = parser.parse_args()
+    config = SpeedConfig(run=args.run, data=args.data, repeats=args.repeats, clock="processor", device="cpu")
+    names = ["", *SWITCHES, "all"]
+    rows: dict[str, dict[str, object]] = {name: {} for name in names}
+    with tempfile.TemporaryDirectory() as folder:
+        subject = find(args.run, config, Path(folder))
+        watch = Watch(args.repeats, torch.device("cpu"), "processor")
+        for task, call in tasks(subject, config).items():
+            seconds = watch.in_turn({name: switched(name, call) for name in names})
+            for name in names:
+                rows[name][task] = {
+                    "milliseconds": 1e3 * min(seconds[name]),
+                    "times_slower": min(seconds[name]) / min(seconds[""]),
+                }
+                print(f"{task:24}{name or 'every kernel':48}{rows[name][task]}", flush=True)
+    about = {"scene": subject.trained.known.name, "step": subject.trained.step, "rounds": args.repeats, "clock": "processor"}
+    forms = {name or "every kernel": row for name, row in rows.items()}
+    write_json(args.output, {"machine": machine(torch.device("cpu")), "run": about, "without": forms})
+
+
+if __name__ == "__main__":
+    main()
