@@ -8,8 +8,7 @@ from torch import Tensor
 
 from fprf.town.layout import build_town
 from fprf.town.palettes import palette
-from fprf.town.render import render
-from fprf.town.views import walk
+from fprf.town.render import render, walk
 
 SEED, WALK, VIEW = 7, 10, 4
 """The town, the length of the walk and the view of it that is shown."""

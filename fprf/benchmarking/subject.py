@@ -13,8 +13,7 @@ from ..io.images import write_image
 from ..rendering.cameras import Cameras
 from ..town.layout import build_town
 from ..town.palettes import palette
-from ..town.render import render
-from ..town.views import walk
+from ..town.render import render, walk
 from ..training.loading import Trained, load_run
 from ..training.model import Model, build_model
 from ..training.prepare import Prepared, prepare

@@ -118,8 +118,7 @@ def _references(folder: Path) -> dict[str, Path]:
     from ..io.images import write_image
     from ..town.layout import build_town
     from ..town.palettes import palette
-    from ..town.render import render
-    from ..town.views import walk
+    from ..town.render import render, walk
 
     paths = {}
     for look, (seed, view) in LOOKS.items():

@@ -9,8 +9,7 @@ from torch import Tensor
 from ..interfaces import Encoder
 from ..town.layout import build_town
 from ..town.palettes import palette
-from ..town.render import colours, geometry
-from ..town.views import walk
+from ..town.render import colours, geometry, walk
 from .semantic_matching import whole_cells
 
 __all__ = ["town_cells"]

@@ -16,7 +16,7 @@ from ..errors import DataError
 from ..evaluation.flat import encoded
 from ..style.dictionary import StyleDictionary
 from ..style.references import Encoders
-from ..town.classes import CAR, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
+from ..town.surface import CAR, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
 from .references import Reference
 
 __all__ = ["KINDS", "Matched", "code_classes", "interior", "match_rates", "winners"]

@@ -13,12 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..town.classes import DOOR, FACADE, FOLIAGE, LAWN, ROAD, SIDEWALK, SKY, TRUNK, WINDOW
 from ..town.layout import build_town
 from ..town.palettes import palette
-from ..town.render import geometry, render
-from ..town.trace import View
-from ..town.views import walk
+from ..town.render import View, geometry, render, walk
+from ..town.surface import DOOR, FACADE, FOLIAGE, LAWN, ROAD, SIDEWALK, SKY, TRUNK, WINDOW
 
 __all__ = ["PARTS", "Place", "Reference", "photograph", "places", "shows"]
 

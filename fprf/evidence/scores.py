@@ -10,7 +10,7 @@ from torch import Tensor
 from ..evaluation.colour_difference import delta_e
 from ..evaluation.metrics import image_metrics, mean_metrics
 from ..style.transport import monge
-from ..town.classes import CLASSES
+from ..town.surface import CLASSES
 
 __all__ = ["Labelled", "Row", "best_class_maps", "mean_rows", "score", "true_class_maps"]
 

@@ -18,8 +18,7 @@ from ..errors import DataError, UsageError
 from ..rendering.cameras import Cameras
 from ..town.layout import Town, build_town
 from ..town.palettes import palette
-from ..town.render import geometry, render
-from ..town.trace import View
+from ..town.render import View, geometry, render
 from ..town.write import TownSettings, is_town
 from ..training.cached_view import CachedView, cache_view
 from ..training.loading import Trained
@@ -41,7 +40,7 @@ class Truth(NamedTuple):
     depth: Annotated[Tensor, "H W"]
     """Metres along the unit ray, inf = sky."""
     labels: Annotated[Tensor, "H W"]
-    """int64, see `fprf.town.classes`."""
+    """int64, see `fprf.town.surface`."""
 
 
 class Stage(NamedTuple):

@@ -11,11 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..town.classes import CLASSES
 from ..town.layout import build_town
 from ..town.palettes import PALETTES
-from ..town.render import geometry, render
-from ..town.views import walk
+from ..town.render import geometry, render, walk
+from ..town.surface import CLASSES
 from .ensemble import Ensemble, taught
 
 __all__ = ["Streets", "render_streets", "street_targets"]

@@ -11,9 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .buildings import Lot, church, house
-from .shapes import Face, Finish, Material, Shape
-from .street import LANTERN, bush, car, forest, hedge, lamp, tree
+from .shapes import LANTERN, Face, Finish, Lot, Material, Shape, bush, car, church, forest, hedge, house, lamp, tree
 
 __all__ = ["CROSSING", "END", "KERB", "ROAD_HALF", "SQUARE_HALF", "START", "WALK_HALF", "FaceTable", "Town", "build_town"]
 

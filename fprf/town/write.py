@@ -20,13 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from .classes import CLASSES
 from .layout import build_town
 from .palettes import Palette
 from .palettes import palette as palette_of
-from .render import Picture, render
-from .trace import View, directions
-from .views import is_test, walk
+from .render import Picture, View, directions, is_test, render, walk
+from .surface import CLASSES
 
 __all__ = ["TownSettings", "is_town", "read_truth", "write_town"]
 
@@ -57,7 +55,7 @@ class TownSettings:
 
 
 def is_town(folder: Path) -> bool:
-    """Whether a folder says that it is a town."""
+    """True where the folder holds a town record."""
     return (folder / _RECORD).is_file()
 
 

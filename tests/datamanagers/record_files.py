@@ -12,8 +12,7 @@ from fprf.datamanagers.parsers.blocknerf import crc32c, masked
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.town.layout import build_town
 from fprf.town.palettes import palette
-from fprf.town.render import render
-from fprf.town.views import walk
+from fprf.town.render import render, walk
 
 __all__ = ["example", "record", "town_records", "varint"]
 

@@ -14,8 +14,7 @@ from fprf.evidence.stage import short_path, town_view
 from fprf.rendering.cameras import Cameras
 from fprf.town.layout import build_town
 from fprf.town.palettes import palette
-from fprf.town.render import geometry, render
-from fprf.town.views import walk
+from fprf.town.render import geometry, render, walk
 
 WIDTH, HEIGHT, FRAMES = 96, 72, 8
 

@@ -10,7 +10,7 @@ from fprf.evaluation.town_classes import town_cells
 from fprf.evaluation.triplets import COLOURS, SIZE, read_regions, read_triplets, triplet_names
 from fprf.io.images import write_image
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.town.classes import CLASSES, SKY
+from fprf.town.surface import CLASSES, SKY
 
 CODES = [
     (0, 0, 0),

@@ -8,7 +8,7 @@ from fprf.evidence.codes import KINDS, code_classes, interior, match_rates, winn
 from fprf.evidence.references import Reference, photograph, places
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
-from fprf.town.classes import CAR, CLASSES, FACADE, SKY, WINDOW
+from fprf.town.surface import CAR, CLASSES, FACADE, SKY, WINDOW
 
 
 def reference(classes: torch.Tensor) -> Reference:

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from fprf.evaluation.metrics import psnr
 from fprf.evidence.scores import best_class_maps, mean_rows, score, true_class_maps
-from fprf.town.classes import CLASSES
+from fprf.town.surface import CLASSES
 
 
 def picture(seed: int) -> Tensor:

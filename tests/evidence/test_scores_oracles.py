@@ -13,7 +13,7 @@ from fprf.evaluation.metrics import psnr
 from fprf.evidence.codes import KINDS, interior, match_rates, winners
 from fprf.evidence.references import Reference
 from fprf.evidence.scores import Row, best_class_maps, mean_rows, score, true_class_maps
-from fprf.town.classes import CLASSES
+from fprf.town.surface import CLASSES
 
 
 def picture(seed: int, low: float = 0.2, high: float = 0.8) -> Tensor:

@@ -11,7 +11,7 @@ from tiny_world import World
 from fprf.errors import DataError, UsageError
 from fprf.evidence.references import PARTS, places, shows
 from fprf.evidence.stage import set_stage, short_path, town_folder, town_view, true_views
-from fprf.town.classes import FACADE, FOLIAGE, LAWN, ROAD, SKY
+from fprf.town.surface import FACADE, FOLIAGE, LAWN, ROAD, SKY
 
 FIXTURE = [HealthCheck.function_scoped_fixture]
 

@@ -1,7 +1,7 @@
 import torch
 
 from fprf.evidence.references import PARTS, photograph, places, shows
-from fprf.town.classes import FACADE, ROAD, SKY
+from fprf.town.surface import FACADE, ROAD, SKY
 
 SIZE = (48, 36)
 

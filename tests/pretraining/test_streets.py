@@ -7,8 +7,8 @@ from photo_folder import teacher_files
 from fprf.pretraining.ensemble import Ensemble, semantic_ensemble, taught
 from fprf.pretraining.teachers import load_teacher
 from fprf.pretraining.towns import FIRST_SEED, VIEWS, Streets, render_streets, street_targets
-from fprf.town.classes import CLASSES
 from fprf.town.palettes import PALETTES
+from fprf.town.surface import CLASSES
 
 SIZE, STRIDE = 32, 8
 

@@ -12,11 +12,10 @@ import torch
 from fprf.datamanagers.parsers.config import TownConfig
 from fprf.errors import DataError
 from fprf.town import write
-from fprf.town.classes import CLASSES, SKY
 from fprf.town.layout import build_town
 from fprf.town.palettes import palette
-from fprf.town.render import render
-from fprf.town.views import FIELD_OF_VIEW, walk
+from fprf.town.render import FIELD_OF_VIEW, render, walk
+from fprf.town.surface import CLASSES, SKY
 from fprf.town.write import TownSettings, is_town, read_truth, write_town
 
 SMALL = {"seed": 2, "palette": "autumn", "views": 9, "width": 24, "height": 18}

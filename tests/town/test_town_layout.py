@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 
-from fprf.town.classes import CLASSES, DOOR, LAWN, ROAD, SIDEWALK, SKY, WINDOW
 from fprf.town.layout import END, ROAD_HALF, START, build_town
 from fprf.town.palettes import PALETTES
-from fprf.town.render import geometry
+from fprf.town.render import directions, geometry, is_test, walk
 from fprf.town.shapes import Material, Polyhedron
-from fprf.town.surface import facade_parts, ground_class, labels
-from fprf.town.trace import directions
-from fprf.town.views import is_test, walk
+from fprf.town.surface import CLASSES, DOOR, LAWN, ROAD, SIDEWALK, SKY, WINDOW, facade_parts, ground_class, labels
 
 SEEDS = range(4)
 

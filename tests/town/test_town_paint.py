@@ -5,16 +5,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fprf.town.buildings import PLINTH, STOREY, Lot, church, house
-from fprf.town.ground import paint_ground
 from fprf.town.layout import CROSSING, KERB, ROAD_HALF, build_town
-from fprf.town.light import shade
-from fprf.town.paint import foliage_normals, paint
+from fprf.town.paint import foliage_normals, paint, paint_ground, paint_walls
 from fprf.town.palettes import PALETTES, palette
-from fprf.town.shapes import Cylinder, Ellipsoid, Finish, Material, Polyhedron, box, cylinder, ellipsoid, extrude
-from fprf.town.street import bush, car, forest, lamp, tree
+from fprf.town.render import shade
+from fprf.town.shapes import (
+    PLINTH,
+    STOREY,
+    Cylinder,
+    Ellipsoid,
+    Finish,
+    Lot,
+    Material,
+    Polyhedron,
+    box,
+    bush,
+    car,
+    church,
+    cylinder,
+    ellipsoid,
+    extrude,
+    forest,
+    house,
+    lamp,
+    tree,
+)
 from fprf.town.surface import facade_parts, on_face
-from fprf.town.walls import paint_walls
 
 DAY = palette("day")
 TOWN = build_town(0)

@@ -8,15 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError
-from fprf.town.classes import FOLIAGE, LAWN, ROAD, ROOF, WINDOW
 from fprf.town.layout import build_town
-from fprf.town.light import shade
 from fprf.town.palettes import PALETTES, palette
-from fprf.town.render import colours, geometry, render
-from fprf.town.sky import sky, sun_direction
-from fprf.town.texture import band, cells, hashed, mix, noise2, noise3, step
-from fprf.town.trace import cast, directions
-from fprf.town.views import walk
+from fprf.town.render import cast, colours, directions, geometry, render, shade, sky, sun_direction, walk
+from fprf.town.surface import FOLIAGE, LAWN, ROAD, ROOF, WINDOW, band, cells, hashed, mix, noise2, noise3, step
 
 TOWN = build_town(0)
 VIEWS = walk(seed=0, views=40, width=48, height=36)

@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.town.layout import Town, build_town
+from fprf.town.render import View, _enter, cast, directions, shadowed, walk
 from fprf.town.shapes import Cylinder, Ellipsoid, Finish, Material, Polyhedron, box, cylinder, ellipsoid, extrude, pyramid
-from fprf.town.trace import View, _enter, cast, directions, shadowed
-from fprf.town.views import walk
 
 GREY = Finish(Material.TRIM)
 TOWN = build_town(0)

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from ...town.layout import build_town
 from ...town.palettes import PALETTES
-from ...town.render import render
-from ...town.views import walk
+from ...town.render import render, walk
 
 __all__ = ["street"]
 
