@@ -19,6 +19,7 @@ ELSEWHERE = {
     "rasterise_reference": "the plain form of rasterise, in test_rasterise",
     "rows": "instructions of kernels",
     "simd": "instructions of kernels",
+    "threads": "how compiled loops run, in test_rasterise",
     "tile": "instructions of kernels",
     "triplane_kernels": "compiled loops behind triplane, in test_triplane",
     "triplane_numba": "the bridge behind triplane, in test_triplane",

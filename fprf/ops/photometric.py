@@ -6,20 +6,24 @@ windows of 11 x 11 (Gaussian, sigma 1.5) that lie inside the image, over colours
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
 
+from typing import Any
+
 import numba
 import numpy as np
 
-from .simd import LANES, absolute, lanes, load, splat, store, total, where_greater
+from .simd import LANES, absolute, as_float, lanes, load, splat, store, take, total, traced, where_greater
+from .threads import on_threads
 
 __all__ = ["WINDOW", "blurred", "loss", "slack"]
 
+Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11
 _weights = np.exp(-((np.arange(11.0) - 5) ** 2) / (2 * 1.5**2))
-_WEIGHTS = (_weights / _weights.sum()).astype(np.float32)
-_f = np.float32
-_0, _1, _2 = _f(0), _f(1), _f(2)
-_C1, _C2 = _f(0.01**2), _f(0.03**2)
-_jit = numba.njit(parallel=True, cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
+_WEIGHTS = (_weights / _weights.sum()).tolist()
+_C1, _C2 = 0.01**2, 0.03**2
+_STRIP = 48
+"""Rows that a thread takes at a time."""
+_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
 
 
 def slack(padded_width: int) -> int:
@@ -27,118 +31,174 @@ def slack(padded_width: int) -> int:
     return 64 + WINDOW * padded_width
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"}, inline="never")
-def _across(source, at, out, to, count):
-    """out[to + x] = the weighted sum of source[at + x : at + x + 11]."""
-    for x in range(0, count, LANES):
-        found = load(source, at + x) * _WEIGHTS[0]
-        for k in range(1, WINDOW):
-            found = found + load(source, at + x + k) * _WEIGHTS[k]
-        store(out, to + x, found)
+def _across(source, at):
+    """Weighted sums of source[at + x : at + x + 11] for the x of a vector."""
+    return _weighted(load(source, at + k) for k in range(WINDOW))
+
+
+def _weighted(values):
+    found = None
+    for weight, each in zip(_WEIGHTS, values, strict=True):
+        found = each * weight if found is None else found + each * weight
+    return found
+
+
+@traced
+def _down(image, at, padded, line, x, room):
+    """Weighted sums of columns of the image and of its square."""
+    rows = [load(image, at + k * padded) for k in range(WINDOW)]
+    store(line, x, _weighted(rows))
+    store(line, room + x, _weighted(v * v for v in rows))
+
+
+@traced
+def _finish_blurred(line, x, room, out, at, area):
+    store(out, at, _across(line, x))
+    store(out, area + at, _across(line, room + x))
 
 
 @_jit
-def blurred(image, width, height):
-    """Windowed means of an image and of its squares, [2, planes]: the part of SSIM that a target has once for all."""
+def _blurred(counters, image, width, height, lines, out):
     padded = (width + LANES - 1) // LANES * LANES
     area = padded * ((height + LANES - 1) // LANES * LANES)
-    out = np.zeros((2, 3 * area + 64), np.float32)
-    for c in numba.prange(3):
-        room = padded + 64
-        line = np.zeros(2 * room, np.float32)
-        for y in range(height - WINDOW + 1):
-            at = c * area + y * padded
-            for x in range(0, width, LANES):
-                mean, square = splat(_0), splat(_0)
-                for k in range(WINDOW):
-                    v = load(image, at + x + k * padded)
-                    mean = mean + v * _WEIGHTS[k]
-                    square = square + v * v * _WEIGHTS[k]
-                store(line, x, mean)
-                store(line, room + x, square)
-            _across(line, 0, out[0], at, width - WINDOW + 1)
-            _across(line, room, out[1], at, width - WINDOW + 1)
+    down = height - WINDOW + 1
+    room, line = padded + 64, lines[take(counters, 1)]
+    while True:
+        unit = take(counters, 0)
+        if unit >= 3 * down:
+            break
+        at = unit // down * area + unit % down * padded
+        for x in range(0, width, LANES):
+            _down(image, at + x, padded, line, x, room)
+        for x in range(0, width - WINDOW + 1, LANES):
+            _finish_blurred(line, x, room, out, at + x, 3 * area + 64)
+
+
+def blurred(image: Floats, width: int, height: int) -> Floats:
+    """Windowed means of an image and of its squares, [2, planes]: the part of SSIM that a target has once for all."""
+    padded = (width + LANES - 1) // LANES * LANES
+    out = np.zeros((2, 3 * padded * ((height + LANES - 1) // LANES * LANES) + 64), np.float32)
+    if min(width, height) >= WINDOW:
+        lines = np.zeros((numba.get_num_threads(), 2 * (padded + 64)), np.float32)
+        on_threads(_blurred, image, width, height, lines, out.reshape(-1))
     return out
 
 
+@traced
+def _down_both(image, target, at, padded, line, x, room):
+    """Weighted sums of columns of the image, of its square and of its product with the target."""
+    rows = [(load(image, at + k * padded), load(target, at + k * padded)) for k in range(WINDOW)]
+    store(line, x, _weighted(v for v, _ in rows))
+    store(line, room + x, _weighted(v * v for v, _ in rows))
+    store(line, 2 * room + x, _weighted(v * w for v, w in rows))
+
+
+@traced
+def _similarity(line, x, room, blurred, at, beyond, across, scale, moves, d, layer):
+    """SSIM of the windows from x on; and what each one's mean of the image, of its square and of its product with the target
+    must move by, to moves."""
+    ma, aa, ab = _across(line, x), _across(line, room + x), _across(line, 2 * room + x)
+    mb, bb = load(blurred, at), load(blurred, beyond + at)
+    n1, n2 = 2 * ma * mb + _C1, 2 * (ab - ma * mb) + _C2
+    i1, i2 = 1 / (ma * ma + mb * mb + _C1), 1 / (aa - ma * ma + bb - mb * mb + _C2)
+    both = i1 * i2
+    s = n1 * n2 * both
+    inside = where_greater(as_float(across) - as_float(x), lanes(s), splat(s, 1), 0)
+    k = inside * scale
+    store(moves, d, k * 2 * (mb * (n2 - n1) * both + s * ma * (i2 - i1)))
+    store(moves, layer + d, -k * s * i2)
+    store(moves, 2 * layer + d, k * 2 * n1 * both)
+    return s * inside
+
+
+@traced
+def _up(moves, o, room, line, x):
+    store(line, x, _weighted(load(moves, o + k * room) for k in range(WINDOW)))
+
+
+@traced
+def _gradient(image, target, at, line, x, room, grad):
+    value = _across(line, x) + 2 * load(image, at) * _across(line, room + x) + load(target, at) * _across(line, 2 * room + x)
+    store(grad, at, value)
+
+
+@traced
+def _difference(image, target, at, width, x, slope, grad):
+    """|image - target|; its slope is added to the gradient, which is 0 beyond the image."""
+    d = load(image, at) - load(target, at)
+    inside = where_greater(as_float(width) - as_float(x), lanes(d), splat(d, 1), 0)
+    sign = where_greater(d, 0, splat(d, 1), where_greater(0, d, splat(d, -1), 0))
+    store(grad, at, (load(grad, at) + sign * slope) * inside)
+    return absolute(d) * inside
+
+
+@traced
+def _zero(array, at):
+    store(array, at, 0)
+
+
 @_jit
-def loss(image, target, target_blurred, width, height, share):
+def _loss(counters, image, target, target_blurred, width, height, share, rooms, grad, sums):
+    padded = (width + LANES - 1) // LANES * LANES
+    area = padded * ((height + LANES - 1) // LANES * LANES)
+    across, down = width - WINDOW + 1, height - WINDOW + 1
+    similar = share > 0 and across > 0 and down > 0
+    slope = (np.float32(1) - share) / np.float32(3 * width * height)
+    scale = -share / np.float32(3 * max(across, 1) * max(down, 1))
+    room, memory = padded + 64, rooms[take(counters, 1)]
+    line, moves = memory[: 3 * room], memory[3 * room :]
+    layer = (_STRIP + WINDOW - 1) * room
+    strips = (height + _STRIP - 1) // _STRIP
+    while True:
+        unit = take(counters, 0)
+        if unit >= 3 * strips:
+            break
+        first = unit % strips * _STRIP
+        last = min(height, first + _STRIP)
+        alike, apart = 0.0, 0.0
+        if similar:
+            # Windows that begin above the strip reach into it.
+            for y in range(first - WINDOW + 1, last):
+                at = unit // strips * area + y * padded
+                d = (y - first + WINDOW - 1) * room
+                if y < 0 or y >= down:
+                    for x in range(0, room, LANES):
+                        for layers in range(3):
+                            _zero(moves, layers * layer + d + x)
+                    continue
+                for x in range(0, width, LANES):
+                    _down_both(image, target, at + x, padded, line, x, room)
+                for x in range(0, across, LANES):
+                    found = _similarity(
+                        line, x, room, target_blurred, at + x, 3 * area + 64, across, scale, moves, d + x + WINDOW - 1, layer
+                    )
+                    if y >= first:
+                        alike += total(found)
+        for y in range(first, last):
+            at = unit // strips * area + y * padded
+            if similar:
+                for layers in range(3):
+                    for x in range(0, width + WINDOW - 1, LANES):
+                        _up(moves, layers * layer + (y - first) * room + x, room, line, layers * room + x)
+                for x in range(0, width, LANES):
+                    _gradient(image, target, at + x, line, x, room, grad)
+            for x in range(0, width, LANES):
+                apart += total(_difference(image, target, at + x, width, x, slope, grad))
+        sums[unit, 0], sums[unit, 1] = apart, alike
+
+
+def loss(
+    image: Floats, target: Floats, target_blurred: Floats, width: int, height: int, share: float
+) -> tuple[float, float, Floats]:
     """Mean |image - target|, mean SSIM, and the gradient [planes] of (1 - share) L1 + share (1 - SSIM) in the image.
 
     Where the image is smaller than a window, SSIM counts as 0 and only L1 has a gradient.
     """
     padded = (width + LANES - 1) // LANES * LANES
-    area = padded * ((height + LANES - 1) // LANES * LANES)
-    across, down = width - WINDOW + 1, height - WINDOW + 1
-    windows = max(across, 0) * max(down, 0)
-    grad = np.zeros(3 * area + 64, np.float32)
-    apart, alike = np.zeros(3, np.float64), np.zeros(3, np.float64)
-    of_l1 = (_1 - share) / _f(3 * width * height)
-    room = padded + 64
-    for c in numba.prange(3):
-        if share > 0 and windows > 0:
-            scale = -share / _f(3 * windows)
-            line, means = np.zeros(3 * room, np.float32), np.zeros(3 * room, np.float32)
-            # What each window's mean of the image, of its square and of its product with the target must move by,
-            # with 10 rows and columns of zeros before them.
-            layer = (height + 10) * room
-            moves = np.zeros(3 * layer, np.float32)
-            summed = 0.0
-            for y in range(down):
-                at = c * area + y * padded
-                for x in range(0, width, LANES):
-                    p, q, r = splat(_0), splat(_0), splat(_0)
-                    for k in range(WINDOW):
-                        v = load(image, at + x + k * padded)
-                        weighted = v * _WEIGHTS[k]
-                        p = p + weighted
-                        q = q + v * weighted
-                        r = r + weighted * load(target, at + x + k * padded)
-                    store(line, x, p)
-                    store(line, room + x, q)
-                    store(line, 2 * room + x, r)
-                for part in range(3):
-                    _across(line, part * room, means, part * room, across)
-                kept = splat(_0)
-                for x in range(0, across, LANES):
-                    ma, aa, ab = load(means, x), load(means, room + x), load(means, 2 * room + x)
-                    mb, bb = load(target_blurred[0], at + x), load(target_blurred[1], at + x)
-                    n1, n2 = _2 * ma * mb + _C1, _2 * (ab - ma * mb) + _C2
-                    i1, i2 = _1 / (ma * ma + mb * mb + _C1), _1 / (aa - ma * ma + bb - mb * mb + _C2)
-                    both = i1 * i2
-                    s = n1 * n2 * both
-                    inside = where_greater(_f(across) - _f(x), lanes(), splat(_1), _0)
-                    k = inside * scale
-                    kept = kept + s * inside
-                    d = (y + 10) * room + x + 10
-                    store(moves, d, k * _2 * (mb * (n2 - n1) * both + s * ma * (i2 - i1)))
-                    store(moves, layer + d, -k * s * i2)
-                    store(moves, 2 * layer + d, k * _2 * n1 * both)
-                summed += total(kept)
-            alike[c] = summed
-            for y in range(height):
-                for part in range(3):
-                    for x in range(0, width + 10, LANES):
-                        o = part * layer + y * room + x
-                        s = load(moves, o) * _WEIGHTS[0]
-                        for k in range(1, WINDOW):
-                            s = s + load(moves, o + k * room) * _WEIGHTS[k]
-                        store(line, part * room + x, s)
-                    _across(line, part * room, means, part * room, width)
-                at = c * area + y * padded
-                for x in range(0, width, LANES):
-                    a, b = load(image, at + x), load(target, at + x)
-                    store(grad, at + x, load(means, x) + _2 * a * load(means, room + x) + b * load(means, 2 * room + x))
-        summed = 0.0
-        for y in range(height):
-            at = c * area + y * padded
-            line_sum = splat(_0)
-            for x in range(0, width, LANES):
-                d = load(image, at + x) - load(target, at + x)
-                inside = where_greater(_f(width) - _f(x), lanes(), splat(_1), _0)
-                line_sum = line_sum + absolute(d) * inside
-                slope = where_greater(d, _0, splat(of_l1), where_greater(_0, d, splat(-of_l1), _0))
-                store(grad, at + x, (load(grad, at + x) + slope) * inside)
-            summed += total(line_sum)
-        apart[c] = summed
-    return apart.sum() / (3 * width * height), alike.sum() / (3 * max(windows, 1)), grad
+    grad = np.zeros(3 * padded * ((height + LANES - 1) // LANES * LANES) + 64, np.float32)
+    rooms = np.zeros((numba.get_num_threads(), 3 * (padded + 64) * (_STRIP + WINDOW)), np.float32)
+    sums = np.zeros((3 * -(-height // _STRIP), 2))
+    on_threads(_loss, image, target, target_blurred.reshape(-1), width, height, np.float32(share), rooms, grad, sums)
+    windows = max(width - WINDOW + 1, 0) * max(height - WINDOW + 1, 0)
+    apart, alike = sums.sum(0)
+    return float(apart) / (3 * width * height), float(alike) / (3 * max(windows, 1)), grad

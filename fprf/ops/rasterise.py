@@ -58,11 +58,7 @@ class _View(NamedTuple):
     bands: int
     total: int
     splats: _Array
-    start: _Array
-    ids: _Array
-    slots: _Array
-    rows: _Array
-    first_slot: _Array
+    entries: Any
     counts: dict[str, int]
 
     @property
@@ -224,15 +220,13 @@ def _view(
 
     count, bands, seen = len(means), harmonics.shape[1], camera_array(camera, antialiased)
     blocks = np.empty(-(-count // kernels.LANES) * kernels.LANES * (kernels.FIXED + 3 * bands), np.float32)
-    splats = np.empty(count * kernels.SLOTS, np.float32)
+    splats = np.empty(-(-count // kernels.LANES) * kernels.LANES * kernels.SLOTS, np.float32)
     plain = (x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics))
     kernels.pack(*plain, blocks)
     kernels.project(blocks, count, bands, seen, camera.width, camera.height, splats)
-    start, ids, slots, rows, first_slot, skipped = kernels.bins(splats, count, camera.width, camera.height)
-    counts = dict(zip(_SKIPPED, skipped.tolist(), strict=True)) | {"entries": len(ids), "saturated": 0}
-    return _View(
-        camera.width, camera.height, seen, blocks, bands, count, splats, start, ids, slots, rows, first_slot, counts
-    )  # fmt: skip
+    entries = kernels.bins(splats, count, camera.width, camera.height)
+    counts = dict(zip(_SKIPPED, entries.skipped.tolist(), strict=True)) | {"entries": len(entries.ids), "saturated": 0}
+    return _View(camera.width, camera.height, seen, blocks, bands, count, splats, entries, counts)
 
 
 def _groups(view: _View, features: Tensor) -> list[tuple[int, _Array, int, int]]:
@@ -256,8 +250,8 @@ def _forward(
         behind = np.zeros(channels, np.float32)
         if not made:
             behind[:3] = background.detach().numpy()
-        saturated = kernels.composite[channels](
-            view.start, view.ids, view.rows, view.splats, values, stride, first, behind, view.width, view.height,
+        saturated = kernels.composite(
+            channels, view.entries, view.splats, values, stride, first, behind, view.width, view.height,
             out.reshape(-1), left.reshape(-1),
         )  # fmt: skip
         made.append((out, left))
@@ -280,8 +274,8 @@ def _backward(
     begin = 0
     for (channels, values, stride, first), (out, left) in zip(groups, made, strict=True):
         slope = _planes(view, grad[..., begin : begin + channels], channels)
-        found = kernels.composite_back[channels](
-            view.start, view.ids, view.slots, view.rows, view.splats, values, stride, first, view.width, view.height,
+        found = kernels.composite_back(
+            channels, view.entries, view.splats, values, stride, first, view.width, view.height,
             out.reshape(-1), left.reshape(-1), slope.reshape(-1), of_left.reshape(-1),
         )  # fmt: skip
         begin += channels
@@ -290,11 +284,11 @@ def _backward(
         else:
             total.reshape(-1, kernels.SUMS)[:-1, :6] += found.reshape(-1, kernels.SUMS)[:-1, :6]  # the last is spare
             kernels.lift_values(
-                found, view.first_slot, view.total, of_features.reshape(-1), of_features.shape[1], first, channels
+                found, view.entries.first_slot, view.total, of_features.reshape(-1), of_features.shape[1], first, channels
             )
     assert total is not None
     blocks = np.empty_like(view.blocks)
-    kernels.gradients(view.blocks, view.total, view.bands, view.camera, total, view.first_slot, 4, blocks)
+    kernels.gradients(view.blocks, view.total, view.bands, view.camera, total, view.entries.first_slot, blocks)
     rows = torch.from_numpy(blocks).view(-1, 11 + 3 * view.bands, 16).transpose(1, 2).reshape(-1, 11 + 3 * view.bands)
     return rows[: view.total], torch.from_numpy(of_features)[:, : features.shape[1]]
 
@@ -312,12 +306,8 @@ def _lifted(view: _View, pixels: Tensor) -> Tensor:
 
     channels = pixels.shape[-1]
     out = np.empty((view.total, -(-channels // 8) * 8), np.float32)
-    nothing = np.empty(0, np.float32)
     for first in range(0, out.shape[1], 8):
         slope = _planes(view, pixels[..., first : first + 8], 8)
-        found = kernels.lift[8](
-            view.start, view.ids, view.slots, view.rows, view.splats, view.splats, 16, 0, view.width, view.height,
-            nothing, nothing, slope.reshape(-1), nothing,
-        )  # fmt: skip
-        kernels.lift_values(found, view.first_slot, view.total, out.reshape(-1), out.shape[1], first, 8)
+        found = kernels.lift(view.entries, view.splats, view.width, view.height, slope.reshape(-1))
+        kernels.lift_values(found, view.entries.first_slot, view.total, out.reshape(-1), out.shape[1], first, 8)
     return torch.from_numpy(out)[:, :channels]

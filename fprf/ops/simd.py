@@ -1,4 +1,9 @@
-"""Vectors of sixteen float32 as a type of compiled kernels: `+ - * /`, tuples of vectors, and the functions below.
+"""Vectors of sixteen float32 in compiled kernels.
+
+A function under `@traced` runs while a kernel that calls it is compiled: once, on placeholders whose operators emit LLVM code.
+Inside it loops and conditions on Python numbers unroll, and other traced functions are plain calls. A kernel passes it arrays
+(or `stack` memory), indices, constants, float32 numbers, vectors and tuples of vectors, and gets vectors or numbers back; numba
+infers no types within, which is most of what compilation costs.
 
 The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may fuse and a division
 may become a product with the reciprocal, nothing else: NaN and infinity keep their meaning. Only `sums` and `total` add lanes,
@@ -7,44 +12,41 @@ in pairs. A number among vectors counts in every lane.
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
-import operator
-
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 __all__ = [
     "LANES",
     "absolute",
-    "add_scaled",
-    "dot",
+    "as_float",
     "exp2",
     "exp2_rough",
     "lanes",
     "largest",
     "load",
-    "loads",
     "log2",
     "maximum",
     "minimum",
     "splat",
-    "splats",
     "square_root",
+    "stack",
     "store",
-    "stores",
     "sums",
+    "take",
     "total",
+    "traced",
+    "transposed",
     "where_greater",
-    "zeros",
 ]
 
 LANES = 16
 """Numbers of a vector."""
 
-_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _VECTOR, _INTS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
 _FUSE = ("contract", "arcp", "nsz")
 _ADD_ANYHOW = ("contract", "arcp", "nsz", "reassoc")
@@ -76,284 +78,297 @@ def _undefined():
     return ir.Constant(_VECTOR, ir.Undefined)
 
 
+class _Placeholder:
+    """A value of the kernel that is being compiled."""
+
+    __array_ufunc__ = None  # operators with numpy's numbers are ours
+
+    def __init__(self, build, value):
+        self.build, self.value = build, value
+
+
+class _Index(_Placeholder):
+    """An integer: a place in an array."""
+
+    def _with(self, instruction, other):
+        value = other.value if isinstance(other, _Index) else ir.Constant(_LONG, other)
+        return _Index(self.build, getattr(self.build, instruction)(self.value, value))
+
+    def __add__(self, other):
+        return self._with("add", other)
+
+    def __sub__(self, other):
+        return self._with("sub", other)
+
+    def __mul__(self, other):
+        return self._with("mul", other)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+
+class _Array(_Placeholder):
+    """A contiguous array of float32. Indexed, it gives a number in every lane."""
+
+    def at(self, index):
+        return self.build.gep(self.value, [index.value if isinstance(index, _Index) else ir.Constant(_LONG, index)])
+
+    def __getitem__(self, index):
+        return _broadcast(self.build, self.build.load(self.at(index)))
+
+
+class _Float(_Placeholder):
+    """A float32 that goes back to the kernel."""
+
+
+class Vector(_Placeholder):
+    """LANES float32."""
+
+    def _with(self, instruction, x, y):
+        x, y = (each.value if isinstance(each, Vector) else _same(each) for each in (x, y))
+        return Vector(self.build, getattr(self.build, instruction)(x, y, flags=_FUSE))
+
+    def __add__(self, other):
+        return self._with("fadd", self, other)
+
+    def __radd__(self, other):
+        return self._with("fadd", other, self)
+
+    def __sub__(self, other):
+        return self._with("fsub", self, other)
+
+    def __rsub__(self, other):
+        return self._with("fsub", other, self)
+
+    def __mul__(self, other):
+        return self._with("fmul", self, other)
+
+    def __rmul__(self, other):
+        return self._with("fmul", other, self)
+
+    def __truediv__(self, other):
+        return self._with("fdiv", self, other)
+
+    def __rtruediv__(self, other):
+        return self._with("fdiv", other, self)
+
+    def __neg__(self):
+        return self._with("fsub", -0.0, self)
+
+
 def _broadcast(build, value):
     vector = build.insert_element(_undefined(), value, ir.Constant(_INT, 0))
-    return build.shuffle_vector(vector, _undefined(), ir.Constant(_INTS, [0] * LANES))
+    return Vector(build, build.shuffle_vector(vector, _undefined(), ir.Constant(_INTS, [0] * LANES)))
 
 
-def _to_vector(context, build, kind, value):
-    return value if kind == _vector else _broadcast(build, context.cast(build, value, kind, types.float32))
+def _wrapped(context, build, kind, value):
+    """The placeholder of an argument; an integer constant is itself."""
+    if isinstance(kind, types.IntegerLiteral):
+        return kind.literal_value
+    if isinstance(kind, types.UniTuple):
+        return tuple(_wrapped(context, build, kind.dtype, build.extract_value(value, k)) for k in range(kind.count))
+    if isinstance(kind, types.Array):
+        return _Array(build, value if context is None else context.make_array(kind)(context, build, value).data)
+    if isinstance(kind, types.CPointer):
+        return _Array(build, value)
+    if isinstance(kind, types.Integer):
+        return _Index(build, value if context is None else context.cast(build, value, kind, types.intp))
+    if isinstance(kind, types.Float):
+        return _broadcast(build, value if context is None else context.cast(build, value, kind, types.float32))
+    return Vector(build, value)
 
 
-def _define_binary(function, instruction):
-    @infer_global(function)
+def _kind_of(result):
+    if result is None:
+        return types.void
+    if isinstance(result, tuple | list):
+        return types.UniTuple(_vector, len(result))
+    return _vector if isinstance(result, Vector) else types.float32
+
+
+def _dry(kind):
+    """The LLVM type of an argument in a trace that only asks what comes back."""
+    if isinstance(kind, types.UniTuple):
+        return ir.LiteralStructType([_dry(kind.dtype)] * kind.count)
+    if isinstance(kind, types.Array | types.CPointer):
+        return _FLOAT.as_pointer()
+    if isinstance(kind, types.Integer):
+        return _LONG
+    return _FLOAT if isinstance(kind, types.Float) else _VECTOR
+
+
+def traced(function):
+    """Let kernels call a function that runs while they are compiled. It stays what it is for other traced functions."""
+    results = {}
+
     class Template(AbstractTemplate):
+        key = function
+        prefer_literal = True
+
         def generic(self, args, kws):
-            if len(args) == 2 and _vector in args and all(isinstance(a, _VectorType | types.Number) for a in args):
-                return signature(_vector, *args)
-            return None
+            if args not in results:
+                body = ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), [_dry(kind) for kind in args]), "dry")
+                build = ir.IRBuilder(body.append_basic_block())
+                given = [_wrapped(None, build, kind, value) for kind, value in zip(args, body.args, strict=True)]
+                results[args] = _kind_of(function(*given))
+            return signature(results[args], *args)
 
+    builtin_registry.register_global(function, types.Function(Template))
+
+    @lower_builtin(function, types.VarArg(types.Any))
     def lower(context, build, sig, args):
-        x, y = (_to_vector(context, build, kind, value) for kind, value in zip(sig.args, args, strict=True))
-        return getattr(build, instruction)(x, y, flags=_FUSE)
-
-    for kinds in ((_vector, _vector), (_vector, types.Number), (types.Number, _vector)):
-        lower_builtin(function, *kinds)(lower)
-
-
-for _function, _instruction in (
-    (operator.add, "fadd"),
-    (operator.sub, "fsub"),
-    (operator.mul, "fmul"),
-    (operator.truediv, "fdiv"),
-    (operator.iadd, "fadd"),
-    (operator.isub, "fsub"),
-    (operator.imul, "fmul"),
-):
-    _define_binary(_function, _instruction)
-
-
-@infer_global(operator.neg)
-class _Negative(AbstractTemplate):
-    def generic(self, args, kws):
-        return signature(_vector, _vector) if args[0] == _vector else None
-
-
-@lower_builtin(operator.neg, _vector)
-def _lower_negative(context, build, sig, args):
-    return build.fsub(_same(-0.0), args[0], flags=_FUSE)
-
-
-def _call(build, name, args, result=_VECTOR, flags=_FUSE):
-    function = cgutils.get_or_insert_function(build.module, ir.FunctionType(result, [a.type for a in args]), name)
-    return build.call(function, args, fastmath=flags)
-
-
-def _element(context, build, kind, array, index, index_kind):
-    data = context.make_array(kind)(context, build, array).data
-    return build.gep(data, [context.cast(build, index, index_kind, types.intp)])
-
-
-def _load(context, build, kind, array, index, index_kind):
-    place = build.bitcast(_element(context, build, kind, array, index, index_kind), _VECTOR.as_pointer())
-    return build.load(place, align=4)
-
-
-def _store(context, build, kind, array, index, index_kind, value):
-    place = build.bitcast(_element(context, build, kind, array, index, index_kind), _VECTOR.as_pointer())
-    build.store(value, place, align=4)
-
-
-@intrinsic
-def load(typing, array, at):
-    """array[at : at + LANES] of a contiguous array."""
-    return _vector(array, at), lambda context, build, sig, args: _load(
-        context, build, sig.args[0], args[0], args[1], sig.args[1]
-    )
-
-
-@intrinsic
-def store(typing, array, at, value):
-    """array[at : at + LANES] = value."""
-
-    def generate(context, build, sig, args):
-        vector = _to_vector(context, build, sig.args[2], args[2])
-        _store(context, build, sig.args[0], args[0], args[1], sig.args[1], vector)
-        return context.get_dummy_value()
-
-    return types.void(array, at, value), generate
-
-
-def _count(kind):
-    return kind.literal_value if isinstance(kind, types.IntegerLiteral) else None
-
-
-@intrinsic(prefer_literal=True)
-def loads(typing, array, at, step, count):
-    """`count` vectors, from array[at], array[at + step] and so on; count is a constant."""
-    if _count(count) is None:
-        return None
-
-    def generate(context, build, sig, args):
-        index = context.cast(build, args[1], sig.args[1], types.intp)
-        step = context.cast(build, args[2], sig.args[2], types.intp)
-        found = []
-        for _ in range(_count(sig.args[3])):
-            found.append(_load(context, build, sig.args[0], args[0], index, types.intp))
-            index = build.add(index, step)
-        return context.make_tuple(build, sig.return_type, found)
-
-    return types.UniTuple(_vector, _count(count))(array, at, step, count), generate
-
-
-@intrinsic
-def stores(typing, array, at, step, values):
-    """Vectors to array[at], array[at + step] and so on."""
-
-    def generate(context, build, sig, args):
-        index = context.cast(build, args[1], sig.args[1], types.intp)
-        step = context.cast(build, args[2], sig.args[2], types.intp)
-        for k in range(len(sig.args[3])):
-            _store(context, build, sig.args[0], args[0], index, types.intp, build.extract_value(args[3], k))
-            index = build.add(index, step)
-        return context.get_dummy_value()
-
-    return types.void(array, at, step, values), generate
-
-
-@intrinsic(prefer_literal=True)
-def splats(typing, array, at, count):
-    """array[at], array[at + 1] and so on, each in every lane of a vector of its own; count is a constant."""
-    if _count(count) is None:
-        return None
-
-    def generate(context, build, sig, args):
-        first = _element(context, build, sig.args[0], args[0], args[1], sig.args[1])
-        places = [build.gep(first, [ir.Constant(_INT, k)]) for k in range(_count(sig.args[2]))]
-        return context.make_tuple(build, sig.return_type, [_broadcast(build, build.load(place)) for place in places])
-
-    return types.UniTuple(_vector, _count(count))(array, at, count), generate
-
-
-@intrinsic(prefer_literal=True)
-def zeros(typing, count):
-    """So many vectors of 0; count is a constant."""
-    if _count(count) is None:
-        return None
-    return types.UniTuple(_vector, _count(count))(count), lambda context, build, sig, args: context.make_tuple(
-        build, sig.return_type, [_same(0)] * _count(sig.args[0])
-    )
-
-
-@intrinsic
-def add_scaled(typing, values, factor, more):
-    """values + factor * more, tuples of vectors and one vector."""
-
-    def generate(context, build, sig, args):
-        values, factor, more = args
-        found = []
-        for k in range(len(sig.args[0])):
-            product = build.fmul(factor, build.extract_value(more, k), flags=_FUSE)
-            found.append(build.fadd(build.extract_value(values, k), product, flags=_FUSE))
-        return context.make_tuple(build, sig.return_type, found)
-
-    return values(values, factor, more), generate
-
-
-@intrinsic
-def dot(typing, first, second):
-    """The sum of the products of two tuples of vectors, a vector."""
-
-    def generate(context, build, sig, args):
-        found = _same(0)
-        for k in range(len(sig.args[0])):
-            product = build.fmul(build.extract_value(args[0], k), build.extract_value(args[1], k), flags=_FUSE)
-            found = build.fadd(found, product, flags=_FUSE)
-        return found
-
-    return _vector(first, second), generate
-
-
-@intrinsic
-def splat(typing, value):
-    """A number in every lane."""
-    return _vector(value), lambda context, build, sig, args: _to_vector(context, build, sig.args[0], args[0])
-
-
-@intrinsic
-def lanes(typing):
-    """0, 1, 2 ..."""
-    return _vector(), lambda context, build, sig, args: ir.Constant(_VECTOR, [float(k) for k in range(LANES)])
-
-
-def _choose(comparison):
-    @intrinsic
-    def function(typing, x, y):
-        def generate(context, build, sig, args):
-            a, b = (_to_vector(context, build, kind, value) for kind, value in zip(sig.args, args, strict=True))
-            return build.select(build.fcmp_ordered(comparison, a, b), a, b)
-
-        return _vector(x, y), generate
+        result = function(*(_wrapped(context, build, kind, value) for kind, value in zip(sig.args, args, strict=True)))
+        if result is None:
+            return context.get_dummy_value()
+        if isinstance(result, tuple | list):
+            return context.make_tuple(build, sig.return_type, [each.value for each in result])
+        return result.value
 
     return function
 
 
-minimum, maximum = _choose("<"), _choose(">")
+def _call(vector, name, args, result=_VECTOR, flags=_FUSE):
+    build = vector.build
+    function = cgutils.get_or_insert_function(build.module, ir.FunctionType(result, [a.type for a in args]), name)
+    return (Vector if result is _VECTOR else _Float)(build, build.call(function, args, fastmath=flags))
+
+
+@intrinsic(prefer_literal=True)
+def stack(typing, count):
+    """Memory for `count` float32, a constant, as long as the kernel runs."""
+    if not isinstance(count, types.IntegerLiteral):
+        return None
+    return types.CPointer(types.float32)(count), lambda context, build, sig, args: cgutils.alloca_once(
+        build, _FLOAT, ir.Constant(_LONG, sig.args[0].literal_value)
+    )
 
 
 @intrinsic
-def where_greater(typing, p, q, x, y):
+def take(typing, counters, k):
+    """counters[k] before 1 is added to it, as one step for all threads."""
+
+    def generate(context, build, sig, args):
+        data = context.make_array(sig.args[0])(context, build, args[0]).data
+        place = build.gep(data, [context.cast(build, args[1], sig.args[1], types.intp)])
+        return build.atomic_rmw("add", place, ir.Constant(_LONG, 1), "monotonic")
+
+    return types.int64(counters, k), generate
+
+
+@traced
+def load(array, at):
+    """array[at : at + LANES]."""
+    return Vector(array.build, array.build.load(array.build.bitcast(array.at(at), _VECTOR.as_pointer()), align=4))
+
+
+@traced
+def store(array, at, value):
+    """array[at : at + LANES] = value."""
+    value = value.value if isinstance(value, Vector) else _same(value)
+    array.build.store(value, array.build.bitcast(array.at(at), _VECTOR.as_pointer()), align=4)
+
+
+def splat(like, value):
+    """A constant in every lane."""
+    return Vector(like.build, _same(value))
+
+
+def lanes(like):
+    """0, 1, 2 ..."""
+    return Vector(like.build, ir.Constant(_VECTOR, [float(k) for k in range(LANES)]))
+
+
+def as_float(index):
+    """An index as a number in every lane."""
+    return _broadcast(index.build, index.build.sitofp(index.value, _FLOAT))
+
+
+def _choose(comparison, x, y):
+    like = x if isinstance(x, Vector) else y
+    x, y = (each.value if isinstance(each, Vector) else _same(each) for each in (x, y))
+    return Vector(like.build, like.build.select(like.build.fcmp_ordered(comparison, x, y), x, y))
+
+
+def minimum(x, y):
+    """The smaller; y where one is NaN."""
+    return _choose("<", x, y)
+
+
+def maximum(x, y):
+    """The larger; y where one is NaN."""
+    return _choose(">", x, y)
+
+
+def where_greater(p, q, x, y):
     """x where p > q, else y: also where p or q is NaN."""
-
-    def generate(context, build, sig, args):
-        p, q, x, y = (_to_vector(context, build, kind, value) for kind, value in zip(sig.args, args, strict=True))
-        return build.select(build.fcmp_ordered(">", p, q), x, y)
-
-    return _vector(p, q, x, y), generate
+    build = (p if isinstance(p, Vector) else q).build
+    p, q, x, y = (each.value if isinstance(each, Vector) else _same(each) for each in (p, q, x, y))
+    return Vector(build, build.select(build.fcmp_ordered(">", p, q), x, y))
 
 
-@intrinsic
-def square_root(typing, x):
+def square_root(x):
     """Square root."""
-    return _vector(x), lambda context, build, sig, args: _call(build, f"llvm.sqrt.v{LANES}f32", [args[0]])
+    return _call(x, f"llvm.sqrt.v{LANES}f32", [x.value])
 
 
-@intrinsic
-def absolute(typing, x):
+def absolute(x):
     """|x|."""
-    return _vector(x), lambda context, build, sig, args: _call(build, f"llvm.fabs.v{LANES}f32", [args[0]])
+    return _call(x, f"llvm.fabs.v{LANES}f32", [x.value])
 
 
-@intrinsic
-def total(typing, x):
+@traced
+def total(x):
     """The sum of the lanes."""
-    return types.float32(x), lambda context, build, sig, args: _call(
-        build, f"llvm.vector.reduce.fadd.v{LANES}f32", [ir.Constant(_FLOAT, 0.0), args[0]], _FLOAT, _ADD_ANYHOW
-    )
+    return _call(x, f"llvm.vector.reduce.fadd.v{LANES}f32", [ir.Constant(_FLOAT, 0.0), x.value], _FLOAT, _ADD_ANYHOW)
 
 
-@intrinsic
-def largest(typing, x):
-    """The largest of the lanes."""
-    return types.float32(x), lambda context, build, sig, args: _call(
-        build, f"llvm.vector.reduce.fmax.v{LANES}f32", [args[0]], _FLOAT
-    )
+@traced
+def largest(array, at):
+    """The largest of array[at : at + LANES]."""
+    return _call(array, f"llvm.vector.reduce.fmax.v{LANES}f32", [load(array, at).value], _FLOAT)
 
 
-@intrinsic
-def sums(typing, values):
+def _picked(x, y, mask):
+    y = _undefined() if y is None else y.value
+    return Vector(x.build, x.build.shuffle_vector(x.value, y, ir.Constant(_INTS, mask)))
+
+
+def transposed(rows):
+    """LANES vectors as rows of a matrix: its columns."""
+    for width in (8, 4, 2, 1):
+        out = list(rows)
+        for k in range(LANES):
+            if k & width == 0:
+                # Of both rows: the blocks of `width` lanes with even numbers, those with odd ones.
+                for odd, to in ((0, k), (width, k + width)):
+                    mask = [(lane & ~width) + odd + (LANES if lane & width else 0) for lane in range(LANES)]
+                    out[to] = _picked(rows[k], rows[k + width], mask)
+        rows = out
+    return rows
+
+
+def sums(values):
     """The sums of the lanes of each of at most LANES vectors, in the lanes of one; what is left over is undefined."""
+    found, fours = list(values), LANES // 4
 
-    def generate(context, build, sig, args):
-        found = [build.extract_value(args[0], k) for k in range(len(sig.args[0]))]
-        fours = LANES // 4
+    def halve(low, high):
+        """Add picked lanes of each pair of vectors: half as many vectors."""
+        pairs = [(found[k], found[k + 1] if k + 1 < len(found) else None) for k in range(0, len(found), 2)]
+        return [_picked(x, y, low) + _picked(x, y, high) for x, y in pairs]
 
-        def halve(low, high):
-            """Add picked lanes of each pair of vectors: half as many vectors."""
-            halved = []
-            for k in range(0, len(found), 2):
-                x, y = found[k], found[k + 1] if k + 1 < len(found) else _undefined()
-                picked = [build.shuffle_vector(x, y, ir.Constant(_INTS, mask)) for mask in (low, high)]
-                halved.append(build.fadd(*picked, flags=_FUSE))
-            return halved
+    def within_fours(*offsets):
+        return [4 * g + o for g in range(fours) for o in offsets]
 
-        def within_fours(*offsets):
-            return [4 * g + o for g in range(fours) for o in offsets]
-
-        found = halve(within_fours(0, LANES, 1, LANES + 1), within_fours(2, LANES + 2, 3, LANES + 3))
-        found = halve(within_fours(0, 1, LANES, LANES + 1), within_fours(2, 3, LANES + 2, LANES + 3))
-        left = fours
-        while left > 1:
-            # Group g of a vector holds the partial sums of four of them; the groups of one vector are added in pairs.
-            low, high = (
-                [side * LANES + 4 * g + j for side in (0, 1) for g in range(first, fours, 2) for j in range(4)]
-                for first in (0, 1)
-            )
-            found, left = halve(low, high), left // 2
-        assert len(found) == 1
-        return found[0]
-
-    return _vector(values), generate
+    found = halve(within_fours(0, LANES, 1, LANES + 1), within_fours(2, LANES + 2, 3, LANES + 3))
+    found = halve(within_fours(0, 1, LANES, LANES + 1), within_fours(2, 3, LANES + 2, LANES + 3))
+    left = fours
+    while left > 1:
+        # Group g of a vector holds the partial sums of four of them; the groups of one vector are added in pairs.
+        low, high = (
+            [side * LANES + 4 * g + j for side in (0, 1) for g in range(first, fours, 2) for j in range(4)] for first in (0, 1)
+        )
+        found, left = halve(low, high), left // 2
+    assert len(found) == 1
+    return found[0]
 
 
 def _fit(function, degree, low, high):
@@ -363,36 +378,36 @@ def _fit(function, degree, low, high):
     return np.linalg.lstsq(powers, np.ones_like(x), rcond=None)[0]
 
 
-def _polynomial(build, coefficients, x):
-    value = _same(coefficients[-1])
+def _polynomial(coefficients, x):
+    value = splat(x, coefficients[-1])
     for each in coefficients[-2::-1]:
-        value = build.fadd(build.fmul(value, x, flags=_FUSE), _same(each), flags=_FUSE)
+        value = value * x + each
     return value
 
 
 _ROUND = 1.5 * 2**23
 """Added to a small number, the sum's last bits are the rounded number."""
+_EXP2 = {degree: _fit(np.exp2, degree, -0.5, 0.5) for degree in (3, 5)}
 
 
-def _exp2(degree, text):
-    coefficients = _fit(np.exp2, degree, -0.5, 0.5)
-
-    @intrinsic
-    def function(typing, x):
-        def generate(context, build, sig, args):
-            rounded = build.fadd(args[0], _same(_ROUND))
-            part = build.fsub(args[0], build.fsub(rounded, _same(_ROUND)))
-            value = _polynomial(build, coefficients, part)
-            exponent = build.shl(build.bitcast(rounded, _INTS), _same_int(23))
-            return build.bitcast(build.add(exponent, build.bitcast(value, _INTS)), _VECTOR)
-
-        return _vector(x), generate
-
-    function.__doc__ = f"2^x for |x| < 126; relative error {text}."
-    return function
+def _exp2(x, degree):
+    build, large = x.build, _same(_ROUND)
+    rounded = build.fadd(x.value, large)  # these must not be simplified
+    part = Vector(build, build.fsub(x.value, build.fsub(rounded, large)))
+    exponent = build.shl(build.bitcast(rounded, _INTS), _same_int(23))
+    value = build.bitcast(_polynomial(_EXP2[degree], part).value, _INTS)
+    return Vector(build, build.bitcast(build.add(exponent, value), _VECTOR))
 
 
-exp2_rough, exp2 = _exp2(3, "1.1e-4"), _exp2(5, "3e-7")
+def exp2_rough(x):
+    """2^x for |x| < 126; relative error 1.1e-4."""
+    return _exp2(x, 3)
+
+
+def exp2(x):
+    """2^x for |x| < 126; relative error 3e-7."""
+    return _exp2(x, 5)
+
 
 _LOG2 = (
     np.polynomial.chebyshev.Chebyshev.interpolate(
@@ -403,17 +418,11 @@ _LOG2 = (
 )
 
 
-@intrinsic
-def log2(typing, x):
+def log2(x):
     """log2 of a positive normal number; error 3e-7 of the larger of 1 and itself."""
-
-    def generate(context, build, sig, args):
-        bits = build.bitcast(args[0], _INTS)
-        # From 2^-0.5 on: 0x3f3504f3 are the bits of the square root of one half.
-        exponent = build.ashr(build.sub(bits, _same_int(0x3F3504F3)), _same_int(23))
-        mantissa = build.bitcast(build.sub(bits, build.shl(exponent, _same_int(23))), _VECTOR)
-        part = build.fsub(mantissa, _same(1.0))
-        found = build.fmul(_polynomial(build, _LOG2, part), part, flags=_FUSE)
-        return build.fadd(found, build.sitofp(exponent, _VECTOR), flags=_FUSE)
-
-    return _vector(x), generate
+    build = x.build
+    bits = build.bitcast(x.value, _INTS)
+    # From 2^-0.5 on: 0x3f3504f3 are the bits of the square root of one half.
+    exponent = build.ashr(build.sub(bits, _same_int(0x3F3504F3)), _same_int(23))
+    part = Vector(build, build.bitcast(build.sub(bits, build.shl(exponent, _same_int(23))), _VECTOR)) - 1.0
+    return _polynomial(_LOG2, part) * part + Vector(build, build.sitofp(exponent, _VECTOR))

@@ -81,22 +81,22 @@ class Learner:
         camera, planes, blurred, valid = level.photographs[view]
         width, height = level.width, level.height
         rasterise_kernels.project(self.blocks, self.count, self.bands, camera, width, height, self.splats)
-        start, ids, slots, rows, first_slot, _ = rasterise_kernels.bins(self.splats, self.count, width, height)
+        entries = rasterise_kernels.bins(self.splats, self.count, width, height)
         out, left = np.zeros(len(planes), np.float32), np.empty(len(planes) // 3, np.float32)
         behind = np.array(self.config.background, np.float32)
-        rasterise_kernels.composite[3](start, ids, rows, self.splats, self.splats, SLOTS, 6, behind, width, height, out, left)
-        l1, ssim, slope = photometric.loss(out, planes, blurred, width, height, np.float32(self.config.ssim))
+        rasterise_kernels.composite(3, entries, self.splats, self.splats, SLOTS, 6, behind, width, height, out, left)
+        l1, ssim, slope = photometric.loss(out, planes, blurred, width, height, self.config.ssim)
         if not math.isfinite(l1 + ssim):
             return None
         if valid is not None:
             slope *= valid
-        found = rasterise_gradient_kernels.composite_back[3](
-            start, ids, slots, rows, self.splats, self.splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
+        found = rasterise_gradient_kernels.composite_back(
+            3, entries, self.splats, self.splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
         )
         grown = np.array([1 / (1 - 0.9 ** (step + 1)), 1 / (1 - _BETA2 ** (step + 1))], np.float32)
         rasterise_gradient_kernels.adam(
-            self.blocks, self.first, self.second, self.count, self.bands, camera, found, first_slot, self._rates(share), grown,
-            np.float32(_BETA2),
+            self.blocks, self.first, self.second, self.count, self.bands, camera, found, entries.first_slot,
+            self._rates(share), grown, np.float32(_BETA2),
         )  # fmt: skip
         if (step + 1) % self.config.relocate_every == 0 and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, share)

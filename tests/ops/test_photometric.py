@@ -30,9 +30,7 @@ def test_loss_and_gradient_are_those_of_float64(size: tuple[int, int], share: fl
     ((1 - share) * apart + share * (1 - similar)).backward()
     height, width = size
     given, wanted = planes(image.detach()), planes(target)
-    l1, ssim, grad = photometric.loss(
-        given, wanted, photometric.blurred(wanted, width, height), width, height, np.float32(share)
-    )
+    l1, ssim, grad = photometric.loss(given, wanted, photometric.blurred(wanted, width, height), width, height, share)
     tall, wide = -(-height // 16) * 16, -(-width // 16) * 16
     found = torch.from_numpy(grad[: 3 * tall * wide].reshape(3, tall, wide))
     inner = found[:, :height, :width].permute(1, 2, 0).double()

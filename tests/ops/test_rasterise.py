@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numba
 import pytest
 import torch
 from torch import Tensor
@@ -207,9 +208,21 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         rasterise.lift(*given[:4], camera(), torch.zeros(40, 30, 2))
 
 
-def test_threads_and_the_plain_form_on_request() -> None:
+def test_the_plain_form_on_request() -> None:
     given, view = cloud(channels=3), camera()
     with backend.plain():
         plain = render(given, view)
     assert plain.image.dtype == torch.float32 and not plain.counts
     assert (plain.image - render(given, view).image).abs().mean() < ROUGH
+
+
+def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    given, view, found = cloud(count=3000, bands=4, channels=3, size=-2.5), camera(170, 90), []
+    for threads in (1, 4):
+        monkeypatch.setattr(numba, "get_num_threads", lambda threads=threads: threads)
+        learnt = [x.detach().clone().requires_grad_() for x in given]
+        seen = render(learnt, view)
+        torch.stack([x.square().sum() for x in seen[:4]]).sum().backward()
+        lifted = rasterise.lift(*given[:4], view, seen.features.detach())
+        found.append([*seen[:4], *(x.grad for x in learnt), *lifted])
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
