@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import DataError, UsageError
-from ..export.config import KINDS, ExportConfig, Plan, look_file, plan
-from ..export.looks import Look, make_looks, styles_of
+from ..export.config import KINDS, ExportConfig, Look, Plan, look_file, make_looks, plan, styles_of
 from .progress import Display
 from .style_flags import read_flags, say
 from .verbs import verbs_of
@@ -15,8 +14,8 @@ from .verbs import verbs_of
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ..export.colours import Coloured, Witnesses
-    from ..export.depth_maps import Sights
+    from ..export.colours import BestViews, Coloured
+    from ..export.depth_maps import DepthMaps
     from ..export.point_cloud import Cloud
     from ..style.files import StyleFile
     from ..training.loading import Trained
@@ -95,7 +94,7 @@ class _Place(NamedTuple):
     trained: "Trained"
     what: Plan
     looks: Sequence[Look]
-    sights: "Sights"
+    maps: "DepthMaps"
     origin: "Tensor"
     display: Display
 
@@ -105,14 +104,14 @@ class _Place(NamedTuple):
             return [self.what.folder / look_file(base, look.name, ending)]
         return [self.what.single] if self.what.single.suffix.lower() == ending else []
 
-    def colours(self, point: "Tensor", seen: "Witnesses", tolerance: float | None) -> "Coloured":
-        """Every look's colours of points that views of the sights see."""
-        from ..export.colours import seen_colours
+    def colours(self, point: "Tensor", seen: "BestViews", tolerance: float | None) -> "Coloured":
+        """Every look's colours of points that views of the maps see."""
+        from ..export.colours import point_colours
 
-        return seen_colours(
+        return point_colours(
             self.trained.model,
             self.trained.known.facts,
-            self.sights.cameras,
+            self.maps.cameras,
             point,
             seen,
             self.trained.config.render,
@@ -128,10 +127,10 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
         return {}
     from ..export.point_cloud import fuse, origin_of
 
-    sights = _sights(trained, config, display)
+    maps = _depth_maps(trained, config, display)
     counts: dict[str, int] = {}
     cloud = fuse(
-        sights,
+        maps,
         edge=config.edge,
         most=config.points,
         tolerance=config.tolerance,
@@ -139,11 +138,11 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
         report=lambda done, total: display.count(done, total, "fusing"),
         counts=counts,
     )
-    place = _Place(trained, what, looks, sights, origin_of(cloud), display)
-    pixels = sum(depth.numel() for depth in sights.depth)
+    place = _Place(trained, what, looks, maps, origin_of(cloud), display)
+    pixels = sum(depth.numel() for depth in maps.depth)
     made: dict[str, Any] = {
         "origin": place.origin.tolist(),
-        "views": len(sights.depth),
+        "views": len(maps.depth),
         "pixels": {"all": pixels, **counts},
         "finest_edge": float(cloud.edge.amin()),
     }
@@ -154,17 +153,17 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
     return made
 
 
-def _sights(trained: "Trained", config: ExportConfig, display: Display) -> "Sights":
-    from ..export.depth_maps import chosen, reach_of, render_sights
+def _depth_maps(trained: "Trained", config: ExportConfig, display: Display) -> "DepthMaps":
+    from ..export.depth_maps import default_reach, render_depth_maps, spread_views
 
     known = trained.known
-    return render_sights(
+    return render_depth_maps(
         trained.model,
         known.cameras,
-        chosen(known.train, config.views),
+        spread_views(known.train, config.views),
         trained.config.render,
         side=config.side,
-        reach=reach_of(trained.model.space) if config.reach is None else config.reach,
+        reach=default_reach(trained.model.space) if config.reach is None else config.reach,
         report=lambda done, total: display.count(done, total, "rendering depth"),
     )
 
@@ -173,21 +172,21 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     """Points and splats: one geometry, a colour set for each look."""
     import torch
 
-    from ..export.colours import alone, expected_presence, witnesses
-    from ..export.point_cloud import Cloud, dome, joined, write_points
-    from ..export.splats import discs, write_gaussians, write_splat
+    from ..export.colours import best_views, expected_presence, single_view
+    from ..export.point_cloud import Cloud, concatenate, sky_dome, write_points
+    from ..export.splats import surface_discs, write_gaussians, write_splat
 
     kinds = place.what.kinds
-    seen = witnesses(place.sights, cloud.point, cloud.normal, cloud.edge, config.witnesses)
+    seen = best_views(place.maps, cloud.point, cloud.normal, cloud.edge, config.witnesses)
     found = place.colours(cloud.point, seen, config.tolerance)
-    solid = found.presence >= config.presence * expected_presence(place.sights, cloud.point, seen, config.tolerance)
+    solid = found.presence >= config.presence * expected_presence(place.maps, cloud.point, seen, config.tolerance)
     if not bool(solid.any()):
         raise DataError(f"export: no point is as present as {config.presence:g} in the field; lower --presence")
     cloud, colours = Cloud(*(column[solid] for column in cloud)), [colour[solid] for colour in found.colours]
-    above = dome(place.sights, cloud) if config.sky and "splat" in kinds else None
-    whole = cloud if above is None else joined(cloud, above)
-    beyond = None if above is None else place.colours(above.point, alone(above.view), None).colours
-    splats = discs(whole)
+    above = sky_dome(place.maps, cloud) if config.sky and "splat" in kinds else None
+    whole = cloud if above is None else concatenate(cloud, above)
+    beyond = None if above is None else place.colours(above.point, single_view(above.view), None).colours
+    splats = surface_discs(whole)
     for number, look in enumerate(place.looks):
         colour = colours[number]
         every = colour if beyond is None else torch.cat([colour, beyond[number]])
@@ -204,16 +203,16 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
 
 def _mesh(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
     """The mesh in both formats, a file for each look."""
-    from ..export.colours import witnesses
+    from ..export.colours import best_views
     from ..export.mesh import build_mesh, write_mesh_glb, write_mesh_ply
 
     mesh = build_mesh(
-        place.sights,
+        place.maps,
         cloud,
         edge=config.mesh_edge,
         report=lambda done, total: place.display.count(done, total, "building the mesh"),
     )
-    seen = witnesses(place.sights, mesh.point, mesh.normal, mesh.edge, config.witnesses)
+    seen = best_views(place.maps, mesh.point, mesh.normal, mesh.edge, config.witnesses)
     for look, colour in zip(place.looks, place.colours(mesh.point, seen, config.tolerance).colours, strict=True):
         for path in place.paths("mesh", look, ".ply"):
             write_mesh_ply(path, mesh, colour, place.origin)
@@ -245,12 +244,12 @@ def _cameras(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequen
 
 def _tables(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequence[Look]) -> dict[str, Any]:
     """Lookup tables of every style, for the whole scene and each region."""
-    from ..export.lut import fit_quality, look_pairs, write_cube
+    from ..export.lut import colour_pairs, fit_quality, write_cube
     from ..training.loading import load_style
 
     known, scene = trained.known, load_style(trained.run)[0]
     styled = [(look.name, look.restyle) for look in looks if look.restyle is not None]
-    pairs = look_pairs(
+    pairs = colour_pairs(
         trained.model, scene, known.cameras, known.train, trained.config.render, [restyle for _, restyle in styled]
     )
     made: dict[str, Any] = {}

@@ -180,7 +180,7 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
 
 def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
     """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
-    from ..export.looks import named_styles
+    from ..export.config import named_styles
     from ..training.footage import Take
 
     takes = []

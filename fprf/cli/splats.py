@@ -72,8 +72,7 @@ class SplatVerbs(Verbs):
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
         """Write files of Gaussians, as they are and in every style."""
-        from ..export.looks import make_looks, styles_of
-        from ..export.config import look_file
+        from ..export.config import look_file, make_looks, styles_of
         from ..splats.files import ENDINGS, write_gaussians
         from ..splats.training import open_gaussians
         from ..training.quality import QualityConfig

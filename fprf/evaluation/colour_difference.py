@@ -10,6 +10,8 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from ..io.images import srgb_to_linear
+
 __all__ = ["delta_e", "delta_e_2000", "srgb_to_lab"]
 
 _TO_XYZ = (
@@ -30,10 +32,8 @@ def delta_e(a: Annotated[Tensor, "... 3"], b: Annotated[Tensor, "... 3"]) -> Ann
 
 def srgb_to_lab(rgb: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "... 3"]:
     """CIE Lab of sRGB colours in [0, 1]; white is the sum of the primaries, so greys have no hue."""
-    colour = rgb.double()
-    linear = torch.where(colour <= 0.04045, colour / 12.92, ((colour.clamp_min(0) + 0.055) / 1.055) ** 2.4)
     matrix = torch.tensor(_TO_XYZ, dtype=torch.float64, device=rgb.device)
-    xyz = linear @ matrix.T / matrix.sum(1)
+    xyz = srgb_to_linear(rgb.double()) @ matrix.T / matrix.sum(1)
     root = torch.where(xyz > _EDGE**3, xyz.clamp_min(1e-12) ** (1 / 3), xyz / (3 * _EDGE**2) + 4 / 29)
     x, y, z = root.unbind(-1)
     return torch.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)

@@ -16,13 +16,13 @@ from ..memory import chunk_size
 from ..plugins.samplers.config import UniformConfig
 from ..plugins.samplers.uniform import UniformSampler
 from ..rendering.cameras import Cameras, project
-from ..rendering.renderer import Kept, Parts, Restyle, composite, march
+from ..rendering.renderer import March, Parts, Restyle, composite, march
 from ..training.model import Facts, Model, background_of
 from ..training.views import on_host
 from ..types import Rays, Want
-from .depth_maps import Sights, gaps
+from .depth_maps import DepthMaps, depth_gaps
 
-__all__ = ["Coloured", "Witnesses", "alone", "expected_presence", "paint", "seen_colours", "witnesses"]
+__all__ = ["BestViews", "Coloured", "best_views", "expected_presence", "point_colours", "shade", "single_view"]
 
 
 _DECAY = math.log(9)
@@ -31,38 +31,38 @@ _GRAZING = 1e-3
 """Smallest cosine: a view that sees a surface from its edge still says more than none."""
 
 
-class Witnesses(NamedTuple):
+class BestViews(NamedTuple):
     """Of N points the K views that see each best."""
 
     view: Annotated[Tensor, "N K"]
-    """int64 index among the sights, the best first."""
+    """int64 index among the maps, the best first."""
     weight: Annotated[Tensor, "N K"]
     """1 for the best, less for the others, 0 for views that do not see the point; float64."""
 
 
-def alone(view: Annotated[Tensor, "N"]) -> Witnesses:
+def single_view(view: Annotated[Tensor, "N"]) -> BestViews:
     """One view a point."""
-    return Witnesses(view[:, None], torch.ones(len(view), 1, dtype=torch.float64))
+    return BestViews(view[:, None], torch.ones(len(view), 1, dtype=torch.float64))
 
 
-def witnesses(
-    sights: Sights,
+def best_views(
+    maps: DepthMaps,
     point: Annotated[Tensor, "N 3"],
     normal: Annotated[Tensor, "N 3"],
     near: Annotated[Tensor, "N"] | float,
     count: int = 1,
-) -> Witnesses:
+) -> BestViews:
     """The finest and straightest of the views that see each point; where none does, the one that misses it least.
 
     A view sees what lies within 2 `near` of its surface, in world units. A view counts as many times as it has pixels on
     the surface: cosine / distance^2.
     """
-    count = min(count, len(sights.depth))
+    count = min(count, len(maps.depth))
     best = torch.full((len(point), count), -torch.inf, dtype=torch.float64)
     found = torch.zeros(len(point), count, dtype=torch.int64)
-    for view in range(len(sights.depth)):
-        gap, distance = gaps(sights, view, point)
-        way = (sights.cameras.pose[view, :, 3] - point) / distance[:, None]
+    for view in range(len(maps.depth)):
+        gap, distance = depth_gaps(maps, view, point)
+        way = (maps.cameras.pose[view, :, 3] - point) / distance[:, None]
         facing = (way * normal.double()).sum(-1).clamp_min(_GRAZING)
         # Both kinds of score in one: positive where it is seen, negative where not.
         missed = torch.nan_to_num(gap.abs(), nan=1e18, posinf=1e17)
@@ -73,11 +73,11 @@ def witnesses(
         found = views.gather(1, order)
     weight = (best / best[:, :1].clamp_min(1e-300)).clamp_min(0)
     weight[:, 0] = 1
-    return Witnesses(found, weight)
+    return BestViews(found, weight)
 
 
 def expected_presence(
-    sights: Sights, point: Annotated[Tensor, "N 3"], seen: Witnesses, tolerance: float
+    maps: DepthMaps, point: Annotated[Tensor, "N 3"], seen: BestViews, tolerance: float
 ) -> Annotated[Tensor, "N"]:
     """How much light comes from within `tolerance` of a point's distance where it lies in a surface as thick as its views see.
 
@@ -85,11 +85,11 @@ def expected_presence(
     its light there; between two surfaces, where nothing is, less light comes than from either. In (0, 1], float32.
     """
     total, weight = torch.zeros(len(point)), torch.zeros(len(point))
-    if not sights.thickness:
+    if not maps.thickness:
         return torch.ones(len(point))
-    for view, thickness in enumerate(sights.thickness):
+    for view, thickness in enumerate(maps.thickness):
         row, rank = ((seen.view == view) & (seen.weight > 0)).nonzero().unbind(1)
-        pixel, _ = project(sights.cameras, torch.full((len(row),), view, dtype=torch.int64), point[row])
+        pixel, _ = project(maps.cameras, torch.full((len(row),), view, dtype=torch.int64), point[row])
         height, width = thickness.shape
         pixel = torch.nan_to_num(pixel)
         x, y = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
@@ -116,23 +116,31 @@ class Coloured(NamedTuple):
     and where that is thick (see `witness.expected_presence`)."""
 
 
-def paint(kept: Kept, parts: Parts, styles: Sequence[Restyle | None]) -> list[Annotated[Tensor, "M 3"]]:
-    """Colours of samples in several styles (None = plain): features and semantics are computed once for all."""
+def shade(
+    rays: Rays, parts: Parts, budget: float, styles: Sequence[Restyle | None]
+) -> tuple[March, list[Annotated[Tensor, "R 3"]]]:
+    """March R rays once and composite their colours in several styles (None = plain), without any background.
+
+    Features and semantics are computed once for all styles.
+    """
+    marched = march(rays, parts, budget=budget)
+    kept = marched.kept
     features = parts.field.content(kept.latent, kept.view)
     shown = [None if style is None or style.idle else style for style in styles]
     semantic = None
     if parts.semantic is not None and any(style is not None and Want.SEMANTIC in style.needs for style in shown):
         semantic = parts.semantic(kept.point)
-    return [parts.decoder(features) if s is None else s.colour(parts.decoder, features, semantic) for s in shown]
+    colours = [parts.decoder(features) if s is None else s.colour(parts.decoder, features, semantic) for s in shown]
+    return marched, [composite(kept, colour, len(rays.near)) for colour in colours]
 
 
 @torch.inference_mode()
-def seen_colours(
+def point_colours(
     model: Model,
     facts: Facts,
     cameras: Cameras,
     points: Annotated[Tensor, "N 3"],
-    seen: Witnesses,
+    seen: BestViews,
     config: RenderConfig,
     styles: Sequence[Restyle | None],
     *,
@@ -163,8 +171,8 @@ def seen_colours(
     colour = (sums / (share if tolerance is None else light).clamp_min(1e-10)[:, None]).clamp(0, 1)
     lost = (presence < _LOST).nonzero()[:, 0]
     if tolerance is not None and len(lost):
-        first = alone(seen.view[lost, 0])
-        whole = seen_colours(model, facts, cameras, points[lost], first, config, styles, tolerance=None)
+        first = single_view(seen.view[lost, 0])
+        whole = point_colours(model, facts, cameras, points[lost], first, config, styles, tolerance=None)
         colour[lost] = torch.cat(whole.colours, 1)
     return Coloured(list(torch.split(colour, 3, 1)), presence)
 
@@ -191,9 +199,8 @@ def _looked(
         rays = rays._replace(near=near, far=far)
     # Close to the point there is nothing to be found first: even steps are as good as proposals, and cost a third.
     parts = model.parts if tolerance is None else model.parts._replace(sampler=_CLOSE)
-    marched = march(Rays(*(x.to(device) for x in rays)), parts, budget=config.budget)
+    marched, colours = shade(Rays(*(x.to(device) for x in rays)), parts, config.budget, styles)
     background = background_of(facts, device) if tolerance is None else None
     behind = 0.0 if background is None else marched.through[:, None] * background
-    colours = [composite(marched.kept, colour, len(points)) + behind for colour in paint(marched.kept, model.parts, styles)]
-    found, opacity = on_host(torch.cat(colours, 1), marched.opacity)
-    return found, opacity
+    composited, opacity = on_host(torch.cat([colour + behind for colour in colours], 1), marched.opacity)
+    return composited, opacity

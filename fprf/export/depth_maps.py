@@ -22,7 +22,17 @@ from ..training.model import Model
 from ..training.views import on_host
 from ..types import Rays
 
-__all__ = ["Sights", "Surface", "chosen", "facing_map", "gaps", "half_way", "reach_of", "render_sights", "surface"]
+__all__ = [
+    "DepthMaps",
+    "Surface",
+    "cosine_map",
+    "default_reach",
+    "depth_gaps",
+    "ray_quantile",
+    "render_depth_maps",
+    "spread_views",
+    "surface_points",
+]
 
 
 _TORN = 1.25
@@ -31,7 +41,7 @@ _BENT = 3.0
 """Where the steps to a pixel's two neighbours differ by more than this factor, an edge runs on the longer one's side."""
 
 
-class Sights(NamedTuple):
+class DepthMaps(NamedTuple):
     """V depth maps with their cameras."""
 
     cameras: Cameras
@@ -55,30 +65,30 @@ class Surface(NamedTuple):
     """World size of the pixel at its depth, seen head-on."""
 
 
-def surface(sights: Sights, view: int) -> Surface:
+def surface_points(maps: DepthMaps, view: int) -> Surface:
     """Points and normals of a view's depth map; pixels at the border are left out."""
-    point, normal, towards = _directed(sights, view)
-    depth = sights.depth[view].double()
+    point, normal, towards = _directed(maps, view)
+    depth = maps.depth[view].double()
     inner = torch.zeros_like(depth, dtype=torch.bool)
     inner[1:-1, 1:-1] = True
     whole = inner & depth.isfinite() & (towards > 0)
-    size = depth[whole] / sights.cameras.focal[view].mean()
+    size = depth[whole] / maps.cameras.focal[view].mean()
     return Surface(point[whole], normal[whole].float(), towards[whole].float(), size.float())
 
 
-def facing_map(sights: Sights, view: int) -> Annotated[Tensor, "H W"]:
+def cosine_map(maps: DepthMaps, view: int) -> Annotated[Tensor, "H W"]:
     """Cosine between each pixel's normal and the way to the camera, float64; 0 where there is no surface."""
-    _, _, towards = _directed(sights, view)
-    return torch.where(sights.depth[view].isfinite(), towards, 0.0).clamp_min(0)
+    _, _, towards = _directed(maps, view)
+    return torch.where(maps.depth[view].isfinite(), towards, 0.0).clamp_min(0)
 
 
-def _directed(sights: Sights, view: int) -> tuple[Tensor, Tensor, Tensor]:
+def _directed(maps: DepthMaps, view: int) -> tuple[Tensor, Tensor, Tensor]:
     """Points [H W 3], normals [H W 3] and their cosines [H W] of all pixels.
 
     Normals come from the steps to neighbouring pixels on the same surface, on one side alone at an edge; what is a pixel
     thin faces the camera.
     """
-    cameras, depth = sights.cameras, sights.depth[view].double()
+    cameras, depth = maps.cameras, maps.depth[view].double()
     height, width = depth.shape
     pixel = pixel_grid(cameras, view)
     origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
@@ -110,15 +120,17 @@ def _step(
     return torch.where(count[..., None] > 0, step, flat)
 
 
-def gaps(sights: Sights, view: int, points: Annotated[Tensor, "N 3"]) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
+def depth_gaps(
+    maps: DepthMaps, view: int, points: Annotated[Tensor, "N 3"]
+) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N"]]:
     """Gap of each world point, infinite where the view sees nothing and NaN outside of it, and its distance; float64."""
-    cameras = sights.cameras
+    cameras = maps.cameras
     pixel, _ = project(cameras, torch.full((len(points),), view, dtype=torch.int64), points)
     distance = torch.linalg.vector_norm(points - cameras.pose[view, :, 3], dim=-1)
     size = cameras.size[view].to(pixel)
     inside = ((pixel >= 0) & (pixel <= size)).all(-1).nonzero()[:, 0]
     gap = torch.full_like(distance, torch.nan)
-    gap[inside] = _lookup(sights.depth[view], pixel[inside]) - distance[inside]
+    gap[inside] = _lookup(maps.depth[view], pixel[inside]) - distance[inside]
     return gap, distance
 
 
@@ -155,12 +167,12 @@ _REACH_AHEAD = 50.0
 """The same for captures that look one way, in distances of the nearest thing."""
 
 
-def reach_of(space: Space) -> float:
+def default_reach(space: Space) -> float:
     """How far surfaces are looked for, in world units: a bounded box is looked at as a whole."""
     return math.inf if space.kind == "box" else _REACH_AHEAD * space.near if space.kind == "ndc" else _REACH / space.scale
 
 
-def chosen(views: Sequence[int], most: int) -> list[int]:
+def spread_views(views: Sequence[int], most: int) -> list[int]:
     """At most so many of the views, spread evenly over their order."""
     if len(views) <= most:
         return list(views)
@@ -168,7 +180,7 @@ def chosen(views: Sequence[int], most: int) -> list[int]:
 
 
 @torch.inference_mode()
-def render_sights(
+def render_depth_maps(
     model: Model,
     cameras: Cameras,
     views: Sequence[int],
@@ -177,7 +189,7 @@ def render_sights(
     side: int,
     reach: float,
     report: Callable[[int, int], None] = lambda done, total: None,
-) -> Sights:
+) -> DepthMaps:
     """Depth maps of some views, reduced to `side` pixels on the longest; what is farther than `reach` world units is sky."""
     some = cameras.select(torch.tensor(list(views)))
     size = some.size.double()
@@ -189,10 +201,10 @@ def render_sights(
         maps.append(_depth(model, some, view, config, reach))
     report(len(some), len(some))
     depths, thicknesses = zip(*maps, strict=True)
-    return Sights(some, depths, thicknesses)
+    return DepthMaps(some, depths, thicknesses)
 
 
-def half_way(
+def ray_quantile(
     weights: Annotated[Tensor, "R S"], t: Annotated[Tensor, "R E"], share: Annotated[Tensor, "R"]
 ) -> Annotated[Tensor, "R"]:
     """Ray parameter before which each ray has met `share` of weight, weight being spread evenly over its step.
@@ -216,7 +228,7 @@ def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reac
 
     def met(here: slice) -> tuple[Tensor, Tensor]:
         marched = march(Rays(*(x[here].to(device) for x in rays)), model.parts, budget=config.budget)
-        parts = [half_way(marched.weights, marched.sampled.t, share * marched.opacity) for share in (0.1, 0.5, 0.9)]
+        parts = [ray_quantile(marched.weights, marched.sampled.t, share * marched.opacity) for share in (0.1, 0.5, 0.9)]
         return torch.stack(parts, 1), marched.opacity
 
     parts = zip(*in_parts(len(pixel), chunk_size(config.chunk, device), met), strict=True)

@@ -23,15 +23,15 @@ from ..config import RenderConfig
 from ..io.atomic import write_text
 from ..memory import chunk_size
 from ..rendering.cameras import Cameras, rays_through
-from ..rendering.renderer import Restyle, composite, march
+from ..rendering.renderer import Restyle, composite
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..training.model import Model
 from ..training.style_pass import lattice
 from ..types import Rays
-from .colours import paint
+from .colours import shade
 
-__all__ = ["RAYS", "Pairs", "apply_lattice", "fit_lattice", "fit_quality", "identity", "look_pairs", "write_cube"]
+__all__ = ["RAYS", "ColourPairs", "apply_lattice", "colour_pairs", "fit_lattice", "fit_quality", "identity", "write_cube"]
 
 
 SMOOTH = 1e-3
@@ -141,7 +141,7 @@ RAYS = 16384
 """Pixels that a table is fitted to."""
 
 
-class Pairs(NamedTuple):
+class ColourPairs(NamedTuple):
     """Colours of R pixels, as they are and in each of S looks."""
 
     plain: Annotated[Tensor, "R 3"]
@@ -151,7 +151,7 @@ class Pairs(NamedTuple):
 
 
 @torch.inference_mode()
-def look_pairs(
+def colour_pairs(
     model: Model,
     scene: SceneStyle,
     cameras: Cameras,
@@ -159,7 +159,7 @@ def look_pairs(
     config: RenderConfig,
     styles: Sequence[Restyle],
     rays: int = RAYS,
-) -> Pairs:
+) -> ColourPairs:
     """Pixels spread evenly over the views, without any background."""
     device = model.device
     weight = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
@@ -169,18 +169,18 @@ def look_pairs(
     size = chunk_size(config.chunk, device)
     for start in range(0, len(view), size):
         part = Rays(*(x[start : start + size].to(device) for x in every))
-        kept = march(part, model.parts, budget=config.budget).kept
-        colours = paint(kept, model.parts, [None, *styles])
+        marched, colours = shade(part, model.parts, config.budget, [None, *styles])
+        kept = marched.kept
         semantic = model.semantic(kept.point) if model.semantic is not None and weight.divided else kept.point[:, :0]
-        found.append(composite(kept, torch.cat([*colours, weight(semantic)], 1), len(part.near)))
+        found.append(torch.cat([*colours, composite(kept, weight(semantic), len(part.near))], 1))
     whole = torch.cat(found).cpu()
     solid = whole[:, 3 * len(styles) + 3 :].sum(1).clamp_min(1e-6)
     colour = (whole[:, : 3 * len(styles) + 3] / solid[:, None]).clamp(0, 1).view(len(whole), -1, 3)
-    return Pairs(colour[:, 0], colour[:, 1:].transpose(0, 1), whole[:, 3 * len(styles) + 3 :])
+    return ColourPairs(colour[:, 0], colour[:, 1:].transpose(0, 1), whole[:, 3 * len(styles) + 3 :])
 
 
 def fit_quality(
-    pairs: Pairs, look: int, weight: Annotated[Tensor, "R"], size: int
+    pairs: ColourPairs, look: int, weight: Annotated[Tensor, "R"], size: int
 ) -> tuple[Annotated[Tensor, "n n n 3"], dict[str, float]]:
     """The table of a look for pixels of some weight; RMS error in colour that it leaves, and that doing nothing leaves."""
     table = fit_lattice(pairs.plain, pairs.styled[look], weight, size)

@@ -9,34 +9,31 @@ whose corners have both signs gets a vertex, the mean of the places where its ed
 zero gives a quad of the 4 cells round it, if all of them are there.
 """
 
-import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import DataError
 from ..io.atomic import write_bytes
+from ..io.images import srgb_to_linear
 from ..rendering.cameras import project
-from .depth_maps import Sights, facing_map, gaps
-from .point_cloud import SPAN, Cloud, cells, columns, keys, told, write_ply
+from ..splats.files.ply import ply_file
+from .depth_maps import DepthMaps, cosine_map, depth_gaps
+from .point_cloud import SPAN, Cloud, cells, keys, origin_comment, vertex_table
 
 __all__ = [
-    "Lattice",
     "Mesh",
-    "around",
+    "SignedDistance",
     "build_mesh",
     "components",
     "integrate",
-    "linear",
+    "lattice_near",
     "surface_nets",
     "vertex_normals",
-    "write_glb",
     "write_mesh_glb",
     "write_mesh_ply",
 ]
@@ -53,7 +50,7 @@ _CLEAR = 0.3
 _CHUNK = 1 << 18
 
 
-class Lattice(NamedTuple):
+class SignedDistance(NamedTuple):
     """M points of a lattice, and how far they are outside of the surface."""
 
     cell: Annotated[Tensor, "M 3"]
@@ -65,7 +62,7 @@ class Lattice(NamedTuple):
     edge: float
 
 
-def around(cloud: Cloud, edge: float, most: int) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
+def lattice_near(cloud: Cloud, edge: float, most: int) -> tuple[Annotated[Tensor, "M 3"], Annotated[Tensor, "3"], float]:
     """Lattice points near a cloud, the lattice's origin, and its edge: doubled until there are at most `most` points."""
     origin = cloud.point.mean(0)
     while True:
@@ -81,25 +78,25 @@ def around(cloud: Cloud, edge: float, most: int) -> tuple[Annotated[Tensor, "M 3
 
 
 def integrate(
-    sights: Sights,
+    maps: DepthMaps,
     cell: Annotated[Tensor, "M 3"],
     origin: Annotated[Tensor, "3"],
     edge: float,
     report: Callable[[int, int], None] = lambda done, total: None,
-) -> Lattice:
+) -> SignedDistance:
     """The signed distance at lattice points that two views or more say something of."""
     far = _TRUNCATION * edge
     total, weight = torch.zeros(len(cell)), torch.zeros(len(cell))
     count = torch.zeros(len(cell), dtype=torch.int16)
-    for view in range(len(sights.depth)):
-        report(view, len(sights.depth))
-        cosine = facing_map(sights, view)
+    for view in range(len(maps.depth)):
+        report(view, len(maps.depth))
+        cosine = cosine_map(maps, view)
         for part in torch.split(torch.arange(len(cell)), _CHUNK):
             point = origin + edge * cell[part].double()
-            gap, distance = gaps(sights, view, point)
+            gap, distance = depth_gaps(maps, view, point)
             close = gap.abs() < far / _STEEP
             slope = torch.full_like(gap, _CLEAR)
-            slope[close] = _slopes(sights, view, cosine, point[close])
+            slope[close] = _slopes(maps, view, cosine, point[close])
             value = (gap * slope / far).clamp(max=1)
             # Far in front nobody asks how the surface behind lies.
             value = torch.where(close, value, torch.where(gap > 0, 1.0, torch.nan))
@@ -108,14 +105,14 @@ def integrate(
             total[here] += one * value[seen].float()
             weight[here] += one
             count[here] += 1
-    report(len(sights.depth), len(sights.depth))
+    report(len(maps.depth), len(maps.depth))
     known = count >= 2
-    return Lattice(cell[known], total[known] / weight[known], origin, edge)
+    return SignedDistance(cell[known], total[known] / weight[known], origin, edge)
 
 
-def _slopes(sights: Sights, view: int, cosine: Annotated[Tensor, "H W"], point: Annotated[Tensor, "N 3"]) -> Tensor:
+def _slopes(maps: DepthMaps, view: int, cosine: Annotated[Tensor, "H W"], point: Annotated[Tensor, "N 3"]) -> Tensor:
     """The cosine at the pixel of each point, at least `_STEEP`."""
-    pixel, _ = project(sights.cameras, torch.full((len(point),), view), point)
+    pixel, _ = project(maps.cameras, torch.full((len(point),), view), point)
     height, width = cosine.shape
     x, y = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
     return cosine[y, x].clamp_min(_STEEP)
@@ -198,74 +195,6 @@ def _quads(cell: Tensor, key: Tensor, inside: Tensor, vertex: Tensor, at: Tensor
     return torch.cat([corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]])
 
 
-_ARRAY, _ELEMENTS = 34962, 34963
-_UINT16, _UINT32, _FLOAT = 5123, 5125, 5126
-
-
-def write_glb(
-    path: Path, point: NDArray[np.float32], normal: NDArray[np.float32], face: NDArray[np.uint32], colour: NDArray[np.float32]
-) -> None:
-    """Vertices [N 3], normals [N 3], triangles [F 3], sRGB colours [N 3] in [0, 1]; whole or not at all.
-
-    Every viewer multiplies COLOR_0 as linear light: 8 bits of that would band in the dark.
-    """
-    shade = np.ones((len(colour), 4))
-    shade[:, :3] = linear(colour)
-    blocks = [
-        point.astype("<f4"),
-        normal.astype("<f4"),
-        np.rint(shade * 65535).astype("<u2"),
-        face.astype("<u4").reshape(-1),
-    ]
-    views, start = [], 0
-    for block, target in zip(blocks, (_ARRAY, _ARRAY, _ARRAY, _ELEMENTS), strict=True):
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": block.nbytes, "target": target})
-        start += block.nbytes
-    count = len(point)
-    document = {
-        "asset": {"version": "2.0", "generator": "fprf"},
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "materials": [
-            {
-                "doubleSided": True,
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}]}],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": _FLOAT,
-                "count": count,
-                "type": "VEC3",
-                "min": blocks[0].min(0).tolist(),
-                "max": blocks[0].max(0).tolist(),
-            },
-            {"bufferView": 1, "componentType": _FLOAT, "count": count, "type": "VEC3"},
-            {"bufferView": 2, "componentType": _UINT16, "normalized": True, "count": count, "type": "VEC4"},
-            {"bufferView": 3, "componentType": _UINT32, "count": face.size, "type": "SCALAR"},
-        ],
-        "bufferViews": views,
-        "buffers": [{"byteLength": start}],
-    }
-    head = json.dumps(document, separators=(",", ":")).encode("ascii")
-    head += b" " * (-len(head) % 4)
-    body = b"".join(block.tobytes() for block in blocks)
-    total = 12 + 8 + len(head) + 8 + len(body)
-    parts = [struct.pack("<4sII", b"glTF", 2, total), struct.pack("<I4s", len(head), b"JSON"), head]
-    write_bytes(path, b"".join([*parts, struct.pack("<I4s", len(body), b"BIN\0"), body]))
-
-
-def linear(colour: NDArray[np.floating]) -> NDArray[np.float64]:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
-    c = np.clip(colour.astype(np.float64), 0, 1)
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-
-
 _NEAR = 4.0
 """Points of voxels more than so many times the finest stay out: far surfaces are known too coarsely for a mesh."""
 _FINE = 2.0
@@ -290,13 +219,13 @@ class Mesh(NamedTuple):
 
 
 def build_mesh(
-    sights: Sights, cloud: Cloud, *, edge: float | None = None, report: Callable[[int, int], None] = lambda done, total: None
+    maps: DepthMaps, cloud: Cloud, *, edge: float | None = None, report: Callable[[int, int], None] = lambda done, total: None
 ) -> Mesh:
     """The mesh of a cloud's near surfaces. Raises DataError where no surface comes out."""
     finest = float(cloud.edge.amin())
     near = Cloud(*(column[cloud.edge <= _NEAR * finest] for column in cloud))
-    cell, origin, width = around(near, _FINE * finest if edge is None else edge, _MOST)
-    lattice = integrate(sights, cell, origin, width, report)
+    cell, origin, width = lattice_near(near, _FINE * finest if edge is None else edge, _MOST)
+    lattice = integrate(maps, cell, origin, width, report)
     at, face = surface_nets(lattice.cell, lattice.value)
     piece = components(len(at), face)
     size = torch.bincount(piece[face[:, 0]], minlength=len(at))
@@ -337,11 +266,36 @@ def vertex_normals(point: Annotated[Tensor, "N 3"], face: Annotated[Tensor, "F 3
 
 def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
     """The mesh as PLY, 8-bit sRGB colours."""
-    table = columns(mesh.point - origin, mesh.normal, colour)
-    write_ply(path, table, mesh.face.numpy().astype(np.int32), comments=told(origin))
+    faces = np.empty(len(mesh.face), [("vertex_indices", [("count", "u1"), ("corners", "<i4", 3)])])
+    faces["vertex_indices"]["count"], faces["vertex_indices"]["corners"] = 3, mesh.face.numpy()
+    tables = {"vertex": vertex_table(mesh.point - origin, mesh.normal, colour), "face": faces}
+    write_bytes(path, ply_file(tables, origin_comment(origin)))
 
 
 def write_mesh_glb(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """The mesh as binary glTF."""
-    point, face = (mesh.point - origin).float().numpy(), mesh.face.numpy().astype(np.uint32)
-    write_glb(path, point, mesh.normal.numpy(), face, colour.float().numpy())
+    """Write the mesh as binary glTF, shown as it is: unlit, with 16-bit linear colours, which glTF asks for."""
+    import trimesh
+
+    shade = np.ones((len(mesh.point), 4))
+    shade[:, :3] = srgb_to_linear(np.clip(colour.double().numpy(), 0, 1))
+    body = trimesh.Trimesh(
+        (mesh.point - origin).float().numpy(),
+        mesh.face.numpy(),
+        vertex_normals=mesh.normal.numpy(),
+        # trimesh rounds colours to 8 bits, which band in the dark where they are linear: they go in as an attribute.
+        vertex_attributes={"_COLOR_0": np.rint(shade * 65535).astype("<u2")},
+        process=False,
+    )
+    data = body.export(file_type="glb", include_normals=True, unitize_normals=False, tree_postprocessor=_unlit)
+    assert isinstance(data, bytes)
+    write_bytes(path, data)
+
+
+def _unlit(tree: dict[str, Any]) -> None:
+    """Make the attribute of colours the vertices' colours, and the material unlit, in a glTF document."""
+    [primitive] = tree["meshes"][0]["primitives"]
+    primitive["attributes"]["COLOR_0"] = colours = primitive["attributes"].pop("_COLOR_0")
+    tree["accessors"][colours]["normalized"] = True
+    primitive["material"], rough = 0, {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material = {"doubleSided": True, "pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}
+    tree["materials"], tree["extensionsUsed"] = [material], ["KHR_materials_unlit"]

@@ -5,7 +5,7 @@ are as wide as the pixels that hit them, in powers of two (edges `base * 2**leve
 coarse. Keys are one int64 a voxel: 5 bits of level and 19 bits an axis, so a scene may span 524,288 voxels of its finest level.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -17,25 +17,25 @@ from torch import Tensor
 from ..errors import DataError
 from ..io.atomic import write_bytes
 from ..rendering.cameras import pixel_grid, rays_through
-from .depth_maps import Sights, Surface, gaps, surface
+from ..splats.files.ply import ply_file
+from .depth_maps import DepthMaps, Surface, depth_gaps, surface_points
 
 __all__ = [
     "LEVELS",
     "SPAN",
     "Cloud",
     "cells",
-    "columns",
-    "dome",
-    "finest_alone",
+    "concatenate",
+    "finest_only",
     "fuse",
-    "joined",
     "keys",
+    "origin_comment",
     "origin_of",
-    "partners",
+    "overlapping_views",
     "pooled",
+    "sky_dome",
     "spacing",
-    "told",
-    "write_ply",
+    "vertex_table",
     "write_points",
 ]
 
@@ -70,7 +70,7 @@ def pooled(
     return sums / total[:, None]
 
 
-def finest_alone(points: Annotated[Tensor, "N 3"], level: Annotated[Tensor, "N"], base: float) -> Annotated[Tensor, "N"]:
+def finest_only(points: Annotated[Tensor, "N 3"], level: Annotated[Tensor, "N"], base: float) -> Annotated[Tensor, "N"]:
     """True for points whose voxel holds no point of a finer level: one surface is not covered twice."""
     alone = torch.ones(len(points), dtype=torch.bool)
     for coarse in sorted(set(level.tolist()))[1:]:
@@ -122,11 +122,11 @@ class Cloud(NamedTuple):
     space: Annotated[Tensor, "N"]
     """Mean distance to the nearest neighbours, world units, float64."""
     view: Annotated[Tensor, "N"]
-    """int64 index, among the sights, of the view that sees it best."""
+    """int64 index, among the maps, of the view that sees it best."""
 
 
 def fuse(
-    sights: Sights,
+    maps: DepthMaps,
     *,
     edge: float | None,
     most: int,
@@ -143,16 +143,16 @@ def fuse(
     those of them that views agree on (`agreed`). Raises DataError where nothing is left.
     """
     found, views = [], []
-    for index in range(len(sights.depth)):
-        report(index, len(sights.depth))
-        seen = _agreed(sights, index, tolerance, agree)
+    for index in range(len(maps.depth)):
+        report(index, len(maps.depth))
+        seen = _consistent(maps, index, tolerance, agree)
         found.append(seen)
         views.append(torch.full((len(seen.point),), index))
-    report(len(sights.depth), len(sights.depth))
+    report(len(maps.depth), len(maps.depth))
     every = Surface(*(torch.cat(column) for column in zip(*found, strict=True)))
     del found, seen  # of many views, the largest thing in memory
     if counts is not None:
-        counts["seen"] = sum(int(depth.isfinite().sum()) for depth in sights.depth)
+        counts["seen"] = sum(int(depth.isfinite().sum()) for depth in maps.depth)
         counts["agreed"] = len(every.point)
     if len(every.point) == 0:
         raise DataError(
@@ -161,51 +161,51 @@ def fuse(
         )
     base = float(every.footprint.median()) if edge is None else edge
     view = torch.cat(views)
-    cloud = _thin(every, view, base)
+    cloud = _one_per_voxel(every, view, base)
     while len(cloud.point) > most:
         base *= 2 ** max(0.25, 0.5 * float(torch.log2(torch.tensor(len(cloud.point) / most))))
-        cloud = _thin(every, view, base)
+        cloud = _one_per_voxel(every, view, base)
     # Last, since it costs more than all before: points that stand alone have no spacing, and go.
     apart = spacing(cloud.point, cloud.edge)
     return Cloud(*(column[apart.isfinite()] for column in cloud._replace(space=apart)))
 
 
-def joined(first: Cloud, second: Cloud) -> Cloud:
-    """Both clouds of the same sights, one after the other."""
+def concatenate(first: Cloud, second: Cloud) -> Cloud:
+    """Both clouds of the same maps, one after the other."""
     return Cloud(*(torch.cat(pair) for pair in zip(first, second, strict=True)))
 
 
-def partners(sights: Sights, view: int, points: Annotated[Tensor, "N 3"], tolerance: float) -> list[int]:
+def overlapping_views(maps: DepthMaps, view: int, points: Annotated[Tensor, "N 3"], tolerance: float) -> list[int]:
     """The other views that see most of a view's points, at most `_PARTNERS`."""
     probe = points[:: max(1, len(points) // _PROBES)]
     shared = []
-    for other in range(len(sights.depth)):
+    for other in range(len(maps.depth)):
         if other == view:
             continue
-        gap, distance = gaps(sights, other, probe)
+        gap, distance = depth_gaps(maps, other, probe)
         count = int((gap.abs() <= 2 * tolerance * distance).sum())
         if count:
             shared.append((-count, other))
     return [other for _, other in sorted(shared)[:_PARTNERS]]
 
 
-def _agreed(sights: Sights, view: int, tolerance: float, agree: int) -> Surface:
-    seen = surface(sights, view)
-    seen = _some(seen, seen.facing > _GRAZING)
+def _consistent(maps: DepthMaps, view: int, tolerance: float, agree: int) -> Surface:
+    seen = surface_points(maps, view)
+    seen = _select(seen, seen.facing > _GRAZING)
     same, past, looked = (torch.zeros(len(seen.point), dtype=torch.int64) for _ in range(3))
-    for other in partners(sights, view, seen.point, tolerance):
-        gap, distance = gaps(sights, other, seen.point)
+    for other in overlapping_views(maps, view, seen.point, tolerance):
+        gap, distance = depth_gaps(maps, other, seen.point)
         near = gap.abs() <= tolerance * distance
         through = gap > 2 * tolerance * distance
         same, past, looked = same + near, past + through, looked + (near | through)
-    return _some(seen, (same >= looked.clamp(1, max(1, agree))) & (2 * past <= same))
+    return _select(seen, (same >= looked.clamp(1, max(1, agree))) & (2 * past <= same))
 
 
-def _some(seen: Surface, which: Tensor) -> Surface:
+def _select(seen: Surface, which: Tensor) -> Surface:
     return Surface(*(column[which] for column in seen))
 
 
-def _thin(seen: Surface, view: Tensor, base: float) -> Cloud:
+def _one_per_voxel(seen: Surface, view: Tensor, base: float) -> Cloud:
     """One point a voxel: means weighted by how finely each pixel samples the surface. Spacings are left at 0."""
     middle = seen.point.mean(0)
     local = seen.point - middle
@@ -214,14 +214,14 @@ def _thin(seen: Surface, view: Tensor, base: float) -> Cloud:
     cell = cells(local, edge)
     reach = cell.abs().amax(-1) < SPAN - 2
     local, level, cell, view, edge = local[reach], level[reach], cell[reach], view[reach], edge[reach]
-    seen = _some(seen, reach)
+    seen = _select(seen, reach)
     key, group = torch.unique(keys(cell, level), return_inverse=True)
     fineness = seen.facing / seen.footprint.square()
     mean = pooled(group, torch.cat([local, seen.normal.double()], 1), fineness, len(key))
     best = _best(group, fineness, len(key))
     point, normal, level, edge = mean[:, :3], mean[:, 3:], level[best], edge[best]
     # Surfaces seen from both sides share a voxel where they are thin: their mean has no direction.
-    keep = (torch.linalg.vector_norm(normal, dim=-1) > 0.5) & finest_alone(point, level, base)
+    keep = (torch.linalg.vector_norm(normal, dim=-1) > 0.5) & finest_only(point, level, base)
     point, normal, edge, view = point[keep], normal[keep], edge[keep], view[best][keep]
     direction = torch.nn.functional.normalize(normal, dim=-1).float()
     return Cloud(point + middle, direction, edge, torch.zeros_like(edge), view)
@@ -243,11 +243,11 @@ _FAR = 3.0
 """Radius of the dome, in distances of the outermost of the scene's points."""
 
 
-def dome(sights: Sights, cloud: Cloud) -> Cloud | None:
+def sky_dome(maps: DepthMaps, cloud: Cloud) -> Cloud | None:
     """Points in the directions in which views see nothing within reach, facing inwards; None where all see something."""
-    cameras = sights.cameras
+    cameras = maps.cameras
     directions, views = [], []
-    for index, depth in enumerate(sights.depth):
+    for index, depth in enumerate(maps.depth):
         pixel = pixel_grid(cameras, index)[depth.isinf().view(-1)]
         views.append(torch.full((len(pixel),), index))
         directions.append(rays_through(cameras, views[-1], pixel)[1])
@@ -269,33 +269,6 @@ def _extent(points: Annotated[Tensor, "N 3"], centre: Annotated[Tensor, "3"]) ->
     return float(torch.linalg.vector_norm(points - centre, dim=-1).amax())
 
 
-_TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-
-
-def write_ply(
-    path: Path,
-    vertices: Mapping[str, NDArray[np.generic]],
-    faces: NDArray[np.int32] | None = None,
-    comments: Sequence[str] = (),
-) -> None:
-    """Write a little-endian PLY, whole or not at all: one property a column, in their order, and faces [F 3]."""
-    columns = {name: np.asarray(column) for name, column in vertices.items()}
-    count = len(next(iter(columns.values())))
-    kinds = {name: column.dtype.str[1:] for name, column in columns.items()}
-    table = np.empty(count, dtype=[(name, "<" + kind) for name, kind in kinds.items()])
-    for name, column in columns.items():
-        table[name] = column
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments), f"element vertex {count}"]
-    lines += [f"property {_TYPES[kind]} {name}" for name, kind in kinds.items()]
-    body = table.tobytes()
-    if faces is not None:
-        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-        corners = np.empty(len(faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
-        corners["count"], corners["corner"] = 3, faces
-        body += corners.tobytes()
-    write_bytes(path, "\n".join([*lines, "end_header", ""]).encode("ascii") + body)
-
-
 _FINE = 1 / 16
 """Largest rounding of a coordinate that is accepted, in edges of the finest voxel."""
 
@@ -309,22 +282,23 @@ def origin_of(cloud: Cloud) -> Annotated[Tensor, "3"]:
 
 
 def write_points(path: Path, cloud: Cloud, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """The coloured cloud with normals as PLY."""
-    write_ply(path, columns(cloud.point - origin, cloud.normal, colour), comments=told(origin))
+    """Write the coloured cloud with normals as PLY."""
+    write_bytes(path, ply_file({"vertex": vertex_table(cloud.point - origin, cloud.normal, colour)}, origin_comment(origin)))
 
 
-def columns(
+def vertex_table(
     point: Annotated[Tensor, "N 3"], normal: Annotated[Tensor, "N 3"], colour: Annotated[Tensor, "N 3"]
-) -> dict[str, NDArray[np.generic]]:
-    """What a PLY says of vertices: float x y z nx ny nz, uchar red green blue, rounded as pictures are."""
-    real = torch.cat([point, normal.to(point)], 1).float().numpy()
-    shade = (colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-    table: dict[str, NDArray[np.generic]] = dict(zip(("x", "y", "z", "nx", "ny", "nz"), real.T, strict=True))
-    return table | dict(zip(("red", "green", "blue"), shade.T, strict=True))
+) -> NDArray[np.void]:
+    """Vertices of a PLY: float x y z nx ny nz, uchar red green blue, rounded as pictures are."""
+    table = np.empty(len(point), [("real", "<f4", 6), ("shade", "u1", 3)])
+    table["real"] = torch.cat([point, normal.to(point)], 1).float().numpy()
+    table["shade"] = (colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+    named = [*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((c, "u1") for c in ("red", "green", "blue"))]
+    return table.view(named)
 
 
-def told(origin: Annotated[Tensor, "3"]) -> list[str]:
-    """What a file says about its frame."""
+def origin_comment(origin: Annotated[Tensor, "3"]) -> list[str]:
+    """The comment of a file whose coordinates are relative to an origin; none for the capture's own frame."""
     if not bool(origin.any()):
         return []
     return [f"coordinates are relative to {' '.join(f'{value:.0f}' for value in origin.tolist())}"]

@@ -11,22 +11,20 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..io.atomic import write_bytes
-from .point_cloud import Cloud, write_ply
+from ..splats.files.ply import ply_bytes
+from ..splats.gaussians import HARMONIC, Gaussians
+from .point_cloud import Cloud
 
-__all__ = ["Splats", "discs", "facing", "write_gaussians", "write_splat"]
+__all__ = ["Splats", "rotation_to_normal", "surface_discs", "write_gaussians", "write_splat"]
 
-_HARMONIC = 0.28209479177387814
-"""The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
 _WIDTH = 0.55
 """Standard deviation along the surface, in spacings."""
 _THICKNESS = 0.1
 """Standard deviation across the surface, as a share of that along it."""
 _OPACITY = 0.95
-_SRGB = 0.5
 
 
 class Splats(NamedTuple):
@@ -43,19 +41,19 @@ class Splats(NamedTuple):
     """0 to 1, float32."""
 
 
-def discs(cloud: Cloud) -> Splats:
+def surface_discs(cloud: Cloud) -> Splats:
     """A disc a point, as wide as its neighbours are apart, so that they cover the surface."""
     along = (_WIDTH * cloud.space).float()
     return Splats(
         cloud.point,
         cloud.normal,
         torch.stack([along, along, _THICKNESS * along], 1),
-        facing(cloud.normal),
+        rotation_to_normal(cloud.normal),
         torch.full((len(cloud.point),), _OPACITY),
     )
 
 
-def facing(normal: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 4"]:
+def rotation_to_normal(normal: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 4"]:
     """The shortest turns, as quaternions w x y z, that bring the z axis to unit vectors."""
     x, y, z = normal.unbind(-1)
     turn = torch.stack([1 + z, -y, x, torch.zeros_like(z)], -1)
@@ -66,15 +64,15 @@ def facing(normal: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 4"]:
 
 
 def write_gaussians(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """The 3D Gaussian PLY. Positions are relative to `origin`; colours are sRGB in [0, 1], without view dependence."""
-    columns = dict(zip("xyz", _columns(splats.point - origin), strict=True))
-    columns |= dict(zip(("nx", "ny", "nz"), _columns(splats.normal), strict=True))
-    harmonics = (colour.double() - _SRGB) / _HARMONIC
-    columns |= {f"f_dc_{i}": column for i, column in enumerate(_columns(harmonics))}
-    columns["opacity"] = _columns(torch.logit(splats.opacity.double())[:, None])[0]
-    columns |= {f"scale_{i}": column for i, column in enumerate(_columns(splats.deviation.log()))}
-    columns |= {f"rot_{i}": column for i, column in enumerate(_columns(splats.rotation))}
-    write_ply(path, columns)
+    """Write the 3D Gaussian PLY. Positions are relative to `origin`; colours are sRGB in [0, 1], without view dependence."""
+    gaussians = Gaussians(
+        means=(splats.point - origin).float(),
+        quaternions=splats.rotation,
+        log_scales=splats.deviation.log(),
+        logits=torch.logit(splats.opacity.double()).float(),
+        harmonics=((colour.double() - 0.5) / HARMONIC).float()[:, None],
+    )
+    write_bytes(path, ply_bytes(gaussians, False, splats.normal.float().numpy()))
 
 
 def write_splat(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
@@ -87,7 +85,3 @@ def write_splat(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], or
     table["rgba"] = (rgba.clamp(0, 1) * 255).round().numpy()[order]
     table["turn"] = (splats.rotation * 128 + 128).round().clamp(0, 255).numpy()[order]
     write_bytes(path, table.tobytes())
-
-
-def _columns(values: Annotated[Tensor, "N C"]) -> list[NDArray[np.generic]]:
-    return list(values.float().numpy().T)

@@ -9,7 +9,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar, overload
 
 import cv2
 import numpy as np
@@ -20,9 +20,20 @@ from torch import Tensor
 from ..errors import DataError, NumericsError
 from .atomic import write_bytes
 
-__all__ = ["Format", "Picture", "checked", "data_uri", "encode", "linear", "shrink", "to_uint8", "write_exr", "write_image"]
+__all__ = [
+    "Format",
+    "Picture",
+    "checked",
+    "data_uri",
+    "encode",
+    "shrink",
+    "srgb_to_linear",
+    "to_uint8",
+    "write_exr",
+    "write_image",
+]
 
-
+_Float = TypeVar("_Float", bound=np.floating)
 Picture: TypeAlias = NDArray[np.uint8]
 Format: TypeAlias = Literal["png", "jpg", "webp"]
 
@@ -89,10 +100,14 @@ Plane = Annotated[NDArray[np.float32], "H W"]
 _FLOAT, _ZIPS = 2, 2
 
 
-def linear(colour: Annotated[NDArray[np.float32], "H W 3"]) -> Annotated[NDArray[np.float32], "H W 3"]:
-    """sRGB in [0, 1] as linear light, which is what EXR readers expect of R, G and B (IEC 61966-2-1)."""
-    bent = ((colour + 0.055) / 1.055) ** 2.4
-    return np.where(colour <= 0.04045, colour / 12.92, bent).astype(np.float32)
+@overload
+def srgb_to_linear(colour: Tensor) -> Tensor: ...
+@overload
+def srgb_to_linear(colour: NDArray[_Float]) -> NDArray[_Float]: ...
+def srgb_to_linear(colour: Any) -> Any:
+    """sRGB in [0, 1] as linear light (IEC 61966-2-1), an array or a tensor, in its own precision."""
+    where: Any = torch.where if isinstance(colour, Tensor) else np.where
+    return where(colour <= 0.04045, colour / 12.92, ((colour.clip(0) + 0.055) / 1.055) ** 2.4)
 
 
 def write_exr(path: Path, channels: Mapping[str, Plane]) -> None:

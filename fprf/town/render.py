@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..io.images import srgb_to_linear
 from .layout import END, Town
 from .paint import foliage_normals, paint
 from .palettes import Palette
@@ -256,11 +257,6 @@ def sky(direction: Array, look: Palette) -> Colours:
     return np.asarray(np.clip(colour, 0, 1), np.float32)
 
 
-def _linear(srgb: NDArray[np.floating]) -> Colours:
-    low = srgb / 12.92
-    return np.where(srgb <= 0.04045, low, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
 def _encode(light: NDArray[np.floating]) -> Colours:
     """Linear light to sRGB through a shoulder that keeps highlights from clipping."""
     x = np.maximum(light, 0)
@@ -334,7 +330,7 @@ def shade(town: Town, look: Palette, face: NDArray[np.integer], points: Array) -
     light = lit[:, None] * np.array(look.sun) + around
     if look.lamps > 0:
         light = light + _lamplight(town, points, normals, look)
-    colour = _linear(albedo) * light * look.exposure + glow * look.exposure
+    colour = srgb_to_linear(albedo).astype(np.float32) * light * look.exposure + glow * look.exposure
     outside = np.maximum(np.abs(points[:, 1]) - 9.0, np.maximum(town.start - points[:, 0], points[:, 0] - END))
     haze = (1 - np.exp(-np.maximum(outside, 0) / 40.0 * 2.0)) * look.haziness
     hazy = np.array(look.haze) * haze[:, None]

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..interfaces import Scene
-from ..io.images import Picture, linear, to_uint8
+from ..io.images import Picture, srgb_to_linear, to_uint8
 from ..io.maps import depth_image, depth_limits
 from ..rendering.cameras import Cameras
 from ..rendering.normals import normals
@@ -89,7 +89,7 @@ def planes(cameras: Cameras, frame: int, takes: Sequence[Take], eyes: float | No
     for take in takes:
         view = shoot(take.scene(frame), cameras, frame, eyes)
         layer = "" if len(takes) == 1 else f"{take.name}."
-        light = linear(view.rgb.numpy())
+        light = srgb_to_linear(view.rgb.numpy())
         found |= {f"{layer}{name}": light[..., k] for k, name in enumerate("RGB")}
     assert view is not None
     found["A"] = view.opacity.numpy()

@@ -10,7 +10,7 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.export.config import ExportConfig
-from fprf.export.depth_maps import render_sights
+from fprf.export.depth_maps import render_depth_maps
 
 LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0"]
 """The tiny model has barely begun to agree with itself."""
@@ -110,7 +110,7 @@ def test_bounds_and_options_reach_the_files(world: World, tmp_path: Path) -> Non
     assert not np.array_equal(several, columns(tmp_path / "x" / "splats.ply", "f_dc_0")), "other colours, the same points"
     trained = world.load()
     known = trained.known
-    [depth] = render_sights(trained.model, known.cameras, known.train[:1], trained.config.render, side=32, reach=1e9).depth
+    [depth] = render_depth_maps(trained.model, known.cameras, known.train[:1], trained.config.render, side=32, reach=1e9).depth
     reach = ["--reach", str(float(depth.median()))]
     near = count(*reach)
     assert near["splats"] > near["points"] < every["points"]

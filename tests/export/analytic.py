@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from fprf.export.depth_maps import Sights
+from fprf.export.depth_maps import DepthMaps
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 
 __all__ = ["RADIUS", "globe", "looking", "plane_depth", "ring", "sphere_depth"]
@@ -59,7 +59,7 @@ def sphere_depth(cameras: Cameras, view: int, radius: float = RADIUS) -> Tensor:
     return torch.where(inside > 0, -along - inside.clamp_min(0).sqrt(), torch.inf).view(height, width)
 
 
-def globe(count: int = 8, *, floor: float | None = None) -> Sights:
+def globe(count: int = 8, *, floor: float | None = None) -> DepthMaps:
     """The sphere, and the floor z = floor if there is one."""
     cameras = ring(count)
     maps = []
@@ -69,4 +69,4 @@ def globe(count: int = 8, *, floor: float | None = None) -> Sights:
             up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
             depth = torch.minimum(depth, plane_depth(cameras, view, up, floor))
         maps.append(depth.float())
-    return Sights(cameras, tuple(maps))
+    return DepthMaps(cameras, tuple(maps))

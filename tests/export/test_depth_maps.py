@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.export.colours import Coloured, alone, seen_colours
-from fprf.export.depth_maps import chosen, half_way, reach_of, render_sights
+from fprf.export.colours import Coloured, point_colours, single_view
+from fprf.export.depth_maps import default_reach, ray_quantile, render_depth_maps, spread_views
 from fprf.rendering.cameras import pixel_grid, rays_through
 from fprf.rendering.renderer import Restyle
 from fprf.rendering.space import Space
@@ -22,7 +22,7 @@ def test_half_way_is_where_that_much_weight_has_been_met(seed: int, share: float
     t = torch.rand(4, 9, generator=draw, dtype=torch.float64).cumsum(1)
     weights = torch.rand(4, 8, generator=draw, dtype=torch.float64) + 1e-3
     weights /= weights.sum(1, keepdim=True)
-    found = half_way(weights, t, torch.full((4,), share, dtype=torch.float64))
+    found = ray_quantile(weights, t, torch.full((4,), share, dtype=torch.float64))
     for ray in range(4):
         part = ((found[ray] - t[ray, :-1]) / (t[ray, 1:] - t[ray, :-1])).clamp(0, 1)
         assert float((weights[ray] * part).sum()) == pytest.approx(share, abs=1e-9)
@@ -32,38 +32,38 @@ def test_half_way_lies_on_a_surface_and_the_mean_between_two() -> None:
     t = torch.linspace(0, 10, 101)[None]
     weights = torch.zeros(1, 100)
     weights[0, 20], weights[0, 80] = 0.6, 0.4
-    found = half_way(weights, t, torch.tensor([0.5]))
+    found = ray_quantile(weights, t, torch.tensor([0.5]))
     assert 2.0 <= float(found) <= 2.1
 
 
 def test_half_way_of_nothing_is_finite() -> None:
-    assert bool(half_way(torch.zeros(3, 5), torch.linspace(0, 1, 6).expand(3, 6), torch.zeros(3)).isfinite().all())
+    assert bool(ray_quantile(torch.zeros(3, 5), torch.linspace(0, 1, 6).expand(3, 6), torch.zeros(3)).isfinite().all())
 
 
 def test_views_are_spread_evenly() -> None:
-    assert chosen([3, 5, 7], 5) == [3, 5, 7]
-    assert chosen(list(range(100)), 3) == [0, 50, 99]
-    assert len(set(chosen(list(range(1000)), 120))) == 120
+    assert spread_views([3, 5, 7], 5) == [3, 5, 7]
+    assert spread_views(list(range(100)), 3) == [0, 50, 99]
+    assert len(set(spread_views(list(range(1000)), 120))) == 120
 
 
 def test_reach() -> None:
     turn = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    assert reach_of(Space("contraction", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == 40
-    assert reach_of(Space("ndc", (0.0, 0.0, 0.0), turn, 1.0, 2.0, 1.0)) == 100
-    assert reach_of(Space("box", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == math.inf
+    assert default_reach(Space("contraction", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == 40
+    assert default_reach(Space("ndc", (0.0, 0.0, 0.0), turn, 1.0, 2.0, 1.0)) == 100
+    assert default_reach(Space("box", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == math.inf
 
 
 def test_depth_maps_are_world_distances_at_a_bounded_size(world: World) -> None:
     trained = world.load()
     known, render = trained.known, trained.config.render
     views = known.train[:2]
-    whole = render_sights(trained.model, known.cameras, views, render, side=400, reach=math.inf)
+    whole = render_depth_maps(trained.model, known.cameras, views, render, side=400, reach=math.inf)
     assert [tuple(d.shape) for d in whole.depth] == [(24, 32)] * 2
-    half = render_sights(trained.model, known.cameras, views, render, side=16, reach=math.inf)
+    half = render_depth_maps(trained.model, known.cameras, views, render, side=16, reach=math.inf)
     assert [tuple(d.shape) for d in half.depth] == [(12, 16)] * 2
     assert torch.equal(half.cameras.focal, whole.cameras.focal / 2)
     assert torch.equal(whole.cameras.pose, known.cameras.pose[list(views)])
-    near = render_sights(trained.model, known.cameras, views, render, side=400, reach=3.0)
+    near = render_depth_maps(trained.model, known.cameras, views, render, side=400, reach=3.0)
     for every, some in zip(whole.depth, near.depth, strict=True):
         assert bool((every[every.isfinite()] > 0).all())
         assert torch.equal(some, torch.where(every < 3.0, every, torch.inf))
@@ -83,8 +83,8 @@ def test_points_on_rays_of_pixels_have_the_colours_of_the_picture(world: World) 
     points = origin + direction * (1 + torch.rand(len(pixel), 1))
     styled = trained_restyle(world)
     told: list[tuple[int, int]] = []
-    seen = alone(torch.full((len(pixel),), 1))
-    [plain, full, none], presence = seen_colours(
+    seen = single_view(torch.full((len(pixel),), 1))
+    [plain, full, none], presence = point_colours(
         trained.model, known.facts, known.cameras, points, seen, render, [None, styled, Restyle(styled.stylizer, 0.0)],
         tolerance=None, report=lambda done, total: told.append((done, total)),
     )  # fmt: skip
@@ -103,17 +103,17 @@ def test_near_a_point_nothing_else_of_its_rays_is_seen(world: World) -> None:
     """Presence is what an interval of the ray holds: it grows with the tolerance, and is small in the empty air."""
     trained = world.load()
     known, render = trained.known, trained.config.render
-    sights = render_sights(trained.model, known.cameras, known.train[:1], render, side=400, reach=math.inf)
-    pixel = pixel_grid(sights.cameras, 0)
-    origin, direction = rays_through(sights.cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
-    depth = sights.depth[0].view(-1, 1).double()
+    maps = render_depth_maps(trained.model, known.cameras, known.train[:1], render, side=400, reach=math.inf)
+    pixel = pixel_grid(maps.cameras, 0)
+    origin, direction = rays_through(maps.cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
+    depth = maps.depth[0].view(-1, 1).double()
     there = depth[:, 0].isfinite()
 
     def look(away: float, tolerance: float | None, styles: int = 1) -> Coloured:
         points = (origin + direction * depth * away)[there]
-        seen = alone(torch.zeros(len(points), dtype=torch.int64))
-        return seen_colours(
-            trained.model, known.facts, sights.cameras, points, seen, render, [None] * styles, tolerance=tolerance
+        seen = single_view(torch.zeros(len(points), dtype=torch.int64))
+        return point_colours(
+            trained.model, known.facts, maps.cameras, points, seen, render, [None] * styles, tolerance=tolerance
         )
 
     narrow, wide, air = look(1, 0.1).presence, look(1, 0.5).presence, look(0.2, 0.1).presence

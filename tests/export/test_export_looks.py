@@ -4,7 +4,7 @@ import pytest
 from tiny_world import World
 
 from fprf.errors import UsageError
-from fprf.export.looks import Named, make_looks, named_styles, style_name
+from fprf.export.config import Named, make_looks, named_styles, style_name
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile, write_style
 

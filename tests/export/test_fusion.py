@@ -6,18 +6,18 @@ import torch
 from analytic import RADIUS, globe
 
 from fprf.errors import DataError
-from fprf.export.depth_maps import Sights, surface
-from fprf.export.point_cloud import Cloud, cells, fuse, joined, keys, partners
+from fprf.export.depth_maps import DepthMaps, surface_points
+from fprf.export.point_cloud import Cloud, cells, concatenate, fuse, keys, overlapping_views
 
 
-def fused(sights: Sights, **changes: object) -> Cloud:
+def fused(maps: DepthMaps, **changes: object) -> Cloud:
     options: dict[str, object] = {"edge": None, "most": 10**6, "tolerance": 0.02, "agree": 2, **changes}
-    return fuse(sights, **options)  # type: ignore[arg-type]
+    return fuse(maps, **options)  # type: ignore[arg-type]
 
 
 def test_points_of_a_sphere_lie_on_it_and_look_outwards() -> None:
-    sights = globe(8)
-    cloud = fused(sights, edge=0.1)
+    maps = globe(8)
+    cloud = fused(maps, edge=0.1)
     radius = cloud.point.norm(dim=-1)
     # The mean of points of one voxel lies inside of the sphere by at most the sagitta of its diagonal.
     assert float(radius.amin()) > RADIUS - (0.1 * math.sqrt(3) / 2) ** 2 / 2 - 1e-3 and float(radius.amax()) < RADIUS + 1e-3
@@ -36,8 +36,8 @@ def test_they_cover_it_evenly() -> None:
 
 
 def test_one_point_a_voxel_and_the_best_view() -> None:
-    sights = globe(8, floor=-1.5)
-    cloud = fused(sights, edge=0.15)
+    maps = globe(8, floor=-1.5)
+    cloud = fused(maps, edge=0.15)
     local = cloud.point - cloud.point.mean(0)
     assert bool((cloud.edge == 0.15).any())
     for edge in cloud.edge.unique().tolist():
@@ -45,64 +45,64 @@ def test_one_point_a_voxel_and_the_best_view() -> None:
         # The lattice starts at a mean that the cloud no longer knows: pairs closer than a voxel are few, not none.
         key = keys(cells(local[mine], edge))
         assert len(key.unique()) > 0.6 * len(key)
-    towards = torch.nn.functional.normalize(sights.cameras.pose[cloud.view, :, 3] - cloud.point, dim=-1)
+    towards = torch.nn.functional.normalize(maps.cameras.pose[cloud.view, :, 3] - cloud.point, dim=-1)
     facing = (towards * cloud.normal.double()).sum(-1)
     assert float((facing > 0).double().mean()) > 0.99
 
 
 def test_a_bound_on_the_number_of_points() -> None:
-    sights = globe(8, floor=-1.5)
-    every = fused(sights)
-    few = fused(sights, most=500)
+    maps = globe(8, floor=-1.5)
+    every = fused(maps)
+    few = fused(maps, most=500)
     assert 100 < len(few.point) <= 500 < len(every.point)
     assert float(few.edge.amin()) > float(every.edge.amin())
 
 
 def test_what_one_view_alone_claims_is_dropped() -> None:
     """A view with a wall right before it: the others look through that wall."""
-    sights = globe(8)
-    wall = torch.full_like(sights.depth[3], 1.5)
-    spoilt = sights._replace(depth=(*sights.depth[:3], wall, *sights.depth[4:]))
-    assert len(surface(spoilt, 3).point) > 1000
+    maps = globe(8)
+    wall = torch.full_like(maps.depth[3], 1.5)
+    spoilt = maps._replace(depth=(*maps.depth[:3], wall, *maps.depth[4:]))
+    assert len(surface_points(spoilt, 3).point) > 1000
     cloud = fused(spoilt, edge=0.1)
     assert float(cloud.point.norm(dim=-1).amax()) < RADIUS + 0.05
     assert not bool((cloud.view == 3).any())
 
 
 def test_noise_within_the_tolerance_is_averaged() -> None:
-    sights = globe(8)
+    maps = globe(8)
     draw = torch.Generator().manual_seed(0)
-    noisy = tuple(d * (1 + 0.005 * torch.randn(d.shape, generator=draw)) for d in sights.depth)
-    cloud = fused(sights._replace(depth=noisy), edge=0.2)
+    noisy = tuple(d * (1 + 0.005 * torch.randn(d.shape, generator=draw)) for d in maps.depth)
+    cloud = fused(maps._replace(depth=noisy), edge=0.2)
     off = (cloud.point.norm(dim=-1) - RADIUS)[cloud.point[:, 2].abs() < 0.5]
     # 0.005 of 3 metres a pixel. Voxels before and behind the surface hold few pixels, those on it dozens.
     assert float(off.abs().median()) < 0.4 * 0.015 and float(off.std()) < 0.8 * 0.015
 
 
 def test_views_that_agree_on_nothing() -> None:
-    sights = globe(2)
+    maps = globe(2)
     with pytest.raises(DataError, match=r"no surface that two views agree on.*--tolerance"):
-        fused(sights._replace(depth=tuple(torch.full_like(d, 1.0 + k) for k, d in enumerate(sights.depth))))
+        fused(maps._replace(depth=tuple(torch.full_like(d, 1.0 + k) for k, d in enumerate(maps.depth))))
 
 
 def test_partners_are_those_that_see_the_same() -> None:
-    sights = globe(8)
-    found = partners(sights, 0, surface(sights, 0).point, 0.02)
+    maps = globe(8)
+    found = overlapping_views(maps, 0, surface_points(maps, 0).point, 0.02)
     assert set(found[:2]) == {1, 7} and 0 not in found and 4 not in found
 
 
 def test_it_is_the_same_far_from_the_origin() -> None:
     """World coordinates of a survey: 4.5e6 m from the origin."""
-    sights = globe(6)
+    maps = globe(6)
     shift = torch.tensor([4.5e6, 5e5, 200.0], dtype=torch.float64)
-    pose = sights.cameras.pose
-    moved = replace(sights.cameras, pose=torch.cat([pose[:, :, :3], (pose[:, :, 3] + shift)[:, :, None]], 2))
-    here, there = fused(sights, edge=0.2), fused(sights._replace(cameras=moved), edge=0.2)
+    pose = maps.cameras.pose
+    moved = replace(maps.cameras, pose=torch.cat([pose[:, :, :3], (pose[:, :, 3] + shift)[:, :, None]], 2))
+    here, there = fused(maps, edge=0.2), fused(maps._replace(cameras=moved), edge=0.2)
     assert abs(len(here.point) - len(there.point)) <= 0.02 * len(here.point)
     assert float((there.point - shift).norm(dim=-1).amax()) < RADIUS + 0.01
 
 
 def test_joined() -> None:
     cloud = fused(globe(6), edge=0.3)
-    both = joined(cloud, cloud)
+    both = concatenate(cloud, cloud)
     assert len(both.point) == 2 * len(cloud.point) == len(both.view)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.export.lut import Pairs, apply_lattice, fit_quality, identity, look_pairs, write_cube
+from fprf.export.lut import ColourPairs, apply_lattice, colour_pairs, fit_quality, identity, write_cube
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.renderer import Restyle
 from fprf.training.loading import load_style
@@ -44,10 +44,10 @@ def style(world: World, count: int = 1) -> Restyle:
     return restyle(world.load(), world.references[:count], RegionOtConfig()).restyle
 
 
-def pairs_of(world: World, *styles: Restyle) -> Pairs:
+def pairs_of(world: World, *styles: Restyle) -> ColourPairs:
     trained = world.load()
     known, scene = trained.known, load_style(trained.run)[0]
-    return look_pairs(trained.model, scene, known.cameras, known.train, trained.config.render, styles, rays=2000)
+    return colour_pairs(trained.model, scene, known.cameras, known.train, trained.config.render, styles, rays=2000)
 
 
 def test_pairs_are_colours_of_pixels_and_shares_of_regions(world: World) -> None:

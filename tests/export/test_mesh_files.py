@@ -12,25 +12,25 @@ from rasters import draw_points, draw_triangles, psnr
 from fprf.errors import DataError
 from fprf.export.mesh import (
     Mesh,
-    around,
     build_mesh,
     components,
     integrate,
-    linear,
+    lattice_near,
     surface_nets,
     vertex_normals,
     write_mesh_glb,
     write_mesh_ply,
 )
 from fprf.export.point_cloud import fuse
+from fprf.io.images import srgb_to_linear
 
 ZERO = torch.zeros(3, dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
 def mesh() -> Mesh:
-    sights = globe(10)
-    return build_mesh(sights, fuse(sights, edge=0.1, most=10**6, tolerance=0.02, agree=2), edge=0.1)
+    maps = globe(10)
+    return build_mesh(maps, fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2), edge=0.1)
 
 
 def ball(radius: float, side: int = 24) -> trimesh.Trimesh:
@@ -56,14 +56,14 @@ def test_surface_nets_without_a_surface_are_empty() -> None:
 
 
 def test_distances_are_positive_outside() -> None:
-    sights = globe(10)
-    cell, origin, edge = around(fuse(sights, edge=0.1, most=10**6, tolerance=0.02, agree=2), 0.1, 10**6)
-    lattice = integrate(sights, cell, origin, edge)
+    maps = globe(10)
+    cell, origin, edge = lattice_near(fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2), 0.1, 10**6)
+    lattice = integrate(maps, cell, origin, edge)
     away = (origin + edge * lattice.cell.double()).norm(dim=1) - RADIUS
     clear = away.abs() > 0.06
     agrees = (lattice.value > 0) == (away > 0)
     assert float(agrees[clear].double().mean()) > 0.97 and lattice.value.abs().amax() <= 1
-    coarse = around(fuse(sights, edge=0.1, most=10**6, tolerance=0.02, agree=2), 0.1, 20_000)
+    coarse = lattice_near(fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2), 0.1, 20_000)
     assert len(coarse[0]) <= 20_000 and coarse[2] > 0.1, "wider until it fits"
 
 
@@ -77,10 +77,10 @@ def test_the_mesh_lies_on_the_sphere_with_its_normals(mesh: Mesh) -> None:
 
 
 def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake() -> None:
-    sights = globe(10)
-    cloud = fuse(sights, edge=0.1, most=10**6, tolerance=0.02, agree=2)
+    maps = globe(10)
+    cloud = fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
     with pytest.raises(DataError, match="no surface for a mesh; raise --mesh-edge"):
-        build_mesh(sights, cloud, edge=50.0)
+        build_mesh(maps, cloud, edge=50.0)
 
 
 def test_components_of_three_balls() -> None:
@@ -119,7 +119,7 @@ def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     assert np.array_equal(ply.visual.vertex_colors[:, :3], (colour * 255 + 0.5).to(torch.uint8).numpy())
     shade = np.asarray(glb.visual.vertex_attributes["color"])
     assert shade.dtype == np.uint16 and (shade[:, 3] == 65535).all()
-    assert np.abs(shade[:, :3] / 65535 - linear(colour.numpy())).max() < 1e-5, "glTF's colours are linear"
+    assert np.abs(shade[:, :3] / 65535 - srgb_to_linear(colour.double().numpy())).max() < 1e-5, "glTF's colours are linear"
     document = (tmp_path / "m.glb").read_bytes()
     assert document[:4] == b"glTF" and int.from_bytes(document[8:12], "little") == len(document)
 

@@ -5,14 +5,14 @@ import torch
 import trimesh
 from analytic import globe
 
-from fprf.export.point_cloud import fuse, origin_of, told, write_points
+from fprf.export.point_cloud import fuse, origin_comment, origin_of, write_points
 
 
 def test_trimesh_reads_points_colours_and_normals(tmp_path: Path) -> None:
     cloud = fuse(globe(6), edge=0.2, most=10**6, tolerance=0.02, agree=2)
     colour = torch.rand(len(cloud.point), 3)
     origin = origin_of(cloud)
-    assert not bool(origin.any()) and told(origin) == []
+    assert not bool(origin.any()) and origin_comment(origin) == []
     write_points(tmp_path / "points.ply", cloud, colour, origin)
     found = trimesh.load(tmp_path / "points.ply")
     assert np.array_equal(found.vertices, cloud.point.float().numpy())
@@ -31,5 +31,5 @@ def test_far_from_its_origin_a_capture_is_moved_and_the_file_says_so(tmp_path: P
     found = trimesh.load(tmp_path / "points.ply")
     # float32 at 4.5e6 has steps of 0.5; here the grain is that of coordinates of some metres.
     assert np.abs(found.vertices + origin.numpy() - far.point.numpy()).max() < 1e-6
-    assert f"comment {told(origin)[0]}".encode() in (tmp_path / "points.ply").read_bytes()
-    assert all(f"{value:.0f}" in told(origin)[0] for value in origin.tolist())
+    assert f"comment {origin_comment(origin)[0]}".encode() in (tmp_path / "points.ply").read_bytes()
+    assert all(f"{value:.0f}" in origin_comment(origin)[0] for value in origin.tolist())

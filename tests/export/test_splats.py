@@ -10,9 +10,9 @@ from splatter import draw, matrices, read_gaussians, read_splat, table
 
 from fprf.datamanagers.images import load_images
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.export.depth_maps import Sights
-from fprf.export.point_cloud import Cloud, dome, fuse, joined
-from fprf.export.splats import discs, facing, write_gaussians, write_splat
+from fprf.export.depth_maps import DepthMaps
+from fprf.export.point_cloud import Cloud, concatenate, fuse, sky_dome
+from fprf.export.splats import rotation_to_normal, surface_discs, write_gaussians, write_splat
 from fprf.rendering.cameras import project
 from fprf.town.write import read_truth, write_town
 
@@ -32,14 +32,14 @@ def test_turns_bring_the_z_axis_to_the_normal(seed: int) -> None:
     drawn = torch.randn(20, 3, generator=torch.Generator().manual_seed(seed)).double()
     poles = torch.tensor([[0, 0, 1.0], [0, 0, -1.0], [0, 1e-4, -1.0]]).double()
     normal = torch.nn.functional.normalize(torch.cat([drawn, poles]), dim=-1)
-    turn = facing(normal)
+    turn = rotation_to_normal(normal)
     assert torch.allclose(turn.norm(dim=-1), torch.ones(23).double())
     axis = torch.from_numpy(matrices(turn.numpy())[:, :, 2])
     assert torch.allclose(axis, normal, atol=1e-6)
 
 
 def test_discs_are_flat_and_as_wide_as_their_spacing(cloud: Cloud) -> None:
-    splats = discs(cloud)
+    splats = surface_discs(cloud)
     along, _, across = splats.deviation.unbind(-1)
     assert torch.allclose(
         along.double() / cloud.space, torch.full_like(cloud.space, float(along[0] / cloud.space[0])), rtol=1e-5
@@ -50,7 +50,7 @@ def test_discs_are_flat_and_as_wide_as_their_spacing(cloud: Cloud) -> None:
 
 
 def test_both_files_hold_the_same_gaussians(cloud: Cloud, tmp_path: Path) -> None:
-    splats = discs(cloud)._replace(opacity=torch.linspace(0.2, 0.99, len(cloud.point)))
+    splats = surface_discs(cloud)._replace(opacity=torch.linspace(0.2, 0.99, len(cloud.point)))
     colour = torch.rand(len(cloud.point), 3)
     origin = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
     write_gaussians(tmp_path / "g.ply", splats, colour, origin)
@@ -78,17 +78,17 @@ def test_both_files_hold_the_same_gaussians(cloud: Cloud, tmp_path: Path) -> Non
 
 
 def test_a_splat_is_32_bytes(cloud: Cloud, tmp_path: Path) -> None:
-    write_splat(tmp_path / "g.splat", discs(cloud), torch.rand(len(cloud.point), 3), ZERO)
+    write_splat(tmp_path / "g.splat", surface_discs(cloud), torch.rand(len(cloud.point), 3), ZERO)
     assert (tmp_path / "g.splat").stat().st_size == 32 * len(cloud.point)
 
 
 def test_discs_leave_no_holes(cloud: Cloud, tmp_path: Path) -> None:
     """A white sphere on black: opaque where it is seen head-on, empty where it is not."""
-    sights = globe(8)
-    write_gaussians(tmp_path / "g.ply", discs(cloud), torch.ones(len(cloud.point), 3), ZERO)
-    pose = sights.cameras.pose[2].numpy()
+    maps = globe(8)
+    write_gaussians(tmp_path / "g.ply", surface_discs(cloud), torch.ones(len(cloud.point), 3), ZERO)
+    pose = maps.cameras.pose[2].numpy()
     image, covered = draw(read_gaussians((tmp_path / "g.ply").read_bytes()), pose, 50.0, (48, 40))
-    sees = sights.depth[2].isfinite().numpy()
+    sees = maps.depth[2].isfinite().numpy()
     inner = sees & np.roll(sees, 2, 0) & np.roll(sees, -2, 0) & np.roll(sees, 2, 1) & np.roll(sees, -2, 1)
     assert covered[inner].min() > 0.88 and image[inner].min() > 0.88
     outer = ~(sees | np.roll(sees, 4, 0) | np.roll(sees, -4, 0) | np.roll(sees, 4, 1) | np.roll(sees, -4, 1))
@@ -105,18 +105,18 @@ def test_views_of_the_town_come_back(tmp_path: Path) -> None:
     scene = parse_scene(tmp_path / "town", 1, None)
     images = load_images(scene)
     depth = tuple(torch.from_numpy(read_truth(tmp_path / "town", v)[0]) for v in scene.train.tolist())
-    sights = Sights(scene.cameras.select(scene.train), depth)
-    solid = fuse(sights, edge=None, most=10**6, tolerance=0.02, agree=2)
-    sky = dome(sights, solid)
+    maps = DepthMaps(scene.cameras.select(scene.train), depth)
+    solid = fuse(maps, edge=None, most=10**6, tolerance=0.02, agree=2)
+    sky = sky_dome(maps, solid)
     assert sky is not None
-    cloud = joined(solid, sky)
+    cloud = concatenate(solid, sky)
     colour = torch.zeros(len(cloud.point), 3)
     for k, view in enumerate(scene.train.tolist()):
         mine = cloud.view == k
-        pixel = project(sights.cameras, cloud.view[mine], cloud.point[mine])[0].long()
+        pixel = project(maps.cameras, cloud.view[mine], cloud.point[mine])[0].long()
         pixel = torch.minimum(pixel.clamp_min(0), scene.cameras.size[view] - 1)
         colour[mine] = torch.from_numpy(images[view])[pixel[:, 1], pixel[:, 0]].float() / 255
-    write_splat(tmp_path / "town.splat", discs(cloud), colour, ZERO)
+    write_splat(tmp_path / "town.splat", surface_discs(cloud), colour, ZERO)
     gaussians = read_splat((tmp_path / "town.splat").read_bytes())
     for view in scene.test.tolist():
         image, covered = draw(gaussians, scene.cameras.pose[view].numpy(), float(scene.cameras.focal[view, 0]), (80, 60))

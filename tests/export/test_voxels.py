@@ -2,7 +2,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.export.point_cloud import LEVELS, SPAN, cells, finest_alone, keys, pooled, spacing
+from fprf.export.point_cloud import LEVELS, SPAN, cells, finest_only, keys, pooled, spacing
 
 seeds = st.integers(0, 2**31)
 
@@ -47,7 +47,7 @@ def test_pooled_is_the_weighted_mean_of_each_group(seed: int) -> None:
 def test_coarse_points_give_way_to_finer_ones_in_their_voxel(seed: int) -> None:
     points = drawn(seed, 60, 3) * 8
     level = torch.randint(0, 3, (60,), generator=torch.Generator().manual_seed(seed))
-    alone = finest_alone(points, level, 1.0)
+    alone = finest_only(points, level, 1.0)
     for i in range(60):
         edge = 2.0 ** int(level[i])
         inside = (torch.floor(points / edge) == torch.floor(points[i] / edge)).all(-1)

@@ -6,8 +6,8 @@ from analytic import RADIUS, globe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.export.colours import alone, expected_presence, witnesses
-from fprf.export.depth_maps import gaps, half_way
+from fprf.export.colours import best_views, expected_presence, single_view
+from fprf.export.depth_maps import depth_gaps, ray_quantile
 
 
 def sphere(count: int, seed: int) -> torch.Tensor:
@@ -19,15 +19,15 @@ def sphere(count: int, seed: int) -> torch.Tensor:
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 5))
 def test_witnesses_are_the_best_of_those_that_see_a_point(seed: int, count: int) -> None:
     """Against looking at each point and view alone."""
-    sights, point = globe(6), sphere(12, seed)
-    seen = witnesses(sights, point, point.float(), 0.05, count)
+    maps, point = globe(6), sphere(12, seed)
+    seen = best_views(maps, point, point.float(), 0.05, count)
     assert seen.view.shape == seen.weight.shape == (12, count)
     for n in range(12):
         scores = {}
         for view in range(6):
-            [gap], [distance] = gaps(sights, view, point[n : n + 1])
+            [gap], [distance] = depth_gaps(maps, view, point[n : n + 1])
             if abs(float(gap)) <= 0.1:
-                way = (sights.cameras.pose[view, :, 3] - point[n]) / distance
+                way = (maps.cameras.pose[view, :, 3] - point[n]) / distance
                 scores[view] = max(1e-3, float(way @ point[n])) / float(distance) ** 2
         best = sorted(scores, key=lambda view: -scores[view])[:count]
         used = seen.weight[n] > 0
@@ -40,8 +40,8 @@ def test_witnesses_are_the_best_of_those_that_see_a_point(seed: int, count: int)
 
 
 def test_the_first_witness_does_not_depend_on_how_many_are_asked() -> None:
-    sights, point = globe(6), sphere(50, 1)
-    one, many = (witnesses(sights, point, point.float(), 0.05, count) for count in (1, 99))
+    maps, point = globe(6), sphere(50, 1)
+    one, many = (best_views(maps, point, point.float(), 0.05, count) for count in (1, 99))
     assert one.view.shape == (50, 1) and many.view.shape == (50, 6), "never more than there are views"
     several = many.weight[:, 1] > 0  # where nobody sees a point, any view may speak for it
     assert int(several.sum()) > 20 and torch.equal(one.view[several, 0], many.view[several, 0])
@@ -49,7 +49,7 @@ def test_the_first_witness_does_not_depend_on_how_many_are_asked() -> None:
 
 
 def test_alone() -> None:
-    seen = alone(torch.tensor([3, 1]))
+    seen = single_view(torch.tensor([3, 1]))
     assert seen.view.tolist() == [[3], [1]] and seen.weight.tolist() == [[1.0], [1.0]]
 
 
@@ -58,11 +58,11 @@ def test_expected_presence_is_the_light_of_a_uniform_medium_of_that_thickness(ex
     depth, tolerance = 4.0, 0.05
     edges = torch.linspace(0, 40 / extinction, 4001, dtype=torch.float64)
     weights = torch.exp(-extinction * edges[:-1]) - torch.exp(-extinction * edges[1:])
-    first, last = (half_way(weights[None], edges[None], torch.tensor([share]).double()) for share in (0.1, 0.9))
-    sights, point = globe(6), sphere(20, 2)
-    maps = tuple(torch.full_like(view, float(last - first) / depth) for view in sights.depth)
-    seen = witnesses(sights, point, point.float(), 0.05, 3)
+    first, last = (ray_quantile(weights[None], edges[None], torch.tensor([share]).double()) for share in (0.1, 0.9))
+    maps, point = globe(6), sphere(20, 2)
+    thick = tuple(torch.full_like(view, float(last - first) / depth) for view in maps.depth)
+    seen = best_views(maps, point, point.float(), 0.05, 3)
     light = -math.expm1(-extinction * 2 * tolerance * depth)
-    found = expected_presence(sights._replace(thickness=maps), point, seen, tolerance)
+    found = expected_presence(maps._replace(thickness=thick), point, seen, tolerance)
     assert torch.allclose(found, torch.full((20,), light), rtol=1e-3)
-    assert bool((expected_presence(sights, point, seen, tolerance) == 1).all()), "sharp where nothing else is known"
+    assert bool((expected_presence(maps, point, seen, tolerance) == 1).all()), "sharp where nothing else is known"

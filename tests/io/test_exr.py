@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fprf.errors import DataError
-from fprf.io.images import linear, write_exr
+from fprf.io.images import srgb_to_linear, write_exr
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
@@ -78,8 +78,10 @@ def test_ffmpeg_reads_it(tmp_path: Path) -> None:
         assert np.array_equal(read_, colours[name]), name
 
 
-def test_light_is_linear() -> None:
-    assert linear(np.array([0.0, 0.04045, 0.5, 1.0], np.float32)) == pytest.approx([0, 0.0031308, 0.2140411, 1], abs=1e-6)
+def test_light_is_srgb_to_linear() -> None:
+    assert srgb_to_linear(np.array([0.0, 0.04045, 0.5, 1.0], np.float32)) == pytest.approx(
+        [0, 0.0031308, 0.2140411, 1], abs=1e-6
+    )
 
 
 def test_planes_must_be_of_one_size(tmp_path: Path) -> None:

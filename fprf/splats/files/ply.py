@@ -34,14 +34,14 @@ from .base import (
     three_to_four,
 )
 
-__all__ = ["compressed_bytes", "is_compressed", "ply_bytes", "read_ply"]
+__all__ = ["compressed_bytes", "is_compressed", "ply_bytes", "ply_file", "read_ply"]
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-_NAMES = {"u1": "uchar", "u4": "uint", "f4": "float"}
+_NAMES = {"u1": "uchar", "u4": "uint", "i4": "int", "f4": "float"}
 _HEADER = 1 << 16
 """Bytes within which a header ends."""
 _CHUNK = 256
@@ -110,15 +110,15 @@ def read_ply(path: Path, data: bytes) -> Capture:
     return Capture(path, gaussians, antialiased, data, recolour)
 
 
-def ply_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
-    """The INRIA file, exact."""
+def ply_bytes(gaussians: Gaussians, antialiased: bool, normals: Floats | None = None) -> bytes:
+    """The INRIA file, exact. Normals [N 3] are 0 unless given."""
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * gaussians.harmonics.shape[1] - 3)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     means, turns, scales, logits, harmonics = _arrays(gaussians)
-    parts = [means, np.zeros_like(means), _flat(harmonics), logits[:, None], scales, turns]
+    parts = [means, np.zeros_like(means) if normals is None else normals, _flat(harmonics), logits[:, None], scales, turns]
     table = np.ascontiguousarray(np.concatenate(parts, 1), "<f4").view([(name, "<f4") for name in names])[:, 0]
-    return _assemble({"vertex": table}, ["SplatRenderMode: mip"] if antialiased else [])
+    return ply_file({"vertex": table}, ["SplatRenderMode: mip"] if antialiased else [])
 
 
 def is_compressed(data: bytes) -> bool:
@@ -147,7 +147,7 @@ def compressed_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     if harmonics.shape[1] > 1:
         rest = _rest_bytes(_flat(harmonics)[:, 3:])
         tables["sh"] = rest.view([(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])[:, 0]
-    return _assemble(tables, ["SplatRenderMode: mip"] if antialiased else [])
+    return ply_file(tables, ["SplatRenderMode: mip"] if antialiased else [])
 
 
 def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], antialiased: bool) -> Capture:
@@ -239,11 +239,18 @@ def _parse(path: Path, data: bytes) -> tuple[list[str], dict[str, _Element]]:
     return comments, elements
 
 
-def _assemble(tables: dict[str, NDArray[np.void]], comments: Sequence[str]) -> bytes:
+def ply_file(tables: dict[str, NDArray[np.void]], comments: Sequence[str] = ()) -> bytes:
+    """A little-endian binary PLY of elements by name, a property a field; a field of (count, values) is a list.
+
+    trimesh would write meshes too, but keeps neither comments nor colours without alpha.
+    """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     for name, table in tables.items():
         lines.append(f"element {name} {len(table)}")
-        lines += [f"property {_NAMES[table.dtype[each].str[1:]]} {each}" for each in table.dtype.names or ()]
+        for field in table.dtype.names or ():
+            kind = table.dtype[field]
+            of = [kind] if kind.names is None else [kind[part].base for part in kind.names]
+            lines.append(f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}")
     return "\n".join([*lines, "end_header", ""]).encode("ascii") + b"".join(table.tobytes() for table in tables.values())
 
 
