@@ -1,22 +1,19 @@
 """A capture in blocks against the same capture in one field, both trained for the same seconds in all.
 
-    python benchmarks/blocks_scenes.py SCENE [--minutes 3] [--sides blocks single] [--name NAME] [--output FILE] -- [any field]
+    python -m benchmarks blocks_scenes SCENE [--minutes 3] [--sides blocks single] [--name NAME] [--output FILE] -- [any field]
 
 The flags behind `--` are those of `fprf train fprf-lite`; the single field takes them too, but for the blocks, and has as many
 parameters as all blocks and their surroundings together (`--same-planes` leaves its planes as they are). Features are extracted
 before the clock runs, which counts what the processor does (see `large_scene.py`).
 """
 
-import argparse
 import json
 import statistics
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from large_scene import parameters, psnr, trained_seconds, use_processor_time, widened
 
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import train_scene
@@ -25,9 +22,12 @@ from fprf.process import keep_memory
 from fprf.training.lay_out import lay_out, load_boxes, plan_scene
 from fprf.training.loading import load_run
 
+from .common import add_entry, arguments, split_flags
+from .large_scene import parameters, psnr, trained_seconds, use_processor_time, widened
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+def main(argv: list[str]) -> None:
+    parser = arguments("blocks_scenes", __doc__)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--minutes", type=float, default=3.0)
     parser.add_argument("--sides", nargs="+", choices=("blocks", "single"), default=("blocks", "single"))
@@ -35,10 +35,10 @@ def main() -> None:
     parser.add_argument("--name", help="of the entry in the JSON file; the scene's by default")
     parser.add_argument("--scratch", type=Path, default=Path("runs/blocks_scenes"))
     parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
-    own = sys.argv[1 : sys.argv.index("--")] if "--" in sys.argv else sys.argv[1:]
+    own, flags_behind = split_flags(argv)
     options = parser.parse_args(own)
     keep_memory()  # as the command line does: else large gradients are mapped anew in every step
-    rest = sys.argv[len(own) + 2 :]
+    rest = flags_behind
     method, _ = load_method("fprf-lite")
     flags = ["--data", str(options.scene), "--minutes", str(options.minutes), *rest]
     blocks = parse(method, flags, prog="blocks_scenes", description="")
@@ -76,9 +76,4 @@ def main() -> None:
     if {"blocks", "single"} <= result.keys():
         result["blocks_minus_single_db"] = result["blocks"]["psnr"] - result["single"]["psnr"]
     if options.output is not None:
-        known = json.loads(options.output.read_text()) if options.output.is_file() else {}
-        options.output.write_text(json.dumps(known | {name: result}, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+        add_entry(options.output, name, result)

@@ -1,6 +1,6 @@
 """Decoders in one run: how faithfully each returns photographs, and what a style term buys.
 
-    python benchmarks/decoders.py [--shared DIR] [--steps 4000] [--output benchmarks/results/decoders.json]
+    python -m benchmarks decoders [--shared DIR] [--steps 4000] [--output benchmarks/results/decoders.json]
 
 Without steps (0) only the decoders that ship, and the released one, are judged.
 
@@ -13,7 +13,6 @@ of the next by AdaIN, in units of VGG-19's filters; 0 is a perfect match. Second
 
 import argparse
 import json
-import os
 import sys
 import tempfile
 import time
@@ -23,7 +22,6 @@ import torch
 from safetensors.torch import load_file
 
 from fprf.interfaces import Encoder
-from fprf.io.atomic import write_json
 from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
 from fprf.plugins.decoders.mlp import MlpDecoder
 from fprf.plugins.encoders.config import BundledContentConfig, EncoderConfig, Vgg19Config
@@ -32,6 +30,8 @@ from fprf.pretraining.decoder import LONGEST, decoder_report, pretrain_decoder, 
 from fprf.pretraining.perceptual import StyleNetwork, load_style_network
 from fprf.pretraining.photos import find_photos
 from fprf.pretraining.restyling import Crops, prepare_crops
+
+from .common import RESULTS, SHARED, arguments, report
 
 LEARN = "data/pretrain"
 JUDGE = "data/pst/content"
@@ -93,15 +93,15 @@ class Judge:
         ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shared", type=Path, default=Path(os.environ.get("FPRF_SHARED", "../shared")))
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/decoders.json"))
+def main(argv: list[str]) -> None:
+    parser = arguments("decoders", __doc__)
+    parser.add_argument("--shared", type=Path, default=SHARED)
+    parser.add_argument("--output", type=Path, default=RESULTS / "decoders.json")
     parser.add_argument("--keep", type=Path, help="folder for the decoders that are trained; by default they are dropped")
     parser.add_argument("--steps", type=int, default=4000, help="steps of each decoder that is trained here")
     parser.add_argument("--photos", type=int, default=120, help="photographs that they learn from")
     parser.add_argument("--weights", type=float, nargs="*", default=[1e-3, 1e-2], help="of the style and the content loss")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     torch.set_num_threads(1)
     rows: list[Row] = []
     absent = [str(part) for part in (LEARN, JUDGE, VGG) if not (args.shared / part).exists()]
@@ -110,7 +110,7 @@ def main() -> None:
     else:
         with tempfile.TemporaryDirectory() as folder:
             rows += measured(args, args.keep or Path(folder))
-    write_json(args.output, {"rows": rows})
+    report(args.output, {"rows": rows})
 
 
 def measured(args: argparse.Namespace, folder: Path) -> list[Row]:
@@ -158,7 +158,3 @@ def trained(args: argparse.Namespace, encoder: Vgg19Config, weight: float, outpu
     decoder = MlpDecoderConfig(weights=output).build(encoder=built.identity, channels=built.channels)
     assert isinstance(decoder, MlpDecoder)
     return decoder, seconds
-
-
-if __name__ == "__main__":
-    main()

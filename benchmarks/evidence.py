@@ -1,4 +1,4 @@
-"""All figures of docs/evidence, made again: `python benchmarks/evidence.py [--only NAME ...] [--scenes DIR] [--runs DIR]`.
+"""All figures of docs/evidence, made again: `python -m benchmarks evidence [--only NAME ...] [--scenes DIR] [--runs DIR]`.
 
 The town is trained first where `--runs` does not hold it yet. Every page carries commit, machine, versions and seeds; seconds
 aside, the same commit on the same machine writes the same figures. Tables whose scene is absent are skipped, and said to be.
@@ -13,8 +13,9 @@ from fprf.cli import main as cli
 from fprf.cli.parsing import parse
 from fprf.errors import FprfError, UsageError
 
-HERE = Path(__file__).resolve().parents[1]
-PAGES, RESULTS = HERE / "docs/evidence", HERE / "benchmarks/results"
+from .common import RESULTS, ROOT, SHARED
+
+PAGES = ROOT / "docs/evidence"
 LIGHTS = ("--palettes", "autumn", "winter", "sunset", "night")
 TOWN = ("--data", "town", "--steps", "800", *LIGHTS)
 SCENES: Mapping[str, tuple[str, str]] = {"reconstruction": ("fox", "2"), "reconstruction-flower": ("llff_flower", "2")}
@@ -29,9 +30,9 @@ class EvidencePages:
 
     only: tuple[str, ...] = ()
     """Names of pages; none = all of them."""
-    scenes: Path = HERE.parent / "shared/data/scenes"
+    scenes: Path = SHARED / "data/scenes"
     """Folder with the photographed scenes fox and llff_flower."""
-    runs: Path = HERE / "runs"
+    runs: Path = ROOT / "runs"
     """Folder for the town's run; one that is there is used."""
     steps: int = 2400
     """Steps that the town is trained for."""
@@ -58,9 +59,9 @@ def command(name: str, config: EvidencePages) -> list[str]:
     return [*table, *(TOWN if name in TRAININGS else ("--run", run)), *files, *device]
 
 
-def main() -> int:
+def main(argv: list[str]) -> int:
     try:
-        config = parse(EvidencePages(), sys.argv[1:], prog="evidence.py", description=__doc__ or "")
+        config = parse(EvidencePages(), argv, prog="python -m benchmarks evidence", description=__doc__ or "")
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -78,7 +79,3 @@ def main() -> int:
         print("fprf " + " ".join(command(name, config)), file=sys.stderr)
         worst = max(worst, cli.main(command(name, config)))
     return worst
-
-
-if __name__ == "__main__":
-    sys.exit(main())

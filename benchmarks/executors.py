@@ -1,6 +1,6 @@
 """Blocks on two workers of Ray against one after the other: how much sooner they are done, and that they are the same bits.
 
-    python benchmarks/executors.py [--blocks 8] [--views 200] [--steps 250] [--workers 2] [--output FILE]
+    python -m benchmarks executors [--blocks 8] [--views 200] [--steps 250] [--workers 2] [--output FILE]
 
 Needs the extra `cluster`. Both sides run `fprf train` in processes of their own on one thread, for the same steps, with the
 features extracted before. `speedup` is that of the whole command, the surroundings (which come first, alone) and Ray's start
@@ -20,6 +20,8 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+
+from .common import RESULTS, report
 
 __all__ = ["blocks_seconds", "flags", "same_bits", "timed"]
 
@@ -77,11 +79,11 @@ def arguments(about: str) -> argparse.ArgumentParser:
     return parser
 
 
-def main() -> None:
+def main(argv: list[str]) -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results/executors.json")
-    options = parser.parse_args()
+    parser.add_argument("--output", type=Path, default=RESULTS / "executors.json")
+    options = parser.parse_args(argv)
     options.scratch = options.scratch.resolve()
     # Features, and compiled kernels, are there before any clock runs.
     subprocess.run(
@@ -107,9 +109,4 @@ def main() -> None:
         "same_bits": same_bits(options.scratch / "serial", options.scratch / "ray"),
     }
     print(json.dumps(result, indent=1))
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(result, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+    report(options.output, result)

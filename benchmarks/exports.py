@@ -1,6 +1,6 @@
 """Exported files, read again by other programs' means and drawn as viewers draw them, against the field's own render.
 
-    python benchmarks/exports.py RUN --references A.jpg [--output benchmarks/results/exports_NAME.json] [--picture FILE.jpg]
+    python -m benchmarks exports RUN --references A.jpg [--output benchmarks/results/exports_NAME.json] [--picture FILE.jpg]
 
 The views are the captured ones that nothing was trained on, as pinholes. Figures are PSNR in dB: of the whole picture, over
 black where nothing is drawn, and of the pixels that are covered. Files made before are taken as they are (`--folder`).
@@ -21,16 +21,16 @@ import fprf
 from fprf.api import TrainedScene
 from fprf.cli.parsing import parse
 from fprf.errors import UsageError
-from fprf.io.atomic import write_json
 from fprf.io.images import write_image
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
 
-HERE = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(HERE / "tests" / "export"))  # the tests' own readers and renderers are the judges
+from .common import ROOT, report
 
-from rasters import draw_points, draw_triangles, psnr  # noqa: E402
-from splatter import draw, read_gaussians, read_splat  # noqa: E402
+sys.path.insert(0, str(ROOT / "tests" / "export"))  # the tests' own readers and renderers are the judges
+
+from rasters import draw_points, draw_triangles, psnr
+from splatter import draw, read_gaussians, read_splat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +51,8 @@ class ExportsConfig:
     """A picture of the first view: the field, splats, mesh and points, plain and in the style."""
 
 
-def main(args: list[str]) -> None:
-    config = parse(ExportsConfig(), args, prog="exports.py", description=__doc__ or "", positional=("run",))
+def main(argv: list[str]) -> None:
+    config = parse(ExportsConfig(), argv, prog="python -m benchmarks exports", description=__doc__ or "", positional=("run",))
     folder = config.folder or config.run / "exports"
     if not (folder / "export.json").is_file():
         style = ["--styles", "style=" + ",".join(map(str, config.references))] if config.references else []
@@ -75,7 +75,7 @@ def main(args: list[str]) -> None:
     found["views"] = [known.names[view] for view in chosen]
     print(json.dumps({key: found[key] for key in ("plain", "style") if key in found}, indent=1))
     if config.output is not None:
-        write_json(config.output, found)
+        report(config.output, found)
     if config.picture is not None:
         write_image(config.picture, (np.concatenate(rows).clip(0, 1) * 255 + 0.5).astype(np.uint8))
 
@@ -132,7 +132,3 @@ def shown(mesh: trimesh.Trimesh) -> np.ndarray:
 def sizes(folder: Path) -> dict[str, int]:
     """Bytes of every file."""
     return {str(path.relative_to(folder)): path.stat().st_size for path in sorted(folder.rglob("*.*")) if path.is_file()}
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -1,6 +1,6 @@
 """How often styles cut through things: trained runs in photographs' styles, regions by themselves, by default, and gently.
 
-    python benchmarks/false_edges.py RUN ... --styles DIR [--references NAME ...] [--output JSON] [--sheets DIR]
+    python -m benchmarks false_edges RUN ... --styles DIR [--references NAME ...] [--output JSON] [--sheets DIR]
 
 false_edges: share of the pairs of pixels on one even surface that the style moves apart (`fprf/evaluation/false_edges.py`).
 structure: what the style keeps of the luminance's structure. palette: distance of the pictures' colours (means and deviations
@@ -8,19 +8,18 @@ of the channels) to the reference's, over the same of the plain render. change: 
 Runs must be of a version that measures contacts between regions. Sheets show other people's photographs.
 """
 
-import argparse
 import statistics
 from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
-from sheets import sheet
+import torch.nn.functional as F
 from torch import Tensor
 
 from fprf.datamanagers.images import load_image
-from fprf.evaluation.false_edges import false_edges
-from fprf.evaluation.structure import structure
-from fprf.io.atomic import write_json
+from fprf.errors import DataError
+from fprf.evaluation.metrics import structure
 from fprf.io.images import shrink, write_image
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.config import StyleConfig
@@ -30,7 +29,53 @@ from fprf.training.cached_view import cache_view
 from fprf.training.loading import load_run
 from fprf.training.restyle import apply_style
 
-HERE = Path(__file__).resolve().parents[1]
+from .common import RESULTS, arguments, report
+from .pictures import sheet
+
+__all__ = ["false_edges"]
+
+
+_SIGMA = 1.0
+"""Pixels that both pictures are blurred by: noise is no edge."""
+_REACH = 12
+"""Ends of a pair lie so many-th of the shorter side apart: further than a soft border between regions is wide."""
+_EVEN, _CUT = 0.05, 0.1
+"""Largest differences of a channel in [0, 1]: thirteen and twenty-six 8-bit steps."""
+
+
+def false_edges(
+    plain: Annotated[Tensor, "H W 3"], styled: Annotated[Tensor, "H W 3"], *, even: float = _EVEN, cut: float = _CUT
+) -> float | None:
+    """Share of the pairs on one surface, along rows and columns, that the style cuts, in [0, 1]; None where there are none.
+
+    Raises DataError for pictures of different sizes, or smaller than 12 pixels.
+    """
+    if plain.shape != styled.shape or plain.ndim != 3 or min(plain.shape[:2]) < _REACH:
+        raise DataError(
+            f"false edges: pictures of shape {tuple(plain.shape)} and {tuple(styled.shape)}; both must be [H W 3] of one size, "
+            f"with sides of at least {_REACH} pixels"
+        )
+    reach = max(2, round(min(plain.shape[:2]) / _REACH))
+    before, after = _blurred(plain), _blurred(styled)
+    pairs = cuts = 0
+    for axis in (1, 2):
+        a, b = before.movedim(axis, 0), after.movedim(axis, 0)
+        starts = len(a) - reach
+        way = torch.stack([(a[i : i + starts] - a[:starts]).abs().amax(1) for i in range(1, reach + 1)])
+        surface = way.amax(0) < even
+        pairs += int(surface.sum())
+        cuts += int((surface & ((b[reach:] - b[:starts]).abs().amax(1) > cut)).sum())
+    return cuts / pairs if pairs else None
+
+
+def _blurred(picture: Tensor) -> Annotated[Tensor, "3 H W"]:
+    at = torch.arange(-3, 4, dtype=torch.float32)
+    kernel = torch.exp(-at.square() / (2 * _SIGMA**2))
+    kernel = kernel / kernel.sum()
+    padded = F.pad(picture.detach().cpu().float().permute(2, 0, 1)[:, None], (3, 3, 3, 3), mode="replicate")
+    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))[:, 0]
+
+
 BASE = StyleConfig()
 STYLES = {
     "regions by themselves": replace(BASE, stylizer=RegionToneConfig(smoothness=0.0)),
@@ -39,16 +84,16 @@ STYLES = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str]) -> None:
+    parser = arguments("false_edges", __doc__)
     parser.add_argument("runs", nargs="+", type=Path)
     parser.add_argument("--styles", type=Path, required=True, help="folder of photographs")
     parser.add_argument("--references", nargs="+", default=["night_town", "red_dusk_tree", "snow_avenue", "cherry_blossom"])
     parser.add_argument("--views", type=int, default=2, help="views of each run, evenly through the capture")
     parser.add_argument("--longest", type=int, default=170, help="longer side in pixels")
-    parser.add_argument("--output", type=Path, default=HERE / "benchmarks/results/false_edges.json")
+    parser.add_argument("--output", type=Path, default=RESULTS / "false_edges.json")
     parser.add_argument("--sheets", type=Path)
-    asked = parser.parse_args()
+    asked = parser.parse_args(argv)
     scenes = []
     for root in asked.runs:
         trained = load_run(root, "cpu")
@@ -85,7 +130,7 @@ def main() -> None:
         }
         for title in STYLES
     }
-    write_json(asked.output, {"benchmark": "false_edges", "longest": asked.longest, "means": total, "scenes": scenes})
+    report(asked.output, {"benchmark": "false_edges", "longest": asked.longest, "means": total, "scenes": scenes})
 
 
 def judged(plain: Tensor, styled: Tensor, reference: Tensor) -> dict[str, float]:
@@ -101,7 +146,3 @@ def judged(plain: Tensor, styled: Tensor, reference: Tensor) -> dict[str, float]
 def _palette(a: Tensor, b: Tensor) -> float:
     ends = [torch.cat([x.reshape(-1, 3).mean(0), x.reshape(-1, 3).std(0)]) for x in (a, b)]
     return float((ends[0] - ends[1]).norm())
-
-
-if __name__ == "__main__":
-    main()

@@ -1,13 +1,11 @@
 """Feature targets: size and error against the exact guided filter for each stride, and the time of a batch.
 
-    python benchmarks/feature_store.py [--shared ../shared] [--output benchmarks/results/feature_store.json]
+    python -m benchmarks feature_store [--shared ../shared] [--output benchmarks/results/feature_store.json]
 
 Errors are root mean squares over all pixels and the first 32 channels, half precision included, divided by the standard
 deviation of the exact filter's output; the worst of the photographs is given. Times are seconds of one core (thread time).
 """
 
-import argparse
-import json
 import math
 import statistics
 import tempfile
@@ -26,6 +24,8 @@ from fprf.datamanagers.images import load_image
 from fprf.interfaces import Encoder
 from fprf.ops import guided
 from fprf.plugins.encoders.config import RandomConfig, Vgg19Config
+
+from .common import RESULTS, SHARED, arguments, report
 
 PHOTOS = ("scenes/llff_flower/images_8", "scenes/street_lund/images", "scenes/fox/images")
 MEASURED = 32
@@ -124,12 +124,11 @@ def lookup() -> list[Row]:
     return rows
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    here = Path(__file__).resolve().parents[1]
-    parser.add_argument("--shared", type=Path, default=here.parent / "shared")
-    parser.add_argument("--output", type=Path, default=here / "benchmarks/results/feature_store.json")
-    options = parser.parse_args()
+def main(argv: list[str]) -> None:
+    parser = arguments("feature_store", __doc__)
+    parser.add_argument("--shared", type=Path, default=SHARED)
+    parser.add_argument("--output", type=Path, default=RESULTS / "feature_store.json")
+    options = parser.parse_args(argv)
     torch.manual_seed(0)
     torch.set_num_threads(1)
     rows = lookup()
@@ -148,12 +147,7 @@ def main() -> None:
     short = [
         r["name"] for r in rows if isinstance(r["goal"], float) and isinstance(r["figure"], float) and r["figure"] > r["goal"]
     ]
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps({"rows": rows, "falls_short": short}, indent=1) + "\n")
+    report(options.output, {"rows": rows, "falls_short": short})
     for r in rows:
         print(f"{r['name']:55} {r['figure']:>10} {r['unit']}" + (f"  (peer {r['peer']})" if r["peer"] is not None else ""))
     print("falls short:", ", ".join(map(str, short)) or "nothing")
-
-
-if __name__ == "__main__":
-    main()

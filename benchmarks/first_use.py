@@ -1,6 +1,6 @@
 """How good a small capture comes out at equal steps: `fprf-lite` with the flags given, judged on held-out views.
 
-    python benchmarks/first_use.py SCENE[:VIEWS] ... --steps 600 --label after --output FILE [-- any field of fprf-lite]
+    python -m benchmarks first_use SCENE[:VIEWS] ... --steps 600 --label after --output FILE [-- any field of fprf-lite]
 
 `SCENE:9` trains on nine of its training views, evenly through the capture; held-out views stay what they are. Such a thinned
 capture keeps the sparse points that at least two of the nine saw. Where the capture does not say who saw a point, it stays with
@@ -11,11 +11,9 @@ Semantics are left out: they never move geometry or colour, and cost time. Secon
 its features; one run after the other, each in this process.
 """
 
-import argparse
 import json
 import math
 import shutil
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -28,24 +26,26 @@ from fprf.cli.train import train_scene
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.parsers.files import read_json
 from fprf.datamanagers.scene import Scene
-from fprf.evaluation.judge import judge
-from fprf.evidence.provenance import commit
+from fprf.evaluation.evaluate import judge
+from fprf.io.atomic import write_json
 from fprf.io.images import to_uint8
 from fprf.io.video import write_frames
 from fprf.process import keep_memory
 from fprf.training.loading import load_run
 
+from .common import arguments, origin, read_report, split_flags
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+def main(argv: list[str]) -> None:
+    parser = arguments("first_use", __doc__)
     parser.add_argument("scenes", nargs="+", help="folders; FOLDER:N is thinned to N training views")
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--side", type=int, default=240, help="longest side of the images at most, in pixels")
     parser.add_argument("--label", required=True, help="key of these figures in the file, for example before")
     parser.add_argument("--renders", type=Path, help="folder that the held-out views are written to")
     parser.add_argument("--output", type=Path, required=True, help="JSON file that the figures are added to")
-    own = sys.argv[1 : sys.argv.index("--")] if "--" in sys.argv else sys.argv[1:]
-    flags = sys.argv[len(own) + 2 :]
+    own, flags_behind = split_flags(argv)
+    flags = flags_behind
     options = parser.parse_args(own)
     keep_memory()
     for text in options.scenes:
@@ -55,10 +55,10 @@ def main() -> None:
             data = thinned(Path(folder), Path(scratch) / Path(folder).name, int(count)) if count else Path(folder)
             renders = options.renders and options.renders / options.label / name.replace(", ", "-").replace(" ", "-")
             found = measured(data, Path(scratch) / "run", options.steps, options.side, flags, renders)
-        entry = {"commit": commit(Path(__file__).parent), "flags": flags, **found}
-        known = json.loads(options.output.read_text()) if options.output.is_file() else {}
+        entry = {**origin(), "flags": flags, **found}
+        known = read_report(options.output)
         known.setdefault(name, {})[options.label] = entry
-        options.output.write_text(json.dumps(known, indent=1) + "\n")
+        write_json(options.output, known)
         print(name, options.label, json.dumps(entry), flush=True)
 
 
@@ -132,7 +132,3 @@ def _points(source: Path, scene: Scene, kept: list[int], remaining: list[int]) -
         "xyz": points[often],
         "seen": np.stack([np.searchsorted(remaining, seen[:, 0]), (np.cumsum(often) - 1)[seen[:, 1]]], 1),
     }
-
-
-if __name__ == "__main__":
-    main()

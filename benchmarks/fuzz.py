@@ -1,13 +1,12 @@
 """Mutated files by the million: every reader must answer each with a value or with one line, and neither die, hang nor grow.
 
-    python benchmarks/fuzz.py [--rounds 1000000] [--seed 0] [--only NAME ...] [--output benchmarks/results/fuzz.json]
+    python -m benchmarks fuzz [--rounds 1000000] [--seed 0] [--only NAME ...] [--output benchmarks/results/fuzz.json]
 
 Each reader runs in a process of its own, a few thousand mutations at a time, with 2 GiB of address space more than it has at
 its start. A process that dies is an entry in the report and the next one goes on behind it; so is one that is silent for five
 minutes. What an output file already holds of the same seed is gone on from: a night's run may be stopped.
 """
 
-import argparse
 import json
 import os
 import resource
@@ -19,9 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fprf.io.atomic import write_json
-from fprf.stress.fuzz import Target, fuzz
-from fprf.stress.readers import targets
+from .common import arguments, report
+from .readers import Target, fuzz, targets
 
 CHUNK = 4000
 """Mutations between two reports of a process."""
@@ -110,14 +108,14 @@ def watch(
 
 def measure(folder: Path, rounds: int, seed: int, only: list[str], output: Path | None) -> dict[str, Any]:
     """All readers, one after the other."""
-    command = f"python benchmarks/fuzz.py --rounds {rounds} --seed {seed}"
+    command = f"python -m benchmarks fuzz --rounds {rounds} --seed {seed}"
     document: dict[str, Any] = {"command": command, "rounds": rounds, "seed": seed, "readers": {}}
     if output is not None and output.exists() and (old := json.loads(output.read_text()))["seed"] == seed:
         document["readers"] = old["readers"]
 
     def keep() -> None:
         if output is not None:
-            write_json(output, document)
+            report(output, document)
 
     chosen = [target for target in targets(folder) if not only or target.name in only]
     for target in chosen:
@@ -129,16 +127,12 @@ def measure(folder: Path, rounds: int, seed: int, only: list[str], output: Path 
     return document
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str]) -> None:
+    parser = arguments("fuzz", __doc__)
     parser.add_argument("--rounds", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME")
     parser.add_argument("--output", type=Path)
-    asked = parser.parse_args()
+    asked = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="fprf-fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         measure(Path(folder) / "files", asked.rounds, asked.seed, asked.only, asked.output)
-
-
-if __name__ == "__main__":
-    main()

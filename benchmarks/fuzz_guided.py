@@ -1,6 +1,6 @@
 """Files that look for unread code: libFuzzer changes each reader's valid file and keeps what reaches lines not reached before.
 
-    python benchmarks/fuzz_guided.py [--minutes 60] [--only NAME ...] [--corpus FOLDER] [--seal] [--output FILE]
+    python -m benchmarks fuzz_guided [--minutes 60] [--only NAME ...] [--corpus FOLDER] [--seal] [--output FILE]
 
 Needs `pip install atheris`. The minutes are shared equally among the readers; each runs in a process of its own, with 2 GiB of
 address space more than it has at its start, and an input may take ten seconds. A reader that fails is told with the bytes that
@@ -8,7 +8,6 @@ did it, and goes on. What reached new code is kept in the corpus, where a later 
 into `tests/fuzz/corpus.zip`, which the tests read again.
 """
 
-import argparse
 import base64
 import contextlib
 import importlib
@@ -24,8 +23,8 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from fprf.io.atomic import write_json
-from fprf.stress.readers import targets
+from .common import ROOT, arguments, report
+from .readers import targets
 
 ROOM = 2 << 30
 """Bytes of address space beyond what a process has at its start."""
@@ -33,7 +32,7 @@ LONGEST = 4096
 """Bytes of the longest file that is tried; the valid ones are shorter."""
 PATIENCE = 10
 """Seconds for one file."""
-SEALED = Path(__file__).resolve().parents[1] / "tests" / "fuzz" / "corpus.zip"
+SEALED = ROOT / "tests" / "fuzz" / "corpus.zip"
 THIRD_PARTY = ("numpy", "torch", "cv2", "numba", "tyro", "rich", "safetensors", "kornia.color")
 """What is imported before: only what comes after is watched, which is fprf."""
 
@@ -48,7 +47,7 @@ def inside(name: str, corpora: list[str], options: list[str]) -> None:
         del sys.modules[module]  # this script's own, which nobody watched
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         with atheris.instrument_imports(include=["fprf"]):
-            readers = importlib.import_module("fprf.stress.readers")
+            readers = importlib.import_module("benchmarks.readers")
             errors = importlib.import_module("fprf.errors")
             target = next(each for each in readers.targets(Path(folder) / "files") if each.name == name)
             valid = target.file.read_bytes()
@@ -68,7 +67,11 @@ def inside(name: str, corpora: list[str], options: list[str]) -> None:
 
 def run(name: str, corpus: Path, options: list[str]) -> tuple[int, str]:
     """One reader in a process of its own: its exit code and what it said."""
-    done = subprocess.run([sys.executable, __file__, "--inside", name, str(corpus), *options], capture_output=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", "fuzz_guided", "--inside", name, str(corpus), *options],
+        capture_output=True,
+        check=False,
+    )
     return done.returncode, (done.stdout + done.stderr).decode(errors="replace")
 
 
@@ -115,7 +118,7 @@ def names() -> list[str]:
 
 def measure(chosen: list[str], corpus: Path, minutes: float, output: Path | None) -> None:
     """Reader after reader; the output is written after each."""
-    command = f"python benchmarks/fuzz_guided.py --minutes {minutes:g}"
+    command = f"python -m benchmarks fuzz_guided --minutes {minutes:g}"
     document: dict[str, Any] = {"command": command, "minutes": minutes, "readers": {}}
     for name in chosen:
         folder = corpus / name
@@ -124,27 +127,23 @@ def measure(chosen: list[str], corpus: Path, minutes: float, output: Path | None
         document["readers"][name] = row
         print(name, json.dumps(row), flush=True)
         if output is not None:
-            write_json(output, document)
+            report(output, document)
 
 
-def main() -> None:
-    if sys.argv[1:2] == ["--inside"]:
-        flags = [each for each in sys.argv[3:] if each.startswith("-")]
-        inside(sys.argv[2], [each for each in sys.argv[3:] if each not in flags], flags)
+def main(argv: list[str]) -> None:
+    if argv[:1] == ["--inside"]:
+        flags = [each for each in argv[2:] if each.startswith("-")]
+        inside(argv[1], [each for each in argv[2:] if each not in flags], flags)
         return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments("fuzz_guided", __doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME")
     parser.add_argument("--corpus", type=Path)
     parser.add_argument("--seal", action="store_true", help="put the corpus into the tests when all is done")
     parser.add_argument("--output", type=Path)
-    asked = parser.parse_args()
+    asked = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="fprf-corpus-") as folder:
         corpus = asked.corpus or Path(folder)
         measure(asked.only or names(), corpus, asked.minutes, asked.output)
         if asked.seal:
             seal(corpus, SEALED)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """The gallery: every method on scenes that may be shown, in the light of rendered towns. Pictures, figures and the page.
 
-    python benchmarks/gallery.py RUN ... [--output docs/gallery] [--shared DIR] [any field]
+    python -m benchmarks gallery RUN ... [--output docs/gallery] [--shared DIR] [any field]
 
 References are towns of another seed. Photographs of --shared may give a style too; they themselves are never written.
 """
@@ -10,20 +10,23 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import style_runs
 import torch
-from sheets import sheet
-from styles import HERE, judges, observer, say
 from torch import Tensor
 
 from fprf.checks import at_least
 from fprf.cli.parsing import parse
 from fprf.errors import FprfError
-from fprf.evaluation.contest import PLAIN, STYLIZERS, Row, mean_rows
+from fprf.evaluation.restyle import STYLIZERS
 from fprf.io.atomic import write_text
 from fprf.io.images import write_image
 from fprf.plugins.encoders.config import BundledSemanticConfig, EncoderConfig
 from fprf.training.loading import Trained, load_run
+
+from . import style_runs
+from .common import ROOT, SHARED
+from .pictures import sheet
+from .style_runs import PLAIN, Row, mean_rows
+from .styles import judges, observer, say
 
 SETS = (("autumn",), ("winter",), ("sunset",), ("night",), ("autumn", "night"))
 LICENCES = {
@@ -48,7 +51,7 @@ class GalleryConfig:
 
     runs: tuple[Path, ...] = ()
     """Trained runs, of scenes that may be shown."""
-    shared: Path = HERE.parent / "shared"
+    shared: Path = SHARED
     """Folder with data/styles and weights; what is absent is skipped."""
     semantic: EncoderConfig = BundledSemanticConfig()
     """Finds the regions that methods are judged in, where DeepLab's weights are absent."""
@@ -58,7 +61,7 @@ class GalleryConfig:
     """Which view is shown, as a share of the capture, in [0, 1)."""
     longest: int = 320
     """Longer side of a picture."""
-    output: Path = HERE / "docs/gallery"
+    output: Path = ROOT / "docs/gallery"
     """Folder of the page."""
 
     def __post_init__(self) -> None:
@@ -71,7 +74,7 @@ def page(sections: list[str]) -> str:
         "# Gallery\n\nEvery method on the same view. The references are other towns, in another light; where "
         "a photograph gave the style it is not shown. *structure*: what is left of the picture's own structure, 1 = all of it. "
         "*style distance*: to the reference, region by region, 1 = no change, 0 = its statistics. Made by "
-        "`python benchmarks/gallery.py RUN ...`.\n\n| method | |\n|---|---|\n"
+        "`python -m benchmarks gallery RUN ...`.\n\n| method | |\n|---|---|\n"
     )
     return intro + methods + "\n\n" + "\n".join(sections)
 
@@ -131,19 +134,19 @@ def gallery(config: GalleryConfig) -> None:
     write_text(config.output / "README.md", page(sections))
 
 
-def main() -> int:
+def main(argv: list[str]) -> int:
     torch.set_num_threads(1)
     roots = []
-    args = sys.argv[1:]
+    args = argv
     while args and not args[0].startswith("-"):
         roots.append(Path(args.pop(0)))
     try:
-        gallery(replace(parse(GalleryConfig(), args, prog="gallery.py", description=__doc__ or ""), runs=tuple(roots)))
+        gallery(
+            replace(
+                parse(GalleryConfig(), args, prog="python -m benchmarks gallery", description=__doc__ or ""), runs=tuple(roots)
+            )
+        )
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,11 @@
 """The rasteriser of 3D Gaussians: time, error and what was skipped, kernels against the plain torch form.
 
-    python benchmarks/gaussians.py [--count 50000] [--threads 1] [--output FILE.json]
+    python -m benchmarks gaussians [--count 50000] [--threads 1] [--output FILE.json]
 
 A cloud in front of a camera of 500 x 375 pixels; most Gaussians are a pixel or two wide, as in a trained scene. Seconds are the
 least of several calls: of wall time, and of processor time, which counts all threads. The plain form runs once.
 """
 
-import argparse
 import json
 import math
 import time
@@ -20,6 +19,8 @@ from torch import Tensor
 
 from fprf.ops import backend
 from fprf.ops.rasterise import Pinhole, Rasterised, lift, rasterise
+
+from .common import arguments
 
 WIDTH, HEIGHT, BANDS, CHANNELS = 500, 375, 4, 32
 
@@ -96,13 +97,13 @@ def measure(count: int, times: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def main(argv: list[str]) -> None:
+    parser = arguments("gaussians", __doc__)
     parser.add_argument("--count", type=int, default=50_000)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--times", type=int, default=30)
     parser.add_argument("--output", type=Path)
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
     numba.set_num_threads(args.threads)
     found = {"threads": args.threads, **measure(args.count, args.times)}
@@ -110,7 +111,3 @@ def main() -> None:
     print(text)
     if args.output is not None:
         args.output.write_text(text + "\n")
-
-
-if __name__ == "__main__":
-    main()

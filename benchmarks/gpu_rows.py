@@ -2,8 +2,8 @@
 
     python benchmarks/gpu_rows.py WORK --output FILE
 
-WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json, profile.json and
-long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
+WORK holds steps.jsonl, a log of each step and, as far as the steps came, run/metrics.json, speed.json, roofline.json,
+profile.json and long/metrics.json. Rows of what is missing are left out. The exit status is 1 where a step failed.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from fprf.benchmarking.report import Row, document, rows_table, table
+from fprf.evaluation.report import Row, document, rows_table, table
 from fprf.io.atomic import write_json
 from fprf.ops import triplane_numba, triplane_triton
 
@@ -73,8 +73,8 @@ def rows(work: Path, form: str) -> Iterator[Row]:
         if name.startswith("tri-plane forward + backward"):
             kept = ("figure", "unit", "low", "high", "peer", "error", "error_kind", "peer_error", "note")
             yield Row(name=f"{form} {name}", **{key: row[key] for key in kept})
-        elif name.endswith("of the memory's speed"):
-            yield Row(name=name, figure=row["figure"], unit="%", goal=50.0, more_is_better=True, note=row["note"])
+    for row in (read(work / "roofline.json") or {}).get("rows", []):
+        yield Row(name=row["name"], figure=row["figure"], unit="%", goal=50.0, more_is_better=True, note=row["note"])
 
 
 def kernels(device: torch.device) -> str:

@@ -17,14 +17,14 @@ from typing import Any
 from unittest import mock
 
 import torch
-from torch import Tensor
-
 from fprf.benchmarking.config import SpeedConfig
 from fprf.benchmarking.report import machine
 from fprf.benchmarking.speed import STYLES
 from fprf.benchmarking.subject import Subject, find, fresh_model, test_view
 from fprf.benchmarking.timing import Watch
 from fprf.benchmarking.training import loop_of, stepper
+from torch import Tensor
+
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
 from fprf.fields.content import PlanesField

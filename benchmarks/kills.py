@@ -1,6 +1,6 @@
 """Training that is killed again and again after its first checkpoint, many times within a save, and what is left of it.
 
-    python benchmarks/kills.py [--kills 100] [--steps 300] [--seed 0] [--output benchmarks/results/kills.json]
+    python -m benchmarks kills [--kills 100] [--steps 300] [--seed 0] [--output benchmarks/results/kills.json]
 
 A whole `fprf train` of a tiny town (features, basis, training, statistics; a checkpoint after every step, so that saving is
 half of the time) is run once undisturbed. Then the same is started and killed with SIGKILL, started again, and so on until it
@@ -9,7 +9,6 @@ process and its first save, four at a random moment after it, and five as soon a
 seen. Every end must be bitwise the undisturbed one: parameters, moments, scene statistics; nothing unfinished may be left.
 """
 
-import argparse
 import contextlib
 import importlib
 import json
@@ -30,13 +29,14 @@ from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.io.atomic import write_json
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.town.write import write_town
 from fprf.training import lay_out, prepare, style_pass, trainer
 from fprf.training.checkpoint import load
 from fprf.training.checkpoint import steps as saved
+
+from .common import arguments, report
 
 KILLED = -9
 PARTS = (lay_out, prepare, style_pass, trainer)
@@ -199,21 +199,17 @@ def measure(
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str]) -> None:
+    parser = arguments("kills", __doc__)
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path)
-    asked = parser.parse_args()
+    asked = parser.parse_args(argv)
     with tempfile.TemporaryDirectory(prefix="fprf-kills-") as folder:
         found = measure(Path(folder), kills=asked.kills, steps=asked.steps, seed=asked.seed, say=print)
-    command = f"python benchmarks/kills.py --kills {asked.kills} --steps {asked.steps} --seed {asked.seed}"
+    command = f"python -m benchmarks kills --kills {asked.kills} --steps {asked.steps} --seed {asked.seed}"
     document = {"command": command, **found}
     print(json.dumps({k: v for k, v in document.items() if k != "newest_checkpoint_at_kills"}, indent=1))
     if asked.output is not None:
-        write_json(asked.output, document)
-
-
-if __name__ == "__main__":
-    main()
+        report(asked.output, document)

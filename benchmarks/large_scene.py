@@ -1,6 +1,6 @@
 """A town as a large scene: blocks against one field of as many parameters, seams, memory, time with ever more blocks.
 
-    python benchmarks/large_scene.py [--views 400] [--blocks 16] [--minutes 9] [--output benchmarks/results/large_scene.json]
+    python -m benchmarks large_scene [--views 400] [--blocks 16] [--minutes 9] [--output benchmarks/results/large_scene.json]
 
 Both sides get the same seconds in all, features not counted: they are extracted before. Seconds are those of the processor,
 so that a busy machine favours neither (`--clock wall` takes the others; with one thread both agree where nobody disturbs).
@@ -19,8 +19,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from blocks_cost import costs
-from blocks_seams import jumps, ratios
 
 from fprf.cli import blocks as blocks_verb
 from fprf.cli import train as train_verb
@@ -43,6 +41,9 @@ from fprf.training.lay_out import lay_out, load_boxes, plan_scene
 from fprf.training.loading import Trained, load_run
 from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
+
+from .blocks import costs, jumps, ratios
+from .common import RESULTS, arguments, report
 
 METRES = 17.0
 """Of street in a block."""
@@ -159,9 +160,8 @@ def references(folder: Path) -> tuple[Path, ...]:
     return tuple(found)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    here = Path(__file__).resolve().parents[1]
+def main(argv: list[str]) -> None:
+    parser = arguments("large_scene", __doc__)
     parser.add_argument("--views", type=int, default=400)
     parser.add_argument("--size", type=int, nargs=2, default=(96, 72))
     parser.add_argument("--blocks", type=int, default=16)
@@ -173,8 +173,8 @@ def main() -> None:
     parser.add_argument("--rows", type=int, nargs="+", default=(4, 16, 64), help="lengths of rows that are timed")
     parser.add_argument("--frames", type=int, default=6, help="views rendered for times and memory")
     parser.add_argument("--scratch", type=Path, default=Path("runs/large_scene"))
-    parser.add_argument("--output", type=Path, default=here / "benchmarks/results/large_scene.json")
-    options = parser.parse_args()
+    parser.add_argument("--output", type=Path, default=RESULTS / "large_scene.json")
+    options = parser.parse_args(argv)
     keep_memory()  # as the command line does: else large gradients are mapped anew in every step
     options.scratch = options.scratch.resolve()
     os.environ.setdefault("XDG_CACHE_HOME", str(options.scratch / "cache"))
@@ -221,10 +221,5 @@ def main() -> None:
     memory = result["costs"]["memory"]
     result["peak_rss_many_over_two"] = memory[1]["peak_rss_mib"] / memory[0]["peak_rss_mib"]
     say(f"costs: {result['costs']}")
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(result, indent=1) + "\n")
+    report(options.output, result)
     say(f"written to {options.output}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """More images than memory: batches of a scene whose pixels are several times what the process may allocate.
 
-    python benchmarks/many_images.py [--images 12000] [--size 256 192] [--limit 1024] [--output FILE]
+    python -m benchmarks many_images [--images 12000] [--size 256 192] [--limit 1024] [--output FILE]
 
 The images are made here (JPEG, one camera a picture). A process of its own is held to `--limit` MiB of memory that it may
 write to (RLIMIT_DATA: what is mapped from files does not count, since the system can take it back) and draws batches as the
@@ -18,6 +18,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+
+from .common import RESULTS, arguments, report
 
 
 def write_scene(folder: Path, count: int, size: tuple[int, int]) -> None:
@@ -73,16 +75,16 @@ def part(folder: Path, cache: Path, limit: int, batches: int, held: bool) -> dic
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str]) -> None:
+    parser = arguments("many_images", __doc__)
     parser.add_argument("--images", type=int, default=12_000)
     parser.add_argument("--size", type=int, nargs=2, default=(256, 192))
     parser.add_argument("--limit", type=int, default=1024, help="MiB that the process may allocate")
     parser.add_argument("--batches", type=int, default=50)
     parser.add_argument("--scratch", type=Path, default=Path("runs/many_images"))
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results/many_images.json")
+    parser.add_argument("--output", type=Path, default=RESULTS / "many_images.json")
     parser.add_argument("--part", choices=("mapped", "held"), help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = parser.parse_args(argv)
     folder, cache = options.scratch / "scene", options.scratch / "cache"
     if options.part:
         print(json.dumps(part(folder, cache, options.limit, options.batches, options.part == "held")))
@@ -96,14 +98,9 @@ def main() -> None:
     }
     words = ["--images", str(options.images), "--limit", str(options.limit), "--batches", str(options.batches)]
     for name in ("mapped", "held"):
-        command = [sys.executable, __file__, *words, "--scratch", str(options.scratch), "--part", name]
+        command = [sys.executable, "-m", "benchmarks", "many_images", *words, "--scratch", str(options.scratch), "--part", name]
         found = subprocess.run(command, capture_output=True, text=True, check=False)
         told = found.stderr.strip().splitlines()[-1:] or [""]
         result[name] = json.loads(found.stdout) if found.returncode == 0 else {"exit": found.returncode, "told": told[0][:200]}
     print(json.dumps(result, indent=1))
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps(result, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+    report(options.output, result)

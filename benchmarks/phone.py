@@ -1,6 +1,6 @@
 """A folder as a phone gives it (the town's views as JPEG, no poses) to a restyled scene, by the README's own lines.
 
-    python benchmarks/phone.py WORK [--output benchmarks/results/phone.json] [--picture FILE.jpg] [--minutes 8]
+    python -m benchmarks phone WORK [--output benchmarks/results/phone.json] [--picture FILE.jpg] [--minutes 8]
 
 WORK holds everything that is made; lines that have run are not repeated. Needs the extra `sfm`.
 """
@@ -17,8 +17,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from sheets import sheet
-from town_references import town_reference
 
 from fprf.cli.parsing import parse
 from fprf.datamanagers.images import load_image
@@ -28,10 +26,12 @@ from fprf.io.atomic import write_json
 from fprf.io.images import to_uint8, write_image
 from fprf.town.write import write_town
 
-HERE = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(HERE / "tests" / "sfm"))  # the tests' own measure of poses
+from .common import ROOT, report
+from .pictures import sheet, town_reference
 
-from alignment import misses  # noqa: E402
+sys.path.insert(0, str(ROOT / "tests" / "reconstruction"))  # the tests' own measure of poses
+
+from alignment import misses
 
 VERBS = ("process", "train", "eval", "stylize")
 
@@ -92,15 +92,15 @@ def poses(work: Path) -> dict[str, float]:
     }
 
 
-def main(args: list[str]) -> None:
-    config = parse(PhoneConfig(), args, prog="phone.py", description=__doc__ or "", positional=("work",))
+def main(argv: list[str]) -> None:
+    config = parse(PhoneConfig(), argv, prog="python -m benchmarks phone", description=__doc__ or "", positional=("work",))
     work = config.work
     work.mkdir(parents=True, exist_ok=True)
     log = work / "lines.json"
     done: dict[str, Any] = json.loads(log.read_text()) if log.is_file() else {}
     if not (work / "night.jpg").is_file():
         photographs(config)
-    for verb, words in lines_of((HERE / "README.md").read_text()).items():
+    for verb, words in lines_of((ROOT / "README.md").read_text()).items():
         if verb in done or verb not in config.verbs:
             continue
         if verb == "train" and config.minutes is not None:
@@ -118,7 +118,7 @@ def main(args: list[str]) -> None:
         figures |= {key: metrics[key] for key in ("psnr", "ssim", "train_seconds", "train_steps")}
     print(json.dumps(figures, indent=1))
     if config.output is not None:
-        write_json(config.output, figures)
+        report(config.output, figures)
     if config.picture is not None and "stylize" in done:
         write_image(config.picture, sheet([row(work, run, name) for name in held_out(run)]))
 
@@ -137,7 +137,3 @@ def row(work: Path, run: Path, name: str) -> dict[str, Any]:
     files |= {file.parent.name: file for file in sorted((run / "styles").glob(f"*/{name}.png"))}
     shown = {key: np.asarray(load_image(path)) for key, path in files.items()}
     return {key: torch.from_numpy(picture).float() / 255 for key, picture in shown.items()}
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

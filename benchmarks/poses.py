@@ -1,21 +1,19 @@
 """Poses that are off, and what refining them wins back.
 
-    python benchmarks/poses.py [SCENE] [--steps 3000] [--degrees 0.5] [--share 0.005] [--output FILE] -- [any field]
+    python -m benchmarks poses [SCENE] [--steps 3000] [--degrees 0.5] [--share 0.005] [--output FILE] -- [any field]
 
 Without a scene, the embedded town. Its training views are turned by so many degrees about random axes and shifted by a share of
 the cameras' extent in random directions; then it is trained with its true poses, with the wrong ones, and with the wrong ones
 refined, for the same steps. A folder whose poses are not exact (`--as-given`) is trained as it is, with and without refining.
 
 Held-out views are judged where they were taken (true poses; the scene may lie a little elsewhere, where its training views put
-it) and with their own pose fitted to their image (`fprf.evaluation.alignment`): both for all sides. Errors of poses are those
+it) and with their own pose fitted to their image (`fprf.evaluation.evaluate`): both for all sides. Errors of poses are those
 of the training views, after the similarity that brings their centres nearest to the true ones.
 """
 
-import argparse
 import json
 import math
 import statistics
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,13 +25,14 @@ from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.evaluation.alignment import align
-from fprf.evaluation.judge import judge
+from fprf.evaluation.evaluate import align, judge
 from fprf.process import keep_memory
 from fprf.rendering.cameras import Cameras
 from fprf.training.loading import load_run
 from fprf.training.poses import rotated
 from fprf.training.prepare import with_downscale
+
+from .common import add_entry, arguments, split_flags
 
 
 def perturbed(source: Path, folder: Path, degrees: float, share: float, seed: int) -> Path:
@@ -108,8 +107,8 @@ def run_one(config: TrainConfig, true: Cameras | None) -> dict[str, Any]:
     return result
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str]) -> None:
+    parser = arguments("poses", __doc__)
     parser.add_argument("scene", type=Path, nargs="?", default=Path("town"))
     parser.add_argument("--as-given", action="store_true", help="the scene's poses are refined as they are")
     parser.add_argument("--steps", type=int, default=3000)
@@ -120,11 +119,11 @@ def main() -> None:
     parser.add_argument("--sides", nargs="+", default=("true", "wrong", "refined"))
     parser.add_argument("--scratch", type=Path, default=Path("runs/poses"))
     parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
-    own = sys.argv[1 : sys.argv.index("--")] if "--" in sys.argv else sys.argv[1:]
+    own, flags_behind = split_flags(argv)
     options = parser.parse_args(own)
     keep_memory()
     method, _ = load_method("fprf-lite")
-    flags = ["--data", str(options.scene), "--steps", str(options.steps), "--device", "cpu", *sys.argv[len(own) + 2 :]]
+    flags = ["--data", str(options.scene), "--steps", str(options.steps), "--device", "cpu", *flags_behind]
     base = with_downscale(parse(method, flags, prog="poses", description=""))
     assert base.downscale is not None
     source = parse_scene(base.data, 1, base.datamanager.parser).paths[0].parents[1]
@@ -140,7 +139,7 @@ def main() -> None:
         "refined": replace(plain, data=data, poses=options.rate),
     }
     result: dict[str, Any] = {
-        "flags": sys.argv[len(own) + 2 :],
+        "flags": flags_behind,
         "steps": options.steps,
         "rate": options.rate,
         "threads": torch.get_num_threads(),
@@ -150,9 +149,4 @@ def main() -> None:
     for side in options.sides:
         result[side] = run_one(replace(sides[side], output=scratch / side), true)
     if options.output is not None:
-        known = json.loads(options.output.read_text()) if options.output.is_file() else {}
-        options.output.write_text(json.dumps(known | {source.name: result}, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    main()
+        add_entry(options.output, source.name, result)

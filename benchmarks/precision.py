@@ -1,12 +1,11 @@
 """What `--precision` costs: colours and gradients of one batch in bfloat16 and TF32, against float32, on the CPU.
 
-    python benchmarks/precision.py RUN [--data DIR] [--rays 1024] [--output benchmarks/results/precision.json]
+    python -m benchmarks precision RUN [--data DIR] [--rays 1024] [--output benchmarks/results/precision.json]
 
 bfloat16 is autocast as training on a GPU enters it, on the plain forms. The CPU has no TF32: factors of the networks' products
 are rounded to its 11 bits, sums are float32, as in tensor cores.
 """
 
-import argparse
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -16,11 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fprf.benchmarking.report import machine
-from fprf.benchmarking.training import batch_rays
 from fprf.config import TrainConfig
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.io.atomic import write_json
+from fprf.evaluation.report import machine
+from fprf.evaluation.subject import batch_rays
 from fprf.ops.backend import plain
 from fprf.rendering.renderer import render_rays
 from fprf.training import checkpoint
@@ -28,6 +26,8 @@ from fprf.training.model import Model, background_of, build_model
 from fprf.training.prepare import Prepared, cache_folder
 from fprf.training.run import Run
 from fprf.types import Want
+
+from .common import RESULTS, arguments, report
 
 
 class Rounded(torch.autograd.Function):
@@ -75,14 +75,14 @@ def answers(model: Model, prepared: Prepared, config: TrainConfig, step: int) ->
     return rgb.detach(), flat
 
 
-def main() -> None:
+def main(argv: list[str]) -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments("precision", __doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--rays", type=int, default=1024)
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/precision.json"))
-    args = parser.parse_args()
+    parser.add_argument("--output", type=Path, default=RESULTS / "precision.json")
+    args = parser.parse_args(argv)
     run = Run(args.run)
     config, method = run.load_config()
     known = run.load_known()
@@ -113,8 +113,4 @@ def main() -> None:
             }
             print(name, rows[name])
     about = {"method": method, "scene": known.name, "step": saved.step, "rays": args.rays}
-    write_json(args.output, {"machine": machine(torch.device("cpu")), "run": about, "errors": rows})
-
-
-if __name__ == "__main__":
-    main()
+    report(args.output, {"machine": machine(torch.device("cpu")), "run": about, "errors": rows})

@@ -1,6 +1,6 @@
 """Restyling captures of Gaussians: processor seconds, peak memory, and what sharp edges become.
 
-    python benchmarks/splat_restyle.py --captures plant.splat --references autumn.jpg night.jpg --output splat_restyle.json
+    python -m benchmarks splat_restyle --captures plant.splat --references autumn.jpg night.jpg --output splat_restyle.json
 
 Each capture, and made-up ones of --synthetic Gaussians, is looked at in a process of its own with one thread. `rims` is how
 much the brightness that stands out at depth edges is amplified, relative to that inside of surfaces: above 1 edges glow.
@@ -19,44 +19,48 @@ from typing import Any
 import cv2
 import numpy as np
 
+from .common import arguments
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+
+def main(argv: list[str]) -> None:
+    parser = arguments("splat_restyle", __doc__)
     parser.add_argument("--captures", type=Path, nargs="*", default=[])
     parser.add_argument("--synthetic", type=int, nargs="*", default=[115_000, 1_000_000])
     parser.add_argument("--references", type=Path, nargs="+", required=True)
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.one:
-        print(json.dumps(measured(arguments.one, arguments.references)))
+    options = parser.parse_args(argv)
+    if options.one:
+        print(json.dumps(measured(options.one, options.references)))
         return
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for count in arguments.synthetic:
+        for count in options.synthetic:
             path = Path(folder) / f"synthetic-{count}.splat"
             made_up(path, count)
-            arguments.captures.append(path)
-        for path in arguments.captures:
+            options.captures.append(path)
+        for path in options.captures:
             words = [
                 sys.executable,
-                __file__,
+                "-m",
+                "benchmarks",
+                "splat_restyle",
                 "--one",
                 str(path),
                 "--output",
                 "-",
                 "--references",
-                *map(str, arguments.references),
+                *map(str, options.references),
             ]
             single = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
             said = subprocess.run(words, capture_output=True, text=True, check=True, env=single).stdout
             rows.append(json.loads(said.splitlines()[-1]))
             print(rows[-1], flush=True)
-            arguments.output.write_text(json.dumps(report(rows), indent=1) + "\n")
+            options.output.write_text(json.dumps(report(rows), indent=1) + "\n")
 
 
 def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    from fprf.evidence.provenance import provenance
+    from fprf.evaluation.report import provenance
 
     return {"threads": 1, "seconds": "of the processor, kernels compiled", "captures": rows, **provenance("cpu")}
 
@@ -153,7 +157,3 @@ def standing_out(scene: Any, harmonics: Any, view: int) -> tuple[float, float]:
     steep = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((5, 5))) > 0.15 * float(scene.gaussians.means.std())
     away = cv2.dilate(steep.astype(np.uint8), np.ones((3, 3))) == 0
     return float(above[solid & steep].mean()), float(above[solid & away].mean())
-
-
-if __name__ == "__main__":
-    main()

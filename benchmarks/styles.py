@@ -1,6 +1,6 @@
 """Restyling side by side: every stylizer, and transfers of colour alone, on painted photographs and on trained runs.
 
-    python benchmarks/styles.py [RUN ...] [--shared DIR] [--sheets DIR] [--output JSON] [any field]
+    python -m benchmarks styles [RUN ...] [--shared DIR] [--sheets DIR] [--output JSON] [any field]
 
 structure, ssim: kept of the unstylised picture, 1 = all of it. style_distance: to the references, region by region, 1 = no
 change, in the eyes of VGG-19, which no shipped part of the product uses. consistency: warp error between neighbouring views.
@@ -10,25 +10,133 @@ Sheets show other people's photographs: they are written only where asked for.
 import json
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import style_runs
-import style_triplets
 import torch
-from sheets import sheet
+import torch.nn.functional as F
+from torch import Tensor
 
 from fprf.checks import at_least
 from fprf.cli.parsing import parse
+from fprf.datamanagers.config import GuidedConfig
+from fprf.datamanagers.images import load_image
 from fprf.errors import FprfError
-from fprf.evaluation.contest import GOALS, RECOMMENDED, Row, mean_rows, verdict
-from fprf.interfaces import Encoder
-from fprf.io.atomic import write_json
-from fprf.io.images import write_image
+from fprf.evaluation.restyle import STYLIZERS
+from fprf.evaluation.single_image import cells_basis, encoded, flat_look, flat_reference, flat_scene, painted, render_flat
+from fprf.interfaces import Decoder, Encoder
+from fprf.io.images import shrink, write_image
+from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, RandomConfig, Vgg19Config
 from fprf.plugins.encoders.segmenter_config import DeepLabConfig
+from fprf.plugins.stylizers.config import IdentityConfig
+from fprf.style.dictionary import build_dictionary
 
-HERE = Path(__file__).resolve().parents[1]
+from . import style_runs
+from .common import RESULTS, SHARED, report
+from .pictures import sheet
+from .semantic_matching import COLOURS, Triplet, read_triplets, triplet_names
+from .style_runs import GOALS, PLAIN, RECOMMENDED, Exhibit, Row, colour_baselines, judge_exhibit, mean_rows, verdict
+
+DIM, REGIONS, CLUSTERS = 32, 16, 20
+"""Of `fprf-lite`: semantic components, regions of a scene, codes of a reference."""
+SOURCES = ("painted", "encoder")
+
+
+@dataclass(frozen=True)
+class Tools:
+    content: Encoder
+    semantic: Encoder
+    decoder: Decoder
+
+    @classmethod
+    def of(cls, content: EncoderConfig, semantic: EncoderConfig) -> "Tools":
+        encoder = content.build()
+        decoder = MlpDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels)
+        return cls(encoder, semantic.build(), decoder)
+
+
+def photograph(path: Path, longest: int) -> Tensor:
+    return torch.from_numpy(shrink(load_image(path), longest)).float() / 255
+
+
+def restyled(triplet: Triplet, tools: Tools, source: str) -> dict[str, Tensor]:
+    """The content photograph by every stylizer, its parts told apart by the painted regions or by the encoder."""
+    guided, size = GuidedConfig(), (triplet.content.shape[0], triplet.content.shape[1])
+    here, there = (encoded(image, tools.content, guided) for image in (triplet.content, triplet.style))
+    if source == "painted":
+        kinds = len(COLOURS)
+        where = painted(triplet.content_regions, kinds, size)
+        where_there = painted(triplet.style_regions, kinds, (triplet.style.shape[0], triplet.style.shape[1]))
+    else:
+        basis = cells_basis(triplet.content, tools.semantic, DIM)
+        where, where_there = (encoded(image, tools.semantic, guided, basis) for image in (triplet.content, triplet.style))
+    flat = flat_scene(here, where, size, regions=len(COLOURS) if source == "painted" else REGIONS)
+    dictionary = build_dictionary(
+        [flat_reference("style", there, where_there, triplet.style.reshape(-1, 3))],
+        clusters=len(COLOURS) if source == "painted" else CLUSTERS,
+    )
+    configs = {"decoded": IdentityConfig(), **STYLIZERS} if source == SOURCES[0] else STYLIZERS
+    return {
+        name: render_flat(flat, flat_look(flat, dictionary, config, tools.decoder), tools.decoder)
+        for name, config in configs.items()
+    }
+
+
+def peer(folder: Path, triplet: Triplet) -> dict[str, Tensor]:
+    """What the paper of the triplets made of it, where that lies beside them."""
+    path = folder / "dpst_result" / f"{triplet.name}.jpg"
+    if not path.is_file():
+        return {}
+    image = torch.from_numpy(load_image(path)).float().permute(2, 0, 1)[None] / 255
+    size = (triplet.content.shape[0], triplet.content.shape[1])
+    return {"luan et al.": F.interpolate(image, size, mode="area")[0].permute(1, 2, 0)}
+
+
+def contests(
+    folder: Path,
+    tools: Tools,
+    judges: dict[str, Encoder],
+    *,
+    count: int,
+    longest: int,
+    full: bool,
+    seen: Callable[[str, dict[str, Tensor]], None],
+) -> dict[str, dict[str, dict[str, Row]]]:
+    """Rows by source of the regions, triplet and method. `seen` is shown all pictures of a triplet."""
+    found: dict[str, dict[str, dict[str, Row]]] = {source: {} for source in SOURCES}
+    for name in _spread(triplet_names(folder), count):
+        (triplet,) = read_triplets(folder, names=[name], size=None)
+        triplet = triplet._replace(
+            content=photograph(folder / "content" / f"{name}.jpg", longest),
+            style=photograph(folder / "style" / f"{name}.jpg", longest),
+        )
+        common = {PLAIN: triplet.content}
+        common |= {k: v[0] for k, v in colour_baselines([triplet.content], [triplet.style]).items()}
+        common |= peer(folder, triplet)
+        made = {source: restyled(triplet, tools, source) for source in SOURCES}
+        every = {**common, **{f"{source}/{k}": image for source in SOURCES for k, image in made[source].items()}}
+        exhibit = Exhibit(
+            plain=[triplet.content],
+            styled={k: [image] for k, image in every.items()},
+            regions=[triplet.content_regions],
+            references=[triplet.style],
+            reference_regions=[triplet.style_regions],
+        )
+        rows = judge_exhibit(exhibit, judges, full=full)
+        for source in SOURCES:
+            found[source][name] = {k: rows[k] for k in common} | {k: rows[f"{source}/{k}"] for k in made[source]}
+        seen(name, {"style": triplet.style, **every})
+    return found
+
+
+def _spread(names: Sequence[str], count: int) -> list[str]:
+    """So many of the names, evenly spread."""
+    kept = min(count, len(names))
+    return [names[i * len(names) // kept] for i in range(kept)]
+
+
 LAYERS = ("relu1_1", "relu2_1", "relu3_1")
 COLUMNS = ("structure", "ssim", "style_distance", "full_distance", "consistency_rmse", "consistency_relative")
 SHEET_ROWS = 12
@@ -40,7 +148,7 @@ class StylesConfig:
 
     runs: tuple[Path, ...] = ()
     """Trained runs."""
-    shared: Path = HERE.parent / "shared"
+    shared: Path = SHARED
     """Folder with data/pst, data/styles, data/pairings.json and weights; what is absent is skipped."""
     content: EncoderConfig = BundledContentConfig()
     """Content encoder of the photographs (runs bring their own); its decoder must ship."""
@@ -56,7 +164,7 @@ class StylesConfig:
     """Also compare whole covariances; several times as slow."""
     sheets: Path | None = None
     """Folder for contact sheets; none = none."""
-    output: Path = HERE / "benchmarks/results/styles.json"
+    output: Path = RESULTS / "styles.json"
     """Figures."""
 
     def __post_init__(self) -> None:
@@ -95,24 +203,25 @@ def triplets(config: StylesConfig) -> dict[str, object]:
     folder, pictures = config.shared / "data/pst", {}
     if not config.triplets or not folder.is_dir():
         return {}
-    tools = style_triplets.Tools.of(config.content, config.semantic)
+    tools = Tools.of(config.content, config.semantic)
 
     def seen(name: str, images: dict[str, torch.Tensor]) -> None:
         say(f"triplet {name}")
         pictures[name] = images
 
-    limits = {"count": config.triplets, "longest": config.longest, "full": config.full}
-    found = style_triplets.contests(folder, tools, judges(config.shared), seen=seen, **limits)
+    found = contests(
+        folder, tools, judges(config.shared), seen=seen, count=config.triplets, longest=config.longest, full=config.full
+    )
     if config.sheets is not None:
         names = list(pictures)
         for first in range(0, len(names), SHEET_ROWS):
             rows = [pictures[name] for name in names[first : first + SHEET_ROWS]]
             write_image(config.sheets / f"triplets-{first // SHEET_ROWS}.jpg", sheet(rows))
     result = {}
-    for source, contests in found.items():
-        means = mean_rows(contests.values())
+    for source, cases in found.items():
+        means = mean_rows(cases.values())
         show(f"triplets, {source}", means)
-        result[source] = {"means": means, "verdict": verdict(means), "triplets": contests}
+        result[source] = {"means": means, "verdict": verdict(means), "triplets": cases}
     return {"content": tools.content.identity, "semantic": tools.semantic.identity, **result}
 
 
@@ -145,15 +254,17 @@ def runs(config: StylesConfig) -> dict[str, object]:
     return result
 
 
-def main() -> int:
+def main(argv: list[str]) -> int:
     torch.set_num_threads(1)
     start = time.perf_counter()
     roots = []
-    args = sys.argv[1:]
+    args = argv
     while args and not args[0].startswith("-"):  # as many positional arguments as there are
         roots.append(Path(args.pop(0)))
     try:
-        config = replace(parse(StylesConfig(), args, prog="styles.py", description=__doc__ or ""), runs=tuple(roots))
+        config = replace(
+            parse(StylesConfig(), args, prog="python -m benchmarks styles", description=__doc__ or ""), runs=tuple(roots)
+        )
         document = {
             "benchmark": "styles",
             "recommended": RECOMMENDED,
@@ -167,12 +278,8 @@ def main() -> int:
     except FprfError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    write_json(config.output, document)
+    report(config.output, document)
     for name, part in {**document["triplets"], **document["runs"]}.items():
         if isinstance(part, dict):
             print(name, json.dumps(part["verdict"], indent=1))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,6 @@
 """How fast the viewer is, whether it keeps memory, and what `fprf train --view` costs.
 
-    python benchmarks/viewer_speed.py RUN --references a.png b.png [--parts start drop memory training] [--steps 300]
+    python -m benchmarks viewer_speed RUN --references a.png b.png [--parts start drop memory training] [--steps 300]
         [--output FILE]
 
 start     `fprf view RUN` until its page and state are served, five times
@@ -14,7 +14,6 @@ Needs the extra `viewer`; drop, memory and the last line of training need playwr
 the load average is written down.
 """
 
-import argparse
 import json
 import os
 import re
@@ -31,11 +30,11 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "viewer"))
+from .common import RESULTS, ROOT, arguments, report
+
+sys.path.insert(0, str(ROOT / "tests" / "viewer"))
 
 from browser import front, served
-
-from fprf.io.atomic import write_json
 
 FORMAT = 1
 TARGETS = {"start_seconds": 3.0, "drop_seconds": 0.5, "memory_ratio": 1.05}
@@ -166,14 +165,14 @@ PARTS: dict[str, Callable[[Path, list[Path], int], dict[str, object]]] = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def main(argv: list[str]) -> None:
+    parser = arguments("viewer_speed", __doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--references", type=Path, nargs="+", required=True)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--steps", type=int, default=300, help="of the trainings")
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/viewer.json"))
-    args = parser.parse_args()
+    parser.add_argument("--output", type=Path, default=RESULTS / "viewer.json")
+    args = parser.parse_args(argv)
     found: dict[str, object] = json.loads(args.output.read_text()) if args.output.is_file() else {}
     found |= {"format": FORMAT, "targets": TARGETS}
     for name in args.parts:
@@ -182,9 +181,5 @@ def main() -> None:
             "load_average_before": load,
             "processors": os.cpu_count(),
         }
-        write_json(args.output, found)
+        report(args.output, found)
         print(name, json.dumps(found[name]), flush=True)
-
-
-if __name__ == "__main__":
-    main()

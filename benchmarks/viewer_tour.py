@@ -1,6 +1,6 @@
 """A tour of the viewer in a headless Chromium, with real drops, drags and clicks, as a film and as pictures.
 
-    python benchmarks/viewer_tour.py RUN --references autumn.png winter.png night.png [--output docs/images]
+    python -m benchmarks viewer_tour RUN --references autumn.png winter.png night.png [--output docs/images]
 
 RUN is a trained run, by preference one of `town`; `fprf demo` leaves photographs that suit it in demo/references. Writes
 viewer-tour.mp4 and viewer-style.png, viewer-wipe.png, viewer-region.png, viewer-matches.png, viewer-flight.png. Needs the
@@ -8,7 +8,6 @@ extras `viewer` and `video`, playwright and a Chromium. The film shows one pictu
 not that of the machine; benchmarks/viewer_speed.py measures times.
 """
 
-import argparse
 import base64
 import sys
 from pathlib import Path
@@ -17,7 +16,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "viewer"))
+from .common import ROOT, arguments
+
+sys.path.insert(0, str(ROOT / "tests" / "viewer"))
 
 from browser import Front, front, served
 
@@ -230,12 +231,12 @@ def take(tour: Tour, references: list[Path]) -> None:
     tour.settle(15)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def main(argv: list[str]) -> None:
+    parser = arguments("viewer_tour", __doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--references", type=Path, nargs=3, required=True)
     parser.add_argument("--output", type=Path, default=Path("docs/images"))
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     with served(args.run, "--pixels", "480") as (address, _), front(address, WIDTH, HEIGHT) as found:
         found.rest(2.0)
         tour = Tour(found, args.output)
@@ -245,7 +246,3 @@ def main() -> None:
     write_video(args.output / "viewer-tour.mp4", tour.frames, FPS)
     size = (args.output / "viewer-tour.mp4").stat().st_size
     print(f"{len(tour.frames)} frames, {len(tour.frames) / FPS:.0f} s, {size / 2**20:.1f} MiB")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,42 +1,39 @@
-"""`fprf bench NAME [RUN]`: measure a run, or a scene that is trained on the spot."""
+"""`fprf bench NAME`: measure a run, a restyling whose truth is known, or the frames of another system."""
 
-import importlib
+import os
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 
-from ..benchmarking.config import (
-    BenchConfig,
-    MemoryConfig,
-    ParetoConfig,
-    ProfileConfig,
-    ScalingConfig,
-    SpeedConfig,
-    StressConfig,
-)
 from ..errors import UsageError
-from . import evidence
+from ..evaluation.config import BenchConfig, MemoryConfig, PeerConfig, ProfileConfig, ReportConfig, RestyleConfig, SpeedConfig
 from .parsing import load_field_method, parse
 from .progress import Display
 from .train import train_scene
 
-__all__ = ["NAMES", "run"]
+if TYPE_CHECKING:
+    from ..evaluation.report import Outcome
 
-NAMES: dict[str, BenchConfig] = {
+__all__ = ["NAMES", "bench_run", "console", "run", "write_report"]
+
+NAMES: dict[str, BenchConfig | ReportConfig] = {
     "speed": SpeedConfig(),
     "profile": ProfileConfig(),
-    "pareto": ParetoConfig(),
     "memory": MemoryConfig(),
-    "scaling": ScalingConfig(),
-    "stress": StressConfig(),
+    "restyle": RestyleConfig(),
+    "peer": PeerConfig(),
 }
-"""Defaults of each benchmark; `fprf.benchmarking.NAME` has a function of its name."""
-
-
-WIDTH = 120
+"""Defaults of each benchmark."""
+_MOVED = ("paper", "pareto", "scaling", "stress")
+"""Benchmarks of the repository, which the installed package does not hold."""
+_WIDTH = 150
 """Columns of a table that goes to a file."""
+C = TypeVar("C", bound=BenchConfig)
+Progress = Callable[[int, int, str], None]
 
 
 def run(args: list[str]) -> int:
@@ -45,47 +42,132 @@ def run(args: list[str]) -> int:
     if name in ("", "-h", "--help"):
         print(_usage())
         return 0 if name else 2
-    if name in evidence.NAMES:
-        return evidence.run(name, rest)
-    if name not in NAMES:
-        raise UsageError(f"fprf bench {name}: no such benchmark; allowed are {', '.join([*NAMES, *evidence.NAMES])}")
-    if rest and not rest[0].startswith("-"):  # tyro has no positional argument that may be absent
-        rest = ["--run", *rest]
-    default = NAMES[name]
-    config = parse(default, rest, prog=f"fprf bench {name} [RUN]", description=_about(default))
+    if name in _MOVED:
+        raise UsageError(
+            f"fprf bench {name}: not in the installed package; run `python -m benchmarks {name}` in a clone of fprf"
+        )
+    if name == "speed":
+        from ..evaluation.speed import speed
+
+        return bench_run(f"fprf bench {name}", SpeedConfig(), rest, speed)
+    if name == "profile":
+        from ..evaluation.profile import profile
+
+        return bench_run(f"fprf bench {name}", ProfileConfig(), rest, profile)
+    if name == "memory":
+        from ..evaluation.memory import memory
+
+        return bench_run(f"fprf bench {name}", MemoryConfig(), rest, memory)
+    if name == "restyle":
+        return _restyle(rest)
+    if name == "peer":
+        return _peer(rest)
+    raise UsageError(f"fprf bench {name}: no such benchmark; allowed are {', '.join(NAMES)}")
+
+
+def bench_run(prog: str, default: C, args: list[str], measure: "Callable[[C, Path, Path, Progress], Outcome]") -> int:
+    """Measure the run that the arguments name, or a scene that is trained first; print the tables and write the JSON.
+
+    `measure` gets the config, the run folder, a temporary folder and a function that shows progress.
+    """
+    config = parse(default, _named_run(args), prog=f"{prog} [RUN]", description=_about(default))
     with tempfile.TemporaryDirectory(prefix="fprf-bench-") as made:
         folder = Path(made)
-        root = config.run or _train(config, folder / "run")
+        root = config.run or _trained(config, folder / "run")
         from ..io.atomic import write_json
 
-        measure = getattr(importlib.import_module(f"fprf.benchmarking.{name}"), name)
         with Display() as display:
             outcome = measure(config, root, folder, display.count)
-        console = Console(highlight=False)
-        if not console.is_terminal:
-            console.width = WIDTH
         for table in outcome.tables:
-            console.print(table)
+            console().print(table)
         if config.output is not None:
             write_json(config.output, outcome.document)
     return 0
 
 
-def _train(config: BenchConfig, output: Path) -> Path:
+def console() -> Console:
+    """A console whose tables are as wide in a file as on a wide terminal."""
+    made = Console(highlight=False)
+    if not made.is_terminal:
+        made.width = _WIDTH
+    return made
+
+
+def write_report(config: ReportConfig, document: dict[str, Any], page: Callable[[], str]) -> None:
+    """Write the JSON and the page where the config asks for them."""
+    from ..io.atomic import write_json, write_text
+
+    if config.output is not None:
+        write_json(config.output, document)
+    if config.page is not None:
+        write_text(config.page, page())
+
+
+def _restyle(args: list[str]) -> int:
+    default = RestyleConfig()
+    config = parse(default, _named_run(args), prog="fprf bench restyle [RUN]", description=_about(default))
+    with tempfile.TemporaryDirectory(prefix="fprf-restyle-") as made:
+        root = config.run or _trained_town(config, Path(made) / "run")
+        from ..evaluation.report import printed, provenance
+        from ..evaluation.restyle import COLUMNS, restyle, restyle_page, restyle_sheet
+        from ..io.images import write_image
+
+        with Display() as display:
+            document, cases = restyle(config, root, Path(made), display.count)
+    document["provenance"] = provenance(config.device)
+    for name, rows in document["means"].items():
+        console().print(printed(f"mean over {len(config.palettes)} palettes, references: {name}", rows, COLUMNS))
+    if config.sheet is not None:
+        write_image(config.sheet, restyle_sheet(cases))
+    write_report(config, document, lambda: restyle_page(document, picture=_beside(config.page, config.sheet)))
+    return 0
+
+
+def _peer(args: list[str]) -> int:
+    default = PeerConfig()
+    config = parse(default, args, prog="fprf bench peer", description=_about(default), positional=("frames",))
+    from ..evaluation.peer import peer, peer_page
+    from ..evaluation.report import provenance
+
+    with Display() as display:
+        document = peer(config, display.count)
+    document["provenance"] = provenance(config.device)
+    page = peer_page(document)
+    print(page)
+    write_report(config, document, lambda: page)
+    return 0
+
+
+def _named_run(args: list[str]) -> list[str]:
+    """A leading RUN as the flag that it stands for: tyro has no positional argument that may be absent."""
+    return ["--run", *args] if args and not args[0].startswith("-") else args
+
+
+def _trained(config: BenchConfig, output: Path) -> Path:
     method, name = load_field_method(config.method)
     data = config.data or method.data or Path("town")
     return train_scene(replace(method, data=data, output=output, steps=config.steps, minutes=None, device=config.device), name)
 
 
-def _about(config: BenchConfig) -> str:
+def _trained_town(config: RestyleConfig, output: Path) -> Path:
+    method, name = load_field_method("fprf-lite")
+    made = replace(method, data=Path("town"), output=output, minutes=config.minutes, device=config.device)
+    return train_scene(made, name)
+
+
+def _beside(page: Path | None, picture: Path | None) -> str | None:
+    """The picture's path relative to the page."""
+    return None if page is None or picture is None else Path(os.path.relpath(picture, page.parent)).as_posix()
+
+
+def _about(config: object) -> str:
     return (type(config).__doc__ or "").strip()
 
 
 def _usage() -> str:
-    every = {name: _about(config) for name, config in NAMES.items()}
-    every |= {name: evidence.about(config) for name, config in evidence.NAMES.items()}
-    width = max(map(len, every))
-    lines = [f"usage: fprf bench {'|'.join(every)} [RUN] [--output JSON] [any field]", ""]
-    lines += [f"  {name:<{width}}  {text}" for name, text in every.items()]
+    width = max(map(len, NAMES))
+    lines = [f"usage: fprf bench {'|'.join(NAMES)} [RUN] [--output JSON] [any field]", ""]
+    lines += [f"  {name:<{width}}  {_about(config)}" for name, config in NAMES.items()]
     lines += ["", "`fprf bench NAME --help` lists every field; without RUN a scene is trained first, --data DIR by --method."]
+    lines += ["Further benchmarks are in the repository: `python -m benchmarks` in a clone of fprf."]
     return "\n".join(lines)

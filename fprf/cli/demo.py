@@ -47,7 +47,7 @@ def run(args: list[str]) -> int:
     start = time.perf_counter()
     from ..datamanagers.config import RayBatchesConfig
     from ..datamanagers.parsers.config import TownConfig, parse_scene
-    from ..evaluation.judge import judge
+    from ..evaluation.evaluate import judge
     from ..fields.config import PlanesConfig
     from ..io.atomic import write_json
     from ..io.video import write_video

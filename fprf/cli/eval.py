@@ -50,8 +50,7 @@ def run(args: list[str]) -> int:
 
 def evaluate_fields(config: EvalConfig) -> dict[str, object]:
     """Judge a run of fields."""
-    from ..evaluation.alignment import align, described
-    from ..evaluation.judge import judge
+    from ..evaluation.evaluate import align, described, judge
     from ..training.loading import load_run
     from ..training.prepare import scene_of
     from ..training.run import view_names

@@ -47,7 +47,7 @@ class SplatVerbs(Verbs):
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Judge renders, lenses included, as those of fields are judged."""
-        from ..evaluation.judge import judge_views
+        from ..evaluation.evaluate import judge_views
         from ..splats.training import open_gaussians, scene_of
         from ..training.run import view_names
         from .eval import store

@@ -1,13 +1,16 @@
-"""How far a picture's style is from its references', region by region, in the eyes of an encoder that took no part.
+"""Style distance: how far a picture's feature statistics are from its references', region by region.
 
-Features of each layer are described in each region by their mean and deviation (or, stricter, their whole covariance), and
-two regions are as far apart as the Gaussians are (Fréchet, the 2-Wasserstein distance):
+Features of each layer are described in each region by mean and deviation (or, with `full`, by their covariance), and two
+regions are compared by the Fréchet (2-Wasserstein) distance of the Gaussians:
 
     d² = |μ_a - μ_b|² + |σ_a - σ_b|²          per channel
     d² = |μ_a - μ_b|² + tr(C_a + C_b - 2 (C_a^½ C_b C_a^½)^½)                                      with covariances
 
-Regions are averaged by their share of the content, then divided by the same for the unstylised picture: 0 = the reference's own
-statistics, 1 = no change. Layers count alike.
+Regions are averaged by their share of the content and divided by the same for the unstylised picture: 0 = the reference's own
+statistics, 1 = no change. Layers count alike. Use an encoder that took no part in the styling.
+
+`matched_regions` finds regions that pictures share: clusters of the references' cells under a semantic encoder; a cell of the
+content takes the region whose direction its own is most like. Both sides are centred on their own mean.
 """
 
 import math
@@ -15,21 +18,42 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import DataError
 from ..interfaces import Encoder
+from ..style.clusters import kmeans
+from ..style.matching import unit
 from ..style.statistics import covariance, moments
 from ..style.transport import symmetric_root
-from .semantic_matching import MIXED, whole_cells
 
-__all__ = ["RegionStatistics", "gaussian_distance", "region_statistics", "relative_distance", "style_distances"]
+__all__ = [
+    "MIXED",
+    "RegionStatistics",
+    "gaussian_distance",
+    "matched_regions",
+    "region_statistics",
+    "relative_distance",
+    "style_distances",
+    "whole_cells",
+]
 
+
+MIXED = -1
+"""Label of cells that more than one region meets in."""
 _CELLS = 8
 """A region needs so many cells of a layer on both sides: fewer say nothing of a style."""
 
 Labelled = Sequence[tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "G F"]]]
 """Pictures, each with the region of its pixels (or of cells of any size); the same ids mean the same on all sides."""
+
+
+def whole_cells(regions: Annotated[Tensor, "H W"], size: tuple[int, int]) -> Annotated[Tensor, "h w"]:
+    """The region of every cell of a grid of `size` (height, width) over the image; MIXED where there are several."""
+    pixels = regions[None, None].double()
+    highest, lowest = F.adaptive_max_pool2d(pixels, size), -F.adaptive_max_pool2d(-pixels, size)
+    return torch.where(highest == lowest, highest, MIXED)[0, 0].long()
 
 
 class RegionStatistics(NamedTuple):
@@ -111,3 +135,30 @@ def style_distances(
 def _described(cells: Annotated[Tensor, "N C"]) -> RegionStatistics:
     found = moments(cells, torch.ones(len(cells)))
     return RegionStatistics(len(cells), found.mean, covariance(found))
+
+
+@torch.no_grad()
+def matched_regions(
+    encoder: Encoder,
+    contents: Sequence[Annotated[Tensor, "H W 3"]],
+    styles: Sequence[Annotated[Tensor, "G F 3"]],
+    *,
+    regions: int,
+    seed: int,
+) -> tuple[list[Annotated[Tensor, "h w"]], list[Annotated[Tensor, "g f"]]]:
+    """Region ids of the encoder's cells, in the contents and in the styles; at most `regions` of them."""
+    here, there = ([encoder(image.permute(2, 0, 1)[None])[0].float() for image in side] for side in (contents, styles))
+    found = kmeans(_directions(there), regions, seed=seed)
+    like = _directions(here) @ torch.nn.functional.normalize(found.centres, dim=1).T
+    return _maps(like.argmax(1), here), _maps(found.label, there)
+
+
+def _directions(maps: Sequence[Annotated[Tensor, "C h w"]]) -> Annotated[Tensor, "N C"]:
+    cells = torch.cat([each.flatten(1).T for each in maps])
+    return unit(cells, cells.mean(0))
+
+
+def _maps(label: Annotated[Tensor, "N"], like: Sequence[Annotated[Tensor, "C h w"]]) -> list[Annotated[Tensor, "h w"]]:
+    sizes = [each.shape[1:] for each in like]
+    parts = torch.split_with_sizes(label, [height * width for height, width in sizes])
+    return [part.reshape(size) for part, size in zip(parts, sizes, strict=True)]

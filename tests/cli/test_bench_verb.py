@@ -1,7 +1,6 @@
 import json
 from pathlib import Path
 
-import cv2
 import pytest
 from tiny_world import World
 
@@ -67,51 +66,12 @@ def test_profile(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "training step" in captured.out and all(line.startswith("{") for line in captured.err.splitlines())
 
 
-def test_pareto(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = bench(world, "pareto", tmp_path / "pareto.json", "--also", str(world.run))
-    plain, styled = document["points"].values()
-    knobs = {point["knob"] for point in plain}
-    assert knobs >= {"run", "quality", "budget", "samples", "chunk", "resolution", "precision", "kernels", "method", "style"}
-    assert "semantic channels" in {point["knob"] for point in styled}
-    by_name = {f"{point['knob']} {point['value']}": point for point in plain}
-    assert by_name["budget 0"]["largest_error"] < 1e-4
-    for text, budget in (("1/64", 1 / 64), ("1/16", 1 / 16)):
-        assert by_name[f"budget {text}"]["largest_error"] <= budget + 1e-5
-    assert by_name["quality standard"]["rms_error"] == by_name["budget 1/512"]["rms_error"]
-    assert by_name["run as trained"]["psnr"] == pytest.approx(by_name["method fprf-lite"]["psnr"])
-    assert by_name["style at strength 0"]["rms_error"] == by_name["run as trained"]["rms_error"]
-    assert 0 < by_name["precision planes stored in float16"]["rms_error"] < 1e-2
-    kept = [counters["kept_samples_share"] for counters in document["counters_by_budget"].values()]
-    assert kept[-1] > 0 and kept == sorted(kept, reverse=True)
-    for name, front in document["fronts"].items():
-        assert front["rms_error"] and {*front["rms_error"]} <= {f"{p['knob']} {p['value']}" for p in document["points"][name]}
-    assert cv2.imread(str(tmp_path / "pareto.png")).std() > 5
-    assert "time against error, plain" in capsys.readouterr().out
-
-
-def test_scaling(world: World, tmp_path: Path) -> None:
-    sizes = ["--images", "2", "3", "--downscales", "2", "1", "--styles", "1", "2", "--points", "200", "400"]
-    document = bench(world, "scaling", tmp_path / "scaling.json", *sizes)
-    series = {each["name"]: each for each in document["series"]}
-    assert [each["of"] for each in document["series"]] == ["images", "images", "pixels", "references", "references", "points"]
-    assert series["a batch"]["sizes"] == [2, 3] and series["tri-plane forward + backward"]["sizes"] == [200, 400]
-    assert all(cost > 0 for each in series.values() for cost in each["milliseconds"])
-    assert all(each["exponent"] is not None for each in series.values())
-
-
 @pytest.mark.slow
 def test_memory(world: World, tmp_path: Path) -> None:
     document = bench(world, "memory", tmp_path / "memory.json")
     rows = {row["name"]: row["figure"] for row in document["rows"]}
     assert 20 < rows["interpreter and packages"] < rows["and a loaded run"] < rows["and training steps"] < 4000
     assert rows["parameters of the field"] > 0
-
-
-def test_every_benchmark_has_a_function() -> None:
-    import importlib
-
-    for name in NAMES:
-        assert callable(getattr(importlib.import_module(f"fprf.benchmarking.{name}"), name))
 
 
 def test_usage_names_every_benchmark(capsys: pytest.CaptureFixture[str]) -> None:
@@ -124,10 +84,11 @@ def test_usage_names_every_benchmark(capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("args", "told"),
     [
-        (["sped"], "fprf bench sped: no such benchmark; allowed are speed, profile, pareto, memory, scaling"),
+        (["sped"], "fprf bench sped: no such benchmark; allowed are speed, profile, memory, restyle, peer"),
         (["speed", "nowhere"], "nowhere: no config.json here"),
         (["speed", "--repeats", "0"], "--repeats: 0 must be at least 1"),
-        (["scaling", "--points", "0"], "--points: 0 must be at least 1"),
+        (["speed", "--points", "0"], "--points: 0 must be at least 1"),
+        (["pareto", "run"], "run `python -m benchmarks pareto` in a clone of fprf"),
         (["speed", "--method", "fprf-quick"], "fprf-quick"),
     ],
 )

@@ -128,7 +128,7 @@ def test_eval_copies_each_frame_once(world: World, tmp_path: Path) -> None:
 
 def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "fprf.evaluation.alignment.AlignmentConfig.__init__.__kwdefaults__", {"steps": 2, "rays": 32, "rate": 2e-3}
+        "fprf.evaluation.evaluate.AlignmentConfig.__init__.__kwdefaults__", {"steps": 2, "rays": 32, "rate": 2e-3}
     )
     found = []
     for device in ("cpu", DEVICE):

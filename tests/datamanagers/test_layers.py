@@ -17,11 +17,9 @@ ABOVE = {
         "cli",
         "viewer",
         "export",
-        "evidence",
-        "benchmarking",
         "api",
     },
-    "blocks": {"training", "style", "evaluation", "cli", "viewer", "export", "evidence", "benchmarking", "api"},
+    "blocks": {"training", "style", "evaluation", "cli", "viewer", "export", "api"},
     "ops": {"fields", "rendering", "datamanagers", "blocks", "training", "style", "evaluation", "cli", "viewer"},
 }
 """Packages, and what they must not import."""

@@ -33,7 +33,7 @@ PARSED = {
     "demo": "minutes; tests/cli/test_demo_verb.py runs it small",
     "process": "needs pycolmap; tests/reconstruction/test_town_sfm.py runs it",
     "train": "minutes; run below with `-m slow`",
-    "bench": "minutes; tests/cli/test_bench_verb.py and tests/evidence run them small",
+    "bench": "minutes; tests/cli/test_bench_verb.py and tests/evaluation run them small",
     "view": "stays up; tests/viewer run it",
     "pretrain": "hours; tests/pretraining run it small",
 }

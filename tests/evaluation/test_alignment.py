@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from tiny_world import World
 
-from fprf.evaluation.alignment import AlignmentConfig, align, align_view
+from fprf.evaluation.evaluate import AlignmentConfig, align, align_view
 from fprf.io.images import to_uint8, write_image
 from fprf.training.poses import rotated
 from fprf.training.views import render_view

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.color import rgb_to_lab
 
-from fprf.evaluation.colour_difference import delta_e, delta_e_2000, srgb_to_lab
+from fprf.evaluation.metrics import delta_e, delta_e_2000, srgb_to_lab
 
 # Sharma, Wu, Dalal 2005, table 1: two colours in Lab and their difference.
 PUBLISHED = """

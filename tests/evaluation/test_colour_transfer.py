@@ -7,7 +7,7 @@ from kornia.color import rgb_to_lab
 from torch import Tensor
 
 from fprf.errors import DataError
-from fprf.evaluation.colour_transfer import histogram_matching, reinhard
+from fprf.evaluation.single_image import histogram_matching, reinhard
 
 
 def colours(count: int, seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:

@@ -3,8 +3,8 @@ import torch
 from torch import Tensor
 
 from fprf.datamanagers.config import GuidedConfig
-from fprf.evaluation.flat import Flat, cells_basis, encoded, flat_reference, flat_scene, painted, render_flat
 from fprf.evaluation.metrics import psnr
+from fprf.evaluation.single_image import Flat, cells_basis, encoded, flat_reference, flat_scene, painted, render_flat
 from fprf.interfaces import Decoder, Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, RandomConfig

@@ -6,7 +6,7 @@ from tiny_world import World
 
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
-from fprf.evaluation.judge import judge, peak_memory
+from fprf.evaluation.evaluate import judge, peak_memory
 from fprf.evaluation.metrics import image_metrics
 from fprf.training.views import render_view
 

@@ -1,7 +1,7 @@
 import torch
 from torch import Tensor
 
-from fprf.evaluation.matched_regions import matched_regions
+from fprf.evaluation.style_distance import matched_regions
 from fprf.interfaces import Encoder
 
 

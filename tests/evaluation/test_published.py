@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from fprf.errors import DataError
-from fprf.evaluation.published import published
+from fprf.evaluation.consistency import published
 from fprf.rendering.cameras import Cameras
 
 FRAMES = 9

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.steadiness import sharpness, steadiness
-from fprf.evidence.stage import short_path, town_view
+from fprf.evaluation.consistency import sharpness, steadiness
+from fprf.evaluation.town_truth import short_path, town_view
 from fprf.rendering.cameras import Cameras
 from fprf.town.layout import build_town
 from fprf.town.palettes import palette

@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError
-from fprf.evaluation.metrics import ssim
-from fprf.evaluation.structure import luminance_ssim, structure
+from fprf.evaluation.metrics import luminance_ssim, ssim, structure
 
 
 def picture(height: int = 24, width: int = 30, seed: int = 0) -> torch.Tensor:

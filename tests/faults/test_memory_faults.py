@@ -24,7 +24,6 @@ from fprf import memory
 from fprf.cli import main as cli
 from fprf.training import cached_view, style_pass, views
 from fprf.training.loading import load_run
-from fprf.evaluation.looks import render_looks
 
 def limit(room):
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

@@ -1,6 +1,5 @@
 """Faults 1, 12, 14 and 17: kills, images that are gone, signals from outside, places and names of all kinds."""
 
-import importlib.util
 import os
 import shutil
 import signal
@@ -10,32 +9,40 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
 from tiny_world import World, flags, parameters
 
+from benchmarks import kills
 from fprf.cli import main as cli
 from fprf.training import checkpoint
 from fprf.training.run import Run
 
 
-def kills() -> ModuleType:
-    """`benchmarks/kills.py`, which is in no package."""
-    spec = importlib.util.spec_from_file_location("kills", Path(__file__).parents[2] / "benchmarks" / "kills.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.fault
 def test_kills_at_random_moments_leave_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of its own: threads of this one would not survive a fork."""
-    script = Path(__file__).parents[2] / "benchmarks" / "kills.py"
-    words = [sys.executable, str(script), "--kills", "5", "--steps", "25", "--output", str(tmp_path / "kills.json")]
-    subprocess.run(words, check=True, timeout=280, env=os.environ | {"TMPDIR": str(tmp_path)}, capture_output=True)
+    words = [
+        sys.executable,
+        "-m",
+        "benchmarks",
+        "kills",
+        "--kills",
+        "5",
+        "--steps",
+        "25",
+        "--output",
+        str(tmp_path / "kills.json"),
+    ]
+    subprocess.run(
+        words,
+        check=True,
+        cwd=Path(__file__).parents[2],
+        timeout=280,
+        env=os.environ | {"TMPDIR": str(tmp_path)},
+        capture_output=True,
+    )
     import json
 
     found = json.loads((tmp_path / "kills.json").read_text())
@@ -44,15 +51,14 @@ def test_kills_at_random_moments_leave_the_same_bits(tmp_path: Path, monkeypatch
 
 
 def test_the_runner_of_kills_sees_what_is_left(world: World, tmp_path: Path) -> None:
-    module = kills()
     shutil.copytree(world.run, tmp_path / "run")
-    assert module.contents(tmp_path / "run") == module.contents(world.run) and module.strays(tmp_path / "run") == []
+    assert kills.contents(tmp_path / "run") == kills.contents(world.run) and kills.strays(tmp_path / "run") == []
     (tmp_path / "run" / "checkpoints" / "step-0000020").mkdir()
     (tmp_path / "run" / ".tmpAbCdEf").touch()
-    assert sorted(module.strays(tmp_path / "run")) == [".tmpAbCdEf", "checkpoints/step-0000020"]
+    assert sorted(kills.strays(tmp_path / "run")) == [".tmpAbCdEf", "checkpoints/step-0000020"]
     style = tmp_path / "run" / "style.safetensors"
     style.write_bytes(style.read_bytes()[:-1] + b"\x7f")
-    assert module.contents(tmp_path / "run") != module.contents(world.run)
+    assert kills.contents(tmp_path / "run") != kills.contents(world.run)
 
 
 @pytest.mark.parametrize("harm", ["gone", "empty", "cut", "text", "rotated"])

@@ -10,10 +10,10 @@ import torch
 from test_readers import NAMES
 
 import fprf
+from benchmarks.readers import targets
 from fprf.datamanagers.parsers.files import read_npy, read_npz
 from fprf.errors import FprfError
 from fprf.plugins.encoders.weight_sources import WeightSource, read_tensors
-from fprf.stress.readers import targets
 
 
 class Canary:

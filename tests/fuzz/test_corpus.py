@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 from test_readers import NAMES
 
+from benchmarks.readers import Target, targets
 from fprf.errors import FprfError
-from fprf.stress.fuzz import Target
-from fprf.stress.readers import targets
 
 CORPUS = Path(__file__).with_name("corpus.zip")
 

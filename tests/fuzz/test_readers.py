@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.readers import Target, fuzz, mutated, targets
 from fprf.datamanagers.images import MAX_PIXELS
 from fprf.datamanagers.parsers.config import ColmapConfig
 from fprf.errors import DataError
-from fprf.stress.fuzz import Target, fuzz, mutated
-from fprf.stress.readers import targets
 
 NAMES = [
     *(f"COLMAP {kind}.{suffix}" for suffix in ("bin", "txt") for kind in ("cameras", "images", "points3D")),

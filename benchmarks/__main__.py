@@ -1,0 +1,60 @@
+"""`python -m benchmarks NAME [flags]`: run one benchmark, or list them all."""
+
+import importlib
+import sys
+
+from fprf.errors import FprfError
+
+BENCHMARKS = {
+    "blocks_scenes": "a capture in blocks against one field, for the same seconds",
+    "decoders": "fidelity of decoders, and what a style loss buys",
+    "evidence": "all pages of docs/evidence",
+    "executors": "blocks on workers of Ray against one after the other",
+    "exports": "exported files drawn again, against the field's own renders",
+    "false_edges": "how often styles cut through things",
+    "feature_store": "size, error and speed of feature targets by stride",
+    "first_use": "quality of small captures at equal steps",
+    "fuzz": "every reader on a million mutated files",
+    "fuzz_guided": "every reader under libFuzzer",
+    "gallery": "the pictures and figures of docs/gallery",
+    "gaussians": "the rasteriser of 3D Gaussians: time and error",
+    "kills": "training that is killed a hundred times",
+    "large_scene": "a town of 400 images in blocks: quality, seams, memory, time",
+    "many_images": "more images than memory",
+    "mutants": "how many small mistakes in the mathematics the tests notice",
+    "paper": "the paper's tables on any scene",
+    "pareto": "time against error, knob by knob",
+    "phone": "photographs without poses to a restyled scene",
+    "poses": "wrong poses, and what refining wins back",
+    "precision": "errors of bfloat16 and TF32",
+    "roofline": "how near the tri-plane lookup comes to the memory's speed",
+    "scaling": "cost against the number of images, pixels, references and points",
+    "semantic_matching": "which encoder finds like with like",
+    "splat_restyle": "time and memory of restyling captures of Gaussians",
+    "stress": "every stage on adversarial inputs, against a reference and a bound",
+    "styles": "every stylizer on painted photographs and on runs",
+    "viewer_speed": "response times and memory of the viewer",
+    "viewer_tour": "film and pictures of the viewer's page",
+}
+"""Module of this package and one line for each. `benchmarks/gpu.sh` measures a machine with a GPU."""
+
+
+def main(args: list[str]) -> int:
+    """0 done; 2 for a mistake in the arguments, which one line on standard error names."""
+    if not args or args[0] in ("-h", "--help"):
+        width = max(map(len, BENCHMARKS))
+        print("usage: python -m benchmarks NAME [flags]\n")
+        print("\n".join(f"  {name:<{width}}  {about}" for name, about in BENCHMARKS.items()))
+        return 0 if args else 2
+    if args[0] not in BENCHMARKS:
+        print(f"error: {args[0]}: no such benchmark; allowed are {', '.join(BENCHMARKS)}", file=sys.stderr)
+        return 2
+    try:
+        return importlib.import_module(f".{args[0]}", __package__).main(args[1:]) or 0
+    except FprfError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

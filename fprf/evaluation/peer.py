@@ -1,0 +1,249 @@
+"""`fprf bench peer`: frames of any system, read from files and scored by the code that scores ours."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..datamanagers.images import IMAGE_SUFFIXES, load_image
+from ..datamanagers.parsers.files import Record, read_bytes, read_json, read_npy, read_npz, record_of
+from ..datamanagers.parsers.views import rigid
+from ..errors import DataError
+from ..plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
+from ..rendering.cameras import Cameras, pixel_grid, rays_through
+from ..training.loading import load_run
+from ..training.views import render_view
+from .config import PeerConfig
+from .consistency import published, steadiness
+from .metrics import delta_e, image_metrics, mean_metrics, structure
+from .report import words
+from .style_distance import matched_regions, style_distances
+
+__all__ = ["Along", "Frames", "peer", "peer_page", "read_cameras", "read_depths", "read_pictures"]
+
+
+Along = Literal["ray", "axis"]
+
+
+class Frames(NamedTuple):
+    """Pictures in the order of their names."""
+
+    names: tuple[str, ...]
+    """Stems of the files."""
+    images: list[Annotated[Tensor, "H W 3"]]
+
+
+def read_pictures(folder: Path, names: Sequence[str] | None = None) -> Frames:
+    """All pictures of a folder, or those with these stems, in [0, 1]. Raises DataError for none, or a missing one."""
+    found = {path.stem: path for path in sorted(folder.glob("*")) if path.suffix.lower() in IMAGE_SUFFIXES}
+    if not found:
+        raise DataError(f"{folder}: no pictures ({' '.join(sorted(IMAGE_SUFFIXES))}); name the folder that the frames lie in")
+    wanted = list(found) if names is None else list(names)
+    missing = [name for name in wanted if name not in found]
+    if missing:
+        raise DataError(f"{folder}: no picture named {missing[0]} ({len(missing)} are missing); name them as the frames")
+    return Frames(tuple(wanted), [torch.from_numpy(load_image(found[name])).float() / 255 for name in wanted])
+
+
+def read_cameras(path: Path, frames: Frames) -> Cameras:
+    """The camera of each frame out of a transforms.json, at the size of the frame.
+
+    A frame belongs to the entry whose `file_path` has its stem; where no stem agrees and the numbers do, to the one at its
+    place by name. Pinholes alone. Raises DataError for what does not fit.
+    """
+    entries = {
+        Path(record.text("file_path") or "").stem: record for record in record_of(path, read_json(path)).records("frames")
+    }
+    chosen = [entries[name] for name in frames.names if name in entries]
+    if not chosen and len(entries) == len(frames.names):
+        chosen = [entries[name] for name in sorted(entries)]
+    if len(chosen) != len(frames.names):
+        raise DataError(
+            f"{path}: cameras for {len(chosen)} of {len(frames.names)} frames; name the frames as the entries' file_path"
+        )
+    views = [_camera(record, image.shape[1], image.shape[0]) for record, image in zip(chosen, frames.images, strict=True)]
+    return Cameras(
+        pose=torch.stack([torch.from_numpy(rigid(r.where, r.matrix("transform_matrix"))) for r in chosen]),
+        focal=torch.tensor([focal for focal, _ in views], dtype=torch.float64),
+        centre=torch.tensor([centre for _, centre in views], dtype=torch.float64),
+        size=torch.tensor([[image.shape[1], image.shape[0]] for image in frames.images]),
+        distortion=torch.zeros(len(views), 6, dtype=torch.float64),
+        lens=torch.zeros(len(views), dtype=torch.int64),
+    )
+
+
+def read_depths(folder: Path, names: Sequence[str], cameras: Cameras, along: Along) -> list[Annotated[Tensor, "H W"]]:
+    """Distances along the unit ray of NAME.npz (array `depth`) or NAME.npy, [H W] in the unit of the poses.
+
+    `along` says what the files hold: distances along the ray, or along the camera's axis. Raises DataError.
+    """
+    found = []
+    for view, name in enumerate(names):
+        packed, plain = folder / f"{name}.npz", folder / f"{name}.npy"
+        if packed.is_file():
+            array = read_npz(packed, "depth")
+        elif plain.is_file():
+            array = read_npy(str(plain), read_bytes(plain))
+        else:
+            raise DataError(f"{folder}: neither {packed.name} nor {plain.name}; write a depth for every frame")
+        depth = torch.from_numpy(array.astype("float64"))
+        width, height = cameras.size[view].tolist()
+        if depth.shape != (height, width):
+            raise DataError(f"{folder}/{name}: depth of shape {tuple(depth.shape)}, the frame has {height} rows of {width}")
+        if along == "axis":
+            pixel = pixel_grid(cameras, view)
+            _, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+            depth = depth / (-direction @ cameras.pose[view, :, 2]).view(height, width)
+        found.append(depth)
+    return found
+
+
+def _camera(record: Record, width: int, height: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Focal lengths and centre in pixels of a frame that may be smaller or larger than the calibrated picture."""
+    bent = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if record.number(key)]
+    if bent:
+        raise DataError(f"{record.where}: {bent[0]} is not 0; only pinholes are judged, undistort the frames")
+    own_width, own_height = record.number("w") or width, record.number("h") or height
+    across, down = width / own_width, height / own_height
+    angle, fx = record.number("camera_angle_x"), record.number("fl_x")
+    if fx is None:
+        if angle is None or not 0 < angle < math.pi:
+            raise DataError(f"{record.where}: no fl_x, and no camera_angle_x between 0 and pi; give the focal length as fl_x")
+        fx = own_width / 2 / math.tan(angle / 2)
+    fy, cx, cy = record.number("fl_y"), record.number("cx"), record.number("cy")
+    centre = (own_width / 2 if cx is None else cx, own_height / 2 if cy is None else cy)
+    return (fx * across, (fx if fy is None else fy) * down), (centre[0] * across, centre[1] * down)
+
+
+REGIONS = 6
+"""Regions in which frames and references are compared."""
+_LARGEST = 512
+"""References are reduced to this longest side."""
+Progress = Callable[[int, int, str], None]
+
+
+class _Known(NamedTuple):
+    """What frames are judged by, as far as it is there."""
+
+    plain: list[Tensor] | None
+    depths: list[Tensor] | None
+
+
+def peer(config: PeerConfig, progress: Progress) -> dict[str, Any]:
+    """The document. What cannot be said for lack of input is None, and `missing` names the flag that would tell.
+
+    Raises DataError for frames, cameras and depths that do not fit each other.
+    """
+    frames = read_pictures(config.frames)
+    cameras = read_cameras(config.cameras, frames)
+    known = _known(config, frames, cameras, progress)
+    missing: dict[str, str] = {}
+    document: dict[str, Any] = {
+        "benchmark": "peer",
+        "frames": len(frames.images),
+        "size": [int(side) for side in cameras.size[0]],
+        "steadiness": None,
+        "published": None,
+        "truth": None,
+        "style": None,
+    }
+    if known.depths is None:
+        missing |= dict.fromkeys(("steadiness", "published"), "--depth or --run")
+    else:
+        document["published"] = published(frames.images, known.depths, cameras)
+        if known.plain is None:
+            missing["steadiness"] = "--plain or --run"
+        else:
+            document["steadiness"] = steadiness(known.plain, frames.images, known.depths, cameras)._asdict()
+    if config.truth is None:
+        missing["truth"] = "--truth"
+    else:
+        document["truth"] = _nearness(frames, read_pictures(config.truth, frames.names).images)
+    if known.plain is None or not config.references:
+        missing["style"] = "--references, and --plain or --run"
+    else:
+        document["style"] = _style(config, frames.images, known.plain)
+    return {**document, "missing": missing}
+
+
+def _known(config: PeerConfig, frames: Frames, cameras: Cameras, progress: Progress) -> _Known:
+    plain = None if config.plain is None else read_pictures(config.plain, frames.names).images
+    depths = None if config.depth is None else read_depths(config.depth, frames.names, cameras, config.depth_along)
+    if config.run is not None and (plain is None or depths is None):
+        trained = load_run(config.run, config.device)
+        rendered = []
+        for view in range(len(cameras)):
+            progress(view, len(cameras), "rendering unstylised frames")
+            rendered.append(render_view(trained.model, trained.known.facts, cameras, view, trained.config.render))
+        plain = [each.rgb for each in rendered] if plain is None else plain
+        depths = [each.depth for each in rendered] if depths is None else depths
+    for name, own, image in zip(frames.names, frames.images, plain or frames.images, strict=True):
+        if image.shape != own.shape:
+            raise DataError(f"--plain: {name} is {_size(image)}, the stylised frame {_size(own)}; both must agree")
+    return _Known(plain, depths)
+
+
+def _nearness(frames: Frames, truth: Sequence[Tensor]) -> dict[str, float]:
+    row = mean_metrics([image_metrics(a, b) for a, b in zip(frames.images, truth, strict=True)])
+    apart = torch.cat([delta_e(a, b).flatten() for a, b in zip(frames.images, truth, strict=True)])
+    return {**row, "delta_e": float(apart.mean())}
+
+
+def _style(config: PeerConfig, styled: Sequence[Tensor], plain: Sequence[Tensor]) -> dict[str, float | None]:
+    """Distance to the references (1 = no change) and what is left of the frames' structure (1 = all of it)."""
+    references = [torch.from_numpy(load_image(path, upright=True)).float() / 255 for path in config.references]
+    references = [_reduced(image) for image in references]
+    here, there = matched_regions(BundledSemanticConfig().build(), plain, references, regions=REGIONS, seed=0)
+    judge = {"bundled-content": BundledContentConfig().build()}
+    before, target = list(zip(plain, here, strict=True)), list(zip(references, there, strict=True))
+    found = style_distances(judge, before, {"frames": list(zip(styled, here, strict=True))}, target)
+    kept = [structure(a, b) for a, b in zip(plain, styled, strict=True)]
+    return {"style_distance": found["frames"]["mean"], "structure": sum(kept) / len(kept)}
+
+
+def _reduced(image: Tensor) -> Tensor:
+    scale = _LARGEST / max(image.shape[:2])
+    if scale >= 1:
+        return image
+    size = [max(1, round(side * scale)) for side in image.shape[:2]]
+    return torch.nn.functional.interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
+
+
+def _size(image: Tensor) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+_ROWS = (
+    ("steadiness", "score", "consistency (0 = as steady and sharp as unstylised)", ".3f"),
+    ("steadiness", "short", "error of neighbouring frames / contrast", ".3f"),
+    ("steadiness", "plain_short", "the same, unstylised", ".3f"),
+    ("steadiness", "long", "error 7 frames apart / contrast", ".3f"),
+    ("steadiness", "plain_long", "the same, unstylised", ".3f"),
+    ("steadiness", "sharpness", "sharpness (1 = as unstylised)", ".3f"),
+    ("truth", "psnr", "PSNR to the truth, dB", ".2f"),
+    ("truth", "ssim", "SSIM to the truth", ".3f"),
+    ("truth", "delta_e", "ΔE2000 to the truth", ".1f"),
+    ("style", "style_distance", "distance to the references (1 = no change)", ".3f"),
+    ("style", "structure", "structure kept", ".3f"),
+)
+_PUBLISHED = (("short", "t, t-1"), ("long", "t, t-7"))
+
+
+def peer_page(document: Mapping[str, Any]) -> str:
+    """Markdown: what is known, and which flag would tell what is not."""
+    width, height = document["size"]
+    lines = [f"{document['frames']} frames of {width}x{height}. {words(document['provenance'])}.", "", "| | |", "|---|---:|"]
+    for part, key, label, form in _ROWS:
+        value = None if document[part] is None else document[part][key]
+        lines.append(f"| {label} | {'–' if value is None else format(value, form)} |")
+    for key, label in _PUBLISHED:
+        found = document["published"] and document["published"][key]
+        for figure, name, form in (("rmse", "RMSE", ".4f"), ("e_warp", "E_warp", ".2e")):
+            value = None if not found else found[figure]
+            lines.append(f"| as others report it: {name} ({label}) | {'–' if value is None else format(value, form)} |")
+    if document["missing"]:
+        lines += ["", *(f"- {part}: not known without {flag}" for part, flag in document["missing"].items())]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,494 @@
+"""`fprf bench restyle`: every method restyles a town by references of other towns, judged by the town in that light."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from ..errors import UsageError
+from ..io.images import Picture, to_uint8, write_image
+from ..plugins import registry
+from ..plugins.stylizers.config import (
+    AdainConfig,
+    LocalAdainConfig,
+    RegionAdainConfig,
+    RegionOtConfig,
+    RegionToneConfig,
+    StylizerConfig,
+)
+from ..style.config import StyleConfig
+from ..style.dictionary import StyleDictionary, build_dictionary
+from ..style.files import StyleFile
+from ..style.look import Restyle
+from ..style.references import Encoders, encode_photograph
+from ..style.wishes import labels
+from ..training.cached_view import CachedView
+from ..training.loading import Trained, load_run
+from ..training.restyle import dress
+from ..types import Want
+from .config import RestyleConfig
+from .consistency import steadiness
+from .report import Column, contact_sheet, markdown, words
+from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
+from .town_truth import (
+    Matched,
+    Reference,
+    Row,
+    Stage,
+    best_class_maps,
+    code_classes,
+    match_rates,
+    mean_rows,
+    photograph,
+    places,
+    score,
+    set_stage,
+    true_class_maps,
+    true_views,
+    winners,
+)
+
+__all__ = [
+    "BOUND",
+    "COLUMNS",
+    "FLAT",
+    "GLOBAL",
+    "GOALS",
+    "MATCHED",
+    "PLAIN",
+    "STYLIZERS",
+    "Case",
+    "Shown",
+    "cases",
+    "dictionary_of",
+    "in_scene",
+    "lineup",
+    "nothing",
+    "one_by_one",
+    "restyle",
+    "restyle_page",
+    "restyle_sheet",
+    "transfers",
+    "verdict",
+]
+
+
+PLAIN = "no change"
+FLAT = "2d"
+"""The recommended stylizer on every picture alone, as if there were no scene."""
+GLOBAL = ("reinhard", "histogram", "adain")
+"""What the recommended stylizer shall beat: colours of each picture alone, and features without regions."""
+STYLIZERS: Mapping[str, StylizerConfig] = {
+    "adain": AdainConfig(),
+    "local-adain": LocalAdainConfig(),
+    "region-adain": RegionAdainConfig(),
+    "region-ot": RegionOtConfig(),
+    "region-tone": RegionToneConfig(),
+}
+_SHARP = 0.01
+"""Relative temperature at which a point takes one code alone."""
+
+Image = Annotated[Tensor, "H W 3"]
+T = TypeVar("T")
+
+
+class Shown(NamedTuple):
+    """One method on the views and frames, given in one list."""
+
+    pictures: list[Image]
+    taken: list[Annotated[Tensor, "N T"]] | None
+    """Share of each style code in each pixel; None where nothing is matched."""
+    style_seconds: float
+    """To make the style of the references, encoders included."""
+    view_seconds: float
+    """To colour one view whose geometry is there already."""
+
+
+def lineup(recommended: StylizerConfig) -> dict[str, StylizerConfig]:
+    """Stylizers by name, the recommended one last; it takes the place of its like."""
+    name = registry.name_of(StylizerConfig.group, type(recommended))
+    others = {other: config for other, config in STYLIZERS.items() if other != name}
+    return {**others, "nearest-code": LocalAdainConfig(temperature=_SHARP), name: recommended}
+
+
+def dictionary_of(
+    trained: Trained, paths: Sequence[Path], encoders: Encoders, *, clusters: int, blend: float
+) -> tuple[StyleDictionary, float]:
+    """The style dictionary of photographs on a scene, and the seconds it took."""
+    start = time.perf_counter()
+    found = [encode_photograph(path, encoders, name=name) for path, name in zip(paths, labels(tuple(paths)), strict=True)]
+    made = build_dictionary(found, clusters=clusters, blend=blend, seed=trained.config.seed)
+    return made, time.perf_counter() - start
+
+
+def nothing(views: Sequence[CachedView]) -> Shown:
+    """The scene as it is."""
+    pictures, seconds = _each(views, lambda view: view.restyled().rgb)
+    return Shown(pictures, None, 0.0, seconds)
+
+
+def transfers(plain: Sequence[Image], references: Sequence[Image]) -> dict[str, Shown]:
+    """Transfers of colour of every picture alone, towards all pixels of all references."""
+    style = torch.cat([image.reshape(-1, 3) for image in references])
+    found = {}
+    for name, transfer in {"reinhard": reinhard, "histogram": histogram_matching}.items():
+
+        def moved(view: Image, transfer: Callable[[Tensor, Tensor], Tensor] = transfer) -> Image:
+            return transfer(view.reshape(-1, 3), style).reshape(view.shape)
+
+        pictures, seconds = _each(plain, moved)
+        found[name] = Shown(pictures, None, 0.0, seconds)
+    return found
+
+
+def in_scene(
+    trained: Trained,
+    views: Sequence[CachedView],
+    config: StylizerConfig,
+    dictionary: StyleDictionary,
+    encoders: Encoders,
+    paths: Sequence[Path],
+) -> Shown:
+    """A stylizer of the scene."""
+    start = time.perf_counter()
+    look = dress(trained, StyleFile(StyleConfig(references=tuple(paths), stylizer=config)), encoders, dictionary).restyle
+    spent = time.perf_counter() - start
+    pictures, seconds = _each(views, lambda view: view.restyled(look).rgb)
+    matched = Want.SEMANTIC in look.stylizer.needs
+    return Shown(pictures, [_taken(view, look) for view in views] if matched else None, spent, seconds)
+
+
+def one_by_one(
+    trained: Trained, plain: Sequence[Image], config: StylizerConfig, dictionary: StyleDictionary, encoders: Encoders
+) -> Shown:
+    """The stylizer on each picture as a photograph of its own: its own statistics and regions, the same dictionary."""
+    guided, decoder = trained.config.datamanager.guided, trained.model.decoder
+    regions, seed = trained.config.statistics.regions, trained.config.seed
+    taken = []
+
+    def restyled(view: Image) -> Image:
+        view, semantic = view.to(encoders.device), None
+        if encoders.semantic is not None:
+            semantic = encoded(view, encoders.semantic, guided, encoders.basis)
+        size = (view.shape[0], view.shape[1])
+        flat = flat_scene(encoded(view, encoders.content, guided), semantic, size, regions=regions, seed=seed)
+        look = flat_look(flat, dictionary, config, decoder)
+        if semantic is not None:
+            taken.append(look.match(semantic).cpu())
+        return render_flat(flat, look, decoder).cpu()
+
+    with torch.inference_mode():
+        pictures, seconds = _each(plain, restyled)
+    return Shown(pictures, taken or None, 0.0, seconds)
+
+
+@torch.inference_mode()
+def _taken(view: CachedView, look: Restyle) -> Annotated[Tensor, "N T"]:
+    """Composited shares of the codes."""
+    return torch.cat([part.mean(look.match(_semantic(part.semantic, part.content))) for part in view.parts])
+
+
+def _semantic(semantic: Tensor | None, content: Tensor) -> Tensor:
+    return content[:, :0] if semantic is None else semantic
+
+
+def _each(views: Sequence[T], function: Callable[[T], Image]) -> tuple[list[Image], float]:
+    """The pictures and the mean seconds of one."""
+    start = time.perf_counter()
+    pictures = [function(view) for view in views]
+    return pictures, (time.perf_counter() - start) / max(1, len(views))
+
+
+MATCHED, BOUND = "true classes", "best class maps"
+"""No methods: they know classes, or even the truth (see `scores`)."""
+GOALS: Mapping[str, float] = {
+    "over_no_change_db": 3.0,
+    "over_best_global_db": 1.5,
+    "over_2d_db": 1.5,
+    "match_inside": 0.90,
+    "consistency": 0.05,
+}
+"""PSNR of the recommended stylizer with three references against no change, the best of GLOBAL, and itself on single pictures,
+at least; its match rate inside of things, at least; its score of consistency, at most."""
+JUDGED = "three"
+LPIPS_MISSING = "its weights do not ship with the package, and no dependency brings them"
+"""Why that figure is null."""
+
+Progress = Callable[[int, int, str], None]
+
+
+class Case(NamedTuple):
+    """One palette with one set of references."""
+
+    light: str
+    set: str
+    references: list[Reference]
+    truth: list[Tensor]
+    shown: dict[str, list[Tensor]]
+    """The judged views by method."""
+    rows: dict[str, Row]
+    classes: dict[str, dict[str, float]]
+    """ΔE2000 by method and class."""
+
+
+def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress) -> tuple[dict[str, Any], list[Case]]:
+    """The document and the cases. `folder` takes the references' files."""
+    trained = load_run(root, config.device)
+    stage = set_stage(trained, views=config.views, frames=config.frames, longest=config.longest)
+    found = cases(config, stage, trained.encoders(), folder, progress)
+    sets = sorted({case.set for case in found}, key=[case.set for case in found].index)
+    means = {name: mean_rows([case.rows for case in found if case.set == name]) for name in sets}
+    best = list(lineup(config.stylizer))[-1]
+    document = {
+        "benchmark": "restyle",
+        "settings": {
+            "method": trained.method,
+            "trained_steps": trained.step,
+            "train_seconds": round(trained.seconds, 1),
+            "town_seed": stage.settings.seed,
+            "trained_palette": stage.settings.palette,
+            "reference_seeds": list(config.seeds),
+            "seed": trained.config.seed,
+            "views": len(stage.views),
+            "frames": len(stage.path),
+            "view_size": [int(side) for side in stage.views.size[0]],
+            "clusters": config.clusters,
+            "blend": config.blend,
+            "regions": trained.config.statistics.regions,
+            "semantic_encoder": trained.known.facts.semantic_encoder,
+        },
+        "lpips": None,
+        "lpips_missing": LPIPS_MISSING,
+        "recommended": best,
+        "reconstruction": _own_look(stage),
+        "means": means,
+        "verdict": verdict(means[JUDGED], best),
+        "palettes": {
+            light: {case.set: {"rows": case.rows, "delta_e_by_class": case.classes} for case in found if case.light == light}
+            for light in config.palettes
+        },
+    }
+    return document, found
+
+
+def restyle_sheet(found: Sequence[Case]) -> Picture:
+    """A row for each palette: three references, the truth, the first view by every method."""
+    rows = [case for case in found if case.set == JUDGED]
+    columns = [*("reference" for _ in rows[0].references), "truth", *rows[0].shown]
+    pictures = {
+        case.light: [*(r.image for r in case.references), case.truth[0], *(views[0] for views in case.shown.values())]
+        for case in rows
+    }
+    return contact_sheet(pictures, columns, height=min(120, rows[0].truth[0].shape[0]))
+
+
+def cases(config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path, progress: Progress) -> list[Case]:
+    """Every palette with every set of references. Raises UsageError for references that would show the run's own town."""
+    if stage.settings.seed in config.seeds:
+        raise UsageError(f"--seeds: {stage.settings.seed} is the town of the run itself; references show other towns")
+    width, height = (int(side) for side in stage.trained.known.cameras.size[0])
+    chosen = places(config.seeds, (width, height))
+    total = len(config.palettes) * len(chosen)
+    found: list[Case] = []
+    for light in config.palettes:
+        truth = true_views(stage, light)
+        for name, where in chosen.items():
+            progress(len(found), total, f"restyling, {light}")
+            references = [photograph(place, light) for place in where]
+            paths = [folder / f"{name}-{reference.name}.png" for reference in references]
+            for path, reference in zip(paths, references, strict=True):
+                write_image(path, to_uint8(reference.image))
+            found.append(_case(config, stage, encoders, (light, name), references, paths, truth))
+    progress(total, total, "restyling")
+    return found
+
+
+def verdict(rows: Mapping[str, Row], best: str) -> dict[str, Any]:
+    """What the recommended stylizer reaches of GOALS."""
+    ours = rows[best]
+    baseline = max(GLOBAL, key=lambda name: rows[name]["psnr"] or -math.inf)
+    reached = {
+        "over_no_change_db": _less(ours["psnr"], rows[PLAIN]["psnr"]),
+        "over_best_global_db": _less(ours["psnr"], rows[baseline]["psnr"]),
+        "over_2d_db": _less(ours["psnr"], rows[FLAT]["psnr"]),
+        "match_inside": ours["match_inside"],
+        "consistency": ours["consistency"],
+    }
+    met = {
+        name: None if value is None else value <= goal if name == "consistency" else value >= goal
+        for (name, goal), value in zip(GOALS.items(), reached.values(), strict=True)
+    }
+    return {"goals": dict(GOALS), "reached": reached, "met": met, "best_global": baseline}
+
+
+def _case(
+    config: RestyleConfig,
+    stage: Stage,
+    encoders: Encoders,
+    names: tuple[str, str],
+    references: list[Reference],
+    paths: Sequence[Path],
+    truth: list[Tensor],
+) -> Case:
+    trained, views = stage.trained, [*stage.shown, *stage.passed]
+    dictionary, spent = dictionary_of(trained, paths, encoders, clusters=config.clusters, blend=config.blend)
+    stylizers = lineup(config.stylizer)
+    best = list(stylizers)[-1]
+    found = {PLAIN: nothing(views)}
+    plain = found[PLAIN].pictures
+    found |= transfers(plain, [reference.image for reference in references])
+    found[FLAT] = one_by_one(trained, plain, config.stylizer, dictionary, encoders)
+    for name, stylizer in stylizers.items():
+        found[name] = in_scene(trained, views, stylizer, dictionary, encoders, paths)
+    known = {path.name: reference for path, reference in zip(paths, references, strict=True)}
+    classes = code_classes(dictionary, known, encoders, trained.config.datamanager.guided)
+    count = len(stage.shown)
+    rows, by_class, shown = {}, {}, {name: each.pictures[:count] for name, each in found.items()}
+    labels = [each.labels for each in stage.truth]
+    known_plain = list(zip(plain[:count], labels, strict=True))
+    shown[MATCHED] = true_class_maps(known_plain, [(reference.image, reference.classes) for reference in references])
+    shown[BOUND] = best_class_maps(known_plain, truth)
+    for name in [*(each for each in shown if each != best), best]:
+        rows[name], by_class[name] = score(shown[name], truth, labels)
+        rows[name] |= _rest(stage, found.get(name), plain[count:], classes, references, spent)
+    return Case(*names, references, truth, {name: shown[name] for name in rows}, rows, by_class)
+
+
+def _rest(
+    stage: Stage,
+    method: Shown | None,
+    plain_path: Sequence[Tensor],
+    classes: Tensor,
+    references: Sequence[Reference],
+    spent: float,
+) -> Row:
+    """Match rates, consistency and seconds; None where a method has none."""
+    row: Row = dict.fromkeys((*Matched._fields, "consistency", "warp_short", "warp_long", "style_seconds", "view_seconds"))
+    if method is None:
+        return row
+    count = len(stage.shown)
+    if method.taken is not None:
+        truth = [each.labels for each in stage.truth]
+        taken = [winners(share, classes).view(like.shape) for share, like in zip(method.taken[:count], truth, strict=True)]
+        row |= match_rates(taken, truth, references)._asdict()
+        row["style_seconds"] = method.style_seconds + spent
+    depths = [each.depth for each in stage.path_truth]
+    steady = steadiness(plain_path, method.pictures[count:], depths, stage.path)
+    row |= {"consistency": steady.score, "warp_short": steady.short, "warp_long": steady.long}
+    row["view_seconds"] = method.view_seconds
+    return row
+
+
+def _own_look(stage: Stage) -> Row:
+    truth = true_views(stage, stage.settings.palette)
+    return score([view.restyled().rgb for view in stage.shown], truth, [each.labels for each in stage.truth])[0]
+
+
+def _less(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a - b
+
+
+COLUMNS: tuple[Column, ...] = (
+    ("psnr", "PSNR dB", ".2f"),
+    ("ssim", "SSIM", ".3f"),
+    ("delta_e", "ΔE2000", ".1f"),
+    ("match", "match", ".1%"),
+    ("match_inside", "match inside", ".1%"),
+    ("match_kind", "match kind", ".1%"),
+    ("consistency", "consistency", ".3f"),
+    ("style_seconds", "style s", ".2f"),
+    ("view_seconds", "view s", ".3f"),
+)
+_GOALS = {
+    "over_no_change_db": ("PSNR over no change", "dB", "≥"),
+    "over_best_global_db": ("PSNR over the best of reinhard, histogram and adain", "dB", "≥"),
+    "over_2d_db": ("PSNR over itself on single pictures (2d)", "dB", "≥"),
+    "match_inside": ("match inside", "", "≥"),
+    "consistency": ("consistency", "", "≤"),
+}
+_ABOUT = """# Restyling with a true answer
+
+Nobody knows what a photographed scene would look like at night. Of the embedded town we know: a palette changes colours and
+light and nothing else. A scene is trained on one town in one palette; references are pictures of *other* towns in another
+palette; the truth is the scene's own town rendered in that palette from the same, held-out cameras.
+
+`one` reference is a view along a street. `three` are pictures of three towns: one shows mostly façades, one mostly plants, one
+the street and its sky.
+
+- **PSNR, SSIM, ΔE2000** against the truth. The scene as it is, against its own palette, is the line *reconstruction*: a style
+  cannot be sharper than the render that it changes.
+- **match**: pixels that take most of a style code of their own true class (12 classes; a code's class is that of most pixels
+  that it was made of). **match inside**: the same without pixels at the border of two classes. **match kind**: of their own
+  kind (sky, plants, ground, buildings, lamps, cars).
+- **consistency**: what a method adds to the error between frames of a path, warped by true depth, plus the sharpness that it
+  loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/steadiness.py`).
+- **style s**: to make the style of the references, once. **view s**: to colour a view whose geometry is there (for `reinhard`,
+  `histogram` and `2d`: a rendered picture).
+- **LPIPS** is not given (null in the JSON): its weights do not ship with the package, and no dependency brings them.
+- **2d** is the recommended stylizer on each picture alone, with the picture's own statistics and regions.
+- **true classes** is no method: it knows the classes, and carries the colours of each to those of the same class in the
+  references, as a perfect match would.
+- **best class maps** is none either: it knows the truth, and gives every true class the affine map of colours that comes
+  nearest to it. What it misses is light: shadows, lit windows and the lamps' cones lie where the town's geometry puts them,
+  another town's picture cannot tell where, and no map of colours makes them.
+"""
+_USE = """## Use it for another system
+
+`fprf bench restyle RUN --output restyle.json --page restyle.md --sheet restyle.jpg` makes all of this again. The town in any
+palette comes from the parser (`--datamanager.parser town --datamanager.parser.palette night` when a scene is trained) or from
+`fprf.town.write.write_town`. Another system's frames of the same cameras are scored by `fprf bench peer`
+([protocol.md](protocol.md)).
+"""
+
+
+def restyle_page(document: Mapping[str, Any], *, picture: str | None = None) -> str:
+    """Markdown; `picture` is the sheet's path as the page should name it."""
+    settings, parts = document["settings"], [_ABOUT]
+    lights = ", ".join(document["palettes"])
+    size = "x".join(str(side) for side in settings["view_size"])
+    parts.append(
+        f"Town {settings['town_seed']} in palette {settings['trained_palette']}, {settings['method']}, "
+        f"{settings['trained_steps']} steps in {settings['train_seconds']:.0f} s; palettes {lights}; references of towns "
+        f"{', '.join(map(str, settings['reference_seeds']))}; {settings['views']} held-out views and "
+        f"{settings['frames']} frames of {size}; seed {settings['seed']}. {words(document['provenance'])}.\n"
+    )
+    parts += [_verdict(document), ""]
+    for name, rows in document["means"].items():
+        parts += [
+            f"## Mean over palettes, {name} reference{'s' * (name != 'one')}\n",
+            markdown(rows, COLUMNS, first="method"),
+            "",
+        ]
+    own = document["reconstruction"]
+    parts.append(f"Reconstruction: {own['psnr']:.2f} dB, SSIM {own['ssim']:.3f}, ΔE {own['delta_e']:.1f}.\n")
+    if picture:
+        parts.append(f"![all methods, one view of each palette, three references]({picture})\n")
+    parts.append("## By palette\n")
+    for light, sets in document["palettes"].items():
+        for name, found in sets.items():
+            parts += [f"### {light}, {name}\n", markdown(found["rows"], COLUMNS, first="method"), ""]
+    parts += ["## ΔE2000 by class, three references, mean over palettes\n", _by_class(document), "", _USE]
+    return "\n".join(parts)
+
+
+def _verdict(document: Mapping[str, Any]) -> str:
+    found = document["verdict"]
+    lines = [f"Recommended: `{document['recommended']}`; the best global baseline is `{found['best_global']}`.\n"]
+    lines += ["| with three references | reached | goal | |", "|---|---:|---:|---|"]
+    for name, (label, unit, sign) in _GOALS.items():
+        reached, met = found["reached"][name], found["met"][name]
+        value = "–" if reached is None else f"{reached:.3g} {unit}".strip()
+        verdict = {None: "not known", True: "met", False: "**not met**"}[met]
+        lines.append(f"| {label} | {value} | {sign} {found['goals'][name]:g} {unit} | {verdict} |")
+    return "\n".join(lines)
+
+
+def _by_class(document: Mapping[str, Any]) -> str:
+    tables = [sets["three"]["delta_e_by_class"] for sets in document["palettes"].values()]
+    methods, kinds = list(tables[0]), list(tables[0][next(iter(tables[0]))])
+    rows = {method: {kind: sum(t[method][kind] for t in tables) / len(tables) for kind in kinds} for method in methods}
+    return markdown(rows, [(kind, kind, ".1f") for kind in kinds], first="method")

@@ -1,0 +1,319 @@
+"""`fprf bench speed`: ours against the naive path, on the same model in the same run, with the error beside each time."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from ..config import RenderConfig
+from ..fields.networks import weights
+from ..fields.semantic import ProjectedPlanes, SemanticPlanes
+from ..interfaces import Stylizer
+from ..ops import dense
+from ..plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from ..rendering.cameras import Cameras
+from ..rendering.renderer import march
+from ..style.look import Restyle
+from ..training.cached_view import cache_view
+from ..training.folding import folded
+from ..training.model import Facts, Model
+from ..training.prepare import Prepared
+from ..training.restyle import restyle
+from ..training.views import render_view
+from .config import SpeedConfig
+from .naive import plain_planes, triplane_rows, without_skipping
+from .report import Outcome, Row, document, ratio, rows_table, spread
+from .subject import (
+    Subject,
+    attempt,
+    batch_rays,
+    colour_gradient,
+    count,
+    difference,
+    exact,
+    find,
+    fresh_model,
+    loop_of,
+    plainly,
+    settings,
+    size_of,
+    small_view,
+    stepper,
+    test_view,
+    view_rays,
+    watch_of,
+)
+
+__all__ = ["CACHED", "cached_rows", "folding_rows", "speed"]
+
+
+CACHED = 135 * 240
+"""Pixels of a cached view, where the run's views have so many."""
+_FAST = 100.0
+"""Milliseconds for a new style on that many pixels."""
+_FOLDED = 1.5
+"""How many times faster the folded layers should be."""
+SIDES = ("folded", "plain")
+HEAD = 4096
+"""Samples whose hidden units go on to shares, so many times: a cache holds them."""
+TIMES = 20
+_Way = tuple[nn.Module, Stylizer, Tensor, int]
+"""A field or a layer, what matches its outputs, its inputs, how often."""
+
+
+def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, StylizerConfig]) -> list[Row]:
+    """A cached view in each style, beside rendering it anew."""
+    trained = subject.trained
+    known, render = trained.known, trained.config.render
+    camera = small_view(known.cameras, (known.test or known.train)[0], CACHED)
+    whole = int(camera.size[0].prod()) > 0.9 * CACHED
+    view = cache_view(trained.model, known.facts, camera, 0, render)
+    looks = {name: restyle(trained, subject.references, s, clusters=config.clusters).restyle for name, s in styles.items()}
+    calls: dict[str, Callable[[], Tensor]] = {}
+    for name, look in looks.items():
+        calls[name] = lambda look=look: view.restyled(look).rgb  # type: ignore[misc]
+        calls[f"anew {name}"] = partial(_drawn_anew, subject, camera, look)
+    seconds = watch_of(config, trained).in_turn(calls)
+    rows = []
+    for name in looks:
+        taken = spread(seconds[name]).map(lambda s: 1e3 * s)
+        rows.append(
+            Row(
+                name=f"cached view restyled, {name}",
+                figure=taken.median,
+                low=taken.low,
+                high=taken.high,
+                unit="ms",
+                goal=_FAST if whole else None,
+                peer=1e3 * spread(seconds[f"anew {name}"]).median,
+                ratio=ratio(seconds[f"anew {name}"], seconds[name]),
+                error=difference(calls[name](), calls[f"anew {name}"]()).largest,
+                error_kind="largest colour difference from the view rendered anew",
+                note=f"{size_of(camera)}, {view.bytes / 2**20:.0f} MiB cached",
+            )
+        )
+    return rows
+
+
+def _drawn_anew(subject: Subject, camera: Cameras, look: Restyle) -> Tensor:
+    trained = subject.trained
+    return render_view(trained.model, trained.known.facts, camera, 0, trained.config.render, look).rgb
+
+
+def folding_rows(config: SpeedConfig, subject: Subject) -> list[Row]:
+    """Semantics and shares of a view's samples, folded and not: local AdaIN by dot products, one reference."""
+    trained, chosen = subject.trained, LocalAdainConfig(similarity="dot")
+    known = trained.known
+    styled = restyle(trained, subject.references[:1], chosen, clusters=config.clusters)
+    found = folded(trained.model, styled, chosen)
+    field = trained.model.semantic
+    if found is None or found.model.semantic is None or field is None:
+        return []
+    camera = small_view(known.cameras, (known.test or known.train)[0], config.rays)
+    with torch.inference_mode():
+        rays = view_rays(trained.model, camera, 0)
+        points = march(rays, trained.model.parts, budget=trained.config.render.budget).kept.point
+    small, plain, folding = found.model.semantic, styled.restyle.stylizer, found.look.stylizer
+    pairs: dict[str, tuple[_Way, _Way, float | None]] = {
+        "semantics and matching, dictionary folded": ((small, folding, points, 1), (field, plain, points, 1), None)
+    }
+    if isinstance(field, SemanticPlanes) and isinstance(small, ProjectedPlanes):
+        with torch.inference_mode():
+            # What a cache holds: in the field, units never leave it.
+            units = field.planes.network(points[:HEAD], weights(field.network)[:-1], [None] * (len(small.maps) - 1)).relu()
+            units = units.repeat(-(-HEAD // max(1, len(units))), 1)[:HEAD]
+        heads = _Head(list(small.maps)[-1]), _Head(weights(field.network)[-1])
+        pairs[f"the same from hidden units to shares, {TIMES} x {HEAD} samples"] = (
+            (heads[0], folding, units, TIMES),
+            (heads[1], plain, units, TIMES),
+            _FOLDED,
+        )
+    ways = {f"{side} {name}": way for name, pair in pairs.items() for side, way in zip(SIDES, pair[:2], strict=True)}
+    calls = {name: partial(_shares, *way) for name, way in ways.items()}
+    seconds = watch_of(config, trained).in_turn(calls)
+    about = f"{len(points)} samples of a view, {len(styled.dictionary.keys)} codes, {known.facts.dim} semantic channels"
+    rows = []
+    for name, (_, _, goal) in pairs.items():
+        ours, peer = (f"{side} {name}" for side in SIDES)
+        taken, shares = spread(seconds[ours]).map(lambda s: 1e3 * s), calls[peer]()
+        rows.append(
+            Row(
+                name=name,
+                figure=taken.median,
+                low=taken.low,
+                high=taken.high,
+                unit="ms",
+                peer=1e3 * spread(seconds[peer]).median,
+                ratio=ratio(seconds[peer], seconds[ours]),
+                ratio_goal=goal,
+                error=difference(calls[ours](), shares).largest / float(shares.max()),
+                error_kind="largest difference of a share from the unfolded one, relative to the largest share",
+                note=about,
+            )
+        )
+    return rows
+
+
+class _Head(nn.Module):
+    """A last layer alone."""
+
+    def __init__(self, weight: Tensor) -> None:
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, units: Tensor) -> Tensor:
+        return dense.network(units, [self.weight], [None])
+
+
+@torch.inference_mode()
+def _shares(field: nn.Module, stylizer: Stylizer, points: Tensor, times: int) -> Tensor:
+    for _ in range(times):
+        shares = stylizer.match(field(points))
+    return shares
+
+
+Progress = Callable[[int, int, str], None]
+STYLES: dict[str, StylizerConfig] = {
+    "region-tone": RegionToneConfig(),
+    "region-ot": RegionOtConfig(),
+    "local-adain": LocalAdainConfig(),
+}
+"""The recommended stylizer, that which costs most, and the paper's."""
+BUDGET = 1 / 512
+"""The error that skipping may cost: half an 8-bit step."""
+
+
+def speed(config: SpeedConfig, root: Path, folder: Path, progress: Progress) -> Outcome:
+    """Training, rendering, restyling, tri-planes."""
+    subject = find(root, config, folder)
+    rows: list[Row] = []
+    progress(0, 5, "training")
+    prepared, missing = attempt(subject)
+    if prepared is not None:
+        rows.append(_training(config, subject, prepared))
+    progress(1, 5, "rendering")
+    drawn, counters = _rendering(config, subject)
+    rows += drawn
+    progress(2, 5, "restyling")
+    rows += _restyling(config, subject)
+    progress(3, 5, "reuse")
+    rows += cached_rows(config, subject, STYLES) + folding_rows(config, subject)
+    progress(4, 5, "tri-planes")
+    rows += triplane_rows(config, subject.trained)
+    progress(5, 5, "done")
+    trained = subject.trained
+    about = settings(config, trained, missing) | {"view": size_of(test_view(config, trained)), "points": config.points}
+    made = document("speed", rows, device=trained.model.device, settings=about, extra={"counters": counters})
+    return Outcome(made, [rows_table("speed, beside the naive path", rows)])
+
+
+def _training(config: SpeedConfig, subject: Subject, prepared: Prepared) -> Row:
+    trained = subject.trained
+    plain = without_skipping(trained.config)
+    ours = loop_of(trained.config, prepared, fresh_model(trained))
+    naive = loop_of(plain, subject.prepare(plain), fresh_model(trained))
+    take, walk = stepper(ours, trained.step), stepper(naive, trained.step)
+
+    def naively() -> None:
+        with plain_planes(naive.model):
+            walk()
+
+    seconds = watch_of(config, trained).in_turn({"ours": take, "naive": naively})
+    batch = ours.manager.batch(trained.step)
+    rays = len(batch.rgb)
+    fast = spread(seconds["ours"]).map(lambda s: rays / s)
+    slow = spread(seconds["naive"]).map(lambda s: len(naive.manager.batch(0).rgb) / s)
+    return Row(
+        name="train",
+        figure=fast.median,
+        low=fast.low,
+        high=fast.high,
+        unit="rays/s",
+        peer=slow.median,
+        ratio=ratio(seconds["naive"], seconds["ours"]),
+        error=_gradient_error(subject, prepared),
+        error_kind="relative L2 error of the colour loss's gradient against float64 without skipping",
+    )
+
+
+def _gradient_error(subject: Subject, prepared: Prepared) -> float:
+    trained = subject.trained
+    batch = prepared.manager.batch(trained.step)
+    model = fresh_model(trained)
+    rays = batch_rays(model, prepared, batch)
+    ours = colour_gradient(model, prepared, trained.config, batch, rays, trained.step).double()
+    wide = fresh_model(trained).double()
+    rays = type(rays)(*(x.double() for x in rays))
+    truth = colour_gradient(wide, prepared, without_skipping(trained.config), batch, rays, trained.step)
+    return float((ours - truth).norm() / truth.norm().clamp_min(1e-30))
+
+
+def _rendering(config: SpeedConfig, subject: Subject) -> tuple[list[Row], dict[str, float]]:
+    trained, camera = subject.trained, test_view(config, subject.trained)
+    pixels = int(camera.size[0].prod())
+    looks: dict[str, Restyle | None] = {"render": None}
+    for name, stylizer in STYLES.items():
+        made = restyle(trained, subject.references, stylizer, clusters=config.clusters)
+        looks[f"stylised, {name}"] = made.restyle
+    model, facts, render = trained.model, trained.known.facts, trained.config.render
+    rays = view_rays(model, camera, 0)
+    calls: dict[str, Callable[[], Tensor]] = {}
+    for name, look in looks.items():
+        calls[name] = partial(_drawn, model, facts, camera, render, look)
+        calls[f"naive {name}"] = partial(_naively, model, facts, camera, replace(render, budget=0.0), look)
+    seconds = watch_of(config, trained).in_turn(calls)
+    rows = []
+    for name, look in looks.items():
+        truth = exact(model, facts, rays, look).cpu()
+        fast = spread(seconds[name]).map(lambda s: pixels / s)
+        rows.append(
+            Row(
+                name=name,
+                figure=fast.median,
+                low=fast.low,
+                high=fast.high,
+                unit="rays/s",
+                peer=pixels / spread(seconds[f"naive {name}"]).median,
+                ratio=ratio(seconds[f"naive {name}"], seconds[name]),
+                ratio_goal=3.0 if render.budget == BUDGET else None,
+                error=difference(calls[name](), truth).largest,
+                error_kind="largest colour error against float64 without skipping",
+                peer_error=difference(calls[f"naive {name}"](), truth).largest,
+            )
+        )
+    return rows, count(model.parts, rays, render.budget).shares
+
+
+def _drawn(model: Model, facts: Facts, camera: Cameras, render: RenderConfig, look: Restyle | None) -> Tensor:
+    return render_view(model, facts, camera, 0, render, look).rgb
+
+
+def _naively(model: Model, facts: Facts, camera: Cameras, render: RenderConfig, look: Restyle | None) -> Tensor:
+    with plain_planes(model):
+        return plainly(model, facts, view_rays(model, camera, 0), render, look).cpu()
+
+
+def _restyling(config: SpeedConfig, subject: Subject) -> list[Row]:
+    """A new photograph: to its dictionary, to the first picture."""
+    trained, camera = subject.trained, test_view(config, subject.trained)
+    made: dict[str, Stylizer] = {}
+
+    def dictionary() -> None:
+        made["new"] = restyle(trained, subject.references[:1], RegionOtConfig(), clusters=config.clusters).restyle.stylizer
+
+    def first() -> None:
+        dictionary()
+        render_view(trained.model, trained.known.facts, camera, 0, trained.config.render, Restyle(made["new"]))
+
+    seconds = watch_of(config, trained).in_turn({"dictionary": dictionary, "first": first})
+    rows = []
+    for name, label, goal in (
+        ("dictionary", "new reference to its dictionary", 1.0),
+        ("first", "new reference to the first view", 2.0),
+    ):
+        taken = spread(seconds[name])
+        rows.append(Row(name=label, figure=taken.median, low=taken.low, high=taken.high, unit="s", goal=goal))
+    return rows

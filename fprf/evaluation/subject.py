@@ -1,0 +1,299 @@
+"""What a benchmark measures: a trained run, its images where they are at hand, references; single training steps and views.
+
+The exact result of a view is the run's own image, sampled as it was trained, in float64 with nothing skipped.
+"""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from ..config import RenderConfig, TrainConfig
+from ..errors import FprfError, UsageError, WeightsError
+from ..io.images import write_image
+from ..ops import backend
+from ..rendering.cameras import Cameras, pixel_grid, rays_through
+from ..rendering.pixel_rays import PixelRays
+from ..rendering.renderer import Parts, march, render_rays
+from ..style.look import Restyle
+from ..town.layout import build_town
+from ..town.palettes import palette
+from ..town.render import render, walk
+from ..training.loading import Trained, load_run
+from ..training.model import Facts, Model, background_of, build_model
+from ..training.prepare import Prepared, prepare
+from ..training.run import view_names
+from ..training.trainer import Loop, optimizer_of
+from ..types import Batch, Rays, Want
+from .config import BenchConfig
+from .report import Watch
+
+__all__ = [
+    "LOOKS",
+    "Counts",
+    "Difference",
+    "Subject",
+    "attempt",
+    "batch_rays",
+    "colour_gradient",
+    "count",
+    "difference",
+    "exact",
+    "find",
+    "fresh_model",
+    "loop_of",
+    "plainly",
+    "settings",
+    "size_of",
+    "small_view",
+    "stepper",
+    "test_view",
+    "town_references",
+    "view_rays",
+    "watch_of",
+]
+
+
+LOOKS = {"autumn": (3, 9), "winter": (5, 14), "night": (2, 4)}
+"""Palette of each default reference, with the seed of the town that it shows and the view of it."""
+
+
+class Subject(NamedTuple):
+    """One run and what goes with it."""
+
+    trained: Trained
+    references: tuple[Path, ...]
+    data: Path
+    """Where its images should lie."""
+    prepare: Callable[[TrainConfig], Prepared]
+    """Images and features for the run's config, or one that differs in its batches. Raises FprfError where they are not
+    at hand."""
+
+
+def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
+    """The run in `root`; `folder` takes what is made on the way."""
+    trained = load_run(root, config.device)
+    data = config.data or trained.config.data or Path(trained.known.data)
+
+    def prepared(chosen: TrainConfig) -> Prepared:
+        made = prepare(replace(chosen, data=data), saved=trained.known.facts)
+        if tuple(view_names(made.scene.paths)) != trained.known.names:
+            raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
+        for kind in ("content_encoder", "semantic_encoder"):
+            own, now = getattr(trained.known.facts, kind), getattr(made.facts, kind)
+            if own != now:
+                raise WeightsError(f"{kind.replace('_', ' ')}: the run was trained with {own}, this is {now}; train it again")
+        return made
+
+    return Subject(trained, config.references or town_references(folder / "references"), data, prepared)
+
+
+def attempt(subject: Subject) -> tuple[Prepared | None, str]:
+    """What training needs; or why it is not at hand: rendering can be measured without."""
+    try:
+        return subject.prepare(subject.trained.config), ""
+    except FprfError as error:
+        return None, str(error)
+
+
+def fresh_model(trained: Trained) -> Model:
+    """A copy of the run's model that may be trained."""
+    model = build_model(trained.config, trained.known.facts)
+    model.load_state_dict(trained.model.state_dict())
+    return model.to(trained.model.device)
+
+
+def watch_of(config: BenchConfig, trained: Trained) -> Watch:
+    """How times of this run are taken."""
+    return Watch(config.repeats, trained.model.device, config.clock)
+
+
+def settings(config: BenchConfig, trained: Trained, missing: str) -> dict[str, object]:
+    """What figures depend on; `missing` says why some are absent."""
+    return {
+        "method": trained.method,
+        "scene": trained.known.name,
+        "trained_steps": trained.step,
+        "rounds": config.repeats,
+        "clock": config.clock,
+        "budget": trained.config.render.budget,
+        "chunk": trained.config.render.chunk,
+        "without": missing,
+    }
+
+
+def test_view(config: BenchConfig, trained: Trained) -> Cameras:
+    """The first held-out view, no larger than `config.rays`."""
+    known = trained.known
+    return small_view(known.cameras, (known.test or known.train)[0], config.rays)
+
+
+def size_of(cameras: Cameras) -> str:
+    """Width and height of the first view."""
+    width, height = (int(v) for v in cameras.size[0])
+    return f"{width}x{height}"
+
+
+def small_view(cameras: Cameras, view: int, rays: int) -> Cameras:
+    """One view alone (as view 0), no larger than so many pixels."""
+    one = cameras.select(torch.tensor([view]))
+    area = float(one.size.prod())
+    return one if area <= rays else one.resized((one.size * (rays / area) ** 0.5).floor().clamp_min(1))
+
+
+def town_references(folder: Path, *, width: int = 160, height: int = 120) -> tuple[Path, ...]:
+    """One picture of another town for each look."""
+    paths = []
+    for look, (seed, view) in LOOKS.items():
+        path = folder / f"{look}.png"
+        camera = walk(seed=seed, views=20, width=width, height=height)[view]
+        write_image(path, render(build_town(seed), camera, palette(look)).rgb)
+        paths.append(path)
+    return tuple(paths)
+
+
+SHARE = 0.5
+"""Where in the learning-rate schedule a step is taken: halfway."""
+
+
+def loop_of(config: TrainConfig, prepared: Prepared, model: Model) -> Loop:
+    """The trainer's own loop around a model."""
+    device = model.device
+    return Loop(config, prepared, model, optimizer_of(config, model), device)
+
+
+def stepper(loop: Loop, first: int) -> Callable[[], None]:
+    """A call that takes the next step, from `first` on."""
+    step = first
+
+    def take() -> None:
+        nonlocal step
+        loop.step(step, SHARE)
+        step += 1
+
+    return take
+
+
+def colour_gradient(model: Model, prepared: Prepared, config: TrainConfig, batch: Batch, rays: Rays, step: int) -> Tensor:
+    """Gradient of the colour loss of a batch in all that the content field learns, flat.
+
+    Samples are not jittered: draws in float32 and float64 would differ.
+    """
+    out = render_rays(
+        rays,
+        model.parts,
+        want=Want.COLOUR,
+        budget=config.render.train_budget,
+        background=background_of(prepared.facts, rays.near.device),
+        step=step,
+    )
+    assert out.rgb is not None
+    loss = (out.rgb - batch.rgb.to(out.rgb)).square().mean()
+    parameters = [p for p in model.field.parameters() if p.requires_grad]
+    found = torch.autograd.grad(loss, parameters, allow_unused=True)
+    return torch.cat([(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, found, strict=True)])
+
+
+def batch_rays(model: Model, prepared: Prepared, batch: Batch) -> Rays:
+    """Rays of a batch, on the model's device."""
+    rays = model.space.rays(*PixelRays(prepared.scene.cameras)(batch.view.cpu(), batch.pixel.cpu()))
+    return Rays(*(x.to(model.device) for x in rays))
+
+
+M = TypeVar("M", bound=nn.Module)
+CHUNK = 4096
+
+
+class Counts(NamedTuple):
+    """What a view was spared."""
+
+    rays: int
+    samples: int
+    kept: int
+    """Samples that met the content network."""
+    empty: int
+    """Rays that kept none."""
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """As shares, by name."""
+        return {
+            "kept_samples_share": self.kept / max(1, self.samples),
+            "empty_rays_share": self.empty / max(1, self.rays),
+            "kept_samples_per_ray": self.kept / max(1, self.rays),
+        }
+
+
+class Difference(NamedTuple):
+    """Of two images in [0, 1]."""
+
+    largest: float
+    rms: float
+
+
+def view_rays(model: Model, cameras: Cameras, view: int) -> Rays:
+    """Rays of all pixels, on the model's device."""
+    pixel = pixel_grid(cameras, view)
+    rays = model.space.rays(*rays_through(cameras, torch.full((len(pixel),), view), pixel))
+    return _to(rays, model.device)
+
+
+@torch.inference_mode()
+def exact(model: Model, facts: Facts, rays: Rays, restyle: Restyle | None = None) -> Annotated[Tensor, "R 3"]:
+    """Colours in [0, 1] in float64, nothing skipped."""
+    wide = _double(model)
+    restyle = None if restyle is None else replace(restyle, stylizer=_double(restyle.stylizer))
+    background = background_of(facts, rays.near.device)
+    rgb = []
+    for part in _chunks(Rays(*(x.double() for x in rays))):
+        out = render_rays(part, wide.parts, want=Want.COLOUR, budget=0.0, background=background, restyle=restyle)
+        assert out.rgb is not None
+        rgb.append(out.rgb)
+    return torch.cat(rgb).clamp(0, 1)
+
+
+def plainly(
+    model: Model, facts: Facts, rays: Rays, render: RenderConfig, look: Restyle | None = None
+) -> Annotated[Tensor, "R 3"]:
+    """Colours in [0, 1] without compiled kernels."""
+    background = background_of(facts, rays.near.device)
+    rgb = []
+    with torch.inference_mode(), backend.plain():
+        for part in _chunks(rays, render.chunk):
+            out = render_rays(part, model.parts, want=Want.COLOUR, budget=render.budget, background=background, restyle=look)
+            assert out.rgb is not None
+            rgb.append(out.rgb)
+    return torch.cat(rgb).clamp(0, 1)
+
+
+@torch.inference_mode()
+def count(parts: Parts, rays: Rays, budget: float) -> Counts:
+    """What a budget spares."""
+    samples = kept = empty = 0
+    for part in _chunks(rays):
+        marched = march(part, parts, budget=budget)
+        samples, kept = samples + marched.weights.numel(), kept + len(marched.kept.ray)
+        empty += len(part.near) - len(torch.unique(marched.kept.ray))
+    return Counts(len(rays.near), samples, kept, empty)
+
+
+def difference(found: Tensor, truth: Tensor) -> Difference:
+    """Largest and root-mean-square difference."""
+    away = found.double().flatten() - truth.double().flatten()
+    return Difference(float(away.abs().max()), float(away.square().mean().sqrt()))
+
+
+def _double(module: M) -> M:
+    return copy.deepcopy(module).double()
+
+
+def _to(rays: Rays, device: torch.device) -> Rays:
+    return Rays(*(x.to(device) for x in rays))
+
+
+def _chunks(rays: Rays, size: int = CHUNK) -> list[Rays]:
+    return [Rays(*(x[at : at + size] for x in rays)) for at in range(0, len(rays.near), size)]

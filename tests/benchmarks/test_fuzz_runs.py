@@ -1,0 +1,95 @@
+"""`benchmarks/fuzz.py`: readers that die, fall silent, fail and grow are told; what was done is gone on from."""
+
+import ctypes
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from benchmarks import fuzz
+from benchmarks.readers import Target
+from benchmarks.readers import fuzz as fuzzed
+from fprf.errors import DataError
+
+
+@pytest.fixture
+def script() -> ModuleType:
+    return fuzz
+
+
+def reader(folder: Path, act: Callable[[bytes], object]) -> Target:
+    """Answers the valid file, refuses every second mutation, and acts on one in ten."""
+    file = folder / "x"
+    file.write_bytes(b"valid bytes of a file")
+
+    def read() -> object:
+        data = file.read_bytes()
+        if data.startswith(b"valid bytes of a file"):
+            return data
+        if sum(data) % 10 == 0:
+            return act(data)
+        if sum(data) % 2:
+            raise DataError("refused")
+        return data
+
+    return Target("x", file, read)
+
+
+def test_all_rounds_are_counted(script: ModuleType, tmp_path: Path) -> None:
+    total = script.fresh()
+    script.watch(reader(tmp_path, len), total, 300, 0)
+    assert total["rounds"] == 300 == total["read"] + total["refused"] and total["refused"] > 50
+    assert total["faults"] == [] and total["slowest_seconds"] > 0 and total["grown_mib"] < 64
+
+
+def test_a_reader_that_ends_its_process_is_told_and_gone_on_behind(script: ModuleType, tmp_path: Path) -> None:
+    total = script.fresh()
+    script.watch(reader(tmp_path, lambda data: os._exit(7)), total, 300, 0)
+    assert total["faults"] == ["0 and on: the process ended with 7"] and total["rounds"] == 300
+    assert (tmp_path / "x").read_bytes() == b"valid bytes of a file"
+
+
+def test_a_reader_that_hangs_is_ended(script: ModuleType, tmp_path: Path) -> None:
+    total = script.fresh()
+    script.watch(reader(tmp_path, lambda data: time.sleep(100)), total, 300, 0, silence=0.5)
+    assert total["faults"] == ["0 and on: the process was silent for 0 s"]
+
+
+def test_other_errors_and_too_much_memory_are_told(script: ModuleType, tmp_path: Path) -> None:
+    total = script.fresh()
+    script.watch(reader(tmp_path, lambda data: bytearray(1 << 40)), total, 100, 0)
+    assert total["faults"] and all("MemoryError" in line for line in total["faults"])
+    total = script.fresh()
+    ctypes.CDLL(None).malloc_trim(0)  # what earlier tests freed would be given out again, and nothing would grow
+    script.watch(reader(tmp_path, lambda data: len(bytearray(b"x") * (384 << 20))), total, 100, 0)
+    # A process that starts large may give some back meanwhile.
+    assert total["faults"] == [] and total["grown_mib"] > 90
+
+
+def test_a_run_goes_on_from_its_output(script: ModuleType, tmp_path: Path) -> None:
+    output = tmp_path / "fuzz.json"
+    for rounds in (40, 100):
+        script.measure(tmp_path / str(rounds), rounds, 3, ["style.json"], output)
+    found = json.loads(output.read_text())
+    assert found["readers"]["style.json"]["rounds"] == 100 and found["rounds"] == 100
+    script.measure(tmp_path / "other", 20, 4, ["style.json"], output)
+    assert json.loads(output.read_text())["readers"]["style.json"]["rounds"] == 20, "another seed begins anew"
+
+
+def test_parts_of_a_run_are_the_run(tmp_path: Path) -> None:
+    """Also where only each sixteenth goes to the whole reader."""
+    seen: list[str] = []
+    file = tmp_path / "x"
+    file.write_bytes(b"valid")
+    target = Target(
+        "x", file, lambda: seen.append(f"whole {file.read_bytes()!r}"), lambda: seen.append(f"{file.read_bytes()!r}")
+    )
+    fuzzed(target, 40, 1, quick=True)
+    once, seen[:] = list(seen), []
+    for first, count in ((0, 7), (7, 20), (27, 13)):
+        fuzzed(target, count, 1, first=first, quick=True)
+    assert seen == once and [k for k, line in enumerate(once) if line.startswith("whole")] == [0, 16, 32]

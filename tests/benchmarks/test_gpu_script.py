@@ -1,0 +1,124 @@
+"""`benchmarks/gpu.sh`: which commands it runs, that it goes on where one fails, and what its JSON then holds."""
+
+import importlib.metadata as metadata
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from fprf.cli.parsing import parse
+from fprf.methods import fprf
+from fprf.plugins.encoders.config import BundledSemanticConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+INTERPRETER = """#!PYTHON
+import os, shutil, sys
+from pathlib import Path
+words, kept = sys.argv[1:], Path(os.environ["KEPT"])
+if words[0].endswith("gpu_check.py"):
+    os.execv(sys.executable, [sys.executable, *words])
+if words[0].endswith("gpu_rows.py"):
+    shutil.copytree(words[1], kept / "work")
+    sys.exit(1)
+with open(kept / "commands", "a") as file:
+    print(*words, sep="\\t", file=file)
+if os.environ["FAILS"] in words:
+    print("this is why")
+    sys.exit(3)
+if "eval" in words:
+    Path(words[3]).mkdir()
+    shutil.copy(kept / "metrics.json", words[3])
+for verb in ("speed", "profile"):
+    if verb in words:
+        shutil.copy(os.environ["RESULTS"] + f"/{verb}_fox.json", words[words.index("--output") + 1])
+"""
+METRICS = {"method": "fprf", "scene": "flower", "train_seconds": 179.0, "train_steps": 9000, "views": 5, "psnr": 26.5}
+
+
+def script(folder: Path, *words: str, fails: str = "nothing") -> tuple[int, list[list[str]]]:
+    """Exit status and commands of the script with an interpreter that runs none of them; its folder is kept."""
+    folder.mkdir(exist_ok=True)
+    stand_in = folder / "python"
+    stand_in.write_text(INTERPRETER.replace("PYTHON", sys.executable, 1))
+    stand_in.chmod(0o755)
+    (folder / "metrics.json").write_text(json.dumps(METRICS))
+    environment = {**os.environ, "PYTHON": str(stand_in), "KEPT": str(folder), "RESULTS": str(RESULTS), "FAILS": fails}
+    command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), *words]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=folder, timeout=100)
+    asked = folder / "commands"
+    return done.returncode, [line.split("\t") for line in asked.read_text().splitlines()] if asked.is_file() else []
+
+
+def module(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return __import__(name)
+
+
+@pytest.mark.parametrize(("fails", "status"), [("nothing", 0), ("speed", 1)])
+def test_a_failed_step_is_reported_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str, status: int
+) -> None:
+    code, commands = script(tmp_path / "run", "--dry", fails=fails)
+    assert code == 1, "what gpu_rows.py says"
+    assert [next(w for w in c if w in ("pytest", "train", "eval", "speed", "profile", "roofline")) for c in commands] == [
+        "pytest", "train", "eval", "speed", "profile", "roofline"
+    ]  # fmt: skip
+    output = tmp_path / "gpu.json"
+    monkeypatch.setattr(sys, "argv", ["gpu_rows.py", str(tmp_path / "run" / "work"), "--output", str(output)])
+    assert module("gpu_rows", monkeypatch).main() == status
+    found = json.loads(output.read_text())
+    assert {each["step"]: each["passed"] for each in found["steps"]} == {
+        "tests": True, "train": True, "eval": True, "speed": fails != "speed", "profile": True, "roofline": True
+    }  # fmt: skip
+    rows = {row["name"]: row for row in found["rows"]}
+    assert rows["held-out PSNR"]["goal"] == 26 and rows["held-out PSNR"]["goal_is"] == "at least"
+    assert found["profile"]
+    if fails == "speed":
+        assert len(rows) == 2 and found["steps"][3]["said"] == "this is why\n"
+    else:
+        assert rows["stylised, local-adain, frames of 1008x756"]["goal"] == 60
+        assert rows["a new style to its first frame"]["goal"] == 100
+        assert any("against reference" in name and {"peer", "error", "peer_error"} <= rows[name].keys() for name in rows)
+
+
+@pytest.mark.parametrize("named", [(), ("--", "--semantic.encoder", "random")])
+def test_a_scene_is_trained_on_the_card_with_the_bundled_semantics_or_those_that_are_named(
+    tmp_path: Path, named: tuple[str, ...]
+) -> None:
+    code, commands = script(tmp_path / "run", "--scene", "flower", "--minutes", "2.5", *named)
+    assert code == 1 and len(commands) == 7, "torch is asked for a card first"
+    train = commands[2][4:]
+    config = parse(fprf(), train, prog="x", description="")
+    assert config.minutes == 2.5 and config.device == "cuda:0" and config.data == Path("flower")
+    assert isinstance(config.semantic.encoder, BundledSemanticConfig) == (not named)
+    assert "not pretended" in commands[1]
+    for command in commands[3:]:
+        assert command[command.index("--device") + 1] == "cuda:0"
+
+
+@pytest.mark.parametrize("words", [["--what"], []])
+def test_wrong_words_are_the_users_mistake(tmp_path: Path, words: list[str]) -> None:
+    assert script(tmp_path, *words) == (2, [])
+
+
+def test_a_checkout_that_is_not_installed_is_registered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module("gpu_check", monkeypatch).register(tmp_path)
+    (made,) = metadata.distributions(path=[str(tmp_path)])
+    assert made.metadata["Name"] == "fprf" and {"fprf.methods", "fprf.encoders"} <= made.entry_points.groups
+    assert all(callable(point.load()) for point in made.entry_points)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_dry(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path)}
+    command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), "--dry", "--output", str(tmp_path / "gpu.json")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path, timeout=1200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "gpu.json").read_text())
+    assert len(found["rows"]) > 10 and all(each["passed"] for each in found["steps"])

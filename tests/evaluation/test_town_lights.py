@@ -1,0 +1,34 @@
+import torch
+
+from fprf.evaluation.town_truth import PARTS, photograph, places, shows
+from fprf.town.surface import FACADE, ROAD, SKY
+
+SIZE = (48, 36)
+
+
+def test_three_references_share_the_work() -> None:
+    found = places((7, 11, 13), SIZE)
+    assert [place.name for place in found["three"]] == list(PARTS)
+    assert [place.seed for place in found["three"]] == [7, 11, 13] and found["one"][0].seed == 7
+    seen = {place.name: photograph(place, "night") for place in found["three"]}
+    for part in PARTS:
+        own = shows(seen[part].classes.numpy(), part)
+        assert own > 0.2
+    assert shows(seen["facades"].classes.numpy(), "facades") > shows(seen["street"].classes.numpy(), "facades")
+
+
+def test_light_changes_no_class() -> None:
+    (place,) = places((7, 11, 13), SIZE)["one"]
+    day, night = photograph(place, "day"), photograph(place, "night")
+    assert torch.equal(day.classes, night.classes) and day.image.shape == (36, 48, 3)
+    assert float(night.image.mean()) < float(day.image.mean())
+    assert (day.name, night.name) == ("day-street", "night-street")
+
+
+def test_a_street_needs_road_and_sky() -> None:
+    labels = torch.full((4, 4), ROAD).numpy()
+    assert shows(labels, "street") == 0
+    labels[:2] = SKY
+    assert shows(labels, "street") == 1
+    labels[0] = FACADE
+    assert shows(labels, "facades") == 0.25
