@@ -13,7 +13,6 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest import mock
 
 import torch
@@ -27,19 +26,15 @@ from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
-from fprf.fields.content import PlanesField
-from fprf.fields.density import density
-from fprf.fields.planes import Planes
+from fprf.fields import proposal as field_proposal
 from fprf.io.atomic import write_json
 from fprf.ops import backend, dense, march, mixture, triplane, triplane_numba
-from fprf.plugins.samplers import proposal
 from fprf.rendering import renderer, space
 from fprf.rendering.cameras import Cameras
 from fprf.style import matching
 from fprf.style.look import Restyle
 from fprf.training.restyle import restyle
 from fprf.training.views import render_view
-from fprf.types import FieldSample
 
 Patches = Sequence[tuple[object, str, object]]
 
@@ -47,32 +42,6 @@ Patches = Sequence[tuple[object, str, object]]
 def never(*tensors: object) -> bool:
     """No kernel applies."""
     return False
-
-
-def fit_without_gradients(x: Tensor) -> bool:
-    """As `dense.usable`."""
-    return march.fit(x) and not torch.is_grad_enabled()
-
-
-def network_without_gradients(x: Tensor, weights: Any, biases: Any, **options: Any) -> Tensor:
-    """Kernels where nobody learns."""
-    return (dense.network_reference if torch.is_grad_enabled() else network)(x, weights, biases, **options)
-
-
-def planes_then_network(self: Planes, points: Tensor, weights: Any, biases: Any, **options: Any) -> Tensor:
-    """The planes' features are written in between."""
-    return dense.network(self(points), weights, biases, **options)
-
-
-def planes_then_density(self: Planes, points: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """The planes' features are written in between."""
-    latent = self(points)
-    return density(latent @ weight), latent
-
-
-def kept_features(self: PlanesField, points: Tensor) -> FieldSample:
-    """The features of every sample are kept for the network."""
-    return FieldSample(*self.planes.density(points, self.to_density.weight[0]))
 
 
 def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
@@ -84,37 +53,19 @@ def plain_lookups(store: FeatureStore, *given: Tensor) -> None:
 
 
 packed: dict[int, FeatureStore] = {}
-network = dense.network
-no_march = SimpleNamespace(fit=never, still=march.still)
+no_march = SimpleNamespace(usable=never)
 SWITCHES: dict[str, Patches] = {
     "tri-planes": [(triplane_numba, "usable", never)],
-    "tri-planes: density in one pass, training": [(Planes, "density", planes_then_density)],
-    "tri-planes: density in one pass, views": [(PlanesField, "density", kept_features)],
-    "tri-planes: network in one pass": [(Planes, "network", planes_then_network)],
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
-    "networks": [
-        (dense, "_fit", never),
-        (mixture, "usable", fit_without_gradients),
-        (matching, "usable", fit_without_gradients),
-    ],
-    "networks: gradients": [(dense, "network", network_without_gradients)],
-    "marching": [(march, "fit", never)],
-    "marching: proposals": [(proposal, "march", no_march)],
+    "networks": [(dense, "network", dense.network_reference)],
+    "marching": [(march, "usable", never)],
+    "marching: proposals": [(field_proposal, "march", no_march)],
     "marching: weights and sums": [(renderer, "compiled", no_march), (space, "march", no_march)],
     "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
     "styles at points: matching": [(matching, "usable", never)],
     "styles at points: maps": [(mixture, "usable", never)],
     "guided features": [(FeatureStore, "_compiled", plain_lookups)],
 }
-SWITCHES["all that bring less than 1.3x"] = [
-    *SWITCHES["tri-planes: density in one pass, training"],
-    *SWITCHES["tri-planes: density in one pass, views"],
-    *SWITCHES["tri-planes: network in one pass"],
-    *SWITCHES["tri-planes: total variation"],
-    *SWITCHES["networks: gradients"],
-    *SWITCHES["marching"],
-    *SWITCHES["guided features"],
-]
 """What is replaced where a kernel is off."""
 
 

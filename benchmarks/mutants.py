@@ -225,23 +225,20 @@ def _with(node: ast.AST, **changes: object) -> ast.AST:
 
 
 MODULES: dict[str, tuple[str, ...]] = {
-    "fprf/ops/march.py": ("ops/test_march.py", "ops/test_march_gradients.py"),
+    "fprf/ops/march.py": ("ops/test_march.py",),
     "fprf/ops/triplane.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
     "fprf/ops/triplane_numba.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
     "fprf/ops/dense.py": ("ops/test_dense.py",),
-    "fprf/ops/exponential.py": ("ops/test_exponential.py", "ops/test_march.py"),
     "fprf/ops/guided.py": ("ops/test_guided.py",),
     "fprf/ops/mixture.py": ("ops/test_mixture.py",),
-    "fprf/ops/march_kernels.py": ("ops/test_march.py", "ops/test_march_gradients.py"),
-    "fprf/ops/march_gradient_kernels.py": ("ops/test_march.py", "ops/test_march_gradients.py"),
+    "fprf/ops/march_kernels.py": ("ops/test_march.py",),
     "fprf/ops/dense_kernels.py": ("ops/test_dense.py",),
-    "fprf/ops/dense_gradients.py": ("ops/test_dense.py",),
     "fprf/ops/guided_kernels.py": ("datamanagers/test_features.py",),
     "fprf/ops/mixture_kernels.py": ("ops/test_mixture.py",),
     "fprf/ops/triplane_kernels.py": ("ops/test_triplane.py", "ops/test_variation.py", "ops/test_point_slopes.py"),
+    "fprf/ops/lanes.py": ("ops/test_exponential.py", "ops/test_march.py"),
     "fprf/ops/tile.py": ("ops/test_dense.py", "ops/test_mixture.py"),
     "fprf/ops/vector.py": ("ops/test_triplane.py", "ops/test_point_slopes.py", "ops/test_march.py"),
-    "fprf/ops/rows.py": ("ops/test_dense.py", "ops/test_march.py"),
     "fprf/style/clusters.py": ("style/test_clusters.py",),
     "fprf/style/colours.py": ("style/test_colours.py",),
     "fprf/style/controls.py": ("style/test_controls.py",),
@@ -259,7 +256,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/rendering/splines.py": ("rendering/test_splines.py",),
 }
 """Each numerics module and its tests."""
-COMPILED = ("_kernels.py", "dense_gradients.py", "tile.py", "vector.py", "rows.py", "exponential.py", "triplane_numba.py")
+COMPILED = ("_kernels.py", "tile.py", "vector.py", "lanes.py", "triplane_numba.py")
 THIRD_PARTY = (
     "torch",
     "torch.distributed.tensor",

@@ -1,7 +1,7 @@
-"""The operator table: every mathematical function, with inputs of any number of rows, for `test_operator_table`.
+"""The operator table: mathematical functions, with inputs of any number of rows, for `test_operator_table`.
 
 A case makes its inputs in float64 from a number of rows; a function that works on one matrix has a number of rows that is
-its side. `operators_elsewhere` lists those that are no function of rows, or of numbers at all.
+its side.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,12 +10,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from fprf.fields.density import LIMIT, density
 from fprf.ops import dense, guided, march, mixture, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
 from fprf.style import alignment, clusters, controls, dictionary, matching, scene, statistics, transport
-from fprf.types import Rays
 
 __all__ = ["CASES", "Case"]
 
@@ -61,32 +59,13 @@ def _planes(points: int) -> Made:
     return 2 * _unit(points, 3) - 1, 0.5 * _draw(triplane.rows((8, 16)), 16), 0.1 * _draw(32)
 
 
-def _density(points: Tensor, table: Tensor, weight: Tensor) -> object:
-    if triplane.fused(points, table):
-        return triplane.density(points, table, (8, 16), weight, LIMIT)
-    latent = triplane.lookup_reference(points, table, (8, 16))
-    return density(latent @ weight), latent
-
-
-def _density_alone(points: Tensor, table: Tensor, weight: Tensor) -> Tensor:
-    with torch.no_grad():
-        if triplane.fused(points, table):
-            return triplane.density_alone(points, table, (8, 16), weight, LIMIT)
-        return density(triplane.lookup_reference(points, table, (8, 16)) @ weight)
-
-
-def _rays(count: int) -> Rays:
-    direction = _draw(count, 3)
-    direction = direction / direction.norm(dim=-1, keepdim=True)
-    return Rays(*(x.float() for x in (0.3 * _draw(count, 3), direction, direction, _unit(count) + 0.05, _unit(count) + 4)))
-
-
 def _weighed(density: Tensor, t: Tensor) -> tuple[Tensor, ...]:
-    if not march.fit(density, t):  # the plain form, as the renderer falls back to
-        weights = stepfun.transmittance_weights(density, t)
-        return weights, weights.sum(-1).detach(), torch.exp(-(density * t.diff(dim=-1)).sum(-1))
-    found = march.weigh(density, t, 0.0)
-    return found.weights, found.opacity, found.through
+    with torch.no_grad():
+        if not march.usable(density, t):  # the plain form, as the renderer falls back to
+            weights = stepfun.transmittance_weights(density, t)
+            return weights, weights.sum(-1), torch.exp(-(density * t.diff(dim=-1)).sum(-1))
+        found = march.weigh(density, t, 0.0)
+        return found.weights, found.opacity, found.transmittance
 
 
 def _lenses(count: int) -> Made:
@@ -134,14 +113,6 @@ def _layers(points: int) -> Made:
     return _draw(points, 16), 0.3 * _draw(32, 16), _draw(32), 0.3 * _draw(5, 32), _draw(5)
 
 
-def _plane_network(points: Tensor, table: Tensor, *parts: Tensor) -> Tensor:
-    return dense.plane_network(points, table, (8, 16), parts[0::2], parts[1::2])
-
-
-def _plane_layers(points: int) -> Made:
-    return *_planes(points)[:2], 0.3 * _draw(32, 32), _draw(32), 0.3 * _draw(5, 32), _draw(5)
-
-
 def _spelt_out(x: Tensor) -> Tensor:
     first, run = dense.runs(x)
     return x[first][run]
@@ -171,7 +142,6 @@ def _code(t: int) -> Made:
 CASES = [
     Case("dense.network", _layers, _network, slopes=(0, 1, 2, 3, 4)),
     Case("dense.network_reference", _layers, lambda x, *p: dense.network_reference(x, p[0::2], p[1::2]), slopes=(0, 1, 2, 3)),
-    Case("dense.plane_network", _plane_layers, _plane_network, slopes=(1, 2, 3)),
     Case("dense.runs", lambda n: ((_unit(n, 2) * 2).floor(),), _spelt_out),
     Case("guided.coefficients", lambda n: (_draw(5, max(1, n // 3), n), _unit(n, n, 3)),
          lambda f, g: guided.coefficients(f, g, radius=2, eps=1e-3, stride=2), sizes=(1, 37, 96), tolerance=1e-4),
@@ -179,9 +149,8 @@ CASES = [
          lambda f, g: guided.upsample(f, g, radius=2, eps=1e-3, stride=2), sizes=(1, 37, 96), tolerance=1e-4),
     Case("guided.apply", lambda n: (_draw(4, 5, 6, 4), 37 * _unit(n, 2), _unit(n, 3)),
          lambda c, p, rgb: guided.apply(c, p, rgb, (37, 37))),
-    Case("march.distances", lambda n: (_edges(n, 21), _unit(n) + 0.05, 9 * _unit(n) + 2), _open("contraction").distance),
-    Case("march.place", lambda n: (0.3 * _draw(n, 3), _draw(n, 3), _unit(n, 1) * 3), lambda o, d, t: space.contract(o + d * t)),
-    Case("march.weigh", lambda n: (4 * _unit(n, 20), 3 * _edges(n, 20)), _weighed, slopes=(0,)),
+    Case("space.distance", lambda n: (_edges(n, 21), _unit(n) + 0.05, 9 * _unit(n) + 2), _open("contraction").distance),
+    Case("march.weigh", lambda n: (4 * _unit(n, 20), 3 * _edges(n, 20)), _weighed),
     Case("mixture.affine", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
          lambda x, s, m, b, c: mixture.affine(x, s, m, b, centre=c)),
     Case("mixture.affine_reference", lambda n: (_draw(n, 16), _shares(n, 3), _draw(3, 16, 16), _draw(3, 16), _draw(16)),
@@ -194,12 +163,8 @@ CASES = [
     Case("triplane.lookup_reference", _planes, lambda p, t, w: triplane.lookup_reference(p, t, (8, 16)), slopes=(1,)),
     Case("triplane.point_slopes_reference", lambda n: (*_planes(n)[:2], _draw(n, 32)),
          lambda p, t, g: triplane.point_slopes_reference(p, t, (8, 16), g), tolerance=1e-4, slack=1e-3),
-    Case("triplane.density", _planes, _density, slopes=(1, 2)),
-    Case("triplane.density_alone", _planes, _density_alone),
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),
          slopes=(0,), sizes=(2, 3, 37, 128)),
-    Case("triplane.variation_reference", lambda n: (_draw(triplane.rows((n,)), 8),),
-         lambda t: triplane.variation_reference(t, (_side(t),)), slopes=(0,), sizes=(2, 3, 37, 128)),
     Case("alignment.match_keys", lambda n: (_draw(n, 6), _unit(n) + 0.1, _draw(5, 6), _unit(5) + 0.1),
          lambda k, s, l, r: alignment.match_keys(alignment.Keys(k, s), alignment.Keys(l, r),
                                                  alignment.Matching(1.0), torch.ones(5)), sizes=(1, 37, 500)),

@@ -16,7 +16,7 @@ from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
 
 from fprf.config import TrainConfig
-from fprf.ops import triplane
+from fprf.ops import triplane, triplane_triton
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from fprf.style.scene import to_tensors
 from fprf.training import trainer
@@ -165,7 +165,7 @@ def test_planes_of_the_methods_size_are_looked_up_by_triton(card: torch.device) 
     resolutions, channels, draw = (64, 128, 256, 512), 32, torch.Generator().manual_seed(0)
     points = torch.empty(2**20, 3).uniform_(-1.1, 1.1, generator=draw).to(card)
     table = torch.empty(triplane.rows(resolutions), channels).uniform_(-1, 1, generator=draw).to(card)
-    assert triplane.fused(points, table)
+    assert triplane_triton.usable(points, table)
     found = triplane.lookup(points, table.requires_grad_(True), resolutions)
     (gradient,) = torch.autograd.grad(found.sum(), table)
     wide = table.detach().double().requires_grad_(True)

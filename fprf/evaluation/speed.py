@@ -123,7 +123,8 @@ def folding_rows(config: SpeedConfig, subject: Subject) -> list[Row]:
     if isinstance(field, SemanticPlanes) and isinstance(small, ProjectedPlanes):
         with torch.inference_mode():
             # What a cache holds: in the field, units never leave it.
-            units = field.planes.network(points[:HEAD], weights(field.network)[:-1], [None] * (len(small.maps) - 1)).relu()
+            hidden = weights(field.network)[:-1]
+            units = dense.network(field.planes(points[:HEAD]), hidden, [None] * len(hidden)).relu()
             units = units.repeat(-(-HEAD // max(1, len(units))), 1)[:HEAD]
         heads = _Head(list(small.maps)[-1]), _Head(weights(field.network)[-1])
         pairs[f"the same from hidden units to shares, {TIMES} x {HEAD} samples"] = (

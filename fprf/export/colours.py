@@ -201,6 +201,6 @@ def _looked(
     parts = model.parts if tolerance is None else model.parts._replace(sampler=_CLOSE)
     marched, colours = shade(Rays(*(x.to(device) for x in rays)), parts, config.budget, styles)
     background = background_of(facts, device) if tolerance is None else None
-    behind = 0.0 if background is None else marched.through[:, None] * background
+    behind = 0.0 if background is None else marched.transmittance[:, None] * background
     composited, opacity = on_host(torch.cat([colour + behind for colour in colours], 1), marched.opacity)
     return composited, opacity

@@ -31,21 +31,14 @@ class PlanesField(ContentField):
         self.offset = nn.Parameter(torch.zeros(channels))
 
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
-        """Density per space unit; the latent is the plane feature, or the point where kernels run without gradients."""
-        if self.planes.fused(points):
-            # Few samples are kept, and only those meet the network: it looks them up again, at their points.
-            return FieldSample(self.planes.density_alone(points, self.to_density.weight[0]), points)
+        """Density per space unit; the latent is the plane feature."""
         return FieldSample(*self.planes.density(points, self.to_density.weight[0]))
 
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
         """Content features seen from a direction; what samples of one ray have in common is computed once."""
-        if len(latent) == 0:
-            return latent.new_zeros(0, len(self.offset))  # nothing kept: what a latent is cannot be told from no points
         first, run = dense.runs(view)
         maps, shared = weights(self.to_content), harmonics(view.index_select(0, first), self.degree)
         biases = [None] * (len(maps) - 1) + [self.offset]
-        if latent.shape[1] == 3 != self.planes.out:
-            return self.planes.network(latent, maps, biases, shared=shared, row=run)
         return dense.network(latent, maps, biases, shared=shared, row=run)
 
     def penalties(self) -> dict[str, Tensor]:

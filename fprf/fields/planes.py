@@ -6,8 +6,8 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
-from ..ops import dense, triplane
-from .density import LIMIT, density
+from ..ops import triplane
+from .density import density
 
 __all__ = ["Planes"]
 
@@ -27,36 +27,12 @@ class Planes(nn.Module):
         """Features, coarse scales first."""
         return triplane.lookup(points, self.table, self.resolutions)
 
-    def fused(self, points: Tensor) -> bool:
-        """Whether kernels may read the table where these points lie, and nobody wants gradients."""
-        return len(points) > 0 and not torch.is_grad_enabled() and triplane.fused(points, self.table)
-
     def density(
         self, points: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "out"]
     ) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N out"]]:
         """`fields.density` of the features' product with the weight, and the features."""
-        if triplane.fused(points, self.table):
-            return triplane.density(points, self.table, self.resolutions, weight, LIMIT)
         latent = self(points)
         return density(latent @ weight), latent
-
-    def density_alone(self, points: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "out"]) -> Annotated[Tensor, "N"]:
-        """The density where `fused`, without gradients."""
-        return triplane.density_alone(points, self.table, self.resolutions, weight, LIMIT)
-
-    def network(
-        self,
-        points: Annotated[Tensor, "N 3"],
-        weights: Sequence[Tensor],
-        biases: Sequence[Tensor | None],
-        *,
-        shared: Annotated[Tensor, "P J"] | None = None,
-        row: Annotated[Tensor, "N"] | None = None,
-    ) -> Annotated[Tensor, "N O"]:
-        """`dense.network` of the features, which are never written where nobody learns."""
-        if self.fused(points):
-            return dense.plane_network(points, self.table, self.resolutions, weights, biases, shared=shared, row=row)
-        return dense.network(self(points), weights, biases, shared=shared, row=row)
 
     def variation(self) -> Tensor:
         """Total variation: mean squared difference of neighbouring nodes, summed over scales."""

@@ -5,6 +5,7 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
+from ..ops import march, triplane_numba
 from .networks import linear
 from .planes import Planes
 
@@ -23,3 +24,7 @@ class ProposalField(nn.Module):
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """Density per space unit at points of the unit cube."""
         return self.planes.density(points, self.to_density.weight[0])[0]
+
+    def kernels_apply(self, *tensors: Tensor) -> bool:
+        """Return whether `ops.march.propose` may read the planes: without gradients, on the CPU, channels in whole vectors."""
+        return march.usable(*tensors) and triplane_numba.usable(tensors[0], self.planes.table)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..interfaces import SemanticField
+from ..ops import dense
 from .config import SemanticPlanesConfig
 from .networks import mlp, weights
 from .planes import Planes
@@ -26,7 +27,7 @@ class SemanticPlanes(SemanticField):
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
         """Semantic features."""
         maps = weights(self.network)
-        return self.planes.network(points, maps, [None] * len(maps))
+        return dense.network(self.planes(points), maps, [None] * len(maps))
 
     def penalties(self) -> dict[str, Tensor]:
         """None: semantics need no smoothing beyond the planes' own resolution."""
@@ -52,7 +53,7 @@ class ProjectedPlanes(SemanticField):
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N T"]:
         """The functions' values."""
         maps = list(self.maps)
-        return self.planes.network(points, maps, [None] * len(maps))
+        return dense.network(self.planes(points), maps, [None] * len(maps))
 
     def penalties(self) -> dict[str, Tensor]:
         """None: it is not trained."""

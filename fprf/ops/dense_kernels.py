@@ -9,12 +9,10 @@ vectors (padded with zeros), and the padding of one layer's outputs meets zero w
 import numba
 import numpy as np
 
-from .lanes import BLOCK, WIDE
-from .rows import add_lanes, copy_lanes
+from .lanes import BLOCK, WIDE, add_lanes, copy_lanes
 from .tile import ROWS_1, ROWS_2, ROWS_3, ROWS_4, multiply_1, multiply_2, multiply_3, multiply_4
-from .triplane_kernels import features
 
-__all__ = ["network", "plane_network", "product", "runs"]
+__all__ = ["network", "product", "runs"]
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 _LEAST = np.float32(-np.inf)
@@ -54,11 +52,8 @@ def product(x, x_at, x_row, x_step, rows, w, w_at, width, start, s_at, s_row, ou
 
 
 @numba.njit(inline="always", cache=True)
-def _layers(source, at, depth, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs, hidden):
-    """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be `there`.
-
-    `hidden` is empty, or keeps what each layer but the last gives: layer after layer [N width].
-    """
+def _layers(source, at, depth, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs):
+    """A block of rows of `source` through all layers, to rows `first` on of `out`; `source` may be `there`."""
     start, s_row = biases, 0
     if len(row) > 0:
         width, start, s_row = widths[0], here, widths[0]
@@ -66,17 +61,13 @@ def _layers(source, at, depth, weights, biases, widths, side, row, last, first, 
             for c in range(0, width, WIDE):
                 add_lanes(biases, c, side, row[first + r] * width + c, here, r * width + c)
         here[rows * width : BLOCK * width] = np.float32(0)
-    w_at, b_at, kept, layers = 0, 0, 0, len(widths)
+    w_at, b_at, layers = 0, 0, len(widths)
     for layer in range(layers):
         width = widths[layer]
         floor = np.float32(0) if layer < layers - 1 or last == 1 else _LEAST
         # Sums that start from `here` may end there: a tile is read whole before it is written.
         goal = here if layer % 2 == 0 else there
         product(source, at, depth, 1, BLOCK, weights, w_at, width, start, b_at, s_row, goal, 0, width, depth, floor)
-        if len(hidden) > 0 and layer < layers - 1:
-            for i in range(0, rows * width, WIDE):
-                copy_lanes(goal, i, hidden, kept + first * width + i)
-            kept += len(out) // outputs * width
         w_at, b_at = w_at + depth * width, b_at + width
         start, s_row, source, at, depth = biases, 0, goal, 0, width
     if depth == outputs:
@@ -88,21 +79,15 @@ def _layers(source, at, depth, weights, biases, widths, side, row, last, first, 
                 out[(first + r) * outputs + c] = source[r * depth + c]
 
 
-@numba.njit(inline="always", cache=True)
-def _broadest(inputs, widths):
-    for width in widths:
-        inputs = max(inputs, width)
-    return inputs
-
-
 @_jit
-def network(x, inputs, weights, biases, widths, side, row, last, out, outputs, hidden):
+def network(x, inputs, weights, biases, widths, side, row, last, out, outputs):
     """out [N outputs] = the network of x [N inputs]: ReLU between layers; last: 0 nothing, 1 ReLU.
 
-    `side` [rows, first width] is added before the first ReLU, row[n] of it to point n; both empty = nothing. `hidden` keeps
-    what the layers between give, if it is not empty.
+    `side` [rows, first width] is added before the first ReLU, row[n] of it to point n; both empty = nothing.
     """
-    count, broad = len(out) // outputs, _broadest(inputs, widths)
+    count, broad = len(out) // outputs, inputs
+    for width in widths:
+        broad = max(broad, width)
     for task in numba.prange((count + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         rows = min(BLOCK, count - first)
@@ -112,23 +97,7 @@ def network(x, inputs, weights, biases, widths, side, row, last, out, outputs, h
             source, at = there, 0
             there[: rows * inputs] = x[first * inputs : (first + rows) * inputs]
             there[rows * inputs : BLOCK * inputs] = np.float32(0)
-        _layers(source, at, inputs, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs, hidden)
-
-
-@_jit
-def plane_network(points, table, channels, sizes, starts, weights, biases, widths, side, row, last, out, outputs):
-    """The network of the tri-plane features of points [N 3]: features never leave the cache."""
-    count, inputs = len(points) // 3, len(sizes) * channels
-    broad = _broadest(inputs, widths)
-    for task in numba.prange((count + BLOCK - 1) // BLOCK):
-        first = task * BLOCK
-        rows = min(BLOCK, count - first)
-        here, there = np.empty(BLOCK * broad, np.float32), np.empty(BLOCK * broad, np.float32)
-        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
-        hidden = np.empty(0, np.float32)
-        features(points, first, rows, table, channels, sizes, starts, corner, part, there, 0)
-        there[rows * inputs : BLOCK * inputs] = np.float32(0)
-        _layers(there, 0, inputs, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs, hidden)
+        _layers(source, at, inputs, weights, biases, widths, side, row, last, first, rows, here, there, out, outputs)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,13 +9,11 @@ distances of a contraction with points as they are, then what a box subtracts an
 import numba
 import numpy as np
 
-from .exponential import exp_lanes, opaque_lanes
-from .lanes import BLOCK, WIDE
-from .rows import copy_lanes
+from .lanes import BLOCK, WIDE, copy_lanes, exp_lanes, opaque_lanes
 from .triplane_kernels import cells
 from .vector import LANES, dot, product_forward
 
-__all__ = ["distances", "gather", "place", "propose", "weigh"]
+__all__ = ["composite", "distances", "gather", "place", "propose", "weigh"]
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 
@@ -91,7 +89,7 @@ def _weights(tau, before, w, samples):
 
 @numba.njit(inline="always", cache=True)
 def _resample(s, first, w, samples, padding, count, shift, out, to):
-    """`stepfun.resample` of one ray: walk through the steps and the wanted shares side by side."""
+    """`stepfun.resample` of one ray: walk transmittance the steps and the wanted shares side by side."""
     extra, total = padding / np.float32(samples), _0
     for k in range(samples):
         total += w[k] + extra
@@ -194,7 +192,7 @@ def _heaviest(w, samples, budget, order, keep, to):
 
 
 @_jit
-def weigh(density, t, budget, weights, depth, opacity, through, keep, kept):
+def weigh(density, t, budget, weights, depth, opacity, transmittance, keep, kept):
     """Weights [R S] of densities between edges, expected distance, opacity and its complement; which samples to keep."""
     rays = len(depth)
     samples = len(density) // rays
@@ -225,14 +223,12 @@ def weigh(density, t, budget, weights, depth, opacity, through, keep, kept):
         for k in range(0, len(optical), WIDE):
             exp_lanes(optical, k, clear, k)
         for ray in range(first, last):
-            opacity[ray], through[ray] = solid[ray - first], clear[ray - first]
+            opacity[ray], transmittance[ray] = solid[ray - first], clear[ray - first]
 
 
 @_jit
-def gather(
-    keep, start, weights, point, latent, view, fair, kept_ray, kept_weight, kept_point, kept_latent, kept_view, kept_fair
-):
-    """The kept samples of all rays one after the other; start [R] = where each ray's begin. `fair` may be empty."""
+def gather(keep, start, weights, point, latent, view, kept_ray, kept_weight, kept_point, kept_latent, kept_view):
+    """The kept samples of all rays one after the other; start [R] = where each ray's begin."""
     rays = len(start)
     samples, width = len(weights) // rays, len(latent) // len(weights)
     for task in numba.prange((rays + RAYS - 1) // RAYS):
@@ -242,8 +238,6 @@ def gather(
                 if not keep[k]:
                     continue
                 kept_ray[at], kept_weight[at] = ray, weights[k]
-                if len(fair) > 0:
-                    kept_fair[at] = fair[k]
                 for axis in range(3):
                     kept_point[3 * at + axis] = point[3 * k + axis]
                     kept_view[3 * at + axis] = view[3 * ray + axis]
@@ -254,3 +248,19 @@ def gather(
                     for c in range(width):
                         kept_latent[width * at + c] = latent[width * k + c]
                 at += 1
+
+
+@_jit
+def composite(weight, values, start, out):
+    """out [R C] = sum of weight * values over the samples start[r] to start[r + 1] of each ray."""
+    rays = len(start) - 1
+    width = len(out) // rays
+    for task in numba.prange((rays + RAYS - 1) // RAYS):
+        sums = np.empty(width, np.float32)
+        for ray in range(task * RAYS, min(rays, task * RAYS + RAYS)):
+            sums[:] = _0
+            for k in range(start[ray], start[ray + 1]):
+                value, w = values[width * k : width * (k + 1)], weight[k]
+                for c in range(width):
+                    sums[c] += w * value[c]
+            out[width * ray : width * (ray + 1)] = sums

@@ -9,9 +9,7 @@ import numba
 import numpy as np
 
 from .dense_kernels import product
-from .exponential import exp_lanes
-from .lanes import BLOCK, WIDE
-from .rows import copy_lanes
+from .lanes import BLOCK, WIDE, copy_lanes, exp_lanes
 from .tile import (
     ROWS_1,
     ROWS_2,

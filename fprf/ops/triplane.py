@@ -12,28 +12,15 @@ the table, and to points that ask for them (poses that are refined); on a GPU th
 has a kink at each node: there its slope is that of the cell above.
 """
 
-import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from . import triplane_numba, triplane_triton
 
-__all__ = [
-    "AXES",
-    "density",
-    "density_alone",
-    "fused",
-    "lookup",
-    "lookup_reference",
-    "point_slopes_reference",
-    "rows",
-    "split",
-    "variation",
-    "variation_reference",
-]
+__all__ = ["AXES", "lookup", "lookup_reference", "point_slopes_reference", "rows", "split", "variation", "variation_reference"]
 
 AXES = ((0, 1), (0, 2), (1, 2))
 
@@ -81,8 +68,8 @@ def point_slopes_reference(
     """Gradient of the points for one of the features, in the plain form; 0 along an axis on which a point lies outside."""
     with torch.enable_grad():
         given = points.detach().requires_grad_()
-        (found,) = torch.autograd.grad(lookup_reference(given, table.detach(), resolutions), given, grad)
-    return found
+        (slopes,) = torch.autograd.grad(lookup_reference(given, table.detach(), resolutions), given, grad)
+    return slopes
 
 
 def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:
@@ -94,101 +81,34 @@ def variation_reference(table: Annotated[Tensor, "rows F"], resolutions: Sequenc
     return total
 
 
-class _Form(Protocol):
-    """Fused kernels of one kind of device: `triplane_numba`, `triplane_triton`."""
-
-    def forward(self, points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Tensor: ...
-
-    def density(
-        self, points: Tensor, table: Tensor, resolutions: Sequence[int], weight: Tensor, limit: float, *, keep: bool
-    ) -> tuple[Tensor, Tensor]: ...
-
-    def backward(
-        self,
-        points: Tensor,
-        table: Tensor,
-        resolutions: Sequence[int],
-        grad: Tensor | None,
-        raw: Tensor | None = None,
-        weight: Tensor | None = None,
-    ) -> Tensor: ...
-
-    def summed(self, raw: Tensor, latent: Tensor) -> Tensor: ...
-
-
-def _form(points: Tensor, table: Tensor) -> _Form | None:
-    if triplane_triton.usable(points, table):
-        return triplane_triton
-    return triplane_numba if triplane_numba.usable(points, table) else None
-
-
-def _point_slopes(
-    form: _Form,
-    points: Tensor,
-    table: Tensor,
-    resolutions: Sequence[int],
-    grad: Tensor | None,
-    raw: Tensor | None,
-    weight: Tensor | None,
-) -> Tensor:
-    """Gradient of the points for the features' gradient grad + raw weight; what is None is not added."""
-    if form is triplane_numba:
-        return triplane_numba.point_slopes(points, table, resolutions, grad, raw, weight)
-    parts = [] if grad is None else [grad]
-    if raw is not None and weight is not None:
-        parts.append(raw[:, None] * weight)
-    return point_slopes_reference(points, table, resolutions, torch.stack(parts).sum(0))
-
-
-def fused(points: Tensor, table: Tensor) -> bool:
-    """Whether `density` and `density_alone` may be called: there are kernels for this device and these dtypes."""
-    return _form(points, table) is not None
-
-
 class _Lookup(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], form: _Form) -> Tensor:
+    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], kernels: Any) -> Tensor:
         ctx.save_for_backward(points, table)
-        ctx.resolutions, ctx.form = resolutions, form
-        return form.forward(points, table, resolutions)
+        ctx.resolutions, ctx.kernels = resolutions, kernels
+        result: Tensor = kernels.forward(points, table, resolutions)
+        return result
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         points, table = ctx.saved_tensors
-        to_points, to_table, grad = None, None, grads[0].contiguous()
+        to_points, to_table, given = None, None, (points, table, ctx.resolutions, grads[0].contiguous())
         if ctx.needs_input_grad[0]:
-            to_points = _point_slopes(ctx.form, points, table, ctx.resolutions, grad, None, None)
+            to_points = (triplane_numba.point_slopes if ctx.kernels is triplane_numba else point_slopes_reference)(*given)
         if ctx.needs_input_grad[1]:
-            to_table = ctx.form.backward(points, table, ctx.resolutions, grad)
+            to_table = ctx.kernels.backward(*given)
         return to_points, to_table, None, None
 
 
-class _Density(torch.autograd.Function):
-    """Density and features together: neither the features' gradient nor its sum with the density's is ever written."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...], weight: Tensor, limit: float, form: _Form
-    ) -> tuple[Tensor, Tensor]:
-        density, latent = form.density(points, table, resolutions, weight, limit, keep=True)
-        ctx.save_for_backward(points, table, weight, density, latent)
-        ctx.resolutions, ctx.limit, ctx.form = resolutions, limit, form
-        ctx.set_materialize_grads(False)
-        return density, latent
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, Tensor | None, None, Tensor | None, None, None]:
-        points, table, weight, density, latent = ctx.saved_tensors
-        thick, feature = grads
-        if thick is None and feature is None:
-            return None, None, None, None, None, None
-        # As `exp_gradient`: no gradient explodes or dies where the density is cut off.
-        raw = None if thick is None else thick * density.clamp_min(math.exp(-ctx.limit))
-        given, needs = (points, table, ctx.resolutions, feature, raw, weight), ctx.needs_input_grad
-        to_points = _point_slopes(ctx.form, *given) if needs[0] else None
-        to_table = ctx.form.backward(*given) if needs[1] else None
-        to_weight = ctx.form.summed(raw, latent) if needs[3] and raw is not None else None
-        return to_points, to_table, None, to_weight, None, None
+def lookup(
+    points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
+) -> Annotated[Tensor, "N scales*F"]:
+    """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3 |value|)."""
+    for kernels in (triplane_triton, triplane_numba):
+        if kernels.usable(points, table):
+            result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions), kernels)  # type: ignore[no-untyped-call]
+            return result
+    return lookup_reference(points, table, resolutions)
 
 
 class _Variation(torch.autograd.Function):
@@ -202,47 +122,6 @@ class _Variation(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
         (table,) = ctx.saved_tensors
         return triplane_numba.variation_gradient(table, ctx.resolutions, float(grads[0])), None
-
-
-def lookup(
-    points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]
-) -> Annotated[Tensor, "N scales*F"]:
-    """The fastest form that this device and dtype have; equal to the reference within 4u (r |slope| + 3 |value|)."""
-    form = _form(points, table)
-    if form is None:
-        return lookup_reference(points, table, resolutions)
-    result: Tensor = _Lookup.apply(points.contiguous(), table, tuple(resolutions), form)  # type: ignore[no-untyped-call]
-    return result
-
-
-def density(
-    points: Annotated[Tensor, "N 3"],
-    table: Annotated[Tensor, "rows F"],
-    resolutions: Sequence[int],
-    weight: Annotated[Tensor, "scales*F"],
-    limit: float,
-) -> tuple[Annotated[Tensor, "N"], Annotated[Tensor, "N scales*F"]]:
-    """exp(min(feature . weight - 1, limit)), and the features of `lookup`, where kernels are `fused`.
-
-    The gradient of the density is that of exp between -limit and limit, and the one at the nearer of them beyond.
-    """
-    form, given = _form(points, table), points.contiguous()
-    assert form is not None, "callers ask `fused`"
-    found: tuple[Tensor, Tensor] = _Density.apply(given, table, tuple(resolutions), weight, limit, form)  # type: ignore[no-untyped-call]
-    return found
-
-
-def density_alone(
-    points: Annotated[Tensor, "N 3"],
-    table: Annotated[Tensor, "rows F"],
-    resolutions: Sequence[int],
-    weight: Annotated[Tensor, "scales*F"],
-    limit: float,
-) -> Annotated[Tensor, "N"]:
-    """The density of `density` without gradients: features are summed up as they are found."""
-    form = _form(points, table)
-    assert form is not None, "callers ask `fused`"
-    return form.density(points.detach().contiguous(), table, resolutions, weight, limit, keep=False)[0]
 
 
 def variation(table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]) -> Tensor:

@@ -6,37 +6,20 @@
 import numba
 import numpy as np
 
-from .exponential import exp_lanes
 from .lanes import BLOCK, WIDE
 from .vector import (
     LANES,
-    dot,
     product_backward,
     product_backward_wide,
     product_forward,
     product_forward_wide,
     product_slopes,
-    scaled,
 )
 
-__all__ = [
-    "GROUP",
-    "PARTS",
-    "backward",
-    "cells",
-    "density",
-    "features",
-    "forward",
-    "point_slopes",
-    "summed",
-    "variation",
-    "variation_gradient",
-]
+__all__ = ["GROUP", "backward", "cells", "forward", "point_slopes", "variation", "variation_gradient"]
 
 GROUP = 16
 """Channels of one backward task: a cache line of float32."""
-PARTS = 8
-"""Ranges of points that are summed up by themselves: the order of sums is fixed for any number of threads."""
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 # Differences of neighbours may be summed in any order inside a row: the sum is a regulariser, kept in float64.
@@ -97,53 +80,8 @@ def forward(points, table, channels, sizes, starts, out):
 
 
 @_jit
-def density(points, table, channels, sizes, starts, weight, limit, latent, out):
-    """out[n] = exp(min(feature . weight - 1, limit)) at point n. The features go to `latent`, or nowhere if that is empty."""
-    total, width = len(points) // 3, len(sizes) * channels
-    for task in numba.prange((total + BLOCK - 1) // BLOCK):
-        first = task * BLOCK
-        corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
-        count = min(BLOCK, total - first)
-        raw = np.zeros(BLOCK, np.float32)
-        feature, to = latent, first * width
-        if len(latent) == 0:
-            feature, to = np.empty(BLOCK * width, np.float32), 0
-        features(points, first, count, table, channels, sizes, starts, corner, part, feature, to)
-        for n in range(count):
-            raw[n] = min(dot(feature, to + n * width, weight, 0, width) - np.float32(1), limit)
-        for n in range(0, BLOCK, WIDE):
-            exp_lanes(raw, n, raw, n)
-        out[first : first + count] = raw[:count]
-
-
-@_jit
-def summed(raw, latent, width, out):
-    """out[part] = sum of raw[n] latent[n] over the points n of each of the PARTS ranges."""
-    total = len(raw)
-    for part in numba.prange(PARTS):
-        at = part * width
-        for n in range(part * total // PARTS, (part + 1) * total // PARTS):
-            for c in range(width):
-                out[at + c] += raw[n] * latent[n * width + c]
-
-
-@numba.njit(inline="always", cache=True)
-def _slopes(grad, raw, weight, first, count, width, at, size, none, out):
-    """Gradients of `size` of the features of some points: grad, if it is not empty, plus raw[n] * weight."""
-    for n in range(count):
-        for s in range(0, size, LANES):
-            if len(grad) > 0:
-                scaled(weight, at + s, raw[first + n], grad, (first + n) * width + at + s, out, n * size + s)
-            else:
-                scaled(weight, at + s, raw[first + n], none, 0, out, n * size + s)
-
-
-@_jit
-def backward(points, table, channels, sizes, starts, grad, raw, weight, slices, out):
-    """Add the table's gradient to `out` [slices ...]; one task a slice of the points, scale (finest first) and channel group.
-
-    The gradient of feature c of point n is grad[n, c] + raw[n] weight[c]; what is empty is not added.
-    """
+def backward(points, table, channels, sizes, starts, grad, slices, out):
+    """Add the table's gradient to `out` [slices ...]; a task per slice of the points, scale, channel group."""
     scales, total = len(sizes), len(points) // 3
     groups, blocks = (channels + GROUP - 1) // GROUP, (len(points) // 3 + BLOCK - 1) // BLOCK
     for task in numba.prange(slices * scales * groups):
@@ -152,67 +90,59 @@ def backward(points, table, channels, sizes, starts, grad, raw, weight, slices, 
         wide = min(here + GROUP, channels) - here
         size, mine = sizes[scale], part_of * len(table)
         corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
-        mixed, none = np.empty(BLOCK * GROUP, np.float32), np.zeros(LANES, np.float32)
         for block in range(part_of * blocks // slices, (part_of + 1) * blocks // slices):
             first = block * BLOCK
             count = min(BLOCK, total - first)
             cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
-            slope, o, apart = grad, (first * scales + scale) * channels + here, scales * channels
-            if len(raw) > 0:
-                _slopes(grad, raw, weight, first, count, scales * channels, scale * channels + here, wide, none, mixed)
-                slope, o, apart = mixed, 0, wide
+            o, apart = (first * scales + scale) * channels + here, scales * channels
             for n in range(count):
                 a, b, c = corner[n] + here, corner[BLOCK + n] + here, corner[2 * BLOCK + n] + here
                 u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
                 if wide % WIDE == 0:
                     for s in range(0, wide, WIDE):
                         product_backward_wide(
-                            table, slope, out, a + s, b + s, c + s, o + n * apart + s, mine, channels, size * channels, u, v, w
+                            table, grad, out, a + s, b + s, c + s, o + n * apart + s, mine, channels, size * channels, u, v, w
                         )
                 else:
                     for s in range(0, wide, LANES):
                         product_backward(
-                            table, slope, out, a + s, b + s, c + s, o + n * apart + s, mine, channels, size * channels, u, v, w
+                            table, grad, out, a + s, b + s, c + s, o + n * apart + s, mine, channels, size * channels, u, v, w
                         )
 
 
 @_jit
-def point_slopes(points, table, channels, sizes, starts, grad, raw, weight, out):
-    """out [N 3] = gradient of the points, for the features' gradient grad[n, c] + raw[n] weight[c]; what is empty is not added.
+def point_slopes(points, table, channels, sizes, starts, grad, out):
+    """out [N 3] = gradient of the points, for the features' gradient grad [N scales*channels].
 
     Along an axis on which a point lies outside of the planes, or nowhere, it is 0: there the border's value holds.
     """
     scales, total = len(sizes), len(points) // 3
-    width = scales * channels
     for task in numba.prange((total + BLOCK - 1) // BLOCK):
         first = task * BLOCK
         corner, part = np.empty(3 * BLOCK, np.int64), np.empty(3 * BLOCK, np.float32)
-        mixed, none, sums = np.empty(BLOCK * channels, np.float32), np.zeros(LANES, np.float32), np.empty(3 * LANES, np.float32)
+        sums = np.empty(3 * LANES, np.float32)
         count = min(BLOCK, total - first)
         out[3 * first : 3 * (first + count)] = np.float32(0)
         for scale in range(scales):
             size = sizes[scale]
             half, last = np.float32(0.5) * np.float32(size - 1), np.float32(size - 1)
             cells(points, first, count, 3, 1, size, starts[scale], channels, corner, part)
-            slope, o, apart = grad, (first * scales + scale) * channels, width
-            if len(raw) > 0:
-                _slopes(grad, raw, weight, first, count, width, scale * channels, channels, none, mixed)
-                slope, o, apart = mixed, 0, channels
+            o, apart = (first * scales + scale) * channels, scales * channels
             for n in range(count):
                 a, b, c = corner[n], corner[BLOCK + n], corner[2 * BLOCK + n]
                 u, v, w = part[n], part[BLOCK + n], part[2 * BLOCK + n]
                 sums[:] = np.float32(0)
                 for s in range(0, channels, LANES):
                     product_slopes(
-                        table, slope, sums, a + s, b + s, c + s, o + n * apart + s, channels, size * channels, u, v, w
+                        table, grad, sums, a + s, b + s, c + s, o + n * apart + s, channels, size * channels, u, v, w
                     )
                 for axis in range(3):
                     at = (points[3 * (first + n) + axis] + np.float32(1)) * half
                     if at >= np.float32(0) and at <= last:
-                        found = np.float32(0)
+                        slope = np.float32(0)
                         for lane in range(LANES):
-                            found += sums[axis * LANES + lane]
-                        out[3 * (first + n) + axis] += half * found
+                            slope += sums[axis * LANES + lane]
+                        out[3 * (first + n) + axis] += half * slope
 
 
 @_jit_sum

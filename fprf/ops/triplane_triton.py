@@ -18,7 +18,7 @@ from torch import Tensor
 
 from .backend import asked_plain
 
-__all__ = ["backward", "density", "forward", "interpreted", "summed", "usable"]
+__all__ = ["backward", "forward", "interpreted", "usable"]
 
 _AVAILABLE = importlib.util.find_spec("triton") is not None
 _TILE = 1024
@@ -78,52 +78,18 @@ def forward(points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Tensor
     return out
 
 
-def density(
-    points: Tensor, table: Tensor, resolutions: Sequence[int], weight: Tensor, limit: float, *, keep: bool
-) -> tuple[Tensor, Tensor]:
-    """[N] exp(min(feature . weight - 1, limit)) of contiguous points; features [N scales*F], or [0] unless they are kept."""
-    from . import triplane_triton_kernels as kernels
-
-    table, weight = table.detach().contiguous(), weight.detach().contiguous()
-    out = torch.empty(len(points), device=points.device)
-    shape = (len(points), len(resolutions) * table.shape[1]) if keep else (0,)
-    latent = torch.empty(shape, device=points.device)
-    if len(points) > 0:
-        with _on(points):
-            kernels.density[_grid(points, table)](
-                points, table, weight, limit, latent, out, len(points),
-                *_constants(table, resolutions), keep, enable_fp_fusion=True,
-            )  # fmt: skip
-    return out, latent
-
-
-def backward(
-    points: Tensor,
-    table: Tensor,
-    resolutions: Sequence[int],
-    grad: Tensor | None,
-    raw: Tensor | None = None,
-    weight: Tensor | None = None,
-) -> Tensor:
-    """Gradient of the table [rows F] for a gradient [N scales*F] of the lookup, and raw [N] weight [scales*F] in addition."""
+def backward(points: Tensor, table: Tensor, resolutions: Sequence[int], grad: Tensor) -> Tensor:
+    """Gradient of the table [rows F] for a contiguous gradient [N scales*F] of the lookup."""
     from . import triplane_triton_kernels as kernels
 
     table = table.detach().contiguous()
     out = torch.zeros_like(table)
     if len(points) > 0:
-        # What is absent is never read; a pointer is needed all the same.
-        given = [table if part is None else part.detach().contiguous() for part in (grad, raw, weight)]
         with _on(points):
             kernels.backward[_grid(points, table)](
-                points, table, *given, out, len(points),
-                *_constants(table, resolutions), grad is not None, raw is not None, enable_fp_fusion=True,
-            )  # fmt: skip
+                points, table, grad, out, len(points), *_constants(table, resolutions), enable_fp_fusion=True
+            )
     return out
-
-
-def summed(raw: Tensor, latent: Tensor) -> Tensor:
-    """raw [N] @ latent [N C]."""
-    return latent.T @ raw
 
 
 def _constants(table: Tensor, resolutions: Sequence[int]) -> tuple[tuple[int, ...], int, int, int]:

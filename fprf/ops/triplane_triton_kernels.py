@@ -11,7 +11,7 @@ precision; coordinates, arithmetic and sums are float32. One build serves any nu
 import triton
 import triton.language as tl
 
-__all__ = ["backward", "density", "forward"]
+__all__ = ["backward", "forward"]
 
 
 @triton.jit
@@ -60,26 +60,6 @@ def forward(points, table, out, count, SIZES: tl.constexpr, CHANNELS: tl.constex
         start += 3 * SIZES[scale] * SIZES[scale]
 
 
-@triton.jit(do_not_specialize=["count"])
-def density(
-    points, table, weight, limit, latent, out, count,
-    SIZES: tl.constexpr, CHANNELS: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr, KEEP: tl.constexpr,
-):  # fmt: skip
-    """out [count] = exp(min(feature . weight - 1, limit)); the features go to `latent` where they are kept."""
-    n, c = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, LANES)
-    inside, real = n < count, c < CHANNELS
-    mask = inside[:, None] & real[None, :]
-    raw, start = tl.zeros([BLOCK], tl.float32), 0
-    for scale in tl.static_range(len(SIZES)):
-        value = _feature(points, table, n, c, inside, mask, start, SIZES[scale], CHANNELS)
-        if KEEP:
-            tl.store(latent + (n[:, None] * len(SIZES) + scale) * CHANNELS + c[None, :], value, mask=mask)
-        part = tl.load(weight + scale * CHANNELS + c, mask=real, other=0.0)
-        raw += tl.sum(value * part[None, :], axis=1)
-        start += 3 * SIZES[scale] * SIZES[scale]
-    tl.store(out + n, tl.exp(tl.minimum(raw - 1.0, limit)), mask=inside)
-
-
 @triton.jit
 def _spread(out, row, c, mask, u, v, slope, SIZE: tl.constexpr, CHANNELS: tl.constexpr):
     """Add the gradient of a sample to its four rows. Others add to them at the same time, in any order."""
@@ -111,21 +91,15 @@ def _spread_product(
 
 @triton.jit(do_not_specialize=["count"])
 def backward(
-    points, table, grad, raw, weight, out, count,
+    points, table, grad, out, count,
     SIZES: tl.constexpr, CHANNELS: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,
-    FEATURE: tl.constexpr, RAW: tl.constexpr,
 ):  # fmt: skip
-    """Add the table's gradient to out. Slope of feature c of point n is grad[n, c] (FEATURE) plus raw[n] weight[c] (RAW)."""
+    """Add the table's gradient to out, for the gradient grad [count scales CHANNELS] of the features."""
     n, c = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.arange(0, LANES)
-    inside, real = n < count, c < CHANNELS
-    mask = inside[:, None] & real[None, :]
+    inside = n < count
+    mask = inside[:, None] & (c < CHANNELS)[None, :]
     start = 0
     for scale in tl.static_range(len(SIZES)):
-        slope = tl.zeros([BLOCK, LANES], tl.float32)
-        if FEATURE:
-            slope += tl.load(grad + (n[:, None] * len(SIZES) + scale) * CHANNELS + c[None, :], mask=mask, other=0.0)
-        if RAW:
-            part = tl.load(weight + scale * CHANNELS + c, mask=real, other=0.0)
-            slope += tl.load(raw + n, mask=inside, other=0.0)[:, None] * part[None, :]
+        slope = tl.load(grad + (n[:, None] * len(SIZES) + scale) * CHANNELS + c[None, :], mask=mask, other=0.0)
         _spread_product(points, table, out, n, c, inside, mask, slope, start, SIZES[scale], CHANNELS)
         start += 3 * SIZES[scale] * SIZES[scale]

@@ -24,11 +24,11 @@ from ..types import Rays, Rendered, Sampled, View, Want
 from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
 
-__all__ = ["VEIL", "Kept", "Parts", "Restyle", "enlarged", "march", "render_rays"]
+__all__ = ["Kept", "Parts", "Restyle", "enlarged", "march", "render_rays"]
 
 
-VEIL = 4.0
-"""Within so many times the nearest distance of a ray, gradients are weighed down in training."""
+_NEAR_CAMERA = 4.0
+"""Within this multiple of a ray's nearest distance gradients are scaled down in training."""
 
 
 class Parts(NamedTuple):
@@ -51,8 +51,8 @@ class Kept(NamedTuple):
     """In the unit cube."""
     latent: Annotated[Tensor, "M L"]
     view: Annotated[Tensor, "M 3"]
-    fair: Annotated[Tensor, "M"] | None = None
-    """What gradients of their features are multiplied by in training; None = nothing."""
+    gradient_scale: Annotated[Tensor, "M"] | None = None
+    """Factor of the gradients of their features in training; None = 1."""
     start: Annotated[Tensor, "R+1"] | None = None
     """Where the samples of each ray begin, and at last where they end; None = unknown."""
     whole: bool = False
@@ -66,8 +66,8 @@ class March(NamedTuple):
     weights: Annotated[Tensor, "R S"]
     depth: Annotated[Tensor, "R"]
     opacity: Annotated[Tensor, "R"]
-    through: Annotated[Tensor, "R"]
-    """Share of the light from behind that reaches the eye. Density learns from it: a background is seen, or it is not."""
+    transmittance: Annotated[Tensor, "R"]
+    """Of the whole ray: the share of the background that is seen. Density learns from it."""
     kept: Kept
 
 
@@ -83,23 +83,23 @@ def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator:
     space = parts.space
     sampled = parts.sampler(_fixed(rays), space=space, step=step, generator=generator)
     # A camera samples what is near it far more densely than any other camera does, and could explain its own image by a
-    # veil there. Weighing gradients by the square of the distance makes every piece of space count alike (Philip and
+    # veil there. Scaling gradients by the square of the distance makes every piece of space count alike (Philip and
     # Deschaintre 2023); beyond a few times the nearest distance that is no longer needed.
-    veiled = step is not None and space.kind in ("contraction", "open")
-    if compiled.fit(rays.origin, sampled.t):
-        return _march_compiled(rays, parts, sampled, budget, veiled)
+    scaled = step is not None and space.kind in ("contraction", "open")
+    if not scaled and compiled.usable(rays.origin, sampled.t):
+        return _march_compiled(rays, parts, sampled, budget)
     middle = midpoints(sampled.t)
     points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
     located = space.locate(points.view(-1, 3))
     sample = parts.field.density(located)
     density = sample.density.view(middle.shape)
-    fair = _fairness(rays, middle) if veiled else None
-    if fair is not None:
-        density = scale_gradient(density, fair)
+    scale = _near_camera_gradient_scale(rays, middle) if scaled else None
+    if scale is not None:
+        density = scale_gradient(density, scale)
     weights = transmittance_weights(density, sampled.t)
     optical = (density * (sampled.t[:, 1:] - sampled.t[:, :-1])).sum(-1)
     # 1 - sum of weights would cancel where the ray is opaque.
-    through = torch.exp(-optical)
+    transmittance = torch.exp(-optical)
     with torch.no_grad():
         opacity = -torch.expm1(-optical)
         depth = (weights * middle).sum(-1) / weights.sum(-1).clamp_min(1e-10)
@@ -107,50 +107,44 @@ def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator:
     if step is not None and rays.origin.device.type != "cpu":
         ray = torch.arange(len(weights), device=weights.device)[:, None].expand(weights.shape).reshape(-1)
         heavy = torch.where(keep, weights, 0.0).view(-1)
-        flat = None if fair is None else fair.view(-1)
+        flat = None if scale is None else scale.view(-1)
         kept = Kept(ray, heavy, located, sample.latent, rays.view.index_select(0, ray), flat, whole=True)
-        return March(sampled, weights, depth, opacity, through, kept)
+        return March(sampled, weights, depth, opacity, transmittance, kept)
     index = keep.view(-1).nonzero()[:, 0]
-    ray = index // middle.shape[1]
+    ray = index // max(1, middle.shape[1])
     kept = Kept(
         ray,
         weights.view(-1).index_select(0, index),
         located.index_select(0, index),
         sample.latent.index_select(0, index),
         rays.view.index_select(0, ray),
-        None if fair is None else fair.view(-1).index_select(0, index),
+        None if scale is None else scale.view(-1).index_select(0, index),
     )
-    return March(sampled, weights, depth, opacity, through, kept)
+    return March(sampled, weights, depth, opacity, transmittance, kept)
 
 
-def _march_compiled(rays: Rays, parts: Parts, sampled: Sampled, budget: float, veiled: bool) -> March:
-    """The same, ray by ray."""
-    if compiled.still(rays.origin, rays.direction):
-        point = compiled.place(rays, sampled.t, parts.space.warp)
-    else:
-        middle = midpoints(sampled.t)
-        points = rays.origin[:, None] + rays.direction[:, None] * middle[..., None]
-        point = parts.space.locate(points.view(-1, 3)).view(points.shape)
+def _march_compiled(rays: Rays, parts: Parts, sampled: Sampled, budget: float) -> March:
+    """The same without gradients, ray by ray."""
+    point = compiled.place(rays, sampled.t, parts.space.warp)
     sample = parts.field.density(point.view(-1, 3))
-    fair = _fairness(rays, midpoints(sampled.t)) if veiled else None
-    found = compiled.weigh(sample.density.view(point.shape[:2]), sampled.t, budget, fair=fair)
-    kept = Kept(*compiled.gather(found, point, sample.latent, rays.view, fair), found.start)
-    return March(sampled, found.weights, found.depth, found.opacity, found.through, kept)
+    weighed = compiled.weigh(sample.density.view(point.shape[:2]), sampled.t, budget)
+    kept = Kept(*compiled.gather(weighed, point, sample.latent, rays.view), start=weighed.start)
+    return March(sampled, weighed.weights, weighed.depth, weighed.opacity, weighed.transmittance, kept)
 
 
 def _fixed(rays: Rays) -> Rays:
     """The rays without gradients: neither where samples lie nor what things are moves a pose."""
-    return rays if compiled.still(rays.origin, rays.direction) else Rays(*(x.detach() for x in rays))
+    return Rays(*(x.detach() for x in rays))
 
 
-def _fairness(rays: Rays, middle: Annotated[Tensor, "R S"]) -> Annotated[Tensor, "R S"]:
-    return (middle / (VEIL * rays.near[:, None])).square().clamp(max=1)
+def _near_camera_gradient_scale(rays: Rays, middle: Annotated[Tensor, "R S"]) -> Annotated[Tensor, "R S"]:
+    return (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1)
 
 
 def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
     values = values.to(kept.weight.dtype)  # under autocast networks answer in half precision
-    if kept.start is not None and compiled.fit(kept.weight, values):
+    if kept.start is not None and compiled.usable(kept.weight, values):
         return compiled.composite(kept.weight, values, kept.start)
     if kept.whole and rays > 0:
         return (values * kept.weight[:, None]).view(rays, -1, values.shape[1]).sum(1)
@@ -182,13 +176,13 @@ def render_rays(
     rgb = content = semantic = unaided = None
     if want & (Want.COLOUR | Want.CONTENT):
         features = parts.field.content(kept.latent, kept.view)
-        if kept.fair is not None:
-            features = scale_gradient(features, kept.fair[:, None])
+        if kept.gradient_scale is not None:
+            features = scale_gradient(features, kept.gradient_scale[:, None])
         if Want.CONTENT in want:
             still = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
             content = composite(still, features, count)
         if Want.COLOUR in want:
-            behind = 0.0 if background is None else marched.through[:, None] * background
+            behind = 0.0 if background is None else marched.transmittance[:, None] * background
             rgb = composite(kept, _colour(features, kept, parts, restyle), count) + behind
             if step is not None and (alone := parts.decoder.unaided(features)) is not None:
                 unaided = composite(kept, alone, count) + behind

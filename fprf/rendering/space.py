@@ -94,7 +94,7 @@ class Space:
         self, s: Annotated[Tensor, "R E"], near: Annotated[Tensor, "R"], far: Annotated[Tensor, "R"]
     ) -> Annotated[Tensor, "R E"]:
         """Ray parameters t of edges s in [0, 1]; increasing, with the ends on near and far."""
-        if march.fit(s, near, far) and march.still(s, near, far):
+        if march.usable(s, near, far):
             return march.distances(s, near, far, self.warp)
         n, f = near[:, None], far[:, None]
         if self.kind in ("box", "ndc"):

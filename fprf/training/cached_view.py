@@ -120,7 +120,7 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
         kept = marched.kept
         content = model.field.content(kept.latent, kept.view)
         semantic = model.semantic(kept.point) if model.semantic is not None else None
-        behind = 0.0 if background is None else marched.through[:, None] * background
+        behind = 0.0 if background is None else marched.transmittance[:, None] * background
         # Points and latents have done their part.
         bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
         metric = model.space.metric(origin[here], direction[here], marched.depth.to(origin.device))

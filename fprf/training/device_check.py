@@ -70,7 +70,9 @@ def compare(device: torch.device) -> list[Outcome]:
 def fast_paths(device: torch.device) -> Iterator[tuple[str, str]]:
     """Name and description of the kernels and the precision that a device uses, and of its free memory."""
     probe = torch.zeros(1, 3, device=device)
-    if march.fit(probe):
+    with torch.no_grad():
+        compiled = march.usable(probe)
+    if compiled:
         yield "kernels", "numba's: tri-planes, networks, marching, matching, guided filter"
     elif triplane_triton.usable(probe, probe):
         yield "kernels", "Triton's for tri-planes; the rest by torch"

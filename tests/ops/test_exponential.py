@@ -4,8 +4,7 @@ import numba
 import numpy as np
 import pytest
 
-from fprf.ops.exponential import exp_lanes, opaque_lanes
-from fprf.ops.lanes import WIDE
+from fprf.ops.lanes import WIDE, exp_lanes, opaque_lanes
 
 U = 2.0**-24
 """Unit round-off of float32."""

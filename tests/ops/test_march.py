@@ -97,7 +97,7 @@ def check_weights(density: Tensor, t: Tensor, found: march.Weighed) -> None:
     assert ((found.weights - exact).abs() <= 4 * U * (2 + before.clamp(max=100)) * exact + 1e-37).all()
     total = tau.sum(-1)
     assert ((found.opacity + torch.expm1(-total)).abs() <= 8 * U * (1 + total) * -torch.expm1(-total) + 1e-37).all()
-    assert ((found.through - torch.exp(-total)).abs() <= 8 * U * (1 + total) * torch.exp(-total) + 1e-37).all()
+    assert ((found.transmittance - torch.exp(-total)).abs() <= 8 * U * (1 + total) * torch.exp(-total) + 1e-37).all()
     mass = exact.sum(-1)
     seen = mass > 1e-8
     depth = (exact * midpoints(t.double())).sum(-1) / mass
@@ -159,7 +159,7 @@ def test_what_is_kept_is_gathered_in_order(latents: int) -> None:
 @torch.no_grad()
 def test_nothing_is_kept_where_nothing_is() -> None:
     weighed = march.weigh(torch.zeros(3, 4), torch.arange(5.0).repeat(3, 1), 0.0)
-    assert not weighed.keep.any() and not weighed.opacity.any() and (weighed.through == 1).all()
+    assert not weighed.keep.any() and not weighed.opacity.any() and (weighed.transmittance == 1).all()
     assert len(march.gather(weighed, torch.zeros(3, 4, 3), torch.zeros(12, 3), torch.zeros(3, 3)).ray) == 0
 
 
@@ -169,7 +169,7 @@ def test_of_no_samples_nothing_is_seen() -> None:
     assert weighed.weights.shape == weighed.keep.shape == (3, 0)
     assert torch.equal(weighed.start, torch.zeros(4, dtype=torch.int64))
     assert torch.equal(weighed.opacity, torch.zeros(3)) and torch.equal(weighed.depth, torch.zeros(3))
-    assert torch.equal(weighed.through, torch.ones(3))
+    assert torch.equal(weighed.transmittance, torch.ones(3))
 
 
 def proposal(seed: int = 0, thickness: float = 4.0, resolution: int = 9, channels: int = 8) -> ProposalField:
@@ -256,10 +256,8 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
-def test_what_is_compiled() -> None:
+def test_kernels_are_for_float32_without_gradients() -> None:
     x = torch.zeros(4, 3)
-    assert march.fit(x) and march.fit(x[:1, :1]) and not march.fit(x, x.double()) and not march.fit(x[:0])
-    wanted = x.clone().requires_grad_(True)
-    assert march.still(x) and not march.still(x, wanted)
+    assert not march.usable(x)
     with torch.no_grad():
-        assert march.still(wanted)
+        assert march.usable(x) and march.usable(x[:1, :1]) and not march.usable(x, x.double()) and not march.usable(x[:0])

@@ -1,41 +1,11 @@
-"""Every mathematical function of ops, style and rendering: no rows, one, an odd number, as many as in production; float32
+"""Mathematical functions of ops, style and rendering: no rows, one, an odd number, as many as in production; float32
 against float64 in values and gradients; nothing written to its inputs.
 """
-
-import ast
-from pathlib import Path
 
 import pytest
 import torch
 from operator_cases import CASES, Case
-from operators_elsewhere import ELSEWHERE
 from torch import Tensor
-
-import fprf
-from fprf.ops import march
-
-PACKAGES = ("ops", "style", "rendering")
-
-
-def public(package: str) -> list[str]:
-    """module.function of what the modules of a package name in __all__."""
-    found = []
-    for path in sorted((Path(fprf.__file__).parent / package).glob("*.py")):
-        tree = ast.parse(path.read_text())
-        lists = [n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"]
-        names = {element for value in lists for element in ast.literal_eval(value)}
-        found += [f"{path.stem}.{n.name}" for n in tree.body if isinstance(n, ast.FunctionDef) and n.name in names]
-    return found
-
-
-def test_every_function_is_in_the_table_or_has_a_reason() -> None:
-    named = {case.name for case in CASES}
-    every = [name for package in PACKAGES for name in public(package)]
-    missing = [name for name in every if name not in named and name not in ELSEWHERE and name.split(".")[0] not in ELSEWHERE]
-    assert not missing
-    modules = {path.stem for package in PACKAGES for path in (Path(fprf.__file__).parent / package).glob("*.py")}
-    gone = [name for name in (*named, *ELSEWHERE) if name not in every and name not in modules]
-    assert not gone
 
 
 def cast(made: list[Tensor], dtype: torch.dtype) -> list[Tensor]:
@@ -102,7 +72,7 @@ def test_gradients_are_those_of_float64(case: Case, n: int) -> None:
         assert abs(float(apart.mean())) <= 1e-4 * float(b.abs().mean())
 
 
-NETWORKS = ("dense.network_reference",)
+NETWORKS = ("dense.network", "dense.network_reference")
 """What somebody who asks for autocast wants to be lowered."""
 
 
@@ -117,21 +87,3 @@ def test_autocast_does_not_lower_the_precision(case: Case, half: torch.dtype) ->
     for one, plain, other in zip(found, usual, exact, strict=True):
         assert one.dtype == plain.dtype
         check_close(case, one, other)
-
-
-@pytest.mark.parametrize(("rays", "samples"), [(0, 5), (5, 0), (0, 0), (1, 1), (37, 21)])
-def test_the_march_of_no_rays_and_of_no_samples(rays: int, samples: int) -> None:
-    """Asked for directly, without `fit`, which would have sent these to the plain form."""
-    density, t = torch.rand(rays, samples), torch.rand(rays, samples + 1).sort(-1).values
-    found = march.weigh(density, t, 0.01)
-    assert found.weights.shape == (rays, samples) and found.start.tolist()[0] == 0
-    assert found.depth.shape == found.opacity.shape == found.through.shape == (rays,)
-    if not samples:
-        assert found.opacity.tolist() == [0.0] * rays and found.through.tolist() == [1.0] * rays
-    kept = march.gather(found, torch.rand(rays, samples, 3), torch.rand(rays * samples, 4), torch.rand(rays, 3))
-    assert len(kept.ray) == len(kept.weight) == int(found.start[-1]) == int(found.keep.sum())
-    out = march.composite(kept.weight, torch.rand(len(kept.ray), 3), found.start)
-    assert out.shape == (rays, 3) and bool(torch.isfinite(out).all())
-    learnt = density.clone().requires_grad_(True)
-    march.weigh(learnt, t, 0.01).weights.sum().backward()
-    assert learnt.grad is not None and learnt.grad.shape == density.shape

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.ops import triplane, triplane_numba
-from fprf.ops.triplane import density, lookup, lookup_reference, point_slopes_reference, rows
+from fprf.ops import triplane_numba
+from fprf.ops.triplane import lookup, lookup_reference, point_slopes_reference, rows
 
 QUICK = settings(max_examples=20, deadline=None)
 U = 2.0**-24
@@ -73,28 +73,6 @@ def test_the_plain_form_differentiates_in_points(resolutions: tuple[int, ...]) -
     assert torch.autograd.gradcheck(lambda p: lookup(p, table, resolutions), (points,))
 
 
-@pytest.mark.parametrize("fixed", [False, True])
-@pytest.mark.parametrize("take", [(True, True), (True, False), (False, True)])
-def test_densities_lead_points_as_well(take: tuple[bool, bool], fixed: bool) -> None:
-    resolutions, count = (9, 17), 60
-    points = points_of(count, 17).requires_grad_(True)
-    table, weight = table_of(resolutions, 8), torch.randn(16, generator=torch.Generator().manual_seed(1)) / 3
-    table.requires_grad_(not fixed)
-    g, h = torch.randn(count), torch.randn(count, 16)
-    found, latent = density(points, table, resolutions, weight, 15.0)
-    pairs = zip(((found * g).sum(), (latent * h).sum()), take, strict=True)
-    loss = torch.stack([part for part, wanted in pairs if wanted]).sum()
-    loss.backward()
-    slope = ((lookup_reference(points.detach().double(), table.detach().double(), resolutions) @ weight.double()) - 1).exp() * g
-    whole = h * take[1] + slope[:, None] * weight * take[0]
-    exact = differences(points.detach(), table.detach(), resolutions, whole, 1 / 512)
-    assert points.grad is not None
-    # exp errs by its argument's error, 20 u at these sizes; the rest as above.
-    room = bound(points.detach(), table.detach(), resolutions, whole) * 2 + 1e-9
-    assert ((points.grad - exact).abs() <= room).all()
-    assert (table.grad is None) == fixed
-
-
 @pytest.mark.parametrize("place", [1.5, -1.5, float("nan"), float("inf"), 1e30])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_outside_the_border_holds(place: float, axis: int) -> None:
@@ -123,31 +101,18 @@ def test_both_forms_agree_anywhere(point: list[float], size: int, seed: int) -> 
     assert torch.allclose(ours, theirs, rtol=1e-5, atol=1e-4 * size)
 
 
-@pytest.mark.parametrize("joint", [False, True])
-def test_nothing_else_changes_where_points_ask(joint: bool) -> None:
+def test_nothing_else_changes_where_points_ask() -> None:
     """Values and the other gradients are the same bits; without asking nothing is found for points."""
     results = []
     for asked in (False, True):
         points = points_of(700, 17).requires_grad_(asked)
         table, weight = table_of((17,), 8).requires_grad_(True), torch.full((8,), 0.3, requires_grad=True)
-        value = density(points, table, (17,), weight, 15.0)[0] if joint else lookup(points, table, (17,)) @ weight
+        value = lookup(points, table, (17,)) @ weight
         value.square().sum().backward()
         assert (points.grad is None) != asked
         results.append((value.detach(), table.grad, weight.grad))
     for a, b in zip(*results, strict=True):
         assert a is not None and b is not None and torch.equal(a, b)
-
-
-def test_forms_without_a_kernel_take_the_plain_one() -> None:
-    class Other:
-        pass
-
-    points, table, weight = points_of(9, 5), table_of((5,), 8), torch.randn(8)
-    raw, grad = torch.randn(9), torch.randn(9, 8)
-    for given_grad, given_raw in ((grad, raw), (grad, None), (None, raw)):
-        found = triplane._point_slopes(Other(), points, table, (5,), given_grad, given_raw, weight)  # type: ignore[arg-type]
-        whole = (0 if given_grad is None else grad) + (0 if given_raw is None else raw[:, None] * weight) + torch.zeros(9, 8)
-        assert torch.allclose(found, point_slopes_reference(points, table, (5,), whole), atol=1e-5)
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")

@@ -1,7 +1,6 @@
 """Tri-plane lookup: the fused and the plain form against fp64 loops, at the documented bound, at production sizes."""
 
 import itertools
-import math
 from collections.abc import Sequence
 
 import numba
@@ -13,16 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.ops import triplane, triplane_numba
-from fprf.ops.triplane import (
-    AXES,
-    density,
-    density_alone,
-    lookup,
-    lookup_reference,
-    rows,
-    split,
-    variation,
-)
+from fprf.ops.triplane import AXES, lookup, lookup_reference, rows, split, variation
 
 QUICK = settings(max_examples=20, deadline=None)
 U = 2.0**-24
@@ -223,8 +213,7 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
         numba.set_num_threads(count)
         found = lookup(points, table, resolutions)
         (gradient,) = torch.autograd.grad(found.square().sum(), table)
-        (smooth,) = torch.autograd.grad(variation(table, resolutions), table)
-        results.append((found, gradient, smooth))
+        results.append((found, gradient))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
@@ -237,55 +226,3 @@ def test_the_fused_form_is_for_float32_with_whole_vectors() -> None:
     assert not triplane_numba.usable(points, table[:, :5])
     assert not triplane_numba.usable(points, table.to("meta")) and not triplane_numba.usable(points.to("meta"), table)
     assert triplane.rows((3, 4)) == 75
-
-
-@pytest.mark.parametrize(("resolutions", "channels", "count"), [((4, 9), 8, 333), ((64, 182), 16, 3000), ((12,), 8, 5000)])
-def test_densities_and_features_come_together(resolutions: tuple[int, ...], channels: int, count: int) -> None:
-    """exp errs by its argument's error: (I + 3) u of the product's magnitudes. Gradients as those of the lookup; the last
-    case is summed up in parts.
-    """
-    points = (points_of(count) * 256).round() / 256
-    table, weight = table_of(resolutions, channels), torch.randn(len(resolutions) * channels) / 3
-    inputs = [table.requires_grad_(True), weight.requires_grad_(True)]
-    exact_inputs = [x.detach().double().requires_grad_(True) for x in inputs]
-    features = lookup_reference(points.double(), exact_inputs[0], resolutions)
-    raw = features @ exact_inputs[1] - 1
-    found, latent = density(points, table, resolutions, weight, 2.0)
-    assert torch.equal(latent, lookup(points, table, resolutions))
-    size = features.abs() @ exact_inputs[1].abs()
-    exact = raw.clamp(max=2.0).exp()
-    assert ((found - exact).abs() <= exact * U * ((len(weight) + 3) * (size + 1) + 4)).all()
-    assert torch.equal(density_alone(points, table, resolutions, weight, 2.0), found)
-    g, h = torch.randn(count), torch.randn(count, len(weight))
-    slope = raw.clamp(-2.0, 2.0).exp().detach()
-    for take in ((True, True), (True, False), (False, True)):
-        ours = sum(x for x, wanted in zip(((found * g).sum(), (latent * h).sum()), take, strict=True) if wanted)
-        theirs = sum(x for x, wanted in zip(((raw * slope * g).sum(), (features * h).sum()), take, strict=True) if wanted)
-        got = torch.autograd.grad(ours, inputs, retain_graph=True, allow_unused=True)
-        want = torch.autograd.grad(theirs, exact_inputs, retain_graph=True, allow_unused=True)
-        for a, b in zip(got, want, strict=True):
-            assert (a is None) == (b is None)
-            if a is not None and b is not None:
-                assert (a - b).norm() <= 1e-5 * b.norm() and (a - b).sum().abs() <= 1e-5 * b.abs().sum()
-
-
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only: nothing to compare")
-@pytest.mark.parametrize("resolutions", [(12,), (16, 182)])
-def test_gradients_of_densities_are_the_same_bits_with_any_threads(resolutions: tuple[int, ...]) -> None:
-    table, points = table_of(resolutions, 8).requires_grad_(True), points_of(6001)
-    weight, results = torch.randn(8 * len(resolutions)).requires_grad_(True), []
-    for count in (1, 2):
-        numba.set_num_threads(count)
-        found, latent = density(points, table, resolutions, weight, 15.0)
-        results.append(torch.autograd.grad(found.sum() + latent.square().sum(), (table, weight)))
-    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-
-
-@pytest.mark.parametrize("score", [-40.0, -2.0, 40.0])
-def test_gradients_neither_die_nor_explode_where_densities_are_cut_off(score: float) -> None:
-    """exp is differentiated as if its argument lay within +-15: planes of one, so that the features are one, too."""
-    table, weight = torch.ones(triplane.rows((4,)), 8), torch.full((8,), (score + 1) / 8)
-    weight.requires_grad_(True)
-    found, _ = triplane.density(torch.zeros(3, 3), table.requires_grad_(True), (4,), weight, 15.0)
-    (gradient,) = torch.autograd.grad(found.sum(), weight)
-    assert torch.allclose(gradient, torch.full((8,), 3 * math.exp(min(max(score, -15.0), 15.0))), rtol=1e-4)

@@ -13,7 +13,6 @@ KERNELS = (
     "exponential",
     "guided",
     "march",
-    "march_gradients",
     "mixture",
     "point_slopes",
     "rasterise",

@@ -1,4 +1,4 @@
-"""Both forms of the march: the compiled one, which float32 on a CPU takes, and the plain one, which all else does."""
+"""Both forms of the march: the compiled one, which float32 on a CPU without gradients takes, and the plain one."""
 
 import pytest
 
@@ -10,5 +10,5 @@ def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str
     """Which form the renderer takes in this test."""
     name: str = request.param
     if name == "plain":
-        monkeypatch.setattr(renderer.compiled, "fit", lambda *given: False)
+        monkeypatch.setattr(renderer.compiled, "usable", lambda *given: False)
     return name

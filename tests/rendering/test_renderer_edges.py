@@ -97,12 +97,13 @@ def test_near_features_learn_by_the_square_of_their_distance() -> None:
     """Each kept feature's gradient is its weight times its own share, sample by sample."""
     parts, rays = parts_of("contraction", 16), rays_of(parts_of("contraction", 16), 4)
     kept = march(rays, parts, budget=0.02, step=0).kept
-    assert kept.fair is not None
+    assert kept.gradient_scale is not None
     t = march(rays, parts, budget=0.02).sampled.t
     share = (midpoints(t) / (4 * rays.near[:, None])).square().clamp(max=1)
     whole = march(rays, parts, budget=0.0).weights
     index = [int((whole[r] - w).abs().argmin()) for r, w in zip(kept.ray.tolist(), kept.weight, strict=True)]
-    assert len(kept.fair) < share.numel() and torch.allclose(kept.fair, share[kept.ray, torch.tensor(index)])
+    assert len(kept.gradient_scale) < share.numel()
+    assert torch.allclose(kept.gradient_scale, share[kept.ray, torch.tensor(index)])
 
 
 def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
@@ -160,7 +161,7 @@ def test_training_also_renders_what_the_decoder_says_alone() -> None:
     parts, rays = toys.parts_of()._replace(decoder=Aided()), toys.rays_of("contraction", 4)
     behind = torch.tensor([0.2, 0.4, 0.6])
     found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, background=behind)
-    through = 1 - found.opacity[:, None]
+    transmittance = 1 - found.opacity[:, None]
     assert found.rgb is not None and found.unaided is not None
-    assert torch.allclose(found.unaided - through * behind, (found.rgb - through * behind) / 2, atol=1e-5)
+    assert torch.allclose(found.unaided - transmittance * behind, (found.rgb - transmittance * behind) / 2, atol=1e-5)
     assert render_rays(rays, parts, want=Want.COLOUR, budget=0.0).unaided is None

@@ -110,7 +110,7 @@ def test_what_was_found_is_gone_on_with() -> None:
 
 
 def test_a_ray_s_slope_is_that_of_its_colour(world: World) -> None:
-    """Compiled march and plain one, against differences of what is rendered; samples stay where they are in both."""
+    """Against differences of what is rendered."""
     run = world.load()
     view, pixel = torch.zeros(6, dtype=torch.int64), torch.rand(6, 2, generator=torch.Generator().manual_seed(0)) * 8 + 1
     origin, direction = rays_through(run.known.cameras, view, pixel.double())

@@ -45,8 +45,7 @@ class ProposalSampler(Sampler):
         levels = []
         for field, count in zip(self.levels, counts, strict=True):
             with torch.set_grad_enabled(learns):
-                compiled = sharpness == 1 and march.fit(rays.origin, s)
-                if compiled and isinstance(field, ProposalField) and field.planes.fused(rays.origin):
+                if sharpness == 1 and isinstance(field, ProposalField) and field.kernels_apply(rays.origin, s):
                     s = self._compiled(field, rays, s, space, count, generator)
                     continue
                 t = space.distance(s, rays.near, rays.far)
