@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..training.model import Model
     from ..training.run import Run
     from ..training.trainer import Report
-    from ..viewer.aside import Aside
+    from ..viewer.live import LiveViewer
 
 __all__ = ["SHARE", "block_minutes", "run_block", "show_plan", "train_blocks"]
 
@@ -31,7 +31,7 @@ def train_blocks(
     plan: "Plan",
     display: Display,
     start: float,
-    view: "Aside | None" = None,
+    view: "LiveViewer | None" = None,
 ) -> None:
     """Features of all views, the surroundings, the blocks, largest first, and the style of the whole. Finished ones stay.
 
@@ -78,7 +78,7 @@ def block_minutes(config: "TrainConfig", blocks: int, spent: float) -> tuple[flo
     return SHARE * left, (1 - SHARE) * left / blocks
 
 
-def run_block(task: "BlockTask", view: "Aside | None" = None) -> None:
+def run_block(task: "BlockTask", view: "LiveViewer | None" = None) -> None:
     """Train one block, here or on a worker, and show how it goes."""
     from ..training.block_task import train_block
     from ..training.blocks import SURROUNDINGS, folder_of

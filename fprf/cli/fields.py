@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from ..export.config import ExportConfig
     from ..plugins.config import Need
     from ..style.files import StyleFile
-    from ..viewer.aside import Aside
+    from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
 __all__ = ["FieldVerbs"]
@@ -29,7 +29,7 @@ class FieldVerbs(Verbs):
 
         show_plan(self.config, method, self.config.output or default_output(self.config, method))
 
-    def train(self, method: str, *, quiet: bool = False, view: "Aside | None" = None, others: bool = False) -> Path:
+    def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
         """Train a model."""
         from .train import train_scene
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..splats.config import GaussiansConfig
     from ..style.files import StyleFile
     from ..training.trainer import Report
-    from ..viewer.aside import Aside
+    from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
 __all__ = ["SplatVerbs"]
@@ -35,7 +35,7 @@ class SplatVerbs(Verbs):
         """Refuse: Gaussians are not trained in blocks."""
         raise UsageError(f"--plan: {method} trains a scene in one piece; leave --plan out")
 
-    def train(self, method: str, *, quiet: bool = False, view: "Aside | None" = None, others: bool = False) -> Path:
+    def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
         """Train Gaussians."""
         if view is not None:
             raise UsageError(f"--view: {method} is not shown while it trains; leave --view out")

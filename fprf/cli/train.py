@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ..errors import UsageError
 from .blocks import train_blocks
 from .event_log import EventLog
-from .live_view import VIEW, linger, open_view, take_view
+from .live_view import VIEW, finish_view, open_view, take_view
 from .parsing import LIST_FLAGS, load_method, methods, parse
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..training.prepare import Prepared
     from ..training.run import Run
     from ..training.trainer import Report
-    from ..viewer.aside import Aside
+    from ..viewer.live import LiveViewer
     from .progress import Display
 
 __all__ = ["check_same", "default_output", "run", "train_scene"]
@@ -76,7 +76,7 @@ def default_output(config: "RunConfig", method: str) -> Path:
 
 
 def train_scene(
-    config: "TrainConfig", method: str, *, quiet: bool = False, view: "Aside | None" = None, others: bool = False
+    config: "TrainConfig", method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False
 ) -> Path:
     """Train to the end and return the run folder. An existing run there is resumed if its config and its images fit;
     with `others` the images may have changed.
@@ -123,7 +123,7 @@ def train_scene(
                 originals.keep(output, marks)
                 train_blocks(config, method, folder, scene, plan, display, start, view)
                 _say_outcome(folder, config, scene, display, time.perf_counter() - start)
-                linger(view, display)
+                finish_view(view, display)
                 return output
         prepared = prepare.prepare(config, _told_features(config, display), look, folder.saved_facts())
         folder.root.mkdir(parents=True, exist_ok=True)
@@ -161,7 +161,7 @@ def train_scene(
         folder.save_tensors("style", to_tensors(style))
         folder.log({"part": "own style", "seconds": round(time.perf_counter() - trained, 3)})
         _say_outcome(folder, config, prepared.scene, display, time.perf_counter() - start)
-    linger(view, display)
+    finish_view(view, display)
     return output
 
 

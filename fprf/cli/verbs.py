@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from ..export.config import ExportConfig
     from ..plugins.config import Need
     from ..style.files import StyleFile
-    from ..viewer.aside import Aside
+    from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
 __all__ = ["Verbs", "verbs_of"]
@@ -25,7 +25,7 @@ class Verbs(ABC):
         """Show what training would cost, and run nothing."""
 
     @abstractmethod
-    def train(self, method: str, *, quiet: bool = False, view: "Aside | None" = None, others: bool = False) -> Path:
+    def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
         """Train to the end and return the run folder; go on with a run that is there.
 
         `view` shows how it goes; `others` lets the images differ from those that the run was begun with.

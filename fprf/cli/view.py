@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 __all__ = ["ViewConfig", "run"]
 
-_PATIENCE = 15.0
+_EXIT_TIMEOUT = 15.0
 """Seconds after an interrupt within which all must have ended."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig(QualityConfig):
-    """What to look at, and who may."""
+    """Which run to show, and to whom."""
 
     run: Path = Path()
     """Run folder."""
@@ -56,21 +56,20 @@ def run(args: list[str]) -> int:
     config = parse(ViewConfig(), args, prog="fprf view", description="Look at a run in the browser.", positional=("run",))
     if importlib.util.find_spec("viser") is None:
         raise UsageError("fprf view: needs viser; install it with pip install 'fprf[viewer]'")
-    from ..viewer.access import make_access
-    from ..viewer.host import Host
+    from ..viewer.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
-    with Host(access, config.port) as host:
+    with ViewerServer(access, config.port) as server:
         if not (config.run / "config.json").is_file():
             raise CheckpointError(f"{config.run}: no config.json here, so it is no run folder; `fprf train` makes one")
         references = _photographs(config.references)
-        print(host.address, flush=True)
-        host.open(lambda: _load(config), references, config.pixels)
+        print(server.address, flush=True)
+        server.open(lambda: _load(config), references, config.pixels)
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
             # Whatever a thread is in the middle of, the terminal comes back.
-            last = threading.Timer(_PATIENCE, os._exit, (130,))
+            last = threading.Timer(_EXIT_TIMEOUT, os._exit, (130,))
             last.daemon = True
             last.start()
             raise

@@ -1,59 +1,51 @@
-"""A flight through the scene with looks along it: keys that are set on the page, and the film that is made of them.
+"""Films: keyframes set on the page become an mp4 in the run's folder, and are played on a client's page before that.
 
 A film's folder holds what `fprf render` takes: `path.json` (a camera path), `keys.json` (styles by frame) and the styles with
 their photographs. The film is rendered from these very files, so the same command makes it again, at any size.
 """
 
 import shutil
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from queue import Full, Queue
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from ..checks import between
 from ..cli.keyframes import keyed_looks, read_keyframes
-from ..errors import UsageError
+from ..errors import FprfError, UsageError
 from ..io.atomic import write_json
 from ..io.images import Picture, to_uint8
+from ..io.video import write_video
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
 from ..training.cached_view import view_parts
 from ..training.loading import Trained
-from .cameras import Eye, Stage
-from .looks import Look, settled, style_of
-from .renderer import CHUNK
+from .cameras import CameraState, PageTransform
+from .render_worker import RenderWorker
+from .renderer import CHUNK, RenderRequest
+from .state import FilmProgress, Key, Look, interpolate_looks, simplified, style_config
 
-__all__ = ["FilmPlan", "Key", "Thumbnail", "frames_of_film", "lay_film", "new_folder", "path_of", "taken"]
+if TYPE_CHECKING:
+    from .session import Session
 
-LONGEST = 600.0
-"""Seconds of a film."""
+__all__ = ["FilmPlan", "FilmRecorder", "film_cameras", "film_frames", "new_folder", "queued_frames", "write_film_files"]
 
-
-@dataclass(frozen=True, eq=False)
-class Thumbnail:
-    """A picture that is compared by what it is, not by its pixels."""
-
-    number: int
-    """What the page calls it by."""
-    picture: Picture
-
-
-class Key(NamedTuple):
-    """A place on the flight, and how the scene looks there."""
-
-    eye: Eye
-    look: Look
-    thumbnail: Thumbnail | None = None
-    """What was seen there."""
+_MAX_SECONDS = 600.0
+PREVIEW_FPS = 8.0
+"""Pictures a second of a flight that is played: as many as a processor makes."""
+_PREVIEW_TIMEOUT = 1.0
+"""Seconds for one of them."""
 
 
 class FilmPlan(NamedTuple):
-    """What a film is to be."""
+    """Keyframes and timing of a film."""
 
     keys: tuple[Key, ...]
     seconds: float
@@ -62,26 +54,27 @@ class FilmPlan(NamedTuple):
     size: tuple[int, int]
     """Width, height."""
 
+    @property
+    def gap(self) -> int:
+        """Frames from one key to the next."""
+        return max(1, round(self.seconds * self.fps))
 
-def path_of(stage: Stage, plan: FilmPlan) -> Cameras:
-    """The frames' cameras; a key alone is one frame. Raises UsageError for no keys or a film that is too long."""
+
+def film_cameras(transform: PageTransform, plan: FilmPlan) -> Cameras:
+    """A camera each frame; a single key is one frame. Raises UsageError for no keys or a film that is too long."""
     if not plan.keys:
         raise UsageError("film: no keys yet; fly somewhere and add one")
     between("fps", plan.fps, 1.0, 120.0)
-    between("seconds", plan.seconds, 0.1, LONGEST)
-    if plan.seconds * (len(plan.keys) - 1) > LONGEST:
-        raise UsageError(f"film: {plan.seconds * (len(plan.keys) - 1):.0f} s; at most {LONGEST:.0f} s are filmed from the page")
-    keys = stage.cameras([key.eye for key in plan.keys], plan.size)
-    return interpolate(keys, torch.arange(len(plan.keys)), gap_of(plan) - 1)
-
-
-def gap_of(plan: FilmPlan) -> int:
-    """Frames from one key to the next."""
-    return max(1, round(plan.seconds * plan.fps))
+    between("seconds", plan.seconds, 0.1, _MAX_SECONDS)
+    seconds = plan.seconds * (len(plan.keys) - 1)
+    if seconds > _MAX_SECONDS:
+        raise UsageError(f"film: {seconds:.0f} s; at most {_MAX_SECONDS:.0f} s are filmed from the page")
+    keys = transform.cameras([key.camera for key in plan.keys], plan.size)
+    return interpolate(keys, torch.arange(len(plan.keys)), plan.gap - 1)
 
 
 def new_folder(root: Path) -> Path:
-    """A folder for the next film of a run, made now: RUN/films/0001 and so on."""
+    """Make a folder for the next film of a run: RUN/films/0001 and so on."""
     number = 1
     while True:
         folder = root / "films" / f"{number:04d}"
@@ -92,25 +85,26 @@ def new_folder(root: Path) -> Path:
             number += 1
 
 
-def lay_film(folder: Path, stage: Stage, plan: FilmPlan, encoder: str) -> None:
-    """Write path.json, keys.json, and a folder a look with style.json and its photographs. `encoder` is the identity of the
-    scene's semantic encoder.
+def write_film_files(folder: Path, transform: PageTransform, plan: FilmPlan, encoder: str) -> None:
+    """Write path.json, keys.json, and a folder a look with style.json and its photographs.
+
+    `encoder` is the identity of the scene's semantic encoder.
     """
-    write_camera_path(folder / "path.json", path_of(stage, plan), plan.fps)
+    write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps)
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
     for i, key in enumerate(plan.keys):
-        if not settled(key.look).plain and key.look not in looks:
+        if not simplified(key.look).plain and key.look not in looks:
             looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, encoder)
         style = looks.get(key.look)
-        rows.append({"frame": i * gap_of(plan), "style": None if style is None else str(style.relative_to(folder))})
+        rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
 
 
-def frames_of_film(
-    folder: Path, trained: Trained, out: "Queue[Picture | None]", told: Callable[[int, int], None]
+def film_frames(
+    folder: Path, trained: Trained, out: "Queue[Picture | None]", progress: Callable[[int, int], None]
 ) -> Iterator[None]:
-    """Work for the desk: render the frames of a film's folder into a queue, at last None. `told(done, total)` of each."""
+    """Render the frames of a film's folder into a queue, at last None, a step each chunk; `progress(done, total)` of each."""
     try:
         cameras, _ = read_camera_path(folder / "path.json")
         looks = keyed_looks(trained, read_keyframes(folder / "keys.json"))
@@ -124,16 +118,111 @@ def frames_of_film(
             picture = to_uint8(torch.cat(rows).view(height, width, 3))
             while not _put(out, picture):
                 yield
-            told(frame + 1, len(cameras))
+            progress(frame + 1, len(cameras))
     finally:
         while not _put(out, None):
             out.get()
 
 
-def taken(frames: "Queue[Picture | None]") -> Iterator[Picture]:
+def queued_frames(frames: "Queue[Picture | None]") -> Iterator[Picture]:
     """The frames of a queue, up to None."""
     while (frame := frames.get()) is not None:
         yield frame
+
+
+class FilmRecorder:
+    """Makes and plays the films of one session."""
+
+    def __init__(self, session: "Session", worker: RenderWorker[RenderRequest]) -> None:
+        self._session, self._worker = session, worker
+        self._lock = threading.Lock()
+        self._flights: dict[Hashable, threading.Event] = {}
+
+    def record(self, plan: FilmPlan, client: Hashable | None) -> None:
+        """Make a film, one at a time."""
+        session = self._session
+        with self._lock:
+            if session.state.film.busy:
+                session.notify("film: one is being made; wait for it", client)
+                return
+            session.update(lambda state: replace(state, film=FilmProgress(0, 1)))
+        threading.Thread(target=self._record, args=(plan, client), name="fprf-film", daemon=True).start()
+
+    def play(self, client: Hashable, plan: FilmPlan, move: Callable[[CameraState], None]) -> None:
+        """Show a client the flight as the film will be, coarsely; a flight that is under way is ended."""
+        self.stop(client)
+        over = threading.Event()
+        with self._lock:
+            self._flights[client] = over
+        threading.Thread(target=self._play, args=(client, plan, move, over), name="fprf-flight", daemon=True).start()
+
+    def playing(self, client: Hashable) -> bool:
+        """Whether a flight is shown to a client."""
+        return client in self._flights
+
+    def stop(self, client: Hashable) -> None:
+        """End a client's flight where it is."""
+        with self._lock:
+            over = self._flights.pop(client, None)
+        if over is not None:
+            over.set()
+
+    def _play(self, client: Hashable, plan: FilmPlan, move: Callable[[CameraState], None], over: threading.Event) -> None:
+        session = self._session
+        try:
+            path = film_cameras(session.transform, plan._replace(fps=PREVIEW_FPS))
+            session.update(lambda state: replace(state, playing=True))
+            last, start, frame = len(path) - 1, time.monotonic(), -1
+            while frame < last and not over.is_set():
+                frame = min(last, max(frame + 1, int((time.monotonic() - start) * PREVIEW_FPS)))
+                camera = session.transform.camera_state(path, frame)
+                before = session.picture(client)
+                session.preview(client, camera, interpolate_looks(plan.keys, frame * (len(plan.keys) - 1) / max(1, last)))
+                move(camera)
+                # As fast as pictures come: where a newer camera replaced each older one, none would be seen.
+                until = time.monotonic() + _PREVIEW_TIMEOUT
+                while not over.wait(1 / PREVIEW_FPS) and session.picture(client) is before and time.monotonic() < until:
+                    pass
+        except FprfError as error:
+            session.notify(str(error), client)
+        finally:
+            with self._lock:
+                if self._flights.get(client) is over:
+                    del self._flights[client]
+                flying = bool(self._flights)
+            session.refresh(client)
+            session.update(lambda state: replace(state, playing=flying))
+
+    def _record(self, plan: FilmPlan, client: Hashable | None) -> None:
+        session, trained = self._session, self._session.trained
+
+        def progress(done: int, total: int) -> None:
+            session.update(lambda state: replace(state, film=FilmProgress(done, total)))
+
+        try:
+            folder = new_folder(trained.run.root)
+            write_film_files(folder, session.transform, plan, trained.known.facts.semantic_encoder)
+            frames: Queue[Picture | None] = Queue(2)
+            failed: list[Exception] = []
+            self._worker.run_when_idle(_noting(film_frames(folder, trained, frames, progress), failed))
+            write_video(folder / "film.mp4", queued_frames(frames), plan.fps)
+            if failed:
+                raise failed[0]
+        except Exception as error:  # whatever it is, the next film can be made
+            session.update(lambda state: replace(state, film=FilmProgress()))
+            session.notify(f"film: {error}", client)
+            return
+        session.update(lambda state: replace(state, film=replace(state.film, path=folder / "film.mp4")))
+        session.notify(f"film: {folder / 'film.mp4'}")
+
+
+def _noting(frames: Iterator[None], failed: list[Exception]) -> Iterator[None]:
+    """The work; what it raises is also put into `failed`."""
+    try:
+        yield from frames
+    except Exception as error:
+        failed.append(error)
+        raise
 
 
 def _put(out: "Queue[Picture | None]", picture: Picture | None) -> bool:
@@ -145,19 +234,19 @@ def _put(out: "Queue[Picture | None]", picture: Picture | None) -> bool:
 
 
 def _write_look(folder: Path, look: Look, encoder: str) -> Path:
-    """The style file of a look, with that of what it goes towards beside it."""
+    """Write the style file of a look, with that of what it goes towards in a folder of its own."""
     folder.mkdir(parents=True)
-    look = settled(look)
-    style = style_of(look)
-    here = []
-    for i, (card, _) in enumerate(look.mix):
-        target = folder / f"{i + 1}-{_stem(card.name)}.png"
-        shutil.copyfile(card.path, target)
-        here.append(target)
+    look = simplified(look)
+    style = style_config(look)
+    references = []
+    for i, (photograph, _) in enumerate(look.mix):
+        target = folder / f"{i + 1}-{_stem(photograph.name)}.png"
+        shutil.copyfile(photograph.path, target)
+        references.append(target)
     other = None
     if look.towards is not None:
         other = _write_look(folder / "towards", look.towards, encoder)
-    style = replace(style, references=tuple(here), between=other, at=look.at if other is not None else 0.5)
+    style = replace(style, references=tuple(references), between=other, at=look.at if other is not None else 0.5)
     path = folder / "style.json"
     write_style(path, StyleFile(style, {}, encoder))
     return path

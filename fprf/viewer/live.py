@@ -1,134 +1,317 @@
-"""The viewer's side of `fprf train --view`, as a process: `Aside` starts it, tells it of the run, and hands over parameters.
+"""`fprf train --view`: both ends of the pipes between training and the viewer, which is a process of its own.
 
-Nothing heavy is imported before somebody opens the page. New parameters are asked for when every client has its sharp picture,
-or, where cameras never rest, after a while; so the picture on the page is always of one moment of training.
+`LiveViewer`, training's end, starts the process and only answers what it asks for. The process (`python -m fprf.viewer.live`)
+says on its standard output, a JSON line each, whether somebody looks and when it wants the newest parameters. They are copied
+between two steps and written to a file; a thread does the writing. While nobody looks nothing is copied and nothing sent.
+Whatever becomes of the viewer, training goes on.
+
+The viewer imports nothing heavy before somebody opens the page. New parameters are asked for when every client has its sharp
+picture, or, where cameras never rest, after a while; so the picture on the page is always of one moment of training.
 """
 
+import contextlib
 import json
+import os
+import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from queue import Empty, Queue
+from queue import Empty, Full, Queue
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
-from ..errors import FprfError
-from .access import make_access
-from .host import Host
-from .training import Training
+from ..errors import FprfError, UsageError
 
 if TYPE_CHECKING:
+    from ..training.model import Model
+    from ..training.trainer import Report
+    from .server import Access, ViewerServer
     from .session import Session
+    from .state import TrainingProgress
 
-__all__ = ["Follower", "main"]
+__all__ = ["LiveViewer", "TrainingFollower", "ViewAddress", "main"]
 
-_REST = 2.0
+_START_TIMEOUT = 60.0
+"""Seconds within which the viewer must say where it listens."""
+_LOG = "log"
+_COPY_SHARE = 0.05
+"""Share of the time that copying parameters may take."""
+_MIN_PAUSE = 2.0
 """Seconds that a sharp picture stays at least."""
-_RESTLESS = 8.0
+_MAX_PAUSE = 8.0
 """Seconds after which cameras that never rest get new parameters all the same."""
 _LEAVING = 3.0
-"""Seconds after which somebody who has gone is taken to have gone."""
+"""Seconds after which nobody who was not seen again is taken to look."""
 
 
-class _Run(NamedTuple):
-    """What is being trained."""
+class ViewAddress(NamedTuple):
+    """Where to listen."""
 
+    host: str = "127.0.0.1"
+    port: int = 8080
+    strict: bool = False
+    """Whether another free port will not do."""
+
+
+class LiveViewer:
+    """The viewer's process; a context manager, which ends it. Called once every half a second of training at most.
+
+    Raises UsageError where the viewer does not start.
+    """
+
+    def __init__(self, address: ViewAddress, command: tuple[str, ...] = (sys.executable, "-m", "fprf.viewer.live")) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="fprf-train-")
+        self._lines: Queue[dict[str, Any] | None] = Queue(64)
+        self._looking = threading.Event()
+        self._wanted = threading.Event()
+        self._ended = threading.Event()
+        self._model: Model | None = None
+        self._next = 0.0
+        with (Path(self._folder.name) / _LOG).open("w") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                start_new_session=True,  # an interrupt at the terminal is training's
+            )
+        self._send(address._asdict())
+        self._writer = threading.Thread(target=self._write, name="fprf-live-write", daemon=True)
+        self._writer.start()
+        try:
+            self.address = self._first_answer()
+        except BaseException:
+            self.close()
+            raise
+        threading.Thread(target=self._read, name="fprf-live-read", daemon=True).start()
+
+    def __enter__(self) -> "LiveViewer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def looked_at(self) -> bool:
+        """Whether somebody looks."""
+        return self._looking.is_set()
+
+    @property
+    def fault(self) -> str | None:
+        """Why the viewer has ended before its time, in one line; None where it has not."""
+        if not self._ended.is_set():
+            return None
+        lines = (Path(self._folder.name) / _LOG).read_text(errors="replace").split("\n")
+        return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "it said nothing")
+
+    def begin(self, root: Path, model: "Model", device: str, *, block: int | None = None, what: str = "") -> None:
+        """Show this run, or a `block` of it, whose config.json and scene.json are written. The page calls it `what`."""
+        self._model = model
+        self._send({"run": str(root.resolve()), "device": device, "block": block, "what": what})
+
+    def __call__(self, report: "Report") -> None:
+        """Between two steps: send the progress, and copy the parameters where the viewer waits for them."""
+        if self._ended.is_set() or not self._looking.is_set():
+            return
+        self._send({"report": [report.step, report.share, report.psnr, report.seconds]})
+        now = time.perf_counter()
+        if not self._wanted.is_set() or self._model is None or now < self._next:
+            return
+        self._wanted.clear()
+        copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in self._model.state_dict().items()}
+        self._next = now + (time.perf_counter() - now) / _COPY_SHARE
+        self._send({"snapshot": copy})
+
+    def finish(self, *, stay: bool) -> bool:
+        """Training has ended. With `stay`, return when nobody looks any more. Return whether somebody had looked."""
+        looked = self.looked_at and not self._ended.is_set()
+        self._model = None
+        self._send({"done": True})
+        while stay and looked and self.looked_at and not self._ended.wait(0.2):
+            pass
+        return looked
+
+    def close(self) -> None:
+        """End the viewer, by force if it does not react."""
+        self._looking.clear()
+        self._send(None)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(3)
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        self._ended.set()
+        self._writer.join(5)
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError, ValueError):
+                if pipe is not None:
+                    pipe.close()
+        self._folder.cleanup()
+
+    def _send(self, line: dict[str, Any] | None) -> None:
+        """Queue a line without waiting: a viewer that does not read misses something."""
+        try:
+            self._lines.put_nowait(line)
+        except Full:
+            if line is None:
+                self._process.kill()
+
+    def _write(self) -> None:
+        """Write the queued lines, on a thread: a viewer that does not read holds up nothing else."""
+        assert self._process.stdin is not None
+        try:
+            while (line := self._lines.get()) is not None:
+                if "snapshot" in line:
+                    line = {"snapshot": str(self._store(line["snapshot"]))}
+                self._process.stdin.write(json.dumps(line) + "\n")
+                self._process.stdin.flush()
+            self._process.stdin.close()
+        except (OSError, ValueError):
+            self._ended.set()
+
+    def _store(self, tensors: dict[str, Any]) -> Path:
+        from safetensors.torch import save_file
+
+        path = Path(self._folder.name) / "newest.safetensors"
+        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path.with_suffix(".part"))
+        os.replace(path.with_suffix(".part"), path)
+        return path
+
+    def _first_answer(self) -> str:
+        """The viewer's address, as soon as it has said it. Raises UsageError with what it says instead."""
+        first: Queue[str] = Queue()
+        stdout = self._process.stdout
+        assert stdout is not None
+        threading.Thread(target=lambda: first.put(stdout.readline()), daemon=True).start()
+        try:
+            said = json.loads(first.get(timeout=_START_TIMEOUT))
+            if "address" in said:
+                return str(said["address"])
+            why = str(said["error"])
+        except (Empty, ValueError, KeyError, TypeError):
+            why = "the viewer did not start; try `fprf view` on a run, or train without --view"
+        raise UsageError(f"--view: {why}")
+
+    def _read(self) -> None:
+        """Read what the viewer says, on a thread."""
+        assert self._process.stdout is not None
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            for line in self._process.stdout:
+                said = json.loads(line)
+                if said.get("looking") is not None:
+                    (self._looking.set if said["looking"] else self._looking.clear)()
+                if said.get("want"):
+                    self._wanted.set()
+        self._looking.clear()
+        self._ended.set()
+
+
+class _TrainingRun(NamedTuple):
     root: Path
     device: str
     block: int | None
     what: str
 
 
-class Follower:
-    """Keeps a session up to date with a training run. `tell` sends a line to training."""
+class TrainingFollower:
+    """The viewer's end: keeps a session up to date with a training run. `tell` sends a line to training."""
 
-    def __init__(self, host: Host, tell: Callable[[dict[str, Any]], None]) -> None:
-        self._host, self._tell = host, tell
-        self._run: _Run | None = None
-        self._shown: _Run | None = None
+    def __init__(self, server: "ViewerServer", tell: Callable[[dict[str, Any]], None]) -> None:
+        self._server, self._tell = server, tell
+        self._run: _TrainingRun | None = None
+        self._shown: _TrainingRun | None = None
         self._session: Session | None = None
-        self._looking = self._wanted = self._over = False
+        self._looking = self._wanted = self._ended = False
         self._last_seen = self._last_new = 0.0
 
     @property
     def over(self) -> bool:
-        """Training is over, and nobody looks."""
-        return self._over and not self._looking
+        """Whether training has ended and nobody looks."""
+        return self._ended and not self._looking
 
-    def hear(self, said: dict[str, Any]) -> None:
-        """A line from training."""
+    def receive(self, said: dict[str, Any]) -> None:
+        """Handle a line from training."""
+        from .state import TrainingProgress
+
         if "run" in said:
-            self._run = _Run(Path(said["run"]), str(said["device"]), said.get("block"), str(said.get("what", "")))
+            self._run = _TrainingRun(Path(said["run"]), str(said["device"]), said.get("block"), str(said.get("what", "")))
             self._wanted = False  # what was asked for was of another model
         elif "snapshot" in said and self._run is not None:
-            self._take(Path(said["snapshot"]))
+            self._load(Path(said["snapshot"]))
         elif "report" in said and self._session is not None:
             step, share, psnr, seconds = said["report"]
             left = seconds * (1 - share) / max(share, 1e-3)
             what = "" if self._run is None else self._run.what
-            self._say_how(Training(int(step), float(share), float(psnr), float(left), what))
+            self._set_progress(TrainingProgress(int(step), float(share), float(psnr), float(left), what))
         elif "done" in said:
-            self._over = True
-            self._finish()
+            self._ended = True
+            self._load_finished()
 
     def tick(self, now: float) -> None:
-        """Every fraction of a second: who looks, and whether they wait for something new."""
+        """Every fraction of a second: tell training who looks, and ask for parameters where clients wait for them."""
         session = self._session
-        if self._host.visited.is_set() or (session is not None and session.watched):
-            self._host.visited.clear()
+        if self._server.visited.is_set() or (session is not None and session.has_clients):
+            self._server.visited.clear()
             self._last_seen = now
         looking = self._last_seen > 0 and now - self._last_seen < _LEAVING
         if looking != self._looking:
             self._looking = looking
             self._tell({"looking": looking})
             self._wanted = False
-        if not looking or self._wanted or self._over or self._run is None:
+        if not looking or self._wanted or self._ended or self._run is None:
             return
         since = now - self._last_new
-        if since < _REST or (session is not None and (session.state.film.busy or (since < _RESTLESS and not session.idle))):
+        if since < _MIN_PAUSE or (
+            session is not None and (session.state.film.busy or (since < _MAX_PAUSE and not session.idle))
+        ):
             return
         self._wanted = True
         self._tell({"want": True})
 
-    def _take(self, path: Path) -> None:
-        """New parameters: the first ones open the page."""
+    def _load(self, path: Path) -> None:
+        """Take new parameters; the first ones open the page."""
         from safetensors.torch import load_file
 
-        from .moment import begun, encoders_now, filled
+        from .restyler import load_unfinished, measure_encoders, set_parameters
+        from .state import TrainingProgress
 
         tensors = load_file(path)
         self._wanted, self._last_new = False, time.monotonic()
         run, session = self._run, self._session
         assert run is not None
         if session is None:
-            trained = filled(begun(run.root, run.device, run.block), tensors)
-            self._session = self._host.open(lambda: trained, (), 640, encoders_now)
-            self._say_how(Training(what=run.what))
+            trained = set_parameters(load_unfinished(run.root, run.device, run.block), tensors)
+            self._session = self._server.open(lambda: trained, (), 640, measure_encoders)
+            self._set_progress(TrainingProgress(what=run.what))
         elif run == self._shown:
-            session.renew(lambda: filled(session.trained, tensors))
+            session.reload(lambda: set_parameters(session.trained, tensors))
         else:
-            session.renew(lambda: filled(begun(run.root, run.device, run.block), tensors))
+            session.reload(lambda: set_parameters(load_unfinished(run.root, run.device, run.block), tensors))
         self._shown = run
 
-    def _finish(self) -> None:
-        """The last parameters and the scene's own style are in the run folder now."""
+    def _load_finished(self) -> None:
+        """Show the run as it was saved, with the style that training measured."""
         if self._session is None or self._run is None:
             return
         from ..training.loading import load_run
+        from .state import TrainingProgress
 
         last = load_run(self._run.root, self._run.device)
-        self._session.renew(lambda: last, lambda trained, before: trained.encoders())
-        self._say_how(Training(last.step, 1.0))
+        self._session.reload(lambda: last, lambda trained, before: trained.encoders())
+        self._set_progress(TrainingProgress(last.step, 1.0))
 
-    def _say_how(self, training: Training) -> None:
+    def _set_progress(self, training: "TrainingProgress") -> None:
         if self._session is not None:
-            self._session.change(lambda state: replace(state, training=training))
+            self._session.update(lambda state: replace(state, training=training))
 
 
 def main(questions: TextIO, answers: TextIO) -> None:
-    """Until training ends, or its end of the pipe does."""
+    """Run the viewer until training ends, or its end of the pipe does."""
+    from .server import make_access
 
     def tell(line: dict[str, Any]) -> None:
         answers.write(json.dumps(line) + "\n")
@@ -136,49 +319,46 @@ def main(questions: TextIO, answers: TextIO) -> None:
 
     said = json.loads(questions.readline())
     try:
-        access = make_access(said["host"], None)
-        host = _host(access, int(said["port"]), bool(said["strict"]))
+        server = _open_server(make_access(said["host"], None), int(said["port"]), bool(said["strict"]))
     except FprfError as error:
         tell({"error": str(error)})
         return
     lines: Queue[dict[str, Any] | None] = Queue()
-    with host:
-        tell({"address": host.address})
-        threading.Thread(target=_hear, args=(questions, lines), daemon=True).start()
-        follower = Follower(host, tell)
+    with server:
+        tell({"address": server.address})
+        threading.Thread(target=_read_lines, args=(questions, lines), daemon=True).start()
+        follower = TrainingFollower(server, tell)
         while not follower.over:
             try:
                 line = lines.get(timeout=0.1)
                 if line is None:
                     return
-                follower.hear(line)
+                follower.receive(line)
             except Empty:
                 pass
             except FprfError as error:  # the page says so; the next parameters may be better
-                host.say(str(error))
+                server.notify(str(error))
             follower.tick(time.monotonic())
 
 
-def _host(access: Any, port: int, strict: bool) -> Host:
+def _open_server(access: "Access", port: int, strict: bool) -> "ViewerServer":
+    from .server import ViewerServer
+
     try:
-        return Host(access, port, eager=False)
+        return ViewerServer(access, port, preload=False)
     except FprfError:
         if strict:
             raise
-        return Host(access, 0, eager=False)
+        return ViewerServer(access, 0, preload=False)
 
 
-def _hear(questions: TextIO, lines: "Queue[dict[str, Any] | None]") -> None:
-    try:
+def _read_lines(questions: TextIO, lines: "Queue[dict[str, Any] | None]") -> None:
+    with contextlib.suppress(ValueError):
         for line in questions:
             lines.put(json.loads(line))
-    except ValueError:
-        pass
     lines.put(None)
 
 
 if __name__ == "__main__":
-    import contextlib
-
     with contextlib.suppress(BrokenPipeError, KeyboardInterrupt):
         main(sys.stdin, sys.stdout)

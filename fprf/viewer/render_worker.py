@@ -1,9 +1,7 @@
-"""One worker for everything that touches the model: the newest request of each client, never an older one.
+"""One thread for everything that touches the model: it serves the newest request of each client and drops older ones.
 
-Work is an iterator that is advanced step by step (a chunk of rays). Before each step the worker looks at what has come in:
-a newer request of a client takes the place of its older one, which is dropped where it stands. So stale pictures never
-queue, however fast a camera moves. Clients take turns step by step. `do` runs something small before the next step; of
-several with one name only the last is run. `spare` is work for when nobody waits (a film).
+Work is an iterator that is advanced step by step (a chunk of rays). Before each step a newer request of a client replaces its
+older one, so stale pictures never queue, however fast a camera moves. Clients take turns step by step.
 """
 
 import threading
@@ -11,71 +9,71 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
 
-__all__ = ["Desk"]
+__all__ = ["RenderWorker"]
 
 Request = TypeVar("Request")
 
 
-class Desk(Generic[Request]):
-    """`work(client, request)` is what there is to do for a request; `fault` is told of what went wrong, and all goes on."""
+class RenderWorker(Generic[Request]):
+    """`work(client, request)` yields between steps; `on_error` receives what a step raised, and the worker goes on."""
 
     def __init__(
-        self, work: Callable[[Hashable, Request], Iterator[None]], fault: Callable[[Hashable | None, Exception], None]
+        self, work: Callable[[Hashable, Request], Iterator[None]], on_error: Callable[[Hashable | None, Exception], None]
     ) -> None:
-        self._work, self._fault = work, fault
+        self._work, self._on_error = work, on_error
         self._change = threading.Condition()
         self._fresh: dict[Hashable, Request] = {}
         self._active: OrderedDict[Hashable, Iterator[None]] = OrderedDict()
         self._left: set[Hashable] = set()
-        self._errands: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
-        self._spare: deque[Iterator[None]] = deque()
+        self._jobs: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
+        self._idle_work: deque[Iterator[None]] = deque()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="fprf-render", daemon=True)
 
     def start(self) -> None:
-        """Begin to work."""
+        """Start the thread."""
         self._thread.start()
 
-    def ask(self, client: Hashable, request: Request) -> None:
-        """What a client wants now, instead of whatever it wanted before."""
+    def request(self, client: Hashable, request: Request) -> None:
+        """Replace whatever the client requested before."""
         with self._change:
             self._left.discard(client)
             self._fresh[client] = request
             self._change.notify()
 
-    def leave(self, client: Hashable) -> None:
-        """A client has gone: drop what it wanted."""
+    def forget(self, client: Hashable) -> None:
+        """Drop the request of a client that has disconnected."""
         with self._change:
             self._fresh.pop(client, None)
             self._left.add(client)
             self._change.notify()
 
-    def do(self, name: Hashable, errand: Callable[[], None]) -> None:
-        """Run something on the worker, before any more rendering; it takes the place of an errand of the same name."""
+    def run(self, name: Hashable, job: Callable[[], None]) -> None:
+        """Run something short before the next step, in the place of a waiting job of the same name."""
         with self._change:
-            self._errands.pop(name, None)
-            self._errands[name] = errand
+            self._jobs.pop(name, None)
+            self._jobs[name] = job
             self._change.notify()
 
-    def spare(self, work: Iterator[None]) -> None:
-        """Work for when no client waits."""
+    def run_when_idle(self, work: Iterator[None]) -> None:
+        """Advance `work` (a film) while no client waits."""
         with self._change:
-            self._spare.append(work)
+            self._idle_work.append(work)
             self._change.notify()
 
     @property
     def idle(self) -> bool:
-        """Nobody waits for anything; spare work does not count."""
+        """Whether no client waits; work for idle times does not count."""
         with self._change:
-            return not (self._fresh or self._active or self._errands)
+            return not (self._fresh or self._active or self._jobs)
 
     @property
     def closed(self) -> bool:
-        """Nothing more will be done."""
+        """Whether `close` was called."""
         return self._closed
 
     def close(self, timeout: float = 5.0) -> None:
-        """Stop after the step at hand; work that is left is dropped."""
+        """Stop after the current step and drop the rest."""
         with self._change:
             self._closed = True
             self._change.notify()
@@ -85,18 +83,18 @@ class Desk(Generic[Request]):
     def _run(self) -> None:
         while True:
             with self._change:
-                while not (self._closed or self._fresh or self._active or self._errands or self._spare or self._left):
+                while not (self._closed or self._fresh or self._active or self._jobs or self._idle_work or self._left):
                     self._change.wait()
                 if self._closed:
                     break
-                errand = self._errands.popitem(last=False)[1] if self._errands else None
+                job = self._jobs.popitem(last=False)[1] if self._jobs else None
                 fresh, self._fresh = self._fresh, {}
                 left, self._left = self._left, set()
             self._drop(left | set(fresh))
             for client, request in fresh.items():
                 self._begin(client, request)
-            if errand is not None:
-                self._guarded(None, errand)
+            if job is not None:
+                self._call(None, job)
             else:
                 self._advance()
         self._drop(set(self._active))
@@ -105,36 +103,36 @@ class Desk(Generic[Request]):
         def begin() -> None:
             self._active[client] = self._work(client, request)
 
-        self._guarded(client, begin)
+        self._call(client, begin)
 
     def _advance(self) -> None:
-        """One step for the client whose turn it is, else one of spare work."""
+        """Make one step for the next client in turn, else one of the work for idle times."""
         if self._active:
             client, work = self._active.popitem(last=False)
-            if self._guarded(client, lambda: next(work)):
+            if self._call(client, lambda: next(work)):
                 self._active[client] = work
-        elif self._spare:
-            work = self._spare[0]
-            if not self._guarded(None, lambda: next(work)):
-                self._spare.popleft()
+        elif self._idle_work:
+            work = self._idle_work[0]
+            if not self._call(None, lambda: next(work)):
+                self._idle_work.popleft()
 
     def _drop(self, clients: set[Hashable]) -> None:
         for client in clients:
             work = self._active.pop(client, None)
-            close = getattr(work, "close", None)  # a generator gives back what it holds; another iterator has nothing to
+            close = getattr(work, "close", None)  # generators give back what they hold; other iterators have nothing to
             if close is not None:
-                self._guarded(client, close)
+                self._call(client, close)
 
-    def _guarded(self, client: Hashable | None, call: Callable[[], object]) -> bool:
-        """Whether there may be more to do. Whatever goes wrong is told, and stops nothing."""
+    def _call(self, client: Hashable | None, call: Callable[[], object]) -> bool:
+        """Return whether there may be more to do; report what was raised."""
         try:
             call()
         except StopIteration:
             return False
         except Exception as error:
             try:
-                self._fault(client, error)
-            except Exception:  # telling can fail too, as when the client has just gone
+                self._on_error(client, error)
+            except Exception:  # reporting can fail too, as when the client has just disconnected
                 return False
             return False
         return True

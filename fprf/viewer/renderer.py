@@ -1,133 +1,304 @@
-"""What each client sees: from a request to pictures, coarse to sharp, with what can be kept kept.
+"""Pictures for clients, rendered here: coarse to sharp, in layers, with what can be kept kept.
 
-Geometry and features of a client's last view are kept up to a bound of memory, so that a slider that is moved while the
-camera is still costs decoding alone. Runs on the desk.
+A moving camera must see something at once, a camera at rest everything: the first picture is the finest one that can be had
+within `FIRST_SECONDS`, as fast as this machine has been so far, and each next one has four times the pixels. Layers (the look,
+the scene as captured, maps) take time; compositing them does not: a wipe that is dragged renders nothing. Geometry and features
+of a client's last view are kept, so that a slider that is moved while the camera rests costs decoding alone.
 """
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-from ..io.images import Picture
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..interfaces import Decoder
+from ..io.images import Picture, to_uint8
+from ..io.maps import depth_image, match_image, palette
+from ..style.regional import RegionWeight
+from ..style.scene import SceneStyle
 from ..training.cached_view import Part, view_parts
 from ..training.loading import Trained
-from .cameras import Eye, Stage, fitted
-from .ladder import Speed, rungs
-from .painter import Layers, Painter, Shown, compose
-from .restyler import Studio
+from ..training.restyle import Styled
+from .cameras import CameraState, PageTransform, picture_size
+from .restyler import Restyler
+from .state import ViewSettings
 
-__all__ = ["Frame", "Glance", "Sight"]
+__all__ = [
+    "CHUNK",
+    "LayerRenderer",
+    "Layers",
+    "ProgressiveRenderer",
+    "RenderRequest",
+    "RenderedFrame",
+    "Speed",
+    "composite_layers",
+    "resolutions",
+]
 
-KEPT = 192 << 20
-"""Bytes of features that are kept, of all clients' views together."""
+CACHE_BYTES = 192 << 20
+"""Features that are kept, of all clients' views together."""
 CHUNK = 4096
 """Rays of a step: after each one a newer request may take over."""
+FIRST_SECONDS = 0.1
+"""Time for the first picture of a new camera."""
+_MIN_SIDE = 16
+"""No picture's longer side is smaller, unless that of the largest is."""
+_DIM = 0.45
+"""Brightness of what does not belong to the region that is picked; it is grey, too."""
+_UNSURE = 0.45
+"""Brightness of a region's colour where a pixel belongs to many."""
 
 
-class Glance(NamedTuple):
-    """A client's request."""
+class RenderRequest(NamedTuple):
+    """What a client wants to see."""
 
-    eye: Eye
-    shown: Shown
+    camera: CameraState
+    view: ViewSettings
     pixels: int
     """Longest side of the sharpest picture."""
 
 
-class Frame(NamedTuple):
+@dataclass(frozen=True)
+class Layers:
+    """Layers of one view at one size."""
+
+    pictures: dict[str, Picture]
+    share: NDArray[np.float32] | None
+    """How much of each pixel belongs to the region that is picked, [H W]."""
+    depth: Tensor
+    """World distance along each ray, [H W]; infinite where there is nothing."""
+
+
+class RenderedFrame(NamedTuple):
     """A picture for a client."""
 
     picture: Picture
     layers: Layers
-    eye: Eye
+    camera: CameraState
     final: bool
     """Nothing sharper follows."""
     seconds: float
     """Since the work on the request began."""
 
 
-@dataclass
-class _Memory:
-    """Of one client."""
+def resolutions(size: tuple[int, int]) -> list[tuple[int, int]]:
+    """Sizes (width, height) from the coarsest to `size` itself, each twice as wide as the one before."""
+    sizes, divisor = [size], 2
+    while max(size) / divisor >= _MIN_SIDE:
+        sizes.append((max(1, round(size[0] / divisor)), max(1, round(size[1] / divisor))))
+        divisor *= 2
+    return sizes[::-1]
 
-    eye: Eye | None = None
+
+class Speed:
+    """Running mean of the seconds that a pixel takes."""
+
+    def __init__(self, guess: float) -> None:
+        self.seconds = guess
+
+    def update(self, pixels: int, seconds: float) -> None:
+        """Learn that a picture of so many pixels took so long."""
+        if pixels > 0:
+            self.seconds += 0.3 * (seconds / pixels - self.seconds)
+
+    def first(self, sizes: list[tuple[int, int]], limit: float = FIRST_SECONDS) -> int:
+        """Index of the finest of `sizes` (coarse to fine) that should take at most `limit` seconds; at least 0."""
+        fits = [i for i, (width, height) in enumerate(sizes) if width * height * self.seconds <= limit]
+        return max(fits, default=0)
+
+
+@dataclass
+class _ClientCache:
+    camera: CameraState | None = None
     parts: dict[tuple[int, int], tuple[Part, ...]] = field(default_factory=dict)
-    last: tuple[Glance, Layers] | None = None
+    last: tuple[RenderRequest, Layers] | None = None
     """The sharpest picture that was finished, and for what."""
 
 
-class Sight:
-    """Pictures for all clients of one scene; `show` gets them."""
+class ProgressiveRenderer:
+    """Renders requests of all clients of one scene; `show` receives the pictures. Runs on the render worker."""
 
-    def __init__(self, trained: Trained, studio: Studio, stage: Stage, show: Callable[[Hashable, Frame], None]) -> None:
-        self._trained, self._studio, self._stage, self._show = trained, studio, stage, show
-        self._memory: OrderedDict[Hashable, _Memory] = OrderedDict()
+    def __init__(
+        self,
+        trained: Trained,
+        restyler: Restyler,
+        transform: PageTransform,
+        show: Callable[[Hashable, RenderedFrame], None],
+    ) -> None:
+        self._trained, self._restyler, self._transform, self._show = trained, restyler, transform, show
+        self._caches: OrderedDict[Hashable, _ClientCache] = OrderedDict()
         # Until something was measured: 100 000 rays a second, and a fifth of the time for a view that is kept.
-        self._fresh, self._again = Speed(1e-5), Speed(2e-6)
+        self._speed, self._cached_speed = Speed(1e-5), Speed(2e-6)
 
     def forget(self, client: Hashable) -> None:
-        """A client has gone."""
-        self._memory.pop(client, None)
+        """Drop what is kept for a client."""
+        self._caches.pop(client, None)
 
-    def renew(self, trained: Trained) -> None:
-        """The scene has changed."""
+    def reload(self, trained: Trained) -> None:
+        """Replace the scene."""
         self._trained = trained
-        self._memory.clear()
+        self._caches.clear()
 
-    def look(self, client: Hashable, glance: Glance) -> Iterator[None]:
-        """Work for the desk: show ever sharper pictures."""
+    def render(self, client: Hashable, request: RenderRequest) -> Iterator[None]:
+        """Show ever sharper pictures, a step each chunk of rays."""
         start = time.perf_counter()
-        memory = self._memory.setdefault(client, _Memory())
-        if memory.eye != glance.eye:
-            self._memory[client] = memory = _Memory(glance.eye)
-        self._memory.move_to_end(client)
-        if memory.last is not None and _same(memory.last[0], glance):
-            layers = memory.last[1]
-            self._show(client, Frame(compose(layers, glance.shown), layers, glance.eye, True, time.perf_counter() - start))
+        cache = self._caches.setdefault(client, _ClientCache())
+        if cache.camera != request.camera:
+            self._caches[client] = cache = _ClientCache(request.camera)
+        self._caches.move_to_end(client)
+
+        def show(layers: Layers, final: bool) -> None:
+            picture = composite_layers(layers, request.view)
+            self._show(client, RenderedFrame(picture, layers, request.camera, final, time.perf_counter() - start))
+
+        if cache.last is not None and _covers(cache.last[0], request):
+            show(cache.last[1], True)
             return
-        styled = self._studio.styled(glance.shown.look)
+        styled = self._restyler.styled(request.view.look)
         # Encoders need not be opened, nor a style be known, to show the scene as it is.
-        scene = self._studio.encoders.scene if glance.shown.of_regions else None
-        sizes = rungs(fitted(glance.eye.aspect, glance.pixels))
-        kept = [size for size in sizes if size in memory.parts]
-        first = max(self._fresh.first(sizes), self._again.first(kept) if kept else 0)
+        scene = self._restyler.encoders.scene if request.view.shows_regions else None
+        sizes = resolutions(picture_size(request.camera.aspect, request.pixels))
+        cached = [size for size in sizes if size in cache.parts]
+        first = max(self._speed.first(sizes), self._cached_speed.first(cached) if cached else 0)
         for size in sizes[first:]:
             begun = time.perf_counter()
-            again = size in memory.parts
-            painter = Painter(self._trained.model.decoder, scene, styled, glance.shown, size)
+            again = size in cache.parts
+            layers = LayerRenderer(self._trained.model.decoder, scene, styled, request.view, size)
             parts: list[Part] = []
-            for part in memory.parts[size] if again else self._render(glance.eye, size):
-                yield from painter.paint([part])
-                if not again and sum(each.bytes for each in parts) + part.bytes <= KEPT:
+            for part in cache.parts[size] if again else self._march(request.camera, size):
+                yield from layers.render([part])
+                if not again and sum(each.bytes for each in parts) + part.bytes <= CACHE_BYTES:
                     parts.append(part)
-            (self._again if again else self._fresh).learn(size[0] * size[1], time.perf_counter() - begun)
+            (self._cached_speed if again else self._speed).update(size[0] * size[1], time.perf_counter() - begun)
             if not again and sum(part.rays for part in parts) == size[0] * size[1]:
-                self._keep(memory, size, tuple(parts))
-            final, layers = size == sizes[-1], painter.layers()
+                self._keep(cache, size, tuple(parts))
+            final, done = size == sizes[-1], layers.finish()
             if final:
-                memory.last = (glance, layers)
-            self._show(client, Frame(compose(layers, glance.shown), layers, glance.eye, final, time.perf_counter() - start))
+                cache.last = (request, done)
+            show(done, final)
             yield
 
-    def _render(self, eye: Eye, size: tuple[int, int]) -> Iterator[Part]:
+    def _march(self, camera: CameraState, size: tuple[int, int]) -> Iterator[Part]:
         trained = self._trained
-        cameras = self._stage.cameras([eye], size)
+        cameras = self._transform.cameras([camera], size)
         config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
         return view_parts(trained.model, trained.known.facts, cameras, 0, config)
 
-    def _keep(self, memory: _Memory, size: tuple[int, int], parts: tuple[Part, ...]) -> None:
-        """Keep the sharpest views that have room together, those of the client that looked last."""
-        memory.parts[size] = parts
-        for each in self._memory.values():
-            while self._bytes() > KEPT and each.parts:
+    def _keep(self, cache: _ClientCache, size: tuple[int, int], parts: tuple[Part, ...]) -> None:
+        """Keep the sharpest views that fit together, those of the latest client first."""
+        cache.parts[size] = parts
+        for each in self._caches.values():
+            while self._bytes() > CACHE_BYTES and each.parts:
                 del each.parts[min(each.parts)]
 
     def _bytes(self) -> int:
-        return sum(part.bytes for memory in self._memory.values() for parts in memory.parts.values() for part in parts)
+        return sum(part.bytes for cache in self._caches.values() for parts in cache.parts.values() for part in parts)
 
 
-def _same(before: Glance, now: Glance) -> bool:
-    """Whether what was painted for one serves the other."""
-    same = before.eye == now.eye and before.pixels == now.pixels and before.shown.look == now.shown.look
-    return same and before.shown.layers >= now.shown.layers
+def _covers(before: RenderRequest, now: RenderRequest) -> bool:
+    """Whether the layers of one request serve the other."""
+    same = before.camera == now.camera and before.pixels == now.pixels and before.view.look == now.view.look
+    return same and before.view.layers >= now.view.layers
+
+
+@dataclass
+class LayerRenderer:
+    """Renders the layers of a view chunk by chunk."""
+
+    decoder: Decoder
+    scene: SceneStyle | None
+    """May be None where no region is shown."""
+    styled: Styled | None
+    """None = the scene as it is."""
+    view: ViewSettings
+    size: tuple[int, int]
+    """Width, height."""
+    _rows: dict[str, list[Picture]] = field(default_factory=dict)
+    _share: list[NDArray[np.float32]] = field(default_factory=list)
+    _depth: list[Tensor] = field(default_factory=list)
+    _opacity: list[Tensor] = field(default_factory=list)
+
+    def render(self, parts: Iterable[Part]) -> Iterator[None]:
+        """Add chunks of the view, a step each."""
+        for part in parts:
+            self._add_part(part)
+            yield
+
+    def finish(self) -> Layers:
+        """The layers of all chunks together."""
+        width, height = self.size
+        depth, opacity = (torch.cat(each).view(height, width) for each in (self._depth, self._opacity))
+        rows = {name: np.concatenate(each) for name, each in self._rows.items()}
+        share = np.concatenate(self._share).reshape(height, width) if self._share else None
+        pictures: dict[str, Picture] = {name: each.reshape(height, width, 3) for name, each in rows.items()}
+        if self.view.map == "depth":
+            pictures["depth"] = depth_image(depth, opacity)
+        solid = torch.where(opacity > 0.5, depth, torch.inf)
+        return Layers(pictures, share, solid)
+
+    @torch.inference_mode()
+    def _add_part(self, part: Part) -> None:
+        restyle = None if self.styled is None else self.styled.restyle
+        self._add("look", _row(to_uint8(part.colour(self.decoder, restyle)[None])))
+        if self.view.wipe is not None:
+            self._add("plain", _row(to_uint8(part.colour(self.decoder, None)[None])))
+        if self.view.map == "matches":
+            self._add("matches", self._matches(part))
+        if self.view.map == "regions":
+            self._add("regions", self._regions(part))
+        if self.view.region is not None:
+            self._share.append(self._memberships(part)[:, self.view.region].float().numpy())
+        self._depth.append(part.depth)
+        self._opacity.append(part.opacity)
+
+    def _matches(self, part: Part) -> Picture:
+        if self.styled is None or part.semantic is None:
+            return np.full((part.rays, 3), 128, np.uint8)
+        codes, look = self.styled.codes, self.styled.restyle
+        taken = part.mean(look.match(part.semantic))
+        total = taken.sum(-1, keepdim=True)
+        attention, kept = taken / total.clamp_min(1e-10), 1 - total[:, 0]
+        return _row(match_image(attention[None], codes.reference, codes.names, part.opacity[None], kept.clamp(0, 1)[None]))
+
+    def _regions(self, part: Part) -> Picture:
+        share = self._memberships(part)
+        most, region = share.max(-1)
+        light = (_UNSURE + (1 - _UNSURE) * most) * part.opacity
+        return _row(to_uint8((palette(share.shape[1])[region] * light[:, None])[None]))
+
+    def _memberships(self, part: Part) -> Tensor:
+        """How much each pixel belongs to each region."""
+        assert self.scene is not None
+        weight = RegionWeight(self.scene, torch.eye(len(self.scene.share))).to(part.content.device)
+        semantic = part.content[:, :0] if part.semantic is None else part.semantic
+        return part.mean(weight(semantic))
+
+    def _add(self, name: str, rows: Picture) -> None:
+        self._rows.setdefault(name, []).append(rows)
+
+
+def _row(picture: Picture) -> Picture:
+    """A picture of one row as its pixels."""
+    return np.asarray(picture[0])
+
+
+def composite_layers(layers: Layers, view: ViewSettings) -> Picture:
+    """One picture of the layers; layers that were not rendered are left out."""
+    picture = layers.pictures["look"]
+    if layers.share is not None and view.region is not None:
+        grey = _DIM * picture.mean(-1, keepdims=True)
+        picture = np.rint(grey + (picture - grey) * layers.share[..., None]).astype(np.uint8)
+    if view.map in layers.pictures:
+        over = layers.pictures[view.map]
+        picture = np.rint(picture * (1 - view.map_opacity) + over * view.map_opacity).astype(np.uint8)
+    if view.wipe is not None and "plain" in layers.pictures:
+        width = picture.shape[1]
+        edge = round(min(1.0, max(0.0, view.wipe)) * width)
+        picture = np.concatenate([layers.pictures["plain"][:, :edge], picture[:, edge:]], 1)
+    return np.ascontiguousarray(picture)

@@ -1,112 +1,123 @@
-"""Photographs and looks on one scene. Not for several threads: all of it happens on the desk.
+"""Photographs and looks on one scene, and a scene in the middle of its training. Runs on the render worker alone.
 
-A photograph is encoded when it comes, clustered once for each number of clusters, and never again: a slider costs the
-stylizer alone.
+A photograph is encoded when it comes and clustered once for each number of clusters: a slider costs the stylizer alone.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
+from ..datamanagers.basis import Basis
 from ..datamanagers.images import load_image
-from ..errors import UsageError
+from ..errors import CheckpointError, UsageError
 from ..io.images import shrink
 from ..rendering.cameras import Cameras
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
+from ..style.matching import unit
 from ..style.references import Encoders, encode_photograph
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..style.wishes import labels
-from ..training.loading import Trained
+from ..training import tensorfiles
+from ..training.block_task import built_block
+from ..training.blocks import folder_of
+from ..training.lay_out import RAYS, load_boxes
+from ..training.loading import Trained, encoders_of
+from ..training.model import build_model
+from ..training.prepare import device_of
 from ..training.restyle import Styled, dress, mixed
+from ..training.run import Run
+from ..training.style_pass import measure_style
 from ..training.views import paint_pixels
-from .looks import Card, Look, settled, style_of
+from .state import Look, Photograph, RegionInfo, simplified, style_config
 
-__all__ = ["Opener", "Picked", "Studio", "joined", "names_of"]
+__all__ = [
+    "OpenEncoders",
+    "Restyler",
+    "concatenate",
+    "load_unfinished",
+    "matching_regions",
+    "measure_encoders",
+    "set_parameters",
+]
 
-Opener: TypeAlias = Callable[[Trained, Encoders | None], Encoders]
-"""Opens the encoders of a scene with its style; those that were opened before may be kept."""
+OpenEncoders: TypeAlias = Callable[[Trained, Encoders | None], Encoders]
+"""Opens the encoders of a scene with its style, given those that were opened before."""
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 _THUMBNAIL = 128
-_KEPT = 24
+"""Longest side in pixels."""
+_CACHED = 24
 """Dictionaries and styles that are kept for when somebody returns to them."""
 _SOLID = 0.01
+"""Opacity below which there is nothing to point at."""
+_RAYS = 2**14
+"""Rays that the style of an unfinished run is measured with: 0.2 s instead of seconds, and it changes soon."""
 
 
-class Picked(NamedTuple):
-    """A region that somebody pointed at."""
+class Restyler:
+    """Looks as styles on one scene; encoders are opened when they are first needed."""
 
-    region: int
-    share: float
-    """Of the scene."""
-    taken: tuple[tuple[str, float], ...]
-    """What it takes from each photograph, the most first; none where there is no style."""
-
-
-class Studio:
-    """Encoders are opened when they are first needed, which takes a fraction of a second."""
-
-    def __init__(self, trained: Trained, opened: Opener | None = None) -> None:
+    def __init__(self, trained: Trained, open_encoders: OpenEncoders | None = None) -> None:
         self.trained = trained
-        self._opened: Opener = opened or (lambda trained, before: trained.encoders())
+        self._open: OpenEncoders = open_encoders or (lambda trained, before: trained.encoders())
         self._encoders: Encoders | None = None
         self._stale = False
-        self._cards = 0
-        self._dictionaries: OrderedDict[tuple[Card, int, float], StyleDictionary] = OrderedDict()
+        self._photographs = 0
+        self._dictionaries: OrderedDict[tuple[Photograph, int, float], StyleDictionary] = OrderedDict()
         self._styles: OrderedDict[Look, Styled] = OrderedDict()
 
     @property
     def encoders(self) -> Encoders:
-        """Those of the scene. Raises WeightsError where those at hand are others."""
+        """Encoders of the scene. Raises WeightsError where those at hand are others."""
         if self._encoders is None or self._stale:
-            self._encoders = self._opened(self.trained, self._encoders)
+            self._encoders = self._open(self.trained, self._encoders)
             self._stale = False
         return self._encoders
 
-    def renew(self, trained: Trained, opened: Opener | None = None) -> SceneStyle | None:
-        """The scene has changed, and with it its style: the one from before, if there was one."""
-        self.trained, self._opened = trained, opened or self._opened
+    def reload(self, trained: Trained, open_encoders: OpenEncoders | None = None) -> SceneStyle | None:
+        """Replace the scene, and with it its style; return the style from before, if there was one."""
+        self.trained, self._open = trained, open_encoders or self._open
         self._stale = True
         self._styles.clear()
         return None if self._encoders is None else self._encoders.scene
 
     @property
     def regions(self) -> int:
-        """How many the scene has."""
+        """Number of regions of the scene."""
         return len(self.encoders.scene.share)
 
-    def card(self, path: Path, name: str) -> Card:
+    def encode(self, path: Path, name: str) -> Photograph:
         """Encode a photograph. Raises DataError for an unreadable one."""
         reference = encode_photograph(path, self.encoders, name=name)
-        self._cards += 1
-        return Card(self._cards, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference)
+        self._photographs += 1
+        return Photograph(self._photographs, name, path, shrink(load_image(path, upright=True), _THUMBNAIL), reference)
 
     def styled(self, look: Look) -> Styled | None:
-        """The look on the scene; None for the scene as it is. Raises UsageError for wishes that contradict each other."""
-        look = settled(look)
-        here = self._alone(look)
+        """The look on the scene; None for the scene as it is. Raises UsageError for rules that contradict each other."""
+        look = simplified(look)
+        here = self._single(look)
         if here is None or look.towards is None:
             return here
-        there = self._alone(look.towards)
-        assert there is not None  # else it would have settled
+        there = self._single(look.towards)
+        assert there is not None  # else the look would have been simplified
         return mixed(here, there, look.at)
 
-    def keep(self, cards: Collection[Card]) -> None:
-        """Nobody will ask for any other photograph again."""
-        self._dictionaries = OrderedDict((key, value) for key, value in self._dictionaries.items() if key[0] in cards)
-        self._styles = OrderedDict((look, value) for look, value in self._styles.items() if {*dict(look.mix)} <= {*cards})
+    def retain(self, photographs: Collection[Photograph]) -> None:
+        """Drop what is kept for any other photograph."""
+        self._dictionaries = OrderedDict((key, value) for key, value in self._dictionaries.items() if key[0] in photographs)
+        self._styles = OrderedDict((look, value) for look, value in self._styles.items() if {*dict(look.mix)} <= {*photographs})
 
     def restyle(self, look: Look) -> Restyle | None:
-        """What a renderer needs of the look."""
+        """The look for a renderer."""
         styled = self.styled(look)
         return None if styled is None else styled.restyle
 
@@ -121,48 +132,42 @@ class Studio:
         share, opacity = paint_pixels(self.trained.model, cameras, 0, place, config, weight, semantic=weight.divided)
         return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
 
-    def picked(self, look: Look, region: int) -> Picked:
-        """What there is to say of a region in a look."""
+    def region_info(self, look: Look, region: int) -> RegionInfo:
+        """What a region takes in a look."""
         scene, styled = self.encoders.scene, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:
-            device = self.trained.model.device
-            attention = styled.restyle.match(scene.keys[region : region + 1].to(device))[0].cpu()
+            look = simplified(look)
+            names = [photograph.name for photograph, _ in (*look.mix, *(look.towards.mix if look.towards else ()))]
+            attention = styled.restyle.match(scene.keys[region : region + 1].to(self.trained.model.device))[0].cpu()
             shares = torch.zeros(len(styled.codes.names)).index_add_(0, styled.codes.reference, attention.float())
-            taken = sorted(zip(names_of(look), shares.tolist(), strict=True), key=lambda row: -row[1])
-        return Picked(region, float(scene.share[region]), tuple(taken))
+            taken = sorted(zip(names, shares.tolist(), strict=True), key=lambda row: -row[1])
+        return RegionInfo(region, float(scene.share[region]), tuple(taken))
 
-    def _alone(self, look: Look) -> Styled | None:
-        """Without what it goes towards."""
+    def _single(self, look: Look) -> Styled | None:
+        """The look without what it goes towards."""
         look = replace(look, towards=None, at=0.0)
         if look.plain:
             return None
         if look not in self._styles:
-            parts = [self._dictionary(card, look.clusters, look.blend) for card, _ in look.mix]
-            style = style_of(look)
-            names = labels(style.references)
-            dictionary = joined(parts, names, [weight for _, weight in look.mix])
+            parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
+            style = style_config(look)
+            dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
             self._styles[look] = dress(self.trained, StyleFile(style), self.encoders, dictionary)
-        return _recent(self._styles, look)
+        return _use(self._styles, look)
 
-    def _dictionary(self, card: Card, clusters: int, blend: float) -> StyleDictionary:
-        key = (card, clusters, blend)
+    def _dictionary(self, photograph: Photograph, clusters: int, blend: float) -> StyleDictionary:
+        key = (photograph, clusters, blend)
         if key not in self._dictionaries:
             seed = self.trained.config.seed
-            self._dictionaries[key] = build_dictionary([card.reference], clusters=clusters, blend=blend, seed=seed)
-        return _recent(self._dictionaries, key)
+            self._dictionaries[key] = build_dictionary([photograph.reference], clusters=clusters, blend=blend, seed=seed)
+        return _use(self._dictionaries, key)
 
 
-def names_of(look: Look) -> tuple[str, ...]:
-    """What the photographs of a look are called on the page, in the order of its style codes."""
-    look = settled(look)
-    mix = look.mix if look.towards is None else (*look.mix, *look.towards.mix)
-    return tuple(card.name for card, _ in mix)
+def concatenate(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequence[float]) -> StyleDictionary:
+    """Dictionaries of one reference each as one, under new names and weights.
 
-
-def joined(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequence[float]) -> StyleDictionary:
-    """Dictionaries of one reference each as one, under new names and weights: what `build_dictionary` makes of all of them
-    at once, but for the order.
+    `build_dictionary` of all references makes the same, in another order.
     """
     counts = torch.tensor([len(part.keys) for part in parts])
     coloured = all(part.colour_mean is not None for part in parts)
@@ -184,9 +189,58 @@ def joined(parts: Sequence[StyleDictionary], names: Sequence[str], weights: Sequ
     )
 
 
-def _recent(kept: OrderedDict[Key, Value], key: Key) -> Value:
-    """What is kept under a key, which becomes the last to be dropped."""
-    kept.move_to_end(key)
-    while len(kept) > _KEPT:
-        kept.popitem(last=False)
-    return kept[key]
+def _use(cache: OrderedDict[Key, Value], key: Key) -> Value:
+    """Return what is kept under a key, which becomes the last to be dropped."""
+    cache.move_to_end(key)
+    while len(cache) > _CACHED:
+        cache.popitem(last=False)
+    return cache[key]
+
+
+def load_unfinished(root: Path, device: str, block: int | None = None) -> Trained:
+    """A run whose config.json and scene.json are written, with its model, or that of a block in its surroundings, untrained.
+
+    Raises CheckpointError.
+    """
+    run = Run(root)
+    saved, method = run.load_config()
+    config = saved.fields_only(root)
+    known = run.load_known()
+    if block is None:
+        model = build_model(config, known.facts)
+    else:
+        views = tensorfiles.read(folder_of(root, block) / RAYS)["views"]
+        model = built_block(root, config, known.facts, load_boxes(root), block, views).model
+    model.requires_grad_(False)
+    return Trained(run, config, method, known, model.to(device_of(device)).eval(), 0, 0.0)
+
+
+def set_parameters(trained: Trained, tensors: Mapping[str, Tensor]) -> Trained:
+    """The run with other parameters in its model. Raises CheckpointError where they are not of this model."""
+    try:
+        trained.model.load_state_dict(dict(tensors))
+    except RuntimeError as error:
+        raise CheckpointError(f"{trained.run.root}: its parameters are not those of its config ({error})") from error
+    return trained
+
+
+def measure_encoders(trained: Trained, before: Encoders | None) -> Encoders:
+    """Encoders with the style of the scene as it is now; those that were opened `before` are kept.
+
+    Raises DataError where the scene still renders empty, NumericsError where its features are not finite.
+    """
+    config, known = trained.config, trained.known
+    few = replace(config, statistics=replace(config.statistics, rays=min(_RAYS, config.statistics.rays)))
+    scene = measure_style(few, trained.model, known.cameras, torch.tensor(known.train))
+    if before is not None:
+        return before._replace(scene=scene)
+    basis = None if scene.keys.shape[1] == 0 else Basis.from_tensors(trained.run.load_tensors("basis"))
+    return encoders_of(trained, scene, basis)
+
+
+def matching_regions(before: SceneStyle, now: SceneStyle) -> Annotated[Tensor, "K"]:
+    """For each region of `before` the most similar one of `now`: regions are measured anew, in any order."""
+    if before.keys.shape[1] == 0:
+        return torch.zeros(len(before.keys), dtype=torch.int64)
+    scores = unit(before.keys, before.semantic_mean) @ unit(now.keys, now.semantic_mean).T
+    return scores.argmax(-1)

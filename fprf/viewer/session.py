@@ -1,6 +1,6 @@
 """The scene that is viewed: its state, its clients' cameras, and everything that changes either. Knows no page.
 
-Calls come from any thread. What touches the model happens on the desk; `Face` is told what became of it.
+Calls come from any thread. What touches the model runs on the render worker; the `Frontend` learns of the results.
 """
 
 import threading
@@ -10,67 +10,64 @@ from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import FprfError, UsageError
-from ..io.images import Picture, shrink
+from ..io.images import Picture, encode, shrink
 from ..training.loading import Trained
-from .cameras import Eye, Stage, stage_of
-from .crew import Crew
-from .film import FilmPlan, Thumbnail
-from .looks import Card, Look
-from .moment import likest
-from .painter import Shown
-from .rehearsal import rehearsal
-from .render_worker import Desk
-from .renderer import Frame, Glance, Sight
-from .restyler import Opener, Studio
-from .state import State, dropped, renumbered
-from .uploads import Intake, shown_name
+from .cameras import CameraState, PageTransform, page_transform
+from .film import FilmPlan, FilmRecorder
+from .render_worker import RenderWorker
+from .renderer import ProgressiveRenderer, RenderedFrame, RenderRequest
+from .restyler import OpenEncoders, Restyler, matching_regions
+from .state import Look, Photograph, State, Thumbnail, ViewSettings, add_photograph, only, renumber_regions
+from .uploads import Uploads, shown_name
 
-__all__ = ["Face", "Session"]
+__all__ = ["Frontend", "Session"]
 
-_PATIENCE = 0.5
-"""Seconds between looks whether the desk is closed."""
+_POLL = 0.5
+"""Seconds between looks whether the worker is closed."""
 _THUMBNAIL = 192
 """Longest side of a key's picture."""
 
 
-class Face(ABC):
-    """What a session talks to: the page. Called from several threads; a call that fails harms nothing."""
+class Frontend(ABC):
+    """The page, as a session talks to it. Called from several threads; a call that fails harms nothing."""
 
     @abstractmethod
-    def show(self, client: Hashable, frame: Frame) -> None:
-        """A picture for a client."""
+    def show(self, client: Hashable, frame: RenderedFrame) -> None:
+        """Show a picture to a client."""
 
     @abstractmethod
     def changed(self, before: State, now: State) -> None:
-        """The state is another one."""
+        """Follow a change of the state."""
 
     @abstractmethod
-    def say(self, text: str, client: Hashable | None = None) -> None:
-        """Something to read, for one client or for all."""
+    def notify(self, text: str, client: Hashable | None = None) -> None:
+        """Show a line of text to one client or to all."""
 
 
 class Session:
     """Use as a context manager, which ends its threads and processes."""
 
-    def __init__(self, trained: Trained, state: State, opened: Opener | None = None) -> None:
+    def __init__(self, trained: Trained, state: State, open_encoders: OpenEncoders | None = None) -> None:
         self.trained = trained
-        self.stage: Stage = stage_of(trained.known.cameras)
-        self.studio = Studio(trained, opened)
-        self.intake = Intake()
+        self.transform: PageTransform = page_transform(trained.known.cameras)
+        self.restyler = Restyler(trained, open_encoders)
+        self.uploads = Uploads()
         self.state = state
-        self._face: Face | None = None
-        self._eyes: dict[Hashable, Eye] = {}
-        self._cards: frozenset[Card] = frozenset()
+        self._frontend: Frontend | None = None
+        self._cameras: dict[Hashable, CameraState] = {}
+        self._photographs: frozenset[Photograph] = frozenset()
         self._lock = threading.RLock()
-        self._sight = Sight(trained, self.studio, self.stage, self._show)
-        self._desk: Desk[Glance] = Desk(self._sight.look, self._fault)
-        self._crew = Crew(self, self._desk)
+        self._renderer = ProgressiveRenderer(trained, self.restyler, self.transform, self._show)
+        self._worker: RenderWorker[RenderRequest] = RenderWorker(self._renderer.render, self._on_error)
+        self._films = FilmRecorder(self, self._worker)
         self._pictures: dict[Hashable, Picture] = {}
-        self._shots = 0
+        self._thumbnails = 0
 
     def __enter__(self) -> "Session":
-        self._desk.start()
+        self._worker.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -78,219 +75,226 @@ class Session:
 
     def close(self) -> None:
         """End everything; a film that is being made is left unfinished."""
-        self._desk.close()
-        self.intake.close()
+        self._worker.close()
+        self.uploads.close()
 
-    def meet(self, face: Face) -> None:
-        """From now on this is who is told."""
-        self._face = face
+    def attach(self, frontend: Frontend) -> None:
+        """Set who is told of pictures, changes and messages."""
+        self._frontend = frontend
 
-    def warm(self) -> None:
-        """Make ready what the first photograph needs, while nobody waits: encoders, kernels, the process that decodes."""
-        threading.Thread(target=self.intake.warm, name="fprf-warm", daemon=True).start()
+    def warm_up(self) -> None:
+        """Prepare what the first photograph needs while nobody waits: decoder, encoders, kernels, a style."""
+        threading.Thread(target=self.uploads.start_decoder, name="fprf-warm-up", daemon=True).start()
 
         def work() -> Iterator[None]:
-            yield from rehearsal(self.studio, self._sight, self.stage, self.intake.folder)
-            self.studio.keep(self.state.all_cards)
+            self.restyler.encoders  # noqa: B018  they are opened by asking for them
+            yield
+            path = self.uploads.folder / "warm-up.png"
+            ramp = np.linspace(0, 255, 96 * 128 * 3).reshape(96, 128, 3).astype(np.uint8)
+            path.write_bytes(encode(ramp, "png"))
+            photograph = self.restyler.encode(path, "warm-up")
+            yield
+            look = only(State().look, photograph)
+            self.restyler.styled(look)
+            yield
+            camera = self.transform.camera_state(self.trained.known.cameras, 0)
+            yield from self._renderer.render(None, RenderRequest(camera, replace(State(), look=look).view, 32))
+            self._renderer.forget(None)
+            self.restyler.retain(self.state.photographs)
 
-        self._desk.spare(work())
+        self._worker.run_when_idle(work())
 
-    def see(self, client: Hashable, eye: Eye) -> None:
-        """A client's camera is here now."""
+    def move_camera(self, client: Hashable, camera: CameraState) -> None:
+        """Render what a client's camera sees now."""
         with self._lock:
-            if self._crew.playing(client):
+            if self._films.playing(client):
                 return
-            self._eyes[client] = eye
-            self._desk.ask(client, Glance(eye, self.state.shown, self.state.pixels))
+            self._cameras[client] = camera
+            self._worker.request(client, RenderRequest(camera, self.state.view, self.state.pixels))
 
-    def leave(self, client: Hashable) -> None:
-        """A client has gone."""
+    def disconnect(self, client: Hashable) -> None:
+        """Drop everything of a client."""
         with self._lock:
-            self._eyes.pop(client, None)
+            self._cameras.pop(client, None)
             self._pictures.pop(client, None)
-        self._crew.stop(client)
-        self._desk.leave(client)
-        self._desk.do(("forget", client), lambda: self._sight.forget(client))
+        self._films.stop(client)
+        self._worker.forget(client)
+        self._worker.run(("forget", client), lambda: self._renderer.forget(client))
 
     @property
-    def watched(self) -> bool:
-        """Whether anybody is here."""
-        return bool(self._eyes)
+    def has_clients(self) -> bool:
+        """Whether anybody is connected."""
+        return bool(self._cameras)
 
     @property
     def idle(self) -> bool:
-        """Everybody has the sharpest picture."""
-        return self._desk.idle
+        """Whether all clients have their sharpest picture."""
+        return self._worker.idle
 
-    def renew(self, load: Callable[[], Trained], opened: Opener | None = None) -> None:
-        """The scene in another state of its training, between two steps of the desk; all that was made of it is made again."""
+    def reload(self, load: Callable[[], Trained], open_encoders: OpenEncoders | None = None) -> None:
+        """Replace the scene by another state of its training, between two steps of the worker."""
 
-        def now() -> None:
+        def job() -> None:
             self.trained = trained = load()
-            self._sight.renew(trained)
-            before = self.studio.renew(trained, opened)
-            if before is not None and self.state.needs_regions:
-                regions = likest(before, self.studio.encoders.scene).tolist()
-                self.change(lambda state: renumbered(state, regions))
-            self._ask_again()
+            self._renderer.reload(trained)
+            before = self.restyler.reload(trained, open_encoders)
+            if before is not None and self.state.names_regions:
+                regions = matching_regions(before, self.restyler.encoders.scene).tolist()
+                self.update(lambda state: renumber_regions(state, regions))
+            self._request_all()
             if self.state.picked is not None:
-                self.choose(self.state.picked.region)
+                self.select_region(self.state.picked.region)
 
-        self._desk.do("renew", self._told(now, None))
+        self._worker.run("reload", self._reporting(job, None))
 
-    def say(self, text: str, client: Hashable | None = None) -> None:
-        """A line to read, for one client or for all."""
-        self._say(text, client)
+    def notify(self, text: str, client: Hashable | None = None) -> None:
+        """Show a line of text to one client or to all."""
+        if self._frontend is not None:
+            self._frontend.notify(text, client)
 
-    def change(self, to: Callable[[State], State], client: Hashable | None = None) -> bool:
-        """Replace the state; all clients see it. What cannot be is said to the client, and nothing changes."""
+    def update(self, change: Callable[[State], State], client: Hashable | None = None) -> bool:
+        """Replace the state for all clients; return False and tell the client where that is not possible."""
         try:
             with self._lock:
-                before, self.state = self.state, to(self.state)
+                before, self.state = self.state, change(self.state)
                 now = self.state
-                if (before.shown, before.pixels) != (now.shown, now.pixels):
-                    self._ask_again()
+                if (before.view, before.pixels) != (now.view, now.pixels):
+                    self._request_all()
         except FprfError as error:
-            self._say(str(error), client)
+            self.notify(str(error), client)
             return False
         if now.picked is not None and now.look != before.look:
-            self.choose(now.picked.region, client)  # what it takes is another thing now
-        if now != before and self._face is not None:
-            self._face.changed(before, now)
+            self.select_region(now.picked.region, client)  # what it takes has changed
+        if now != before and self._frontend is not None:
+            self._frontend.changed(before, now)
         return True
 
-    def drop(self, data: bytes, name: str) -> Card:
-        """A photograph: decoded, encoded, and the scene's style from now on. Raises DataError for what is none."""
-        return self.add(self.intake.take(data), shown_name(name))
+    def upload(self, data: bytes, name: str) -> Photograph:
+        """Decode and encode a photograph and restyle the scene with it. Raises DataError for what is none."""
+        return self.add_photograph(self.uploads.store(data), shown_name(name))
 
-    def add(self, path: Path, name: str) -> Card:
-        """The same for a file of this machine."""
-        done: Future[Card] = Future()
+    def add_photograph(self, path: Path, name: str) -> Photograph:
+        """Encode a photograph of this machine and restyle the scene with it."""
+        done: Future[Photograph] = Future()
 
-        def encode() -> None:
+        def job() -> None:
             try:
-                card = self.studio.card(path, _free(name, self.state))
-                self.change(lambda state: dropped(state, card))
-                self._tidy(card)
-                done.set_result(card)
+                photograph = self.restyler.encode(path, _unused_name(name, self.state))
+                self.update(lambda state: add_photograph(state, photograph))
+                self._delete_unused(photograph)
+                done.set_result(photograph)
             except Exception as error:
                 done.set_exception(error)
 
-        self._desk.do(("add", path), encode)
-        while True:  # who waits for ever keeps the process from ending
+        self._worker.run(("add", path), job)
+        while True:  # waiting for ever would keep the process from ending
             try:
-                return done.result(_PATIENCE)
+                return done.result(_POLL)
             except TimeoutError:
-                if self._desk.closed and not done.done():
+                if self._worker.closed and not done.done():
                     raise UsageError("the viewer is ending") from None
 
-    def _tidy(self, card: Card) -> None:
-        """Photographs that left the shelf, and that no look needs, go with what was made of them: some 6 MB each."""
-        held = self.state.all_cards
-        for gone in {*self._cards, card} - held:
-            if gone.path.parent == self.intake.folder:
-                gone.path.unlink(missing_ok=True)
-        self._cards = held
-        self.studio.keep(held)
-
     def pick(self, client: Hashable, place: tuple[float, float]) -> None:
-        """A click at shares of a client's width and height: the region there is picked; of nothing, none is."""
+        """Select the region at a click, given as shares of the client's width and height; none where there is nothing."""
 
-        def find() -> None:
-            eye = self._eyes.get(client)
-            if eye is None:
+        def job() -> None:
+            camera = self._cameras.get(client)
+            if camera is None:
                 return
             side = 1000
-            cameras = self.stage.cameras([eye], (round(side * eye.aspect), side))
+            cameras = self.transform.cameras([camera], (round(side * camera.aspect), side))
             width, height = cameras.size[0].tolist()
-            region = self.studio.region_at(cameras, (place[0] * width, place[1] * height))
-            self._choose(region)
+            self._select(self.restyler.region_at(cameras, (place[0] * width, place[1] * height)))
 
-        self._desk.do(("pick", client), self._told(find, client))
+        self._worker.run(("pick", client), self._reporting(job, client))
 
-    def choose(self, region: int | None, client: Hashable | None = None) -> None:
-        """Pick a region by number, or none."""
-        self._desk.do("choose", self._told(lambda: self._choose(region), client))
+    def select_region(self, region: int | None, client: Hashable | None = None) -> None:
+        """Select a region by number, or none."""
+        self._worker.run("select", self._reporting(lambda: self._select(region), client))
 
-    def film(self, plan: FilmPlan, client: Hashable | None = None) -> None:
-        """Make a film in the run's folder, while nobody waits for a picture; one at a time."""
-        self._crew.film(plan, client)
+    def record_film(self, plan: FilmPlan, client: Hashable | None = None) -> None:
+        """Make a film in the run's folder while no client waits for a picture, one at a time."""
+        self._films.record(plan, client)
 
-    def play(self, client: Hashable, plan: FilmPlan, fly: Callable[[Eye], None]) -> None:
-        """Show a client the flight; `fly` moves its camera. Its own moves count again when it is over."""
-        self._crew.play(client, plan, fly)
+    def play_flight(self, client: Hashable, plan: FilmPlan, move: Callable[[CameraState], None]) -> None:
+        """Show a client the flight; `move` moves its camera, whose own moves are ignored until it ends."""
+        self._films.play(client, plan, move)
 
-    def preview(self, client: Hashable, eye: Eye, look: Look) -> None:
-        """For one client, another look than that of all."""
-        with self._lock:
-            if client in self._eyes:
-                self._eyes[client] = eye = eye._replace(aspect=self._eyes[client].aspect)
-                self._desk.ask(client, Glance(eye, Shown(look), self.state.pixels))
-
-    def look_again(self, client: Hashable) -> None:
-        """What a client sees is to be what all see."""
-        with self._lock:
-            if client in self._eyes:
-                self._desk.ask(client, Glance(self._eyes[client], self.state.shown, self.state.pixels))
-
-    def land(self, client: Hashable) -> None:
+    def stop_flight(self, client: Hashable) -> None:
         """End a client's flight where it is."""
-        self._crew.stop(client)
+        self._films.stop(client)
+
+    def preview(self, client: Hashable, camera: CameraState, look: Look) -> None:
+        """Show one client another look than that of all."""
+        with self._lock:
+            if client in self._cameras:
+                self._cameras[client] = camera = camera._replace(aspect=self._cameras[client].aspect)
+                self._worker.request(client, RenderRequest(camera, ViewSettings(look), self.state.pixels))
+
+    def refresh(self, client: Hashable) -> None:
+        """Show one client the look of all again."""
+        with self._lock:
+            if client in self._cameras:
+                self._worker.request(client, RenderRequest(self._cameras[client], self.state.view, self.state.pixels))
 
     def picture(self, client: Hashable) -> Picture | None:
-        """What a client was shown last."""
+        """The last picture that a client was shown."""
         return self._pictures.get(client)
 
     def thumbnail(self, client: Hashable) -> Thumbnail | None:
-        """What a client sees now, small."""
+        """The last picture that a client was shown, small."""
         picture = self._pictures.get(client)
         if picture is None:
             return None
-        self._shots += 1
-        return Thumbnail(self._shots, shrink(picture, _THUMBNAIL))
+        self._thumbnails += 1
+        return Thumbnail(self._thumbnails, shrink(picture, _THUMBNAIL))
 
-    def _choose(self, region: int | None) -> None:
-        count = self.studio.regions
+    def _delete_unused(self, added: Photograph) -> None:
+        """Delete photographs that left the shelf and that no look needs, with what was made of them: some 6 MB each."""
+        used = self.state.photographs
+        for gone in {*self._photographs, added} - used:
+            if gone.path.parent == self.uploads.folder:
+                gone.path.unlink(missing_ok=True)
+        self._photographs = used
+        self.restyler.retain(used)
+
+    def _select(self, region: int | None) -> None:
+        count = self.restyler.regions
         if region is not None and not 0 <= region < count:
             raise UsageError(f"region {region}: regions go from 0 to {count - 1}")
-        picked = None if region is None else self.studio.picked(self.state.look, region)
-        self.change(lambda state: replace(state, picked=picked))
+        picked = None if region is None else self.restyler.region_info(self.state.look, region)
+        self.update(lambda state: replace(state, picked=picked))
 
-    def _told(self, call: Callable[[], None], client: Hashable | None) -> Callable[[], None]:
-        """The call, with what goes wrong told to the client."""
+    def _reporting(self, call: Callable[[], None], client: Hashable | None) -> Callable[[], None]:
+        """The call, with its errors told to the client."""
 
-        def told() -> None:
+        def reporting() -> None:
             try:
                 call()
             except FprfError as error:
-                self._say(str(error), client)
+                self.notify(str(error), client)
 
-        return told
+        return reporting
 
-    def _ask_again(self) -> None:
-        """Pictures for everybody."""
+    def _request_all(self) -> None:
         with self._lock:
-            for client, eye in self._eyes.items():
-                self._desk.ask(client, Glance(eye, self.state.shown, self.state.pixels))
+            for client, camera in self._cameras.items():
+                self._worker.request(client, RenderRequest(camera, self.state.view, self.state.pixels))
 
-    def _show(self, client: Hashable, frame: Frame) -> None:
-        if self._face is not None and client is not None:  # a rehearsal has no one to show itself to
+    def _show(self, client: Hashable, frame: RenderedFrame) -> None:
+        if self._frontend is not None and client is not None:  # the warm-up has no client
             self._pictures[client] = frame.picture
-            self._face.show(client, frame)
+            self._frontend.show(client, frame)
 
-    def _say(self, text: str, client: Hashable | None = None) -> None:
-        if self._face is not None:
-            self._face.say(text, client)
-
-    def _fault(self, client: Hashable | None, error: Exception) -> None:
-        known = isinstance(error, FprfError)
-        self._say(str(error) if known else f"this should not have happened: {type(error).__name__}: {error}", client)
+    def _on_error(self, client: Hashable | None, error: Exception) -> None:
+        expected = isinstance(error, FprfError)
+        self.notify(str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}", client)
 
 
-def _free(name: str, state: State) -> str:
-    """The name, or one like it that no photograph on the shelf has."""
-    taken, count, found = {card.name for card in state.shelf}, 1, name
-    while found in taken:
+def _unused_name(name: str, state: State) -> str:
+    """The name, with a number where a photograph on the shelf has it already."""
+    taken, count, unused = {photograph.name for photograph in state.shelf}, 1, name
+    while unused in taken:
         count += 1
-        found = f"{name} ({count})"
-    return found
+        unused = f"{name} ({count})"
+    return unused

@@ -12,24 +12,28 @@ from fprf.cli.live_view import open_view, take_view
 from fprf.errors import UsageError
 from fprf.training import trainer
 from fprf.training.run import Run
-from fprf.viewer import aside
-from fprf.viewer.aside import Aside, Place
-from fprf.viewer.moment import begun
+from fprf.viewer import live
+from fprf.viewer.live import LiveViewer, ViewAddress
+from fprf.viewer.restyler import load_unfinished
 
 
 @pytest.mark.parametrize(
     ("args", "rest", "place"),
     [
         (["--steps", "3"], ["--steps", "3"], None),
-        (["--view"], [], Place()),
-        (["--view", "--steps", "3"], ["--steps", "3"], Place()),
-        (["--steps", "3", "--view", "9000", "--seed", "1"], ["--steps", "3", "--seed", "1"], Place("127.0.0.1", 9000, True)),
-        (["--view=0.0.0.0:0"], [], Place("0.0.0.0", 0, True)),
-        (["--view", "[::1]:81"], [], Place("::1", 81, True)),
-        (["--view", ":81"], [], Place("127.0.0.1", 81, True)),
+        (["--view"], [], ViewAddress()),
+        (["--view", "--steps", "3"], ["--steps", "3"], ViewAddress()),
+        (
+            ["--steps", "3", "--view", "9000", "--seed", "1"],
+            ["--steps", "3", "--seed", "1"],
+            ViewAddress("127.0.0.1", 9000, True),
+        ),
+        (["--view=0.0.0.0:0"], [], ViewAddress("0.0.0.0", 0, True)),
+        (["--view", "[::1]:81"], [], ViewAddress("::1", 81, True)),
+        (["--view", ":81"], [], ViewAddress("127.0.0.1", 81, True)),
     ],
 )
-def test_the_flag_is_taken_out_of_the_others(args: list[str], rest: list[str], place: Place | None) -> None:
+def test_the_flag_is_taken_out_of_the_others(args: list[str], rest: list[str], place: ViewAddress | None) -> None:
     assert take_view(args) == (rest, place)
 
 
@@ -42,7 +46,7 @@ def test_what_is_no_place_is_refused(args: list[str]) -> None:
 def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'fprf\[viewer\]'"):
-        open_view(Place())
+        open_view(ViewAddress())
 
 
 @pytest.mark.parametrize("script", [GREEDY, DEAF, DEAD])
@@ -50,7 +54,7 @@ def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = tmp_path / "log"
-    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(script, str(log))))
+    monkeypatch.setattr(train, "open_view", lambda place: LiveViewer(place, viewer(script, str(log))))
     monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)  # look after every step
     assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--view"]) == 0
     here, there = parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15)
@@ -72,9 +76,9 @@ def test_help_and_completion_know_it(capsys: pytest.CaptureFixture[str]) -> None
 def test_blocks_are_shown_one_after_the_other_and_trained_the_same(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(train, "open_view", lambda place: Aside(place, viewer(GREEDY, str(tmp_path / "log"))))
+    monkeypatch.setattr(train, "open_view", lambda place: LiveViewer(place, viewer(GREEDY, str(tmp_path / "log"))))
     monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)
-    monkeypatch.setattr(aside, "_SHARE", 1e6)  # so short a training gives no time for more than one copy
+    monkeypatch.setattr(live, "_COPY_SHARE", 1e6)  # so short a training gives no time for more than one copy
     blocks = ["--blocks", "street", "--blocks.segments", "2", "--steps", "6"]
     for name, view in (("plain", []), ("shown", ["--view"])):
         assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / name), *blocks, *view]) == 0
@@ -87,5 +91,5 @@ def test_blocks_are_shown_one_after_the_other_and_trained_the_same(
     for line in heard:
         shown = line["block"] if "run" in line else shown
         if "names" in line:  # what was handed over fits the model that the viewer builds
-            assert line["names"] == sorted(begun(tmp_path / "shown", "cpu", shown).model.state_dict())
+            assert line["names"] == sorted(load_unfinished(tmp_path / "shown", "cpu", shown).model.state_dict())
     assert any("names" in line for line in heard)

@@ -13,7 +13,7 @@ class Client:
 
     def __init__(self, number: int) -> None:
         self.client_id = number
-        self.eyes: list[Any] = []
+        self.cameras: list[Any] = []
 
 
 class Control:

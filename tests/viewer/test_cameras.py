@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -9,15 +10,26 @@ from tiny_world import World
 
 from fprf.errors import UsageError
 from fprf.rendering.cameras import Cameras, project
-from fprf.viewer.cameras import Eye, checked_eye, fitted, stage_of
+from fprf.rendering.space import Space
+from fprf.types import Boxes
+from fprf.viewer.cameras import (
+    CameraState,
+    PageTransform,
+    box_edges,
+    camera_frustums,
+    checked_camera,
+    page_transform,
+    path_segments,
+    picture_size,
+)
 
 
 def test_a_captured_camera_goes_to_the_page_and_back(world: World) -> None:
     cameras = world.load().known.cameras
-    stage = stage_of(cameras)
+    transform = page_transform(cameras)
     for view in range(len(cameras)):
         width, height = (int(v) for v in cameras.size[view])
-        back = stage.cameras([stage.eye(cameras, view)], (width, height))
+        back = transform.cameras([transform.camera_state(cameras, view)], (width, height))
         assert torch.allclose(back.pose[0], cameras.pose[view], atol=1e-9)
         assert torch.allclose(back.focal[0], cameras.focal[view, 1].repeat(2), atol=1e-9)
 
@@ -26,23 +38,23 @@ def test_far_from_the_origin_nothing_is_lost(world: World) -> None:
     cameras = world.load().known.cameras
     shift = torch.tensor([4.5e6, -3.0e5, 120.0], dtype=torch.float64)
     far = replace(cameras, pose=torch.cat([cameras.pose[:, :, :3], cameras.pose[:, :, 3:] + shift[:, None]], -1))
-    here, there = stage_of(cameras).eye(cameras, 3), stage_of(far).eye(far, 3)
+    here, there = page_transform(cameras).camera_state(cameras, 3), page_transform(far).camera_state(far, 3)
     assert torch.allclose(torch.tensor(here.position), torch.tensor(there.position), atol=1e-6)
 
 
 def test_most_cameras_lie_within_two_units_and_up_is_theirs(world: World) -> None:
     cameras = world.load().known.cameras
-    stage = stage_of(cameras)
-    places = stage.to_page(cameras.pose[:, :, 3])
+    transform = page_transform(cameras)
+    places = transform.to_page(cameras.pose[:, :, 3])
     assert 0.85 <= float((places.norm(dim=-1) <= 2.001).double().mean()) <= 1.0
-    assert math.isclose(math.hypot(*stage.up), 1.0, rel_tol=1e-9)
-    assert float((cameras.pose[:, :, 1] @ torch.tensor(stage.up, dtype=torch.float64)).mean()) > 0.5
+    assert math.isclose(math.hypot(*transform.up), 1.0, rel_tol=1e-9)
+    assert float((cameras.pose[:, :, 1] @ torch.tensor(transform.up, dtype=torch.float64)).mean()) > 0.5
 
 
 def test_one_camera_alone_has_a_stage(world: World) -> None:
     one = world.load().known.cameras.select(torch.tensor([0]))
-    stage = stage_of(one)
-    assert stage.scale == 1.0 and stage.eye(one, 0).position == (0.0, 0.0, 0.0)
+    transform = page_transform(one)
+    assert transform.scale == 1.0 and transform.camera_state(one, 0).position == (0.0, 0.0, 0.0)
 
 
 def test_the_page_looks_along_plus_z_with_y_down() -> None:
@@ -54,9 +66,9 @@ def test_the_page_looks_along_plus_z_with_y_down() -> None:
         distortion=torch.zeros(1, 6, dtype=torch.float64),
         lens=torch.zeros(1, dtype=torch.int64),
     )
-    stage = stage_of(one)._replace(scale=1.0)
-    eye = checked_eye((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), math.pi / 2, 100, 100)
-    cameras = stage.cameras([eye], (100, 100))
+    transform = page_transform(one)._replace(scale=1.0)
+    eye = checked_camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), math.pi / 2, 100, 100)
+    cameras = transform.cameras([eye], (100, 100))
     pixel, depth = project(cameras, torch.zeros(1, dtype=torch.int64), torch.tensor([[0.5, 0.25, 1.0]], dtype=torch.float64))
     assert float(depth[0]) == pytest.approx(1.0) and pixel[0].tolist() == pytest.approx([75.0, 62.5])
 
@@ -72,7 +84,7 @@ def test_the_page_looks_along_plus_z_with_y_down() -> None:
 def test_whatever_numbers_come_the_eye_is_one_that_can_be_rendered(
     wxyz: tuple[float, ...], position: tuple[float, ...], fov: float, width: int, height: int
 ) -> None:
-    eye = checked_eye(wxyz, position, fov, width, height)
+    eye = checked_camera(wxyz, position, fov, width, height)
     assert math.hypot(*eye.wxyz) == pytest.approx(1.0) and all(abs(x) <= 1e6 for x in eye.position)
     assert 0.02 <= eye.fov <= 3.0 and 0.1 <= eye.aspect <= 10
 
@@ -89,16 +101,70 @@ def test_whatever_numbers_come_the_eye_is_one_that_can_be_rendered(
 )
 def test_what_is_no_camera_is_refused(numbers: tuple[tuple[float, ...], tuple[float, ...], float]) -> None:
     with pytest.raises(UsageError, match="camera"):
-        checked_eye(*numbers, 640, 480)
+        checked_camera(*numbers, 640, 480)
 
 
 @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.floats(0.1, 10), st.integers(1, 100_000))
 def test_pictures_have_the_shape_asked_for_and_are_never_huge(aspect: float, longest: int) -> None:
-    width, height = fitted(aspect, longest)
+    width, height = picture_size(aspect, longest)
     assert max(width, height) == max(8, min(longest, 4096)) and min(width, height) >= 1
     assert abs(width / aspect - height) <= 1 + 1 / aspect
 
 
 def test_equal_eyes_are_equal() -> None:
-    assert Eye((1, 0, 0, 0), (0, 0, 0), 1.0, 1.5) == Eye((1, 0, 0, 0), (0, 0, 0), 1.0, 1.5)
+    assert CameraState((1, 0, 0, 0), (0, 0, 0), 1.0, 1.5) == CameraState((1, 0, 0, 0), (0, 0, 0), 1.0, 1.5)
+
+
+def test_pyramids_stand_where_the_cameras_are_and_look_their_way(world: World) -> None:
+    cameras = world.load().known.cameras
+    transform = page_transform(cameras)
+    lines = camera_frustums(transform, cameras, 0.1)
+    assert lines.shape == (10 * len(cameras), 2, 3) and lines.dtype == np.float32
+    for view in range(len(cameras)):
+        own = lines[10 * view : 10 * view + 10]
+        tip = transform.to_page(cameras.pose[view, :, 3]).numpy()
+        assert np.allclose(own[:4, 0], tip, atol=1e-5)
+        ahead = -cameras.pose[view, :, 2].numpy()
+        assert np.allclose((own[:4, 1] - tip) @ ahead, 0.1, atol=1e-5)
+        up = cameras.pose[view, :, 1].numpy()
+        assert ((own[8, 1] - tip) @ up) > 0 and np.allclose(own[8, 1], own[9, 0])  # the roof
+
+
+def test_boxes_have_twelve_edges_of_their_own_sides() -> None:
+    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
+    boxes = Boxes(
+        torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64),
+        torch.tensor([[1.0, 2, 3], [2, 2, 3]], dtype=torch.float64),
+        torch.stack([turn, turn]),
+        0.1,
+    )
+    space = Space(kind="open", centre=(10.0, 20.0, 30.0), rotation=tuple(map(tuple, torch.eye(3).tolist())), scale=2.0,
+                  near=0.1, far=10.0)  # fmt: skip
+    transform = PageTransform(torch.tensor([10.0, 20.0, 30.0], dtype=torch.float64), 0.5, (0.0, 0.0, 1.0))
+    lines = box_edges(transform, space, boxes)
+    assert lines.shape == (24, 2, 3)
+    lengths = np.sort(np.linalg.norm(lines[:12, 1] - lines[:12, 0], axis=-1))
+    assert np.allclose(lengths, np.repeat([0.25, 0.5, 0.75], 4), atol=1e-5)  # sides over 2 (space) times 0.5 (page)
+    corners = lines.reshape(2, 24, 3)
+    inside = turn.numpy() @ (corners[0] * 4).T  # back to the space
+    assert inside.min() == pytest.approx(0, abs=1e-5) and inside.max(1) == pytest.approx([1, 2, 3], abs=1e-4)
+    shared = {tuple(np.round(p, 4)) for p in corners[0]} & {tuple(np.round(p, 4)) for p in corners[1]}
+    assert len(shared) == 4  # neighbours share a face
+
+
+def test_a_path_goes_from_frame_to_frame(world: World) -> None:
+    cameras = world.load().known.cameras
+    transform = page_transform(cameras)
+    lines = path_segments(transform, cameras)
+    assert lines.shape == (len(cameras) - 1, 2, 3) and np.array_equal(lines[:-1, 1], lines[1:, 0])
+    assert path_segments(transform, cameras.select(torch.tensor([0]))).shape == (0, 2, 3)
+
+
+def test_pyramids_behind_their_cameras_are_not_seen_from_there(world: World) -> None:
+    cameras = world.load().known.cameras
+    transform = page_transform(cameras)
+    ahead, behind = camera_frustums(transform, cameras, 0.1), camera_frustums(transform, cameras, 0.1, behind=True)
+    assert ahead.shape == behind.shape
+    axis = cameras.pose[:, :, 2].repeat_interleave(10, 0).numpy()
+    assert np.allclose(behind - ahead, 0.1 * axis[:, None], atol=1e-6)

@@ -1,5 +1,8 @@
 import json
 import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from queue import Queue
@@ -7,38 +10,44 @@ from queue import Queue
 import cv2
 import numpy as np
 import pytest
-from shelves import cards_of
+from photographs import encoded
+from test_session import Listener
 from tiny_world import World
 
 from fprf.cli import main as cli
 from fprf.errors import ConfigError, UsageError
 from fprf.io.images import Picture
-from fprf.viewer.cameras import stage_of
-from fprf.viewer.film import FilmPlan, Key, frames_of_film, lay_film, new_folder, path_of, taken
-from fprf.viewer.looks import Look, ordered
-from fprf.viewer.restyler import Studio
+from fprf.training.loading import load_run
+from fprf.viewer import film
+from fprf.viewer.cameras import CameraState, page_transform
+from fprf.viewer.film import FilmPlan, film_cameras, film_frames, new_folder, queued_frames, write_film_files
+from fprf.viewer.restyler import Restyler
+from fprf.viewer.session import Session
+from fprf.viewer.state import Key, Look, State, set_rule
 
 
-def plan_of(studio: Studio, looks: list[Look], seconds: float = 0.1, fps: float = 30.0) -> FilmPlan:
-    stage, cameras = stage_of(studio.trained.known.cameras), studio.trained.known.cameras
-    keys = tuple(Key(stage.eye(cameras, view), look) for view, look in enumerate(looks))
+def plan_of(restyler: Restyler, looks: list[Look], seconds: float = 0.1, fps: float = 30.0) -> FilmPlan:
+    transform, cameras = page_transform(restyler.trained.known.cameras), restyler.trained.known.cameras
+    keys = tuple(Key(transform.camera_state(cameras, view), look) for view, look in enumerate(looks))
     return FilmPlan(keys, seconds, fps, (32, 24))
 
 
 def test_the_film_is_what_fprf_render_makes_of_its_folder(world: World, tmp_path: Path) -> None:
     shutil.copytree(world.run, tmp_path / "run")
-    studio = Studio(world.load())
-    a, b = cards_of(studio, world)
-    one = ordered(Look(mix=((a, 1.0),), clusters=3), 0, "keep")
+    restyler = Restyler(world.load())
+    a, b = encoded(restyler, world)
+    one = set_rule(Look(mix=((a, 1.0),), clusters=3), 0, "keep")
     between = Look(mix=((b, 1.0),), clusters=3, towards=Look(mix=((a, 1.0),), clusters=3), at=0.5)
-    plan = plan_of(studio, [Look(), one, between])
+    plan = plan_of(restyler, [Look(), one, between])
     folder = new_folder(tmp_path / "run")
-    lay_film(folder, stage_of(studio.trained.known.cameras), plan, studio.trained.known.facts.semantic_encoder)
+    write_film_files(
+        folder, page_transform(restyler.trained.known.cameras), plan, restyler.trained.known.facts.semantic_encoder
+    )
     out: Queue[Picture | None] = Queue()
     told: list[tuple[int, int]] = []
-    for _ in frames_of_film(folder, studio.trained, out, lambda done, total: told.append((done, total))):
+    for _ in film_frames(folder, restyler.trained, out, lambda done, total: told.append((done, total))):
         pass
-    frames = list(taken(out))
+    frames = list(queued_frames(out))
     assert len(frames) == 7 and told == [(i + 1, 7) for i in range(7)]
     args = ["render", str(tmp_path / "run"), "--path", str(folder / "path.json"), "--keyframes", str(folder / "keys.json")]
     assert cli.main([*args, "--output", str(tmp_path / "frames")]) == 0
@@ -50,9 +59,11 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(world: World, tmp_path
 
 
 def test_files_name_no_path_of_this_machine(world: World, tmp_path: Path) -> None:
-    studio = Studio(world.load())
-    a, _ = cards_of(studio, world)
-    lay_film(tmp_path, stage_of(studio.trained.known.cameras), plan_of(studio, [Look(mix=((a, 1.0),))] * 2), "")
+    restyler = Restyler(world.load())
+    a, _ = encoded(restyler, world)
+    write_film_files(
+        tmp_path, page_transform(restyler.trained.known.cameras), plan_of(restyler, [Look(mix=((a, 1.0),))] * 2), ""
+    )
     keys = json.loads((tmp_path / "keys.json").read_text())
     assert keys["keyframes"] == [{"frame": 0, "style": "style-1/style.json"}, {"frame": 3, "style": "style-1/style.json"}]
     style = json.loads((tmp_path / "style-1" / "style.json").read_text())
@@ -60,31 +71,31 @@ def test_files_name_no_path_of_this_machine(world: World, tmp_path: Path) -> Non
 
 
 def test_a_fade_to_the_scene_as_it_is_is_written_as_less_strength(world: World, tmp_path: Path) -> None:
-    studio = Studio(world.load())
-    a, _ = cards_of(studio, world)
+    restyler = Restyler(world.load())
+    a, _ = encoded(restyler, world)
     look = Look(mix=((a, 1.0),), towards=Look(), at=0.25)
-    lay_film(tmp_path, stage_of(studio.trained.known.cameras), plan_of(studio, [look]), "")
+    write_film_files(tmp_path, page_transform(restyler.trained.known.cameras), plan_of(restyler, [look]), "")
     style = json.loads((tmp_path / "style-1" / "style.json").read_text())["style"]
     assert style["strength"] == 0.75 and style["between"] is None
 
 
 def test_paths_pass_through_their_keys(world: World) -> None:
-    studio = Studio(world.load())
-    stage = stage_of(studio.trained.known.cameras)
-    plan = plan_of(studio, [Look()] * 4, seconds=0.2, fps=25)
-    path = path_of(stage, plan)
+    restyler = Restyler(world.load())
+    transform = page_transform(restyler.trained.known.cameras)
+    plan = plan_of(restyler, [Look()] * 4, seconds=0.2, fps=25)
+    path = film_cameras(transform, plan)
     assert len(path) == 3 * 5 + 1 and path.size[0].tolist() == [32, 24]
     for i, key in enumerate(plan.keys):
-        assert np.allclose(stage.eye(path, 5 * i).position, key.eye.position, atol=1e-9)
-    assert len(path_of(stage, plan._replace(keys=plan.keys[:1]))) == 1
+        assert np.allclose(transform.camera_state(path, 5 * i).position, key.camera.position, atol=1e-9)
+    assert len(film_cameras(transform, plan._replace(keys=plan.keys[:1]))) == 1
 
 
 @pytest.mark.parametrize("change", [{"keys": ()}, {"fps": 0.0}, {"seconds": 1e9}, {"seconds": 400.0}])
 def test_films_that_cannot_be_are_refused(world: World, change: dict[str, object]) -> None:
-    studio = Studio(world.load())
-    plan = plan_of(studio, [Look()] * 4)._replace(**change)  # type: ignore[arg-type]
+    restyler = Restyler(world.load())
+    plan = plan_of(restyler, [Look()] * 4)._replace(**change)  # type: ignore[arg-type]
     with pytest.raises((UsageError, ConfigError)):
-        path_of(stage_of(studio.trained.known.cameras), plan)
+        film_cameras(page_transform(restyler.trained.known.cameras), plan)
 
 
 def test_folders_are_numbered(tmp_path: Path) -> None:
@@ -94,13 +105,122 @@ def test_folders_are_numbered(tmp_path: Path) -> None:
 def test_a_film_that_fails_ends_its_frames(world: World, tmp_path: Path) -> None:
     out: Queue[Picture | None] = Queue()
     with pytest.raises(Exception, match="no such camera path"):
-        list(frames_of_film(tmp_path, world.load(), out, lambda done, total: None))
+        list(film_frames(tmp_path, world.load(), out, lambda done, total: None))
     assert out.get_nowait() is None
 
 
 def test_looks_that_differ_get_folders_of_their_own(world: World, tmp_path: Path) -> None:
-    studio = Studio(world.load())
-    a, _ = cards_of(studio, world)
+    restyler = Restyler(world.load())
+    a, _ = encoded(restyler, world)
     look = Look(mix=((a, 1.0),))
-    lay_film(tmp_path, stage_of(studio.trained.known.cameras), plan_of(studio, [look, replace(look, blend=0.9)]), "")
+    write_film_files(
+        tmp_path, page_transform(restyler.trained.known.cameras), plan_of(restyler, [look, replace(look, blend=0.9)]), ""
+    )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["keys.json", "path.json", "style-1", "style-2"]
+
+
+@pytest.fixture
+def opened(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Session, Listener]]:
+    monkeypatch.setattr(film, "PREVIEW_FPS", 50.0)
+    shutil.copytree(world.run, tmp_path / "run")
+    with Session(load_run(tmp_path / "run", "cpu"), State(pixels=64)) as session:
+        listener = Listener()
+        session.attach(listener)
+        yield session, listener
+
+
+def flight(session: Session, looks: list[Look], seconds: float = 0.2) -> FilmPlan:
+    cameras = session.trained.known.cameras
+    return FilmPlan(
+        tuple(Key(session.transform.camera_state(cameras, view), look) for view, look in enumerate(looks)),
+        seconds,
+        24.0,
+        (32, 24),
+    )
+
+
+def until(true: Callable[[], bool]) -> None:
+    end = time.monotonic() + 120
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_a_flight_goes_from_the_first_key_to_the_last_for_one_client_alone(
+    opened: tuple[Session, Listener], world: World
+) -> None:
+    session, listener = opened
+    card = session.upload(world.references[0].read_bytes(), "dusk.png")
+    styled = session.state.look
+    cameras = session.trained.known.cameras
+    for client in (1, 2):
+        session.move_camera(client, session.transform.camera_state(cameras, 5))
+    listener.until(lambda: {c for c, f in listener.frames if f.final} == {1, 2})
+    listener.frames.clear()
+    flown: list[CameraState] = []
+    plan = flight(session, [Look(), styled])
+    session.play_flight(1, plan, flown.append)
+    until(lambda: not session.state.playing and len(flown) > 1 and session.idle)
+    for key, eye in ((plan.keys[0], flown[0]), (plan.keys[1], flown[-1])):
+        assert eye.position == pytest.approx(key.camera.position, abs=1e-6)
+    assert {client for client, _ in listener.frames} == {1}
+    assert session.state.look == styled and session.state.shelf == (card,)
+    last = [frame for _, frame in listener.frames if frame.final][-1]
+    assert last.camera.position == pytest.approx(plan.keys[1].camera.position, abs=1e-6)
+    assert any(state.playing for state in listener.states)
+
+
+def test_moves_of_the_client_s_own_do_not_count_while_it_flies(opened: tuple[Session, Listener]) -> None:
+    session, _ = opened
+    here = session.transform.camera_state(session.trained.known.cameras, 5)
+    session.move_camera(1, here)
+    gate, flown = threading.Event(), list[CameraState]()
+
+    def fly(eye: CameraState) -> None:
+        flown.append(eye)
+        assert gate.wait(60)
+
+    session.play_flight(1, flight(session, [Look(), Look()]), fly)
+    until(lambda: len(flown) == 1)
+    session.move_camera(1, here)
+    assert session._cameras[1].position != here.position
+    gate.set()
+    session.stop_flight(1)
+    until(lambda: not session.state.playing)
+    session.move_camera(1, here)
+    assert session._cameras[1] == here
+
+
+def test_who_leaves_or_plays_again_ends_the_flight(opened: tuple[Session, Listener]) -> None:
+    session, _ = opened
+    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 5))
+    long, flown = flight(session, [Look(), Look()], seconds=300.0), list[CameraState]()
+    session.play_flight(1, long, flown.append)
+    until(lambda: bool(flown))
+    session.play_flight(1, flight(session, [Look(), Look()]), flown.append)
+    until(lambda: not session.state.playing)
+    session.play_flight(1, long, flown.append)
+    until(lambda: session.state.playing)
+    session.disconnect(1)
+    until(lambda: not session.state.playing)
+    assert not session._films._flights
+
+
+def test_a_flight_of_nothing_is_told(opened: tuple[Session, Listener]) -> None:
+    session, listener = opened
+    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 5))
+    session.play_flight(1, FilmPlan((), 1.0, 24.0, (32, 24)), lambda eye: None)
+    listener.until(lambda: any("no keys" in text for text in listener.said))
+    until(lambda: not session._films._flights)
+
+
+def test_a_thumbnail_is_what_was_seen_last(opened: tuple[Session, Listener]) -> None:
+    session, listener = opened
+    assert session.thumbnail(1) is None
+    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 5))
+    listener.until(lambda: any(frame.final for _, frame in listener.frames))
+    first, second = session.thumbnail(1), session.thumbnail(1)
+    assert first is not None and second is not None and first != second and first.number < second.number
+    assert (first.picture == listener.frames[-1][1].picture).all()
+    session.disconnect(1)
+    assert session.thumbnail(1) is None

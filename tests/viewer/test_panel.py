@@ -15,15 +15,14 @@ from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.config import StyleConfig
 from fprf.style.presets import with_preset
 from fprf.training.loading import load_run
-from fprf.viewer import crew
-from fprf.viewer.cameras import Eye
-from fprf.viewer.looks import style_of
+from fprf.viewer import film
+from fprf.viewer.cameras import CameraState
 from fprf.viewer.panel import Panel
 from fprf.viewer.session import Session
-from fprf.viewer.state import Film, State
+from fprf.viewer.state import FilmProgress, State, style_config
 
 
-class Desk(Listener):
+class Face(Listener):
     """A face with the panel on it."""
 
     panel: Panel
@@ -35,27 +34,27 @@ class Desk(Listener):
 
 class Room:
     def __init__(self, session: Session) -> None:
-        self.session, self.gui, self.face, self.client = session, Gui(), Desk(), Client(1)
+        self.session, self.gui, self.face, self.client = session, Gui(), Face(), Client(1)
         self.drawn = 0
-        here = session.stage.eye(session.trained.known.cameras, 2)
-        self.client.eyes.append(here)
+        here = session.transform.camera_state(session.trained.known.cameras, 2)
+        self.client.cameras.append(here)
         self.face.panel = self.panel = Panel(
             self.gui,  # type: ignore[arg-type]
             session,
-            lambda client, eye: client.eyes.append(eye),  # type: ignore[attr-defined]
-            lambda client: client.eyes[-1],  # type: ignore[attr-defined, no-any-return]
+            lambda client, eye: client.cameras.append(eye),  # type: ignore[attr-defined]
+            lambda client: client.cameras[-1],  # type: ignore[attr-defined, no-any-return]
             self.draw,
         )
-        session.meet(self.face)
-        session.see(1, here)
+        session.attach(self.face)
+        session.move_camera(1, here)
 
     @property
     def state(self) -> State:
         return self.session.state
 
     @property
-    def eye(self) -> Eye:
-        found: Eye = self.client.eyes[-1]
+    def camera(self) -> CameraState:
+        found: CameraState = self.client.cameras[-1]
         return found
 
     def draw(self, panel: Panel) -> None:
@@ -76,7 +75,7 @@ class Room:
 
 @pytest.fixture
 def room(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Room]:
-    monkeypatch.setattr(crew, "STEPS", 50.0)
+    monkeypatch.setattr(film, "PREVIEW_FPS", 50.0)
     shutil.copytree(world.run, tmp_path / "run")
     with Session(load_run(tmp_path / "run", "cpu"), State(pixels=64)) as session:
         yield Room(session)
@@ -115,7 +114,7 @@ def test_a_preset_moves_the_sliders(room: Room) -> None:
     room.move("clusters", 5.0)
     room.press("gentle")
     wanted = with_preset(StyleConfig(), "gentle")
-    assert style_of(room.state.look) == replace(wanted, clusters=5)
+    assert style_config(room.state.look) == replace(wanted, clusters=5)
     shown = [room.gui[name].value for name in ("strength", "keep light", "local ↔ global", "smoothness", "temperature")]
     kind = wanted.stylizer
     assert isinstance(kind, RegionToneConfig)
@@ -132,13 +131,13 @@ def test_what_no_browser_of_ours_sends_is_told_and_changes_nothing(room: Room, v
 def test_what_is_shown(room: Room) -> None:
     for label, value, name, wanted in (
         ("map", "depth", "map", "depth"),
-        ("map covers", 0.5, "cover", 0.5),
+        ("map covers", 0.5, "map_opacity", 0.5),
         ("before/after", True, "wipe", 0.5),
         ("before/after", False, "wipe", None),
         ("pick a region", True, "picking", True),
         ("sharpness", 128.0, "pixels", 128),
-        ("new photo", "in the mix", "landing", "in the mix"),
-        ("new photo", "nonsense", "landing", "alone"),
+        ("new photo", "in the mix", "drop_mode", "in the mix"),
+        ("new photo", "nonsense", "drop_mode", "alone"),
     ):
         room.move(label, value)
         assert getattr(room.state, name) == wanted, label
@@ -152,29 +151,29 @@ def test_what_is_shown(room: Room) -> None:
 
 def test_the_camera_flies_to_captured_views(room: Room) -> None:
     room.move("fly to view", 4)
-    assert room.eye == room.session.stage.eye(room.session.trained.known.cameras, 4)
+    assert room.camera == room.session.transform.camera_state(room.session.trained.known.cameras, 4)
     room.move("fly to view", 999)
     room.gui["fly to view"].moved(3, None)  # nobody's
-    assert len(room.client.eyes) == 2
+    assert len(room.client.cameras) == 2
 
 
 def test_what_others_change_comes_back_to_the_controls(room: Room, world: World) -> None:
     from dataclasses import replace
 
-    room.session.change(lambda state: replace(state, look=replace(state.look, strength=0.25), map="regions", wipe=0.7))
+    room.session.update(lambda state: replace(state, look=replace(state.look, strength=0.25), map="regions", wipe=0.7))
     assert room.gui["strength"].value == 0.25 and room.gui["map"].value == "regions" and room.gui["before/after"].value
-    room.session.change(lambda state: replace(state, film=Film(3, 12)))
+    room.session.update(lambda state: replace(state, film=FilmProgress(3, 12)))
     assert room.gui["progress"].value == 25.0 and room.gui["Make the film"].disabled
     assert "frame 3 of 12" in room.gui["about"].content
 
 
 def test_looks_are_kept_gone_back_to_and_lie_at_the_end_of_a_slider(room: Room, world: World) -> None:
-    room.session.drop(world.references[0].read_bytes(), "dusk.png")
+    room.session.upload(world.references[0].read_bytes(), "dusk.png")
     first = room.state.look
     room.move("name", "dusk")
     room.press("Keep this look")
     assert room.gui["towards"].options == room.gui["back to"].options == ("nothing", "dusk")
-    room.session.drop(world.references[1].read_bytes(), "snow.png")
+    room.session.upload(world.references[1].read_bytes(), "snow.png")
     room.move("towards", "dusk")
     room.move("on the way", 0.5)
     assert room.state.look.towards == first and room.state.look.at == 0.5 and room.gui["towards"].value == "dusk"
@@ -187,17 +186,17 @@ def test_looks_are_kept_gone_back_to_and_lie_at_the_end_of_a_slider(room: Room, 
 def test_keys_are_set_replaced_and_gone_to(room: Room, world: World) -> None:
     room.press("Go to the chosen key")
     assert any("no key is chosen" in text for text in room.face.said)
-    start = room.eye
+    start = room.camera
     room.until(lambda: room.session.thumbnail(1) is not None)
     room.press("Add a key here")
-    room.session.drop(world.references[0].read_bytes(), "dusk.png")
+    room.session.upload(world.references[0].read_bytes(), "dusk.png")
     room.move("fly to view", 4)
     room.press("Add a key here")
-    assert [key.eye for key in room.state.keys] == [start, room.eye] and room.state.chosen == 1
+    assert [key.camera for key in room.state.keys] == [start, room.camera] and room.state.selected_key == 1
     assert all(key.thumbnail is not None for key in room.state.keys) and "2 keys" in room.gui["about"].content
     room.move("fly to view", 5)
     room.press("Replace the chosen key")
-    assert room.state.keys[1].eye == room.eye and room.drawn >= 3
+    assert room.state.keys[1].camera == room.camera and room.drawn >= 3
     room.move("strength", 0.3)
     room.press("Go to the chosen key")
     assert room.state.look == room.state.keys[1].look and room.state.look.strength == 1.0
@@ -208,7 +207,7 @@ def test_a_flight_is_played_and_ended_by_the_same_button(room: Room) -> None:
     room.move("fly to view", 4)
     room.press("Add a key here")
     room.move("fly along", 0.0)
-    assert room.eye.position == pytest.approx(room.state.keys[0].eye.position, abs=1e-6)
+    assert room.camera.position == pytest.approx(room.state.keys[0].camera.position, abs=1e-6)
     room.gui["seconds between keys"].value = 60.0
     room.press("Play the flight")
     room.until(lambda: room.state.playing)

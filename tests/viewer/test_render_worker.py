@@ -4,13 +4,13 @@ from collections.abc import Callable, Hashable, Iterator
 
 import pytest
 
-from fprf.viewer.render_worker import Desk
+from fprf.viewer.render_worker import RenderWorker
 
 Told = list[tuple[Hashable | None, str]]
 
 
 class Bench:
-    """A desk whose work waits for a permit before each step, and remembers what it did."""
+    """A worker whose work waits for a permit before each step, and remembers what it did."""
 
     def __init__(self, steps: int = 4) -> None:
         self.steps = steps
@@ -18,7 +18,9 @@ class Bench:
         self.log: list[tuple[Hashable, object, int]] = []
         self.closed: list[object] = []
         self.faults: Told = []
-        self.desk: Desk[object] = Desk(self.work, lambda client, error: self.faults.append((client, str(error))))
+        self.worker: RenderWorker[object] = RenderWorker(
+            self.work, lambda client, error: self.faults.append((client, str(error)))
+        )
 
     def work(self, client: Hashable, request: object) -> Iterator[None]:
         try:
@@ -41,7 +43,7 @@ def bench() -> Iterator[Bench]:
     bench = Bench()
     yield bench
     bench.let(10_000)
-    bench.desk.close()
+    bench.worker.close()
 
 
 def until(true: Callable[[], bool]) -> None:
@@ -53,42 +55,42 @@ def until(true: Callable[[], bool]) -> None:
 
 
 def test_a_request_is_worked_off(bench: Bench) -> None:
-    bench.desk.start()
-    bench.desk.ask("a", 1)
+    bench.worker.start()
+    bench.worker.request("a", 1)
     bench.let(4)
     until(lambda: bench.closed == [1])
     assert bench.log == [("a", 1, step) for step in range(4)]
 
 
 def test_a_newer_request_takes_over_between_steps_and_those_between_are_never_begun(bench: Bench) -> None:
-    bench.desk.start()
-    bench.desk.ask("a", 0)
+    bench.worker.start()
+    bench.worker.request("a", 0)
     bench.let(1)
     until(lambda: len(bench.log) == 1)
     for request in range(1, 200):  # while the second step of request 0 is held
-        bench.desk.ask("a", request)
+        bench.worker.request("a", request)
     bench.let(100)
     until(lambda: 199 in bench.closed)
-    begun = {request for _, request, _ in bench.log}
-    assert begun == {0, 199}
+    load_unfinished = {request for _, request, _ in bench.log}
+    assert load_unfinished == {0, 199}
     assert sum(request == 0 for _, request, _ in bench.log) <= 2 and 0 in bench.closed
 
 
 def test_clients_take_turns(bench: Bench) -> None:
-    bench.desk.ask("a", "x")
-    bench.desk.ask("b", "y")
-    bench.desk.start()
+    bench.worker.request("a", "x")
+    bench.worker.request("b", "y")
+    bench.worker.start()
     bench.let(8)
     until(lambda: len(bench.closed) == 2)
     assert [client for client, _, _ in bench.log] == ["a", "b"] * 4
 
 
 def test_a_fault_is_told_and_work_goes_on(bench: Bench) -> None:
-    bench.desk.start()
-    bench.desk.ask("a", "bad")
+    bench.worker.start()
+    bench.worker.request("a", "bad")
     bench.let(2)
     until(lambda: bench.faults == [("a", "it broke")])
-    bench.desk.ask("a", "good")
+    bench.worker.request("a", "good")
     bench.let(4)
     until(lambda: "good" in bench.closed)
 
@@ -105,21 +107,21 @@ def test_even_where_telling_fails() -> None:
         done.set()
         yield
 
-    desk: Desk[object] = Desk(work, fault)
-    desk.start()
-    desk.ask("a", "bad")
-    desk.do("errand", lambda: 1 / 0)
-    desk.ask("b", "good")
+    worker: RenderWorker[object] = RenderWorker(work, fault)
+    worker.start()
+    worker.request("a", "bad")
+    worker.run("errand", lambda: 1 / 0)
+    worker.request("b", "good")
     assert done.wait(10)
-    desk.close()
+    worker.close()
 
 
 def test_who_leaves_is_dropped(bench: Bench) -> None:
-    bench.desk.start()
-    bench.desk.ask("a", 1)
+    bench.worker.start()
+    bench.worker.request("a", 1)
     bench.let(1)
     until(lambda: len(bench.log) == 1)
-    bench.desk.leave("a")
+    bench.worker.forget("a")
     bench.let(10)
     until(lambda: bench.closed == [1])
     time.sleep(0.02)
@@ -128,29 +130,29 @@ def test_who_leaves_is_dropped(bench: Bench) -> None:
 
 def test_errands_come_first_and_only_the_last_of_a_name(bench: Bench) -> None:
     done: list[str] = []
-    bench.desk.ask("a", 1)
-    bench.desk.do("slider", lambda: done.append("old"))
-    bench.desk.do("photo", lambda: done.append("photo"))
-    bench.desk.do("slider", lambda: done.append("new"))
-    bench.desk.start()
+    bench.worker.request("a", 1)
+    bench.worker.run("slider", lambda: done.append("old"))
+    bench.worker.run("photo", lambda: done.append("photo"))
+    bench.worker.run("slider", lambda: done.append("new"))
+    bench.worker.start()
     until(lambda: len(done) == 2)
     assert done == ["photo", "new"] and bench.log == []
 
 
 def test_spare_work_waits_for_clients_and_is_done_in_order(bench: Bench) -> None:
-    bench.desk.spare(bench.work("film", "first"))
-    bench.desk.spare(bench.work("film", "second"))
-    bench.desk.ask("a", 1)
-    bench.desk.start()
+    bench.worker.run_when_idle(bench.work("film", "first"))
+    bench.worker.run_when_idle(bench.work("film", "second"))
+    bench.worker.request("a", 1)
+    bench.worker.start()
     bench.let(12)
     until(lambda: len(bench.closed) == 3)
     assert [request for _, request, _ in bench.log] == [1] * 4 + ["first"] * 4 + ["second"] * 4
 
 
 def test_a_broken_film_makes_way_for_the_next(bench: Bench) -> None:
-    bench.desk.spare(bench.work("film", "bad"))
-    bench.desk.spare(bench.work("film", "second"))
-    bench.desk.start()
+    bench.worker.run_when_idle(bench.work("film", "bad"))
+    bench.worker.run_when_idle(bench.work("film", "second"))
+    bench.worker.start()
     bench.let(8)
     until(lambda: "second" in bench.closed)
     assert bench.faults == [(None, "it broke")]
@@ -158,19 +160,21 @@ def test_a_broken_film_makes_way_for_the_next(bench: Bench) -> None:
 
 def test_closing_ends_the_thread_in_the_middle_of_work() -> None:
     bench = Bench(steps=10_000)
-    bench.desk.start()
-    bench.desk.ask("a", 1)
+    bench.worker.start()
+    bench.worker.request("a", 1)
     bench.let(3)
     until(lambda: len(bench.log) == 3)
     threading.Timer(0.05, lambda: bench.let(5)).start()
-    bench.desk.close()
+    bench.worker.close()
     assert bench.closed == [1] and len(bench.log) < 10
 
 
 def test_many_threads_ask_at_once(bench: Bench) -> None:
-    bench.desk.start()
+    bench.worker.start()
     bench.let(100_000)
-    threads = [threading.Thread(target=lambda n=n: [bench.desk.ask(n, request) for request in range(50)]) for n in range(8)]
+    threads = [
+        threading.Thread(target=lambda n=n: [bench.worker.request(n, request) for request in range(50)]) for n in range(8)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:

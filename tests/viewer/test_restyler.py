@@ -1,59 +1,65 @@
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
-from shelves import cards_of
+from photographs import encoded
 from tiny_world import World
 
-from fprf.errors import UsageError
+from fprf.errors import CheckpointError, UsageError
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import build_dictionary
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
+from fprf.style.scene import SceneStyle
+from fprf.training.loading import load_run, load_style
 from fprf.training.regions import membership_view
 from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
-from fprf.viewer.looks import Look, ordered, style_of
-from fprf.viewer.restyler import Studio, joined, names_of
+from fprf.viewer.restyler import Restyler, concatenate, load_unfinished, matching_regions, measure_encoders, set_parameters
+from fprf.viewer.state import Look, set_rule, style_config
 
 
-def seen(studio: Studio, restyle: Restyle | None) -> torch.Tensor:
-    trained = studio.trained
+def seen(restyler: Restyler, restyle: Restyle | None) -> torch.Tensor:
+    trained = restyler.trained
     return render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle).rgb
 
 
 def test_a_look_is_the_style_that_the_command_line_makes(world: World) -> None:
-    studio = Studio(world.load())
-    a, b = cards_of(studio, world)
-    look = ordered(Look(mix=((a, 1.0), (b, 0.5)), strength=0.8, clusters=3, luminance=0.2), 1, "pin", b)
-    wanted = apply_style(studio.trained, StyleFile(style_of(look)))
-    assert torch.allclose(seen(studio, studio.restyle(look)), seen(studio, wanted.restyle), atol=2e-5)
+    restyler = Restyler(world.load())
+    a, b = encoded(restyler, world)
+    look = set_rule(Look(mix=((a, 1.0), (b, 0.5)), strength=0.8, clusters=3, luminance=0.2), 1, "pin", b)
+    wanted = apply_style(restyler.trained, StyleFile(style_config(look)))
+    assert torch.allclose(seen(restyler, restyler.restyle(look)), seen(restyler, wanted.restyle), atol=2e-5)
 
 
 def test_no_photograph_and_no_strength_are_the_scene_as_it_is(world: World) -> None:
-    studio = Studio(world.load())
-    a, _ = cards_of(studio, world)
-    assert studio.styled(Look()) is None and studio.styled(Look(mix=((a, 1.0),), strength=0.0)) is None
+    restyler = Restyler(world.load())
+    a, _ = encoded(restyler, world)
+    assert restyler.styled(Look()) is None and restyler.styled(Look(mix=((a, 1.0),), strength=0.0)) is None
 
 
 def test_between_two_looks(world: World) -> None:
-    studio = Studio(world.load())
-    a, b = cards_of(studio, world)
+    restyler = Restyler(world.load())
+    a, b = encoded(restyler, world)
     one, two = Look(mix=((a, 1.0),), clusters=3), Look(mix=((b, 1.0),), clusters=3)
     half = replace(one, towards=two, at=0.5)
-    ends = [studio.restyle(each) for each in (one, two)]
+    ends = [restyler.restyle(each) for each in (one, two)]
     assert ends[0] is not None and ends[1] is not None
-    assert torch.equal(seen(studio, studio.restyle(half)), seen(studio, ends[0].mixed(ends[1], 0.5)))
-    assert names_of(half) == ("dusk.png", "snow.png") and names_of(one) == ("dusk.png",)
+    assert torch.equal(seen(restyler, restyler.restyle(half)), seen(restyler, ends[0].mixed(ends[1], 0.5)))
+    assert {name for name, _ in restyler.region_info(half, 0).taken} == {"dusk.png", "snow.png"}
     from_plain = replace(Look(), towards=two, at=0.5)
-    assert torch.allclose(seen(studio, studio.restyle(from_plain)), seen(studio, ends[1].faded.mixed(ends[1], 0.5)), atol=1e-5)
+    assert torch.allclose(
+        seen(restyler, restyler.restyle(from_plain)), seen(restyler, ends[1].faded.mixed(ends[1], 0.5)), atol=1e-5
+    )
 
 
 def test_joining_is_building_at_once(world: World) -> None:
-    studio = Studio(world.load())
-    cards = cards_of(studio, world)
+    restyler = Restyler(world.load())
+    cards = encoded(restyler, world)
     parts = [build_dictionary([card.reference], clusters=3) for card in cards]
-    found = joined(parts, [card.name for card in cards], [1.0, 2.0])
+    found = concatenate(parts, [card.name for card in cards], [1.0, 2.0])
     references = [card.reference._replace(weight=weight) for card, weight in zip(cards, (1.0, 2.0), strict=True)]
     wanted = build_dictionary(references, clusters=3)
     for name in found.names:
@@ -63,47 +69,112 @@ def test_joining_is_building_at_once(world: World) -> None:
 
 
 def test_styles_are_kept_and_bounded(world: World) -> None:
-    studio = Studio(world.load())
-    a, _ = cards_of(studio, world)
+    restyler = Restyler(world.load())
+    a, _ = encoded(restyler, world)
     first = Look(mix=((a, 1.0),), clusters=2)
-    styled = studio.styled(first)
-    assert studio.styled(replace(first, towards=None)) is styled
+    styled = restyler.styled(first)
+    assert restyler.styled(replace(first, towards=None)) is styled
     for step in range(30):
-        studio.styled(replace(first, strength=0.01 * (step + 1)))
-    assert len(studio._styles) <= 24 and len(studio._dictionaries) == 1
-    studio.keep([a])
-    assert studio._styles and studio._dictionaries
-    studio.keep([])
-    assert not studio._styles and not studio._dictionaries
+        restyler.styled(replace(first, strength=0.01 * (step + 1)))
+    assert len(restyler._styles) <= 24 and len(restyler._dictionaries) == 1
+    restyler.retain([a])
+    assert restyler._styles and restyler._dictionaries
+    restyler.retain([])
+    assert not restyler._styles and not restyler._dictionaries
 
 
 def test_a_click_finds_the_region_that_is_there(world: World) -> None:
-    studio = Studio(world.load())
-    trained = studio.trained
-    _, *_ = cards_of(studio, world)
+    restyler = Restyler(world.load())
+    trained = restyler.trained
+    _, *_ = encoded(restyler, world)
     cameras = trained.known.cameras.select(torch.tensor([2]))
     from fprf.training.regions import Regions
 
-    share, _ = membership_view(Regions(trained, studio.encoders.scene, studio.encoders.basis), 2, 1000)
+    share, _ = membership_view(Regions(trained, restyler.encoders.scene, restyler.encoders.basis), 2, 1000)
     for x, y in ((3, 4), (20, 18), (31, 23)):
-        assert studio.region_at(cameras, (x + 0.5, y + 0.5)) == int(share[y, x].argmax())
+        assert restyler.region_at(cameras, (x + 0.5, y + 0.5)) == int(share[y, x].argmax())
     with pytest.raises(UsageError, match="outside"):
-        studio.region_at(cameras, (32.0, 1.0))
+        restyler.region_at(cameras, (32.0, 1.0))
 
 
 def test_what_there_is_to_say_of_a_region(world: World) -> None:
-    studio = Studio(world.load())
-    a, b = cards_of(studio, world)
-    assert studio.picked(Look(), 0).taken == ()
+    restyler = Restyler(world.load())
+    a, b = encoded(restyler, world)
+    assert restyler.region_info(Look(), 0).taken == ()
     look = Look(mix=((a, 1.0), (b, 1.0)), clusters=3)
-    picked = studio.picked(look, 1)
+    picked = restyler.region_info(look, 1)
     assert {name for name, _ in picked.taken} == {"dusk.png", "snow.png"}
     assert sum(share for _, share in picked.taken) == pytest.approx(1.0, abs=1e-4) and 0 < picked.share < 1
     # A soft membership leaves a little to the neighbours of a pinned region.
-    assert dict(studio.picked(ordered(look, 1, "pin", b), 1).taken)["snow.png"] > 0.5
-    kept = studio.picked(ordered(look, 1, "keep"), 1)
+    assert dict(restyler.region_info(set_rule(look, 1, "pin", b), 1).taken)["snow.png"] > 0.5
+    kept = restyler.region_info(set_rule(look, 1, "keep"), 1)
     assert sum(share for _, share in kept.taken) < sum(share for _, share in picked.taken)
 
 
 def test_styles_ask_for_at_least_one_reference() -> None:
     assert StyleConfig().references == ()
+
+
+@pytest.fixture
+def fresh(world: World, tmp_path: Path) -> Path:
+    """A run as it is when training begins: no checkpoint, no style."""
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in ("config.json", "scene.json", "basis.safetensors"):
+        shutil.copy(world.run / name, run / name)
+    return run
+
+
+def test_a_run_that_has_just_begun_renders_and_with_its_parameters_is_the_run(world: World, fresh: Path) -> None:
+    trained, last = load_unfinished(fresh, "cpu"), world.load()
+    assert not trained.model.training and not any(p.requires_grad for p in trained.model.parameters())
+    facts, cameras, config = trained.known.facts, trained.known.cameras, trained.config.render
+    start = render_view(trained.model, facts, cameras, 0, config).rgb
+    assert set_parameters(trained, last.model.state_dict()) is trained
+    end = render_view(trained.model, facts, cameras, 0, config).rgb
+    assert torch.equal(end, render_view(last.model, facts, cameras, 0, config).rgb) and not torch.equal(start, end)
+
+
+def test_parameters_of_another_config_are_refused(fresh: Path) -> None:
+    with pytest.raises(CheckpointError, match="not those of its config"):
+        set_parameters(load_unfinished(fresh, "cpu"), {"x": torch.zeros(3)})
+
+
+def test_no_folder_is_no_run(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"no config\.json"):
+        load_unfinished(tmp_path, "cpu")
+
+
+def test_the_style_of_a_moment_is_that_which_training_measures(world: World, fresh: Path) -> None:
+    trained = set_parameters(load_unfinished(fresh, "cpu"), world.load().model.state_dict())
+    first = measure_encoders(trained, None)
+    wanted, _ = load_style(load_run(world.run, "cpu").run)  # the tiny world has fewer rays than a moment takes
+    for found, each in zip(first.scene, wanted, strict=True):
+        assert torch.allclose(found, each, atol=1e-5)
+    again = measure_encoders(trained, first)
+    assert again.content is first.content and again.semantic is first.semantic and again.basis is first.basis
+
+
+def test_regions_are_known_again_whatever_their_order() -> None:
+    generator = torch.Generator().manual_seed(0)
+    keys = torch.randn(6, 8, generator=generator)
+    middle = torch.randn(8, generator=generator)
+
+    def style(keys: torch.Tensor) -> SceneStyle:
+        k, c = len(keys), 3
+        return SceneStyle(
+            torch.zeros(c),
+            torch.eye(c),
+            keys,
+            torch.zeros(k, c),
+            torch.zeros(k, c, c),
+            torch.full((k,), 1 / k),
+            middle,
+            torch.zeros(k, k),
+        )
+
+    order = torch.randperm(6, generator=generator)
+    moved = style(keys[order] + 0.01 * torch.randn(6, 8, generator=generator))
+    assert torch.equal(order[matching_regions(style(keys), moved)], torch.arange(6))
+    assert matching_regions(style(keys), style(keys[:4])).max() < 4
+    assert torch.equal(matching_regions(style(keys[:, :0]), style(keys[:, :0])), torch.zeros(6, dtype=torch.int64))

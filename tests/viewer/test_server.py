@@ -1,201 +1,339 @@
-"""The gate with real sockets on this machine."""
+"""Hostile and slow clients, origins, tokens and sizes, on a server of its own."""
 
 import json
 import socket
 import threading
 import time
-from collections.abc import Iterator
+import urllib.error
+import urllib.request
+from collections.abc import Iterator, Sequence
 
 import pytest
-from test_wire import frame
 
 from fprf.errors import DataError, UsageError
-from fprf.viewer.access import COOKIE, Access
-from fprf.viewer.server import Answer, Gate, Request
 
+pytest.importorskip("uvicorn", reason="the extra `viewer` is not installed")
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.sync.server import ServerConnection, serve
+from websockets.typing import Subprotocol
+
+from fprf.viewer import server
+from fprf.viewer.server import COOKIE, Access, HttpServer, Request, Response, ViewerServer, is_loopback, make_access
+
+HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
+THERE = Access("0.0.0.0", TOKEN)
 
 
-async def hello(request: Request) -> Answer:
-    return Answer(200, "text/plain", b"hello")
+@pytest.mark.parametrize("name", ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "127.9.8.7:1"])
+def test_this_machine_by_its_names(name: str) -> None:
+    assert HERE.refusal({"host": name}) is None
+    assert HERE.refusal({"host": name, "origin": f"http://{name}"}) is None
 
 
-async def echo(request: Request) -> Answer:
-    return Answer(200, "application/json", json.dumps({"size": len(request.body), "query": dict(request.query)}).encode())
+@pytest.mark.parametrize("name", ["evil.example:8080", "127.0.0.1.evil.example", "", "[", "192.168.0.7:8080", "localhost.evil"])
+def test_names_made_to_point_here_are_refused(name: str) -> None:
+    assert HERE.refusal({"host": name}) is not None
 
 
-async def angry(request: Request) -> Answer:
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "", "https://localhost:8080"])
+def test_pages_of_other_sites_are_refused(origin: str) -> None:
+    assert HERE.refusal({"host": "127.0.0.1:8080", "origin": origin}) is not None
+
+
+def test_from_elsewhere_a_token_is_needed_in_one_of_three_places() -> None:
+    host = {"host": "machine.example:8080"}
+    assert THERE.refusal(host, TOKEN) is None
+    assert THERE.refusal({**host, "cookie": f"other=1; {COOKIE}={TOKEN}"}) is None
+    assert THERE.refusal({**host, "authorization": f"Bearer {TOKEN}"}) is None
+    assert THERE.refusal(host) is not None and THERE.refusal({}, TOKEN) is not None
+    assert THERE.refusal(host, "wrong-token-of-16-chars") is not None
+    assert THERE.refusal(host, "töken-that-is-no-ascii") is not None
+    assert THERE.refusal({**host, "cookie": f"{COOKIE}=x{TOKEN}"}) is not None
+    assert THERE.refusal({**host, "origin": "http://evil.example", "cookie": f"{COOKIE}={TOKEN}"}) is not None
+
+
+def test_tokens_are_made_where_they_are_needed() -> None:
+    assert make_access("127.0.0.1", None).token is None and make_access("localhost", TOKEN).token == TOKEN
+    one, two = (make_access("0.0.0.0", None).token for _ in range(2))
+    assert one is not None and two is not None and one != two and len(one) >= 32
+
+
+@pytest.mark.parametrize("token", ["short", "", "with spaces in its midst", "tökentökentökentök", "line\nbreak-in-a-long"])
+def test_weak_tokens_are_refused(token: str) -> None:
+    with pytest.raises(UsageError, match="--token"):
+        make_access("127.0.0.1", token)
+
+
+def test_loopback() -> None:
+    assert all(is_loopback(host) for host in ("127.0.0.1", "LocalHost", "::1", "[::1]"))
+    assert not any(is_loopback(host) for host in ("0.0.0.0", "::", "a.b"))
+
+
+async def hello(request: Request) -> Response:
+    return Response(200, "text/plain", b"hello")
+
+
+async def echo(request: Request) -> Response:
+    return Response(200, "application/json", json.dumps({"size": len(request.body), "query": dict(request.query)}).encode())
+
+
+async def film(request: Request) -> Response:
+    return Response(200, "video/mp4", b"x" * (64 << 20))
+
+
+async def refused(request: Request) -> Response:
     raise UsageError("the scene has no such thing")
 
 
-async def broken(request: Request) -> Answer:
-    raise ValueError("a fault of ours")
-
-
-ROUTES = {("GET", "/"): hello, ("POST", "/echo"): echo, ("GET", "/angry"): angry, ("GET", "/broken"): broken}
+ROUTES = {("GET", "/"): hello, ("POST", "/echo"): echo, ("GET", "/refused"): refused, ("GET", "/film"): film}
 
 
 @pytest.fixture
-def gate() -> Iterator[Gate]:
-    gate = Gate(Access("127.0.0.1", None), 0, ROUTES, largest=1000)
-    gate.open()
-    yield gate
-    gate.close()
+def http(monkeypatch: pytest.MonkeyPatch) -> Iterator[HttpServer]:
+    monkeypatch.setattr(server, "_MAX_BODY", 100_000)
+    monkeypatch.setattr(server, "_TIMEOUT", 1.0)
+    found = HttpServer(HERE, 0, ROUTES)
+    yield found
+    found.close()
 
 
-def talk(gate: Gate, data: bytes) -> bytes:
-    with socket.create_connection(("127.0.0.1", gate.port), timeout=30) as wire:
+def talk(http: HttpServer, data: bytes) -> bytes:
+    with socket.create_connection(("127.0.0.1", http.port), timeout=30) as wire:
         wire.sendall(data)
-        found = b""
+        answer = b""
         while piece := wire.recv(65536):
-            found += piece
-    return found
+            answer += piece
+    return answer
 
 
-def request(gate: Gate, line: str, *headers: str, body: bytes = b"", host: str | None = None) -> bytes:
-    name = f"127.0.0.1:{gate.port}" if host is None else host
-    return talk(gate, "\r\n".join([f"{line} HTTP/1.1", f"Host: {name}", *headers, "", ""]).encode() + body)
+def request(http: HttpServer, line: str, *headers: str, body: bytes = b"", host: str | None = None) -> bytes:
+    name = f"127.0.0.1:{http.port}" if host is None else host
+    return talk(http, "\r\n".join([f"{line} HTTP/1.1", f"Host: {name}", *headers, "", ""]).encode() + body)
 
 
 def status(answer: bytes) -> int:
     return int(answer.split(b" ", 2)[1])
 
 
-def test_a_page_comes_with_headers_that_keep_it_to_itself(gate: Gate) -> None:
-    answer = request(gate, "GET /")
+def test_a_page_comes_with_headers_that_keep_it_to_itself(http: HttpServer) -> None:
+    answer = request(http, "GET /")
     assert status(answer) == 200 and answer.endswith(b"\r\n\r\nhello")
     for header in (b"x-frame-options: DENY", b"x-content-type-options: nosniff", b"connection: close"):
         assert header in answer
 
 
-def test_bodies_and_queries_arrive(gate: Gate) -> None:
-    answer = request(gate, "POST /echo?name=a%20b&x=1", "Content-Length: 1000", body=b"x" * 1000)
-    assert json.loads(answer.rpartition(b"\r\n\r\n")[2]) == {"size": 1000, "query": {"name": "a b", "x": "1"}}
+@pytest.mark.parametrize("headers", [("Content-Length: 100000",), ("Transfer-Encoding: chunked",)])
+def test_bodies_and_queries_arrive(http: HttpServer, headers: tuple[str, ...]) -> None:
+    body = b"x" * 100_000
+    if "chunked" in headers[0]:
+        body = f"{len(body):x}\r\n".encode() + body + b"\r\n0\r\n\r\n"
+    answer = request(http, "POST /echo?name=a%20b&x=1", *headers, body=body)
+    assert json.loads(answer.rpartition(b"\r\n\r\n")[2]) == {"size": 100_000, "query": {"name": "a b", "x": "1"}}
 
 
 @pytest.mark.parametrize(
-    ("line", "headers", "expected"),
+    ("line", "headers", "body", "expected"),
     [
-        ("GET /nowhere", (), 404),
-        ("DELETE /", (), 405),
-        ("POST /echo", (), 411),
-        ("POST /echo", ("Content-Length: -1",), 411),
-        ("POST /echo", ("Content-Length: 1001",), 413),
-        ("POST /echo", ("Content-Length: 99999999999999",), 413),
-        ("POST /echo", ("Content-Length: 1", "Content-Length: 2"), 400),
-        ("GET /", ("Origin: http://evil.example",), 403),
-        ("GET /", ("Host: evil.example",), 400),
-        ("GET /angry", (), 400),
-        ("GET / extra", (), 400),
-        ("GET /", ("no colon",), 400),
-        ("GET /", ("X: " + "y" * 20_000,), 431),
-        ("GET http://[bad/", (), 400),
-        ("GET /", ("Upgrade: websocket", "Connection: Upgrade"), 503),
+        ("GET /nowhere", (), b"", 404),
+        ("DELETE /", (), b"", 405),
+        ("GET /refused", (), b"", 400),
+        ("POST /echo", ("Content-Length: -1",), b"", 400),
+        ("POST /echo", ("Content-Length: 100001",), b"", 413),
+        ("POST /echo", ("Content-Length: 99999999999999",), b"", 413),
+        ("POST /echo", ("Transfer-Encoding: chunked",), b"186a1\r\n" + b"x" * 0x186A1 + b"\r\n0\r\n\r\n", 413),
+        ("POST /echo", ("Content-Length: 1", "Content-Length: 2"), b"", 400),
+        ("POST /echo", ("Content-Length: 10",), b"slow", 408),
+        ("GET /", ("Origin: http://evil.example",), b"", 403),
+        ("GET /", ("Origin: http://127.0.0.1", "Origin: http://evil.example"), b"", 400),
+        ("GET /", ("Host: evil.example",), b"", 400),
+        ("GET /?" + "a=1&" * 20, (), b"", 400),
+        ("GET / extra", (), b"", 400),
+        ("GET /", ("no colon",), b"", 400),
     ],
 )
-def test_what_is_wrong_is_refused(gate: Gate, line: str, headers: tuple[str, ...], expected: int) -> None:
-    assert status(request(gate, line, *headers)) == expected
-    assert status(request(gate, "GET /")) == 200
+def test_what_is_wrong_is_refused(http: HttpServer, line: str, headers: tuple[str, ...], body: bytes, expected: int) -> None:
+    assert status(request(http, line, *headers, body=body)) == expected
+    assert status(request(http, "GET /")) == 200
 
 
-def test_faults_are_told_as_text(gate: Gate) -> None:
-    assert b"the scene has no such thing" in request(gate, "GET /angry")
+def test_another_name_for_this_machine_is_refused(http: HttpServer) -> None:
+    assert status(request(http, "GET /", host="evil.example")) == 403
 
 
-def test_another_name_for_this_machine_is_refused(gate: Gate) -> None:
-    assert status(request(gate, "GET /", host="evil.example")) == 403
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\x16\x03\x01\x02\x00",
+        b"GET / HTTP/1.1\r\n",
+        b"\r\n\r\n",
+        b"\0" * 100 + b"\r\n\r\n",
+        b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000,
+    ],
+)
+def test_nonsense_and_half_heads_end_their_own_connection_alone(http: HttpServer, data: bytes) -> None:
+    talk(http, data)  # returns when the server hangs up
+    assert status(request(http, "GET /")) == 200
 
 
-@pytest.mark.parametrize("data", [b"", b"\x16\x03\x01\x02\x00", b"GET / HTTP/1.1\r\n", b"\r\n\r\n", b"\0" * 100 + b"\r\n\r\n"])
-def test_nonsense_ends_its_own_connection_alone(gate: Gate, data: bytes) -> None:
-    with socket.create_connection(("127.0.0.1", gate.port)) as wire:
-        wire.sendall(data)
-    assert status(request(gate, "GET /")) == 200
-
-
-def test_many_idle_connections_do_not_shut_others_out_for_good(gate: Gate) -> None:
-    wires = [socket.create_connection(("127.0.0.1", gate.port)) for _ in range(80)]
-    time.sleep(0.2)
-    for wire in wires:
-        wire.close()
+def test_idle_connections_are_closed_and_do_not_shut_others_out(http: HttpServer) -> None:
+    wires = [socket.create_connection(("127.0.0.1", http.port)) for _ in range(80)]
     deadline = time.monotonic() + 30
-    while status(request(gate, "GET /")) != 200:
+    while status(request(http, "GET /")) != 200:
         assert time.monotonic() < deadline
         time.sleep(0.05)
+    for wire in wires:
+        wire.settimeout(30)
+        assert wire.recv(1) == b""
+        wire.close()
+
+
+def test_who_does_not_read_is_dropped(http: HttpServer) -> None:
+    with socket.create_connection(("127.0.0.1", http.port), timeout=30) as wire:
+        wire.sendall(f"GET /film HTTP/1.1\r\nHost: 127.0.0.1:{http.port}\r\n\r\n".encode())
+        time.sleep(3)
+        size = 0
+        while piece := wire.recv(1 << 20):
+            size += len(piece)
+    assert size < 64 << 20
 
 
 def test_a_token_in_the_address_becomes_a_cookie() -> None:
-    gate = Gate(Access("127.0.0.1", TOKEN), 0, ROUTES, largest=1000)
-    gate.open()
+    http = HttpServer(Access("127.0.0.1", TOKEN), 0, ROUTES)
     try:
-        assert status(request(gate, "GET /")) == 403
-        assert status(request(gate, "GET /?token=wrong")) == 403
-        answer = request(gate, f"GET /?token={TOKEN}")
+        assert status(request(http, "GET /")) == 403
+        assert status(request(http, "GET /?token=wrong")) == 403
+        answer = request(http, f"GET /?token={TOKEN}")
         assert status(answer) == 303 and b"location: /\r\n" in answer
         assert f"set-cookie: {COOKIE}={TOKEN}; Path=/; HttpOnly; SameSite=Strict".encode() in answer
-        assert status(request(gate, "GET /", f"Cookie: {COOKIE}={TOKEN}")) == 200
-        assert status(request(gate, "POST /echo", f"Cookie: {COOKIE}={TOKEN}", "Content-Length: 0")) == 200
-        assert status(request(gate, "POST /echo", "Content-Length: 0")) == 403
+        assert status(request(http, "GET /", f"Cookie: {COOKIE}={TOKEN}")) == 200
+        assert status(request(http, "POST /echo", f"Cookie: {COOKIE}={TOKEN}", "Content-Length: 0")) == 200
+        assert status(request(http, "POST /echo", "Content-Length: 0")) == 403
     finally:
-        gate.close()
-
-
-def test_a_port_that_is_taken_is_told(gate: Gate) -> None:
-    other = Gate(Access("127.0.0.1", None), gate.port, ROUTES, largest=1000)
-    with pytest.raises(UsageError, match=f"--port {gate.port}"):
-        other.open()
-
-
-class Inner:
-    """A server that says hello and then sends back what it gets."""
-
-    def __init__(self) -> None:
-        self.got = b""
-        self.listener = socket.create_server(("127.0.0.1", 0))
-        self.address: tuple[str, int] = self.listener.getsockname()
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def _run(self) -> None:
-        while True:
-            try:
-                wire, _ = self.listener.accept()
-            except OSError:
-                return
-            threading.Thread(target=self._serve, args=(wire,), daemon=True).start()
-
-    def _serve(self, wire: socket.socket) -> None:
-        with wire:
-            while data := wire.recv(65536):
-                self.got += data
-                wire.sendall(data[-20:])
+        http.close()
 
 
 def check(payload: bytes) -> None:
-    if payload.startswith(b"bad"):
+    if not payload.startswith(b"good"):
         raise DataError("message: bad")
 
 
-def test_messages_pass_until_one_is_bad_and_then_that_client_is_out(gate: Gate) -> None:
-    inner = Inner()
-    gate.lead(ROUTES, inner.address, check)
-    head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{gate.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n".encode()
-    with socket.create_connection(("127.0.0.1", gate.port), timeout=30) as wire:
-        wire.sendall(head)
-        assert wire.recv(100) == head[-20:]
-        good, bad = frame(b"a good message"), frame(b"bad message")
-        wire.sendall(good)
-        assert wire.recv(100) == good[-20:]
-        wire.sendall(frame(b"another") + bad + frame(b"after"))
-        while wire.recv(100):
+@pytest.fixture
+def inner(http: HttpServer) -> Iterator[list[bytes]]:
+    """A server in the place of viser, which sends back what it receives; and what it received."""
+    received: list[bytes] = []
+
+    def handle(connection: ServerConnection) -> None:
+        for message in connection:
+            assert isinstance(message, bytes)
+            received.append(message)
+            connection.send(message[::-1])
+
+    def choose(connection: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+        return offered[-1] if offered else None
+
+    with serve(handle, "127.0.0.1", 0, select_subprotocol=choose) as listening:
+        threading.Thread(target=listening.serve_forever, daemon=True).start()
+        http.relay_to(ROUTES, listening.socket.getsockname(), check)
+        yield received
+        listening.shutdown()
+
+
+def opened(http: HttpServer, **more: object) -> ClientConnection:
+    return connect(f"ws://127.0.0.1:{http.port}/", compression=None, proxy=None, **more)  # type: ignore[arg-type]
+
+
+def test_messages_pass_until_one_is_bad_and_then_that_client_is_out(http: HttpServer, inner: list[bytes]) -> None:
+    with opened(http, subprotocols=["viser-v1"]) as bad, opened(http) as other:
+        assert bad.subprotocol == "viser-v1"
+        for message in (b"good", b"good" + b"x" * 1000, [b"go", b"od in parts"]):
+            bad.send(message)
+            whole = b"".join(message) if isinstance(message, list) else message
+            assert bad.recv() == whole[::-1]
+        bad.send(b"bad")
+        with pytest.raises(ConnectionClosed):
+            bad.recv()
+        other.send(b"good still")
+        assert other.recv() == b"good still"[::-1]
+    assert b"bad" not in inner
+
+
+@pytest.mark.parametrize("message", [b"good" + b"x" * (1 << 20), [b"good" + b"x" * 600_000, b"x" * 600_000], "good text"])
+def test_messages_that_are_too_long_or_text_end_the_connection(
+    http: HttpServer, inner: list[bytes], message: bytes | list[bytes] | str
+) -> None:
+    with opened(http) as client, pytest.raises(ConnectionClosed):
+        client.send(message)
+        client.recv()
+    assert inner == [] and status(request(http, "GET /")) == 200
+
+
+@pytest.mark.parametrize("frame", [b"\x82\xfe\xff\xff" + b"x" * 70_000, b"\x82\x04good", b"\xf2\x80abcd", b"\x00\x84abcdgood"])
+def test_frames_that_break_the_protocol_end_the_connection(http: HttpServer, inner: list[bytes], frame: bytes) -> None:
+    head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{http.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    head += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", http.port), timeout=30) as wire:
+        wire.sendall(head.encode())
+        assert wire.recv(4096).startswith(b"HTTP/1.1 101")
+        wire.sendall(frame)
+        wire.shutdown(socket.SHUT_WR)
+        while wire.recv(65536):
             pass
-    assert good in inner.got and bad not in inner.got and frame(b"after", mask=b"....") not in inner.got
-    assert status(request(gate, "GET /")) == 200
-    inner.listener.close()
+    assert inner == [] or inner == [b"x" * 65535]
+    assert status(request(http, "GET /")) == 200
 
 
-def test_a_websocket_of_another_site_is_refused(gate: Gate) -> None:
-    gate.lead(ROUTES, ("127.0.0.1", 9), check)
-    headers = ("Upgrade: websocket", "Connection: Upgrade", "Origin: http://evil.example")
-    assert status(request(gate, "GET /", *headers)) == 403
-    request(gate, "GET /", *headers[:2])  # nobody listens inside: the connection ends
-    assert status(request(gate, "GET /")) == 200
+def test_websockets_of_other_sites_and_before_the_scene_is_there_are_refused(http: HttpServer) -> None:
+    for origin, expected in (("http://evil.example", 403), (f"http://127.0.0.1:{http.port}", 503)):
+        with pytest.raises(InvalidStatus) as told, opened(http, origin=origin):
+            pass
+        assert told.value.response.status_code == expected
+    http.relay_to(ROUTES, ("127.0.0.1", 9), check)
+    with pytest.raises(InvalidStatus), opened(http):  # nobody listens inside
+        pass
+    assert status(request(http, "GET /")) == 200
+
+
+def page_of(address: str) -> bytes:
+    with urllib.request.urlopen(address, timeout=60) as answer:
+        body: bytes = answer.read()
+        return body
+
+
+def test_before_the_scene_is_there_a_page_says_so_and_a_visit_is_known() -> None:
+    with ViewerServer(HERE, 0) as found:
+        address = found.address
+        assert not found.visited.is_set()
+        assert b"Loading the scene" in page_of(address) and found.visited.is_set()
+        found.notify("nobody hears this")
+
+        def load() -> None:
+            raise UsageError("no such run")
+
+        with pytest.raises(UsageError, match="no such run"):
+            found.open(load, (), 64)  # type: ignore[arg-type]
+        assert b"Loading" in page_of(address)
+        with pytest.raises(UsageError, match="choose another port"):
+            ViewerServer(HERE, int(address.rstrip("/").rpartition(":")[2]), preload=False)
+    with pytest.raises(OSError):
+        page_of(address)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+def test_the_address_is_one_that_this_machine_can_open(host: str) -> None:
+    try:
+        found = ViewerServer(make_access(host, None), 0, preload=False)
+    except UsageError:
+        pytest.skip("no such addresses on this machine")
+    with found:
+        assert found.address.startswith("http://127.0.0.1:") and "?token=" in found.address
+
+
+def test_the_address_carries_the_token_and_without_it_nothing_opens() -> None:
+    with ViewerServer(make_access("127.0.0.1", "a-token/of-&-characters"), 0, preload=False) as found:
+        assert "?token=a-token/of-%26-characters" in found.address
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            page_of(found.address.partition("?")[0])
+        assert not found.visited.is_set()

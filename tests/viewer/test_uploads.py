@@ -14,8 +14,8 @@ import pytest
 from photo_files import HEIC, turned_jpeg
 
 from fprf.errors import DataError
-from fprf.viewer import decode
-from fprf.viewer.uploads import LARGEST, SIDE, Intake, check_photograph, shown_name
+from fprf.viewer import uploads
+from fprf.viewer.uploads import MAX_BYTES, MAX_SIDE, Uploads, check_photograph, shown_name
 
 
 def png(width: int, height: int) -> bytes:
@@ -30,25 +30,25 @@ def claimed(width: int, height: int) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def intake() -> Iterator[Intake]:
-    with Intake(seconds=120) as found:
+def uploaded() -> Iterator[Uploads]:
+    with Uploads(timeout=120) as found:
         yield found
 
 
-def test_a_photograph_becomes_a_png_of_ours(intake: Intake) -> None:
-    path = intake.take(png(60, 40))
-    assert path.parent == intake.folder and path.suffix == ".png"
+def test_a_photograph_becomes_a_png_of_ours(uploaded: Uploads) -> None:
+    path = uploaded.store(png(60, 40))
+    assert path.parent == uploaded.folder and path.suffix == ".png"
     assert cv2.imread(str(path)).shape == (40, 60, 3)
-    large = intake.take(png(SIDE * 2, 100))
-    assert cv2.imread(str(large)).shape == (50, SIDE, 3)
-    assert sorted(intake.folder.glob("*.part")) == []
+    large = uploaded.store(png(MAX_SIDE * 2, 100))
+    assert cv2.imread(str(large)).shape == (50, MAX_SIDE, 3)
+    assert sorted(uploaded.folder.glob("*.part")) == []
 
 
-def test_photographs_of_phones_come_upright(intake: Intake, tmp_path: Path) -> None:
+def test_photographs_of_phones_come_upright(uploaded: Uploads, tmp_path: Path) -> None:
     shown = turned_jpeg(tmp_path / "a.jpg", cv2.imdecode(np.frombuffer(png(60, 40), np.uint8), cv2.IMREAD_COLOR), 6)
-    assert np.array_equal(cv2.imread(str(intake.take((tmp_path / "a.jpg").read_bytes())))[:, :, ::-1], shown)
+    assert np.array_equal(cv2.imread(str(uploaded.store((tmp_path / "a.jpg").read_bytes())))[:, :, ::-1], shown)
     pytest.importorskip("pillow_heif")
-    assert cv2.imread(str(intake.take(HEIC))).shape == (64, 48, 3)
+    assert cv2.imread(str(uploaded.store(HEIC))).shape == (64, 48, 3)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_photographs_of_phones_come_upright(intake: Intake, tmp_path: Path) -> N
         (b"<svg xmlns='x'/>", "no PNG"),
         (claimed(100_000, 100_000), "100000x100000"),
         (claimed(0, 10), "0x10"),
-        (b"\x89PNG\r\n\x1a\n" + b"x" * (LARGEST + 1), f"at most {LARGEST}"),
+        (b"\x89PNG\r\n\x1a\n" + b"x" * (MAX_BYTES + 1), f"at most {MAX_BYTES}"),
     ],
 )
 def test_by_its_header_it_is_refused_before_anything_is_decoded(data: bytes, said: str) -> None:
@@ -70,25 +70,25 @@ def test_by_its_header_it_is_refused_before_anything_is_decoded(data: bytes, sai
 @pytest.mark.parametrize(
     "data", [claimed(30, 20), png(30, 20)[:-40], b"\xff\xd8\xff" + b"\xc0\0\x0b\x08\0\x10\0\x10" + b"\0" * 40]
 )
-def test_damaged_ones_are_told_and_the_next_one_goes(intake: Intake, data: bytes) -> None:
+def test_damaged_ones_are_told_and_the_next_one_goes(uploaded: Uploads, data: bytes) -> None:
     with pytest.raises(DataError, match="photograph: ") as told:
-        intake.take(data)
-    assert str(intake.folder) not in str(told.value)
-    assert intake.take(png(20, 20)).is_file()
+        uploaded.store(data)
+    assert str(uploaded.folder) not in str(told.value)
+    assert uploaded.store(png(20, 20)).is_file()
 
 
-def test_a_decoder_that_died_is_replaced(intake: Intake) -> None:
-    intake.take(png(20, 20))
-    process = intake._process
+def test_a_decoder_that_died_is_replaced(uploaded: Uploads) -> None:
+    uploaded.store(png(20, 20))
+    process = uploaded._process
     assert process is not None
     process.kill()
     process.wait()
-    assert intake.take(png(20, 20)).is_file() and intake._process is not process
+    assert uploaded.store(png(20, 20)).is_file() and uploaded._process is not process
 
 
 def test_one_that_takes_too_long_is_ended() -> None:
-    with Intake(seconds=0.0) as hasty, pytest.raises(DataError, match="not decoded within"):
-        hasty.take(png(20, 20))
+    with Uploads(timeout=0.0) as hasty, pytest.raises(DataError, match="not decoded within"):
+        hasty.store(png(20, 20))
     assert not hasty.folder.exists()
 
 
@@ -102,7 +102,7 @@ def test_the_decoder_answers_line_by_line_and_survives_everything(tmp_path: Path
     ]
     lines = [json.dumps(each) for each in asked]
     answers = io.StringIO()
-    decode.serve(io.StringIO("\n".join([*lines, "not json", "{}"]) + "\n"), answers)
+    uploads.serve_decoder(io.StringIO("\n".join([*lines, "not json", "{}"]) + "\n"), answers)
     said = [json.loads(line)["said"] for line in answers.getvalue().splitlines()]
     assert len(said) == 5 and said[1] == "ok" and "no PNG" in said[0] and str(tmp_path) not in said[0]
     assert cv2.imread(str(tmp_path / "y.png")).shape == (5, 10, 3)
@@ -110,7 +110,9 @@ def test_the_decoder_answers_line_by_line_and_survives_everything(tmp_path: Path
 
 @pytest.mark.skipif(os.name != "posix", reason="limits are a matter of Unix")
 def test_memory_beyond_the_room_is_refused() -> None:
-    greedy = "from fprf.viewer.decode import confine; import numpy; confine(64 << 20); numpy.ones(256 << 20, numpy.uint8)"
+    greedy = (
+        "from fprf.viewer.uploads import limit_memory; import numpy; limit_memory(64 << 20); numpy.ones(256 << 20, numpy.uint8)"
+    )
     ended = subprocess.run([sys.executable, "-c", greedy], capture_output=True, text=True, timeout=120)
     assert ended.returncode == 1 and "MemoryError" in ended.stderr
 
