@@ -27,7 +27,7 @@ class RenderWorker(Generic[Request]):
         self._left: set[Hashable] = set()
         self._jobs: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
         self._idle_work: deque[Iterator[None]] = deque()
-        self._closed = False
+        self._busy = self._closed = False
         self._thread = threading.Thread(target=self._run, name="fprf-render", daemon=True)
 
     def start(self) -> None:
@@ -65,7 +65,7 @@ class RenderWorker(Generic[Request]):
     def idle(self) -> bool:
         """Whether no client waits; work for idle times does not count."""
         with self._change:
-            return not (self._fresh or self._active or self._jobs)
+            return not (self._busy or self._fresh or self._active or self._jobs)
 
     @property
     def closed(self) -> bool:
@@ -83,6 +83,7 @@ class RenderWorker(Generic[Request]):
     def _run(self) -> None:
         while True:
             with self._change:
+                self._busy = False
                 while not (self._closed or self._fresh or self._active or self._jobs or self._idle_work or self._left):
                     self._change.wait()
                 if self._closed:
@@ -90,6 +91,7 @@ class RenderWorker(Generic[Request]):
                 job = self._jobs.popitem(last=False)[1] if self._jobs else None
                 fresh, self._fresh = self._fresh, {}
                 left, self._left = self._left, set()
+                self._busy = bool(fresh or job or self._active)
             self._drop(left | set(fresh))
             for client, request in fresh.items():
                 self._begin(client, request)
