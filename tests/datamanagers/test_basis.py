@@ -52,20 +52,6 @@ def test_a_plane_is_found_under_a_large_offset() -> None:
     assert (back - (flat - flat.mean(0))).abs().max() <= 1000 * UNIT * 16
 
 
-def test_the_same_samples_give_the_same_bits_in_any_type_and_shape() -> None:
-    x = torch.randn(64, 8)
-    one, two = fit_basis(x, 3), fit_basis(x.clone(), 3)
-    assert torch.equal(one.matrix, two.matrix) and torch.equal(one.mean, two.mean)
-    assert one.project(x.reshape(4, 16, 8)).shape == (4, 16, 3)
-    assert one.project(x.double()).dtype == torch.float64
-
-
-def test_constant_features_are_no_error() -> None:
-    basis = fit_basis(torch.full((5, 4), 2.0), 2)
-    assert basis.energy == 1.0
-    assert basis.project(torch.full((1, 4), 2.0)).abs().max() == 0
-
-
 def test_through_tensors_and_back() -> None:
     basis = fit_basis(torch.randn(30, 5), 2)
     again = Basis.from_tensors(basis.tensors())

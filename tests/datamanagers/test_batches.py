@@ -1,5 +1,8 @@
-"""Training batches: pure in (seed, step), uniform over pixels, right at every pixel."""
+"""Training batches: pure in (seed, step), uniform over the pixels that masks leave, right at every pixel, through points."""
 
+import errno
+import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,16 +10,24 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from capture_files import Capture, write_transforms
+from hypothesis import given
+from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
+from tiny_world import World
 from torch import Tensor
 
-from fprf.datamanagers.batches import RayBatches, generator_of
+import fprf.datamanagers.batches as pixel_file
+from fprf.datamanagers.batches import RayBatches, Runs, generator_of, room_for
 from fprf.datamanagers.config import RayBatchesConfig
+from fprf.datamanagers.images import load_mask
+from fprf.datamanagers.parsers.config import TransformsConfig
+from fprf.datamanagers.parsers.views import masks_beside
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
-from fprf.interfaces import Encoder
+from fprf.interfaces import DataManager, Encoder
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.rendering.cameras import Cameras
+from fprf.rendering.cameras import Cameras, rays_through
 
 SIZES = [(24, 16), (30, 20), (18, 26), (24, 16), (12, 10)]
 """Width, height; views 0, 2, 3, 4 are for training."""
@@ -128,24 +139,6 @@ def test_the_share_of_semantic_rays(tmp_path: Path, share: float, expected: int 
     assert torch.equal(batch.semantic, store.at(batch.view[:expected], batch.pixel[:expected], batch.rgb[:expected]))
 
 
-def test_images_of_all_views(tmp_path: Path) -> None:
-    scene, images = make_scene(tmp_path)
-    manager = make(scene, tmp_path)
-    assert manager.background is None
-    for view, image in enumerate(images):
-        assert torch.equal(manager.image(view), torch.from_numpy(image.copy()).float() / 255)
-
-
-def test_transparency_shows_white(tmp_path: Path) -> None:
-    scene, images = make_scene(tmp_path, channels=4)
-    manager = make(scene, tmp_path)
-    assert manager.background == (1.0, 1.0, 1.0)
-    for view in (0, 1):
-        alpha = images[view][..., 3:] / 255
-        expected = torch.from_numpy(images[view][..., :3] / 255 * alpha + 1 - alpha).float()
-        assert (manager.image(view) - expected).abs().max() <= 0.51 / 255
-
-
 @pytest.mark.parametrize("channels", [3, 4])
 def test_transparency_shows_the_background_that_is_given(tmp_path: Path, channels: int) -> None:
     scene, images = make_scene(tmp_path, channels=channels)
@@ -159,24 +152,6 @@ def test_transparency_shows_the_background_that_is_given(tmp_path: Path, channel
         assert (manager.image(view) - expected).abs().max() <= 0.51 / 255
         for pixel, rgb in zip(batch.pixel[batch.view == view].long(), batch.rgb[batch.view == view], strict=True):
             assert (rgb - expected[pixel[1], pixel[0]]).abs().max() <= 0.51 / 255
-
-
-def test_features_are_made_for_training_views_only(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
-    told: list[int] = []
-    manager = RayBatches(
-        RayBatchesConfig(),
-        scene=scene,
-        content=RandomConfig(channels=3, stride=2).build(),
-        semantic=None,
-        dim=4,
-        cache=tmp_path / "cache",
-        seed=0,
-        progress=lambda done, total, what: told.append(total),
-    )
-    assert set(told) == {4} and manager.semantic_store is None
-    assert manager.content_store is not None and manager.content_store.channels == 3
-    assert len(list((tmp_path / "cache" / "content").glob("*.safetensors"))) == 4
 
 
 def test_a_scene_without_training_views_is_refused(tmp_path: Path) -> None:
@@ -218,3 +193,214 @@ def test_a_device_draws_what_the_host_draws(tmp_path: Path) -> None:
                     assert torch.equal(value.cpu().nan_to_num(-1.0), other.nan_to_num(-1.0)), name
             seen.syncs.clear()
         assert torch.equal(there.image(2), manager.image(2)), "views stay in host memory"
+
+
+MASKS = st.lists(st.lists(st.booleans(), min_size=1, max_size=12), max_size=5)
+
+
+@given(MASKS, st.integers(0, 7))
+def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
+    parts, start, wanted = [], first, []
+    for mask in masks:
+        parts.append((start, torch.tensor(mask)))
+        wanted += [start + k for k, each in enumerate(mask) if each]
+        start += len(mask)
+    runs = Runs.of(parts)
+    assert len(runs) == len(wanted)
+    assert runs.pick(torch.arange(len(wanted))).tolist() == wanted
+    everything = torch.arange(start + 3)
+    assert everything[runs.holds(everything)].tolist() == wanted
+
+
+def test_nothing_is_a_set_too() -> None:
+    runs = Runs.of([])
+    assert len(runs) == 0 and not runs.holds(torch.tensor([0, 5])).any()
+    assert len(Runs.of([(4, torch.zeros(9, dtype=torch.bool))])) == 0
+
+
+@pytest.mark.parametrize("held", [0, 10**9])
+def test_what_is_written_is_read(tmp_path: Path, held: int) -> None:
+    pixels = room_for(1000, tmp_path / "cache", held)
+    assert pixels.shape == (1000, 3) and pixels.dtype == torch.uint8
+    given = torch.randint(256, (1000, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    pixels[:] = given
+    at = torch.tensor([999, 0, 5, 5])
+    assert torch.equal(pixels[at], given[at])
+
+
+def test_the_file_has_no_name(tmp_path: Path) -> None:
+    pixels = room_for(5000, tmp_path, held=0)
+    assert not list(tmp_path.iterdir())
+    maps = Path("/proc/self/maps")
+    if maps.is_file():
+        assert str(tmp_path) in maps.read_text()
+    del pixels
+
+
+def test_a_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file: int, offset: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(pixel_file.os, "posix_fallocate", full, raising=False)
+    with pytest.raises(DataError, match="No space left"):
+        room_for(1000, tmp_path, held=0)
+
+
+def manager(world: World, folder: Path, share: float, **fields: object) -> DataManager:
+    """Of the tiny town, whose points any view may see."""
+    config = RayBatchesConfig(rays=64, depth_share=share)
+    scene = fields.pop("scene", replace(world.prepared.scene, seen=None))
+    return config.build(scene=scene, content=None, semantic=None, dim=4, cache=folder, seed=3, **fields)  # type: ignore[arg-type]
+
+
+def test_marked_rays_pass_their_points_at_the_distance_told(world: World, tmp_path: Path) -> None:
+    scene = world.prepared.scene
+    assert scene.points is not None
+    batch = manager(world, tmp_path, 0.25).batch(7)
+    assert batch.distance is not None
+    known = torch.isfinite(batch.distance)
+    assert known.tolist() == [False] * 48 + [True] * 16
+    origin, direction = rays_through(scene.cameras, batch.view[known], batch.pixel[known])
+    end = origin + direction * batch.distance[known].double()[:, None]
+    # Points lie anywhere in the pixel, rays in its middle: half a diagonal of a pixel away at most.
+    apart = torch.cdist(end, scene.points).amin(1)
+    pixel = batch.distance[known].double() / scene.cameras.focal[batch.view[known], 0]
+    assert bool((apart <= 0.75 * pixel + 1e-6).all())
+
+
+def test_a_batch_stays_a_function_of_its_step(world: World, tmp_path: Path) -> None:
+    one, other = manager(world, tmp_path, 0.25), manager(world, tmp_path, 0.25)
+    a, b, c = one.batch(5), other.batch(5), other.batch(6)
+    assert a.distance is not None and b.distance is not None
+    assert torch.equal(a.pixel, b.pixel) and torch.equal(a.distance[48:], b.distance[48:])
+    assert not torch.equal(a.pixel, c.pixel)
+    plain = manager(world, tmp_path, 0.0).batch(5)
+    assert plain.distance is None and torch.equal(plain.pixel[:48], a.pixel[:48]), "the other rays are what they were"
+
+
+def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World, tmp_path: Path) -> None:
+    scene = world.prepared.scene
+    first, second = scene.train.tolist()[:2]
+    held = int(scene.test[0])
+    both = torch.tensor([[first, 0], [second, 0]])
+    alone = torch.tensor([[first, point] for point in range(1, 50)] + [[held, point] for point in range(1, 50)])
+    marks = manager(world, tmp_path, 0.5, scene=replace(scene, seen=torch.cat([both, alone]))).batch(0)
+    expected = manager(world, tmp_path, 0.5, scene=replace(scene, seen=both)).batch(0)
+    assert marks.distance is not None and expected.distance is not None
+    torch.testing.assert_close(marks.distance, expected.distance, equal_nan=True)
+    assert manager(world, tmp_path, 0.5, scene=replace(scene, seen=alone)).batch(0).distance is None
+
+
+def test_a_block_is_marked_where_it_learns(world: World, tmp_path: Path) -> None:
+    def left(view: int) -> torch.Tensor:
+        mask = torch.zeros(24, 32, dtype=torch.bool)
+        mask[:, :12] = True
+        return mask
+
+    batch = manager(world, tmp_path, 0.5, seen=left).batch(2)
+    assert batch.distance is not None and bool((batch.pixel[:, 0] < 12).all())
+
+
+def write_mask(path: Path, pixels: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), pixels)
+    return path
+
+
+@pytest.mark.parametrize("name", ["{}.png.png", "{}.png"])
+def test_masks_beside_the_images_are_found(tmp_path: Path, name: str) -> None:
+    write_transforms(tmp_path, Capture.make(5))
+    write_mask(tmp_path / "masks" / name.format("0002"), np.zeros((16, 24), np.uint8))
+    scene = TransformsConfig().build().parse(tmp_path, 1)
+    assert scene.sky_masks == ()
+    assert [path is not None for path in scene.masks] == [False, False, True, False, False]
+
+
+def test_frames_name_their_masks(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, Capture.make(4))
+    frames = content["frames"]
+    assert isinstance(frames, list)
+    frames[1]["mask_path"], frames[3]["sky_mask_path"] = "people/a.png", "sky/b.png"
+    write_mask(tmp_path / "people/a.png", np.ones((16, 24), np.uint8))
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match=r"b\.png"):
+        TransformsConfig().build().parse(tmp_path, 1)
+    write_mask(tmp_path / "sky/b.png", np.ones((16, 24), np.uint8))
+    scene = TransformsConfig().build().parse(tmp_path, 1)
+    assert scene.masks == (None, tmp_path / "people/a.png", None, None)
+    assert scene.sky_masks == (None, None, None, tmp_path / "sky/b.png")
+    frames[1]["mask_path"] = "../a.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(DataError, match="leaves"):
+        TransformsConfig().build().parse(tmp_path, 1)
+
+
+def test_folders_of_cameras_and_splits_have_theirs(tmp_path: Path) -> None:
+    images = [
+        tmp_path / "images/left/1.jpg",
+        tmp_path / "images/right/1.jpg",
+        tmp_path / "train/rgbs/7.jpg",
+        Path("/other/8.jpg"),
+    ]
+    wanted = [
+        write_mask(tmp_path / "masks/left/1.jpg.png", np.ones((2, 2), np.uint8)),
+        None,
+        write_mask(tmp_path / "train/masks/7.png", np.ones((2, 2), np.uint8)),
+        None,
+    ]
+    assert list(masks_beside(tmp_path, images, "masks")) == wanted
+    assert masks_beside(tmp_path, images, "sky_masks") == ()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "kind"), [(0, 255, np.uint8), (0, 1, np.uint8), (20, 200, np.uint8), (0, 65535, np.uint16)]
+)
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_bright_is_true(tmp_path: Path, low: int, high: int, kind: type, channels: int) -> None:
+    mask = np.random.default_rng(0).random((9, 7)) > 0.5
+    pixels = np.repeat(np.where(mask, high, low)[..., None], channels, 2).astype(kind)
+    path = write_mask(tmp_path / "m.png", pixels)
+    assert np.array_equal(load_mask(path, (7, 9)), mask)
+    double = load_mask(path, (14, 18))
+    assert np.array_equal(double, mask.repeat(2, 0).repeat(2, 1))
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
+    path = write_mask(tmp_path / "m.png", np.ones((40, 10), np.uint8))
+    with pytest.raises(DataError, match="10x40 pixels do not fit an image of 60x40"):
+        load_mask(path, (60, 40))
+
+
+def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
+    scene, _ = make_scene(tmp_path)
+    allowed = [np.random.default_rng(9 + view).random((height, width)) > 0.7 for view, (width, height) in enumerate(SIZES)]
+    paths = [write_mask(tmp_path / f"mask{view}.png", np.uint8(255) * mask) for view, mask in enumerate(allowed)]
+    masked = replace(scene, masks=(paths[0], None, paths[2], None, paths[4]))
+    batch = make(masked, tmp_path, rays=60_000).batch(0)
+    seen = {view: np.zeros_like(mask) for view, mask in enumerate(allowed)}
+    for view, (x, y) in zip(batch.view.tolist(), batch.pixel.long().tolist(), strict=True):
+        seen[view][y, x] = True
+    for view in (0, 2, 4):
+        assert np.array_equal(seen[view], allowed[view])
+    assert seen[3].all() and batch.sky is None
+    plain = RayBatchesConfig(rays=64, masks=False)
+    build = {"content": None, "semantic": None, "dim": 4, "cache": tmp_path, "seed": 0}
+    ours, theirs = (plain.build(scene=each, **build).batch(1) for each in (masked, scene))  # type: ignore[arg-type]
+    assert torch.equal(ours.pixel, theirs.pixel)
+
+
+def test_a_mask_that_leaves_nothing_is_told(tmp_path: Path) -> None:
+    scene, _ = make_scene(tmp_path)
+    paths = tuple(write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES))
+    with pytest.raises(DataError, match="none of 4 training views"):
+        make(replace(scene, masks=paths), tmp_path)
+
+
+def test_rays_know_whether_they_look_into_the_sky(tmp_path: Path) -> None:
+    scene, _ = make_scene(tmp_path)
+    upper = np.zeros((16, 24), np.uint8)
+    upper[:5] = 1
+    path = write_mask(tmp_path / "sky.png", upper)
+    batch = make(replace(scene, sky_masks=(path, None, None, None, None)), tmp_path, rays=3000).batch(0)
+    assert batch.sky is not None and batch.sky.dtype == torch.bool
+    assert torch.equal(batch.sky, (batch.view == 0) & (batch.pixel[:, 1] < 5)) and bool(batch.sky.any())

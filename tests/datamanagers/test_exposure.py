@@ -72,12 +72,6 @@ def test_held_out_views_are_like_their_neighbours_where_neighbours_are_alike(wor
     torch.testing.assert_close(measured(scene, image)[scene.test], torch.zeros(len(scene.test), dtype=torch.float64))
 
 
-def test_what_the_capture_says_is_kept(world: World) -> None:
-    scene, image = capture(world, torch.zeros(VIEWS))
-    known = replace(scene, exposure=torch.linspace(1.0, 2.0, VIEWS, dtype=torch.float64))
-    assert with_exposure(known, image) is known
-
-
 def test_nothing_is_known_without_shared_points(world: World) -> None:
     """None at all, or each seen by one view."""
     scene, image = capture(world, torch.zeros(VIEWS))

@@ -4,22 +4,17 @@ import re
 import struct
 import sys
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from capture_files import Capture, write_image, write_transforms
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from photo_files import HEIC, turned_jpeg
 
 from fprf.datamanagers.images import header_of, load_image, load_images, photographs, read_header
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
-
-FUZZ = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def chunk(kind: bytes, body: bytes) -> bytes:
@@ -204,40 +199,6 @@ def test_a_thumbnail_s_end_does_not_hide_truncation(tmp_path: Path) -> None:
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nothing\.png: cannot be read"):
         load_image(tmp_path / "nothing.png")
-
-
-def spoilt(data: bytes) -> st.SearchStrategy[bytes]:
-    """A file with a few bytes changed, and perhaps cut."""
-    change = st.lists(st.tuples(st.integers(0, len(data) - 1), st.integers(0, 255)), max_size=4)
-
-    def apply(changes: list[tuple[int, int]], stop: int) -> bytes:
-        copy = bytearray(data)
-        for place, value in changes:
-            copy[place] = value
-        return bytes(copy[:stop])
-
-    return st.builds(apply, change, st.integers(0, len(data)))
-
-
-@FUZZ
-@given(st.one_of([spoilt(encoded(suffix, NOISE)) for suffix in (".png", ".jpg", ".webp", ".bmp", ".tiff")]))
-def test_any_bytes_give_an_image_or_a_data_error(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(content)
-    try:
-        image = load_image(path)
-    except DataError:
-        return
-    assert image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8
-
-
-@pytest.mark.parametrize("reader", [header_of])
-@given(
-    st.binary(max_size=64), st.sampled_from([b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"RIFF....WEBP", b"BM", b"II*\0", b"MM\0*"])
-)
-@settings(max_examples=100, deadline=None)
-def test_headers_of_any_bytes(reader: Callable[[bytes], object], tail: bytes, magic: bytes) -> None:
-    reader(magic + tail)
 
 
 def test_all_views_of_a_scene_at_their_cameras_sizes(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
-"""Captures in the format of Mission Bay: two cameras, exposure, rays of every pixel; read, refused, and trained."""
+"""Captures in the format of Mission Bay: TFRecord files, cameras behind rays; read, refused, and trained."""
 
 import json
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -9,12 +10,188 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from record_files import example, record, town_records
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from record_files import example, record, town_records, varint
 
 from fprf.datamanagers.images import load_image
+from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, read_examples, read_records
 from fprf.datamanagers.parsers.config import BlockNerfConfig, parse_scene, recognise
 from fprf.errors import ConfigError, DataError
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
+
+
+@pytest.mark.parametrize(
+    "data, value",
+    [
+        (b"", 0),
+        (b"123456789", 0xE3069283),
+        (bytes(32), 0x8A9136AA),
+        (b"\xff" * 32, 0x62A8AB43),
+        (bytes(range(32)), 0x46DD794E),
+        (bytes(range(31, -1, -1)), 0x113FDB5C),
+    ],
+)
+def test_values_of_rfc_3720(data: bytes, value: int) -> None:
+    assert crc32c(data) == value
+
+
+@pytest.mark.parametrize("length", [16383, 16384, 16385, 20000, 99_991])
+def test_chunks_agree_with_one_byte_after_the_other(length: int) -> None:
+    data = np.random.default_rng(length).integers(0, 256, length, dtype=np.uint8).tobytes()
+    state = 0xFFFFFFFF
+    for byte in data:
+        state ^= byte
+        for _ in range(8):
+            state = state >> 1 ^ (0x82F63B78 if state & 1 else 0)
+    assert crc32c(data) == state ^ 0xFFFFFFFF
+
+
+names = st.text(min_size=1, max_size=8)
+values = st.one_of(
+    st.binary(max_size=40),
+    st.lists(st.integers(-(2**63), 2**63 - 1), min_size=1, max_size=5),
+    st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=1, max_size=5).map(
+        lambda v: np.array(v, np.float32)
+    ),
+)
+
+
+@settings(deadline=None)
+@given(st.lists(st.dictionaries(names, values, max_size=4), max_size=3), st.booleans())
+def test_what_was_written_is_read(tmp_path_factory, written, packed: bool) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path_factory.mktemp("records") / "a.tfrecord"
+    path.write_bytes(b"".join(record(example(features, packed)) for features in written))
+    found = list(read_examples(path))
+    assert len(found) == len(written)
+    for one, features in zip(found, written, strict=True):
+        assert one.features.keys() == features.keys()
+        for name, value in features.items():
+            if isinstance(value, bytes):
+                assert one.blob(name) == value
+            elif isinstance(value, list):
+                assert np.asarray(one.features[name]).tolist() == value
+            else:
+                assert one.numbers(name, len(value)).tobytes() == value.tobytes()
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_a_flipped_bit_is_found_wherever_it_is(tmp_path_factory, data: st.DataObject) -> None:  # type: ignore[no-untyped-def]
+    whole = bytearray(record(b"some bytes") + record(b"more"))
+    at = data.draw(st.integers(0, 8 * len(whole) - 1))
+    whole[at // 8] ^= 1 << at % 8
+    path = tmp_path_factory.mktemp("flipped") / "a.tfrecord"
+    path.write_bytes(bytes(whole))
+    with pytest.raises(DataError, match=r"record [01]: .*; (download|split)"):
+        list(read_records(path))
+
+
+@pytest.mark.parametrize("cut", [1, 5, 11, 12, 15, 21, 25])
+def test_a_cut_file_is_named(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "a.tfrecord"
+    path.write_bytes(record(b"some bytes")[:cut])
+    with pytest.raises(DataError, match="record 0: the file ends"):
+        list(read_records(path))
+
+
+@pytest.mark.parametrize(
+    "data, said",
+    [
+        (varint(1 << 3 | 2) + varint(50) + b"short", "50 bytes where 5 are left"),
+        (varint(1 << 3 | 4), "wire type 4"),
+        (b"\x80" * 11, "more than ten bytes"),
+        (b"\x0a", "ends within a number"),
+    ],
+)
+def test_bad_messages_are_named(tmp_path: Path, data: bytes, said: str) -> None:
+    path = tmp_path / "a.tfrecord"
+    path.write_bytes(record(data))
+    with pytest.raises(DataError, match=said):
+        list(read_examples(path))
+
+
+def test_asking_for_something_else_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.tfrecord"
+    path.write_bytes(record(example({"a": b"x", "b": [1, 2], "c": np.array([1.0, np.inf], np.float32)})))
+    (one,) = read_examples(path)
+    for call in (
+        lambda: one.blob("b"),
+        lambda: one.integer("b"),
+        lambda: one.integer("none"),
+        lambda: one.numbers("a"),
+        lambda: one.numbers("c"),
+        lambda: one.numbers("c", 3),
+    ):
+        with pytest.raises(DataError, match=r"a.tfrecord: record 0: \w+ holds .* is needed"):
+            call()
+
+
+number = st.floats(-1, 1)
+
+
+def rays_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    width, height = camera.size[0].tolist()
+    origin, direction = rays_through(camera, torch.zeros(width * height, dtype=torch.int64), pixel_grid(camera, 0))
+    return (x.float().numpy().reshape(height, width, 3) for x in (origin, direction))  # type: ignore[return-value]
+
+
+def camera(turn: np.ndarray, k: tuple[float, ...] = (0.0,) * 6, focal: tuple[float, float] = (40.0, 42.0)) -> Cameras:
+    pose = np.concatenate([turn, np.array([[100.0], [-20.0], [3.0]])], 1)
+    return Cameras(
+        pose=torch.from_numpy(pose)[None],
+        focal=torch.tensor([focal], dtype=torch.float64),
+        centre=torch.tensor([[31.0, 25.5]], dtype=torch.float64),
+        size=torch.tensor([[64, 48]]),
+        distortion=torch.tensor([k], dtype=torch.float64),
+        lens=torch.tensor([1 if any(k) else 0]),
+    )
+
+
+def turned(x: float, y: float, z: float) -> np.ndarray:
+    length = math.sqrt(x * x + y * y + z * z)
+    if length < 1e-9:
+        return np.eye(3)
+    a = np.array([x, y, z]) / length
+    cross = np.array([[0, -a[2], a[1]], [a[2], 0, -a[0]], [-a[1], a[0], 0]])
+    angle = length * 3
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)
+
+
+@settings(max_examples=25, deadline=None)
+@given(number, number, number, number, number)
+def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p1: float) -> None:
+    truth = camera(turned(x, y, z), (0.1 * k1, -0.02 * k1, 0.0, 0.0, 0.002 * p1, 0.001))
+    found = fit_camera(*rays_of(truth))
+    assert found.error < 2e-3 and found.drift < 1e-4
+    np.testing.assert_allclose(found.pose, truth.pose[0].numpy(), atol=3e-4)
+    np.testing.assert_allclose(found.focal, (40.0, 42.0), rtol=3e-4)
+    np.testing.assert_allclose(found.centre, (31.0, 25.5), atol=2e-2)
+    np.testing.assert_allclose(found.distortion, truth.distortion[0].numpy(), atol=2e-3)
+
+
+def test_directions_need_not_be_unit() -> None:
+    origin, direction = rays_of(camera(np.eye(3)))
+    found = fit_camera(origin, direction * np.float32(3.5))
+    np.testing.assert_allclose(found.focal, (40.0, 42.0), rtol=1e-4)
+
+
+def test_a_rolling_shutter_is_told_by_its_drift() -> None:
+    origin, direction = rays_of(camera(np.eye(3)))
+    moved = origin + np.linspace(-0.1, 0.1, 48, dtype=np.float32)[:, None, None] * np.array([1, 0, 0], np.float32)
+    found = fit_camera(moved, direction)
+    assert found.drift == pytest.approx(0.1, rel=1e-3) and found.error < 1e-3
+
+
+def test_rays_of_no_camera_have_a_large_error_or_are_refused() -> None:
+    origin, direction = rays_of(camera(np.eye(3)))
+    noisy = direction + np.random.default_rng(0).normal(0, 0.1, direction.shape).astype(np.float32)
+    assert fit_camera(origin, noisy).error > 1.5
+    for wrong in (np.zeros_like(direction), direction[:, ::-1], np.random.default_rng(0).normal(size=direction.shape)):
+        with pytest.raises(ValueError, match="rays"):
+            fit_camera(origin, wrong.astype(np.float32))
+    with pytest.raises(ValueError, match="too few"):
+        fit_camera(origin[:2, :2], direction[:2, :2])
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_files import Capture, write_colmap
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.colmap import MODELS, model_folder, read_model
+from fprf.datamanagers.parsers.colmap import MODELS, model_folder
 from fprf.datamanagers.parsers.config import ColmapConfig
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
 
-FUZZ = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 ID = {name: index for index, (name, _) in enumerate(MODELS)}
 
 
@@ -34,17 +31,6 @@ def test_a_model_is_the_capture(tmp_path: Path, binary: bool) -> None:
     depth = (capture.points - capture.poses[3, :, 3]) @ -capture.poses[3, :, 2]
     assert scene.depths is not None
     assert scene.depths[3].tolist() == pytest.approx(np.percentile(depth, (0.1, 99.9)).tolist(), rel=1e-12)
-
-
-def test_binary_and_text_agree_to_the_bit(tmp_path: Path) -> None:
-    capture = Capture.make()
-    one = read_model(write_colmap(tmp_path / "a", capture))
-    other = read_model(write_colmap(tmp_path / "b", capture, binary=False))
-    assert one.cameras == other.cameras
-    assert np.array_equal(one.points, other.points) and np.array_equal(one.point_ids, other.point_ids)
-    for a, b in zip(one.images, other.images, strict=True):
-        assert (a.name, a.camera, a.quaternion, a.translation) == (b.name, b.camera, b.quaternion, b.translation)
-        assert np.array_equal(a.observed, b.observed)
 
 
 @pytest.mark.parametrize(
@@ -156,19 +142,6 @@ def test_counts_are_checked_before_memory_is_taken(tmp_path: Path, file: str) ->
             parse(tmp_path)
 
 
-@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_truncation_anywhere_is_a_data_error(tmp_path: Path, file: str) -> None:
-    path = write_colmap(tmp_path, Capture.make(2)) / file
-    whole = path.read_bytes()
-    for stop in sorted({*range(min(len(whole), 120)), *range(0, len(whole), 37)}):
-        path.write_bytes(whole[:stop])
-        with pytest.raises(DataError, match=f"{file}: byte"):
-            read_model(path.parent)
-    path.write_bytes(whole + b"\0")
-    with pytest.raises(DataError, match="bytes too many"):
-        read_model(path.parent)
-
-
 @pytest.mark.parametrize(
     ("file", "text", "finding"),
     [
@@ -200,25 +173,3 @@ def test_an_image_without_features_and_a_name_with_spaces(tmp_path: Path) -> Non
     (sparse / "images.txt").write_text("1 1 0 0 0 0 0 0 7 a b.png\n\n2 1 0 0 0 1 0 0 7 0001.png\n")
     scene = parse(tmp_path)
     assert [path.name for path in scene.paths] == ["0001.png", "a b.png"] and scene.depths is None
-
-
-@FUZZ
-@given(st.data(), st.sampled_from(["cameras", "images", "points3D"]), st.booleans())
-def test_any_bytes_are_a_scene_or_a_data_error(tmp_path: Path, data: st.DataObject, file: str, binary: bool) -> None:
-    suffix = "bin" if binary else "txt"
-    root = tmp_path / suffix
-    if not root.exists():
-        write_colmap(root, Capture.make(2), binary=binary)
-        for path in (root / "sparse" / "0").iterdir():
-            path.with_suffix(".whole").write_bytes(path.read_bytes())
-    for whole in (root / "sparse" / "0").glob("*.whole"):
-        whole.with_suffix(f".{suffix}").write_bytes(whole.read_bytes())
-    path = root / "sparse" / "0" / f"{file}.{suffix}"
-    content = bytearray(path.read_bytes())
-    for _ in range(data.draw(st.integers(0, 4))):
-        content[data.draw(st.integers(0, min(len(content), 400) - 1))] = data.draw(st.integers(0, 255))
-    path.write_bytes(content[: data.draw(st.sampled_from([len(content), len(content) // 2]))])
-    try:
-        parse(root)
-    except DataError as error:
-        assert "\n" not in str(error)

@@ -174,23 +174,3 @@ def test_a_unit_of_meganerf_that_is_none(tmp_path: Path, unit: object) -> None:
     with pytest.raises(DataError, match=r"coordinates.pt: pose_scale_factor is .*write it again") as told:
         parse_scene(tmp_path, 1, MegaNerfConfig())
     assert "\n" not in str(told.value)
-
-
-@pytest.mark.parametrize("name", ["W", "H"])
-@pytest.mark.parametrize("value", [float("inf"), torch.zeros(2), torch.tensor(float("nan"))])
-def test_a_size_of_meganerf_that_is_none(tmp_path: Path, name: str, value: object) -> None:
-    write_meganerf(tmp_path, Capture.make(3), held=())
-    file = sorted((tmp_path / "train/metadata").iterdir())[0]
-    torch.save(torch.load(file, weights_only=True) | {name: value}, file)
-    with pytest.raises(DataError, match="W, H, c2w"):
-        parse_scene(tmp_path, 1, MegaNerfConfig())
-
-
-@pytest.mark.parametrize("data", [b"", b"\x80\x02.", b"\x80\x02t.", b"\x80\x02]\x85q\x00a.", b"PK\x03\x04"])
-def test_bytes_that_confuse_the_unpickler_are_one_line(tmp_path: Path, data: bytes) -> None:
-    write_meganerf(tmp_path, Capture.make(3), held=())
-    file = sorted((tmp_path / "train/metadata").iterdir())[0]
-    file.write_bytes(data)
-    with pytest.raises(DataError, match="no tensors of torch") as told:
-        parse_scene(tmp_path, 1, MegaNerfConfig())
-    assert "\n" not in str(told.value)

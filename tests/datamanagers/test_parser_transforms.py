@@ -7,14 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_files import Capture, write_image, write_transforms
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from fprf.datamanagers.parsers.config import TransformsConfig
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
-
-FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def parse(folder: Path, downscale: int = 1, file: str = "") -> Scene:
@@ -37,14 +33,6 @@ def test_global_and_per_frame_intrinsics_are_the_same(tmp_path: Path) -> None:
     assert one.cameras.lens.unique().tolist() == [1]
     assert one.points is not None and np.allclose(one.points.numpy(), capture.points, atol=1e-6)
     assert one.depths is None and one.test.tolist() == [0, 8]
-
-
-def test_views_are_sorted_by_name(tmp_path: Path) -> None:
-    capture = Capture.make(5)
-    content = write_transforms(tmp_path, capture)
-    edit(tmp_path, content, frames=list(reversed(content["frames"])))  # type: ignore[call-overload]
-    assert [path.name for path in parse(tmp_path).paths] == list(capture.names)
-    assert np.allclose(parse(tmp_path).cameras.pose.numpy(), capture.poses, atol=1e-14)
 
 
 def test_depths_stand_by_frame_or_once(tmp_path: Path) -> None:
@@ -135,62 +123,6 @@ def test_the_capture_says_what_is_held_out(tmp_path: Path, lists: dict[str, obje
     assert scene.train.tolist() == train and scene.test.tolist() == test
 
 
-@pytest.mark.parametrize(
-    ("changes", "finding"),
-    [
-        ({"frames": []}, "no list of frames"),
-        ({"frames": None}, "no list of frames"),
-        ({"fl_x": 0}, "focal length is 0"),
-        ({"fl_y": -3}, "focal length is -3"),
-        ({"fl_x": "20"}, "fl_x is '20', not a number"),
-        ({"w": 25}, "24x16 pixels, but its camera has 25x16"),
-        ({"w": 0}, "w and h are 0 and 16"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not supported"),
-        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "fisheye with tangential"),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, "PINHOLE with distortion"),
-        ({"near": 3, "far": 1}, "0 < near < far"),
-        ({"test_filenames": ["images/0009.png"]}, "'images/0009.png', which no frame is"),
-        ({"test_filenames": ["images/0000.png"], "train_filenames": ["images/0000.png"]}, "is in train_filenames and in"),
-        ({"test_filenames": "x"}, "test_filenames is 'x'"),
-        ({"fl_x": None, "fl_y": None, "camera_angle_x": 4.0}, "between 0 and pi"),
-        ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
-    ],
-)
-def test_what_the_file_must_not_say(tmp_path: Path, changes: dict[str, object], finding: str) -> None:
-    edit(tmp_path, write_transforms(tmp_path, Capture.make(2)), **changes)
-    with pytest.raises(DataError, match=finding) as caught:
-        parse(tmp_path)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("changes", "finding"),
-    [
-        ({"file_path": "images/none.png"}, r"1 of 3 images are missing, the first is .*none\.png"),
-        ({"file_path": "/etc/passwd"}, r"frames\[1\]: the path '/etc/passwd' leaves"),
-        ({"file_path": "../0001.png"}, r"frames\[1\]: the path"),
-        ({"file_path": None}, r"frames\[1\]: file_path is missing"),
-        ({"file_path": "images/0000.png"}, "0000.png occurs twice"),
-        ({"transform_matrix": np.eye(4)[:2].tolist()}, r"frames\[1\]: transform_matrix is a list, not 3 or 4 rows"),
-        ({"transform_matrix": (2 * np.eye(4)).tolist()}, r"frames\[1\] \(images/0001.png\): the pose's last row"),
-        ({"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, r"frames\[1\] \(images/0001.png\): the pose holds no rotation"),
-        ({"transform_matrix": [["a"] * 4] * 4}, "not 3 or 4 rows"),
-        ({"transform_matrix": None}, "transform_matrix is missing"),
-    ],
-)
-def test_bad_frames_are_named(tmp_path: Path, changes: dict[str, object], finding: str) -> None:
-    content = write_transforms(tmp_path, Capture.make(3))
-    content["frames"][1].update(changes)  # type: ignore[index]
-    edit(tmp_path, content)
-    with pytest.raises(DataError, match=finding):
-        parse(tmp_path)
-
-
-def test_no_file_at_all(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"neither transforms\.json nor transforms_train\.json"):
-        parse(tmp_path)
-
-
 def test_points_of_another_shape_are_refused_and_infinite_ones_dropped(tmp_path: Path) -> None:
     write_transforms(tmp_path, Capture.make(2))
     np.savez(tmp_path / "points.npz", xyz=np.array([[0, 0, 1], [np.inf, 0, 0], [np.nan, 0, 0]]))
@@ -199,34 +131,3 @@ def test_points_of_another_shape_are_refused_and_infinite_ones_dropped(tmp_path:
     np.savez(tmp_path / "points.npz", xyz=np.zeros((4, 2)))
     with pytest.raises(DataError, match=r"\(4, 2\), not \[P 3\]"):
         parse(tmp_path)
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
-    max_leaves=8,
-)
-KEYS = ["w", "h", "fl_x", "cx", "k1", "p1", "camera_model", "near", "far", "file_path", "transform_matrix", "frames"]
-
-
-@FUZZ
-@given(st.dictionaries(st.sampled_from([*KEYS, "train_filenames", "is_fisheye"]), JSON, max_size=3), st.booleans())
-def test_any_values_are_a_scene_or_a_data_error(tmp_path: Path, changes: dict[str, object], in_frame: bool) -> None:
-    if not (tmp_path / "whole").exists():
-        (tmp_path / "whole").write_text(json.dumps(write_transforms(tmp_path, Capture.make(2))))
-    content = json.loads((tmp_path / "whole").read_text())
-    (content["frames"][1] if in_frame else content).update(changes)
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    try:
-        parse(tmp_path)
-    except DataError as error:
-        assert "\n" not in str(error)
-
-
-def test_truncation_anywhere_is_a_data_error(tmp_path: Path) -> None:
-    write_transforms(tmp_path, Capture.make(2))
-    whole = (tmp_path / "transforms.json").read_bytes()
-    for stop in range(0, len(whole) - 1, 7):
-        (tmp_path / "transforms.json").write_bytes(whole[:stop])
-        with pytest.raises(DataError, match="no valid JSON"):
-            parse(tmp_path)

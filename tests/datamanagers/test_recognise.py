@@ -1,5 +1,7 @@
-"""Which parser a folder gets, and the same scene in every format."""
+"""Which parser a folder gets, the same scene in every format, and the contract that parsers keep."""
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +14,17 @@ from fprf.datamanagers.parsers.config import (
     ColmapConfig,
     DataParserConfig,
     LlffConfig,
+    Recognised,
     TownConfig,
     TransformsConfig,
     parse_scene,
     recognise,
 )
 from fprf.datamanagers.scene import Scene
-from fprf.errors import ConfigError, DataError
+from fprf.errors import DataError
+from fprf.interfaces import DataParser
 from fprf.rendering.cameras import project, rays_through
+from fprf.testing import check_parser
 
 
 def rays(scene: Scene) -> tuple[torch.Tensor, torch.Tensor]:
@@ -47,14 +52,6 @@ def test_one_capture_in_every_format_has_the_same_rays(tmp_path: Path, downscale
     first = parse_scene(tmp_path / "transforms", downscale, None)
     for name in ("llff", "llff_8", "colmap", "text"):
         assert_same(first, parse_scene(tmp_path / name, downscale, None))
-
-
-def test_one_distorted_capture_in_two_formats(tmp_path: Path) -> None:
-    k = (0.05, -0.02, 0.001, -0.002)
-    capture = Capture.make(4, k=k)
-    write_transforms(tmp_path / "a", capture)
-    write_colmap(tmp_path / "b", capture, model=(4, "OPENCV"), params=(20.0, 20.0, 12.0, 8.0, *k))
-    assert_same(parse_scene(tmp_path / "a", 2, None), parse_scene(tmp_path / "b", 2, None))
 
 
 def test_formats_are_told_by_their_files(tmp_path: Path) -> None:
@@ -164,20 +161,6 @@ def test_a_broken_parser_is_named_and_skipped(
             recognise(folder)
 
 
-def test_a_named_parser_wins(tmp_path: Path) -> None:
-    capture = Capture.make(3)
-    write_colmap(tmp_path, capture)
-    write_llff(tmp_path, capture)
-    assert parse_scene(tmp_path, 1, ColmapConfig()).points is not None
-    assert parse_scene(tmp_path, 1, LlffConfig()).points is None
-
-
-def test_the_town_s_ranges() -> None:
-    for field in ("views", "width", "height"):
-        with pytest.raises(ConfigError, match=field):
-            TownConfig(**{field: 1})
-
-
 SCENES = ["blender_lego", "drone_caliterra", "fox", "llff_fern", "llff_flower", "m360_bonsai", "street_lund"]
 
 
@@ -214,3 +197,74 @@ def test_real_points_of_both_sources_agree(shared: Path) -> None:
     other = parse_scene(folder, 1, ColmapConfig()).points
     assert one is not None and other is not None
     assert np.allclose(np.sort(one.numpy(), 0), np.sort(other.numpy(), 0), rtol=1e-6)
+
+
+class Parser(DataParser):
+    """The built-in one, with one thing wrong."""
+
+    def __init__(self, wrong: str) -> None:
+        self.wrong, self.calls = wrong, 0
+
+    def parse(self, data: Path, downscale: int) -> Scene:
+        self.calls += 1
+        if self.wrong == "absent" and not data.exists():
+            raise FileNotFoundError(data)
+        scene = TransformsConfig().build().parse(data, 1 if self.wrong == "size" else downscale)
+        pose = scene.cameras.pose
+        changed: dict[str, Callable[[], Scene]] = {
+            "mirrored": lambda: replace(scene, cameras=replace(scene.cameras, pose=pose * torch.tensor([[-1.0, 1, 1, 1]]))),
+            "scaled": lambda: replace(scene, cameras=replace(scene.cameras, pose=2 * pose)),
+            "float": lambda: replace(scene, cameras=replace(scene.cameras, pose=pose.float())),
+            "split": lambda: replace(scene, test=scene.train[:1]),
+            "paths": lambda: replace(scene, paths=scene.paths[1:]),
+            "order": lambda: replace(scene, paths=scene.paths[:: 1 if self.calls == 1 else -1]),
+        }
+        return changed.get(self.wrong, lambda: scene)()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParserConfig(DataParserConfig):
+    wrong: str = ""
+
+    def recognises(self, data: Path) -> Recognised | None:
+        anything = {"anything": Recognised(0.5, ""), "surer": Recognised(2.0, "")}
+        known = Recognised(0.5, "transforms.json") if (data / "transforms.json").exists() else None
+        return anything.get(self.wrong, known)
+
+    def build(self) -> DataParser:
+        return Parser(self.wrong)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One capture in three formats."""
+    folder = tmp_path_factory.mktemp("capture")
+    for write in (write_transforms, write_llff, write_colmap):
+        write(folder / write.__name__, Capture.make(9))
+    return folder
+
+
+def test_built_in_and_plain_parsers_pass(capture: Path) -> None:
+    for config, name in ((TransformsConfig(), "transforms"), (LlffConfig(), "llff"), (ColmapConfig(), "colmap")):
+        check_parser(config, capture / f"write_{name}")
+    check_parser(ParserConfig(), capture / "write_transforms")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "breach"),
+    [
+        ("mirrored", AssertionError, "right-handed"),
+        ("scaled", AssertionError, "must be rotations"),
+        ("float", AssertionError, "fp64"),
+        ("split", AssertionError, "train and test"),
+        ("paths", AssertionError, "8 paths but 9 cameras"),
+        ("order", AssertionError, "the same each time"),
+        ("size", AssertionError, "must halve the size"),
+        ("anything", AssertionError, "must not recognise a folder that is absent"),
+        ("surer", AssertionError, r"in \(0, 1\]"),
+        ("absent", FileNotFoundError, "no-such-folder"),
+    ],
+)
+def test_a_breach_of_a_parser_is_told(capture: Path, wrong: str, error: type[Exception], breach: str) -> None:
+    with pytest.raises(error, match=breach):
+        check_parser(ParserConfig(wrong=wrong), capture / "write_transforms")

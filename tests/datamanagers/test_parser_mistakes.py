@@ -1,0 +1,70 @@
+"""Values that no capture may hold, one at a time in files that are right otherwise: each is refused in one line."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from capture_files import Capture, write_llff, write_odm, write_polycam, write_record3d, write_transforms
+
+from fprf.datamanagers.parsers.config import parse_scene
+from fprf.errors import DataError
+
+EYE, BENT = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]", "[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]"
+WRONG = {
+    "transforms": """frames=[] frames=null fl_x=0 fl_y=-3 fl_x="20" w=25 w=0 camera_model="EQUIRECTANGULAR" near=3&far=1
+        camera_model="OPENCV_FISHEYE"&p1=0.1 camera_model="PINHOLE"&k1=0.1 test_filenames=["images/0009.png"]
+        test_filenames=["images/0000.png"]&train_filenames=["images/0000.png"] test_filenames="x"
+        fl_x=null&fl_y=null&camera_angle_x=4.0 fl_x=null&fl_y=null""",
+    "frame": f"""file_path="images/none.png" file_path="/etc/passwd" file_path="../0001.png" file_path=null
+        file_path="images/0000.png" transform_matrix=[[1,0,0,0],[0,1,0,0]] transform_matrix={EYE[:-2]}2]]
+        transform_matrix={BENT} transform_matrix=[["a"]] transform_matrix=null""",
+    "polycam": 't_00=null fx="20" fx=-1.0 t_11=7.0 width=0 width=1e9 width=48',
+    "record3d": """poses=[[0,0,0,1,0,0,0],[0,0,0,1,0,0,0]] poses=[[0,0,0,1,0,0,0]] poses=[[0,0,0,2,0,0,0],[0,0,0,2,1,0,0]]
+        poses=[[1,2,3]] poses=null K=[1,2] perFrameIntrinsicCoeffs=[[1,2,3,"4"]] w=null h=1e9 h=17""",
+    "odm": """projection_type="spherical" focal_x=null&focal_y=null focal_x=-0.5 width=24&height=24 k1="x" """,
+    "shot": 'rotation=[1,2] rotation=[1e9,0,0] translation=null camera="none"',
+    "reconstruction": '=[] ={} =[{}] =[{"shots":{}}] =[3] =[{"shots":3}]',
+    "llff": "0=NaN 15=Infinity 1=3.0 4=0.0 9=1e30 14=-5.0 15=10.0 9=16.0",
+    "rows": "=[] =[[1,2,3]] =[1,2,3]",
+}
+"""Changes `key=value` by what they are made to, several at once joined by &."""
+
+
+def changed(folder: Path, file: Path, change: Callable[[Any], object]) -> None:
+    content = json.loads(file.read_text())
+    replaced = change(content)
+    file.write_text(json.dumps(content if replaced is None else replaced))
+
+
+@pytest.mark.parametrize(("what", "change"), [(what, change) for what, line in WRONG.items() for change in line.split()])
+def test_wrong_values_are_refused_in_one_line(tmp_path: Path, what: str, change: str) -> None:
+    values = {key: json.loads(value) for key, _, value in (each.partition("=") for each in change.split("&"))}
+    capture = Capture.make(2)
+    if what in ("llff", "rows"):
+        rows = write_llff(tmp_path, capture)
+        for column, value in values.items():
+            if what == "rows":
+                rows = np.array(value, float)
+            else:
+                rows[1, int(column)] = value
+        np.save(tmp_path / "poses_bounds.npy", rows)
+    elif what in ("transforms", "frame"):
+        write_transforms(tmp_path, capture)
+        place = (lambda c: c["frames"][1].update(values)) if what == "frame" else (lambda c: c.update(values))
+        changed(tmp_path, tmp_path / "transforms.json", place)
+    elif what == "polycam":
+        write_polycam(tmp_path / "keyframes", capture, **values)
+    elif what == "record3d":
+        write_record3d(tmp_path, capture, **values)
+    else:
+        file = write_odm(tmp_path, capture, **(values if what == "odm" else {}))
+        if what == "shot":
+            changed(tmp_path, file, lambda c: c[0]["shots"]["0001.png"].update(values))
+        if what == "reconstruction":
+            changed(tmp_path, file, lambda c: values[""])
+    with pytest.raises(DataError) as fault:
+        parse_scene(tmp_path, 1, None)
+    assert "\n" not in str(fault.value) and str(tmp_path) in str(fault.value)
