@@ -98,6 +98,9 @@ class SplatVerbs(Verbs):
 
 def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) -> Path:
     """Train to the end, or go on; see `train.train_scene` for fields."""
+    from ..ops.rasterise_training import compile_beside
+
+    compiling = compile_beside((config.degree + 1) ** 2)  # while torch is imported and images are read
     from ..io.atomic import remove_unfinished
     from ..splats.training import facts_of, prepare, scene_of, train, with_downscale
     from ..training import originals
@@ -135,6 +138,11 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
             display.training(event)
             log(event)
 
+        if compiling:
+            display.say("compiling kernels, once after installation")
+            for process in compiling:
+                process.wait()
+            spent = time.perf_counter() - start
         train(config, prepared, folder, report, spent=spent)
         display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
     return output

@@ -49,13 +49,15 @@ from .simd import (
 )
 from .threads import on_threads
 
-__all__ = ["SUMS", "adam", "composite_back", "gradients", "lift", "lift_values"]
+__all__ = ["SUMS", "adam", "cache_path", "composite_back", "gradients", "lift", "lift_values"]
 
 SUMS = LANES
 GEOMETRY = 6
 """Sums of an entry that are about its shape; those of channels follow."""
 _LOG_MAX = math.log2(MAX_ALPHA)
 _HUGE = 1e16
+_BETAS = 0.9, 0.99
+"""Of Adam's moments."""
 _BLOCK = SUMS * LANES
 
 
@@ -338,16 +340,16 @@ def _block_gradient(blocks, at, bands, view, summed):
 
 
 @traced
-def _learn_block(blocks, first, second, at, bands, view, memory, rates, grown, beta2):
+def _learn_block(blocks, first, second, at, bands, view, memory, rates, unbiased):
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 3]
     for row, g in enumerate(_block_gradient(blocks, at, bands, view, [*summed, 0])):
         o = at + row * LANES
         m, s = load(first, o), load(second, o)
-        m = m + 0.1 * (g - m)
-        s = s + (1 - beta2) * (g * g - s)
+        m = m + (1 - _BETAS[0]) * (g - m)
+        s = s + (1 - _BETAS[1]) * (g * g - s)
         store(first, o, m)
         store(second, o, s)
-        store(blocks, o, load(blocks, o) - rates[row] * grown[0] * m / (square_root(s * grown[1]) + 1e-15))
+        store(blocks, o, load(blocks, o) - rates[row] * unbiased[0] * m / (square_root(s * unbiased[1]) + 1e-15))
 
 
 @traced
@@ -393,7 +395,7 @@ def _gradients(bands):
 
 def _adam(bands):
     @jit
-    def adam(counters, blocks, first, second, count, view, found, first_slot, rates, grown, beta2):
+    def adam(counters, blocks, first, second, count, view, found, first_slot, rates, unbiased):
         memory = stack(_BLOCK)
         while True:
             begin = take(counters, 0) * BLOCKS * LANES
@@ -403,7 +405,7 @@ def _adam(bands):
                 if first_slot[start + LANES] > first_slot[start]:
                     _add_block(found, first_slot, start, memory)
                     at = start * (FIXED + 3 * bands)
-                    _learn_block(blocks, first, second, at, bands, view, memory, rates, grown, beta2)
+                    _learn_block(blocks, first, second, at, bands, view, memory, rates, unbiased)
 
     return adam
 
@@ -427,12 +429,16 @@ def adam(
     found: Floats,
     first_slot: Any,
     rates: Floats,
-    grown: Floats,
-    beta2: np.float32,
+    step: int,
 ) -> None:
     """One step of Adam, in place, for the blocks that have an entry; the others keep their moments as well.
 
-    found: sums of shape and colour. rates: a learning rate for each row of a block; grown: what the two moments are multiplied
-    by, 1 / (1 - beta^step).
+    found: sums of shape and colour. rates: a learning rate for each row of a block. step: how many there were before.
     """
-    on_threads(_ADAM[bands], blocks, first, second, count, view, found, first_slot, rates, grown, beta2)
+    unbiased = np.array([1 / (1 - beta ** (step + 1)) for beta in _BETAS], np.float32)
+    on_threads(_ADAM[bands], blocks, first, second, count, view, found, first_slot, rates, unbiased)
+
+
+def cache_path(bands: int) -> str:
+    """The folder where numba keeps what it compiled of this module."""
+    return str(_ADAM[bands].stats.cache_path)

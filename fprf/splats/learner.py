@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..ops import photometric, rasterise_gradient_kernels, rasterise_kernels
 from ..ops.rasterise_kernels import FIXED, SLOTS
+from ..ops.rasterise_training import learn
 from ..ops.simd import LANES
 from .config import GaussiansConfig
 from .gaussians import HARMONIC, Gaussians
@@ -27,7 +27,6 @@ _DEAD = 0.005
 _SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
 """Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
 _START_OPACITY, _START_SCALE = 0.3, 0.7
-_BETA2 = 0.99
 _BINOMIALS = [[math.comb(i, k) for k in range(i + 1)] for i in range(11)]
 
 
@@ -78,32 +77,20 @@ class Learner:
         views = list(level.photographs)
         epoch, turn = divmod(step, len(views))
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
-        camera, planes, blurred, valid = level.photographs[view]
-        width, height = level.width, level.height
-        rasterise_kernels.project(self.blocks, self.count, self.bands, camera, width, height, self.splats)
-        entries = rasterise_kernels.bins(self.splats, self.count, width, height)
-        out, left = np.zeros(len(planes), np.float32), np.empty(len(planes) // 3, np.float32)
-        behind = np.array(self.config.background, np.float32)
-        rasterise_kernels.composite(3, entries, self.splats, self.splats, SLOTS, 6, behind, width, height, out, left)
-        l1, ssim, slope = photometric.loss(out, planes, blurred, width, height, self.config.ssim)
-        if not math.isfinite(l1 + ssim):
-            return None
-        if valid is not None:
-            slope *= valid
-        found = rasterise_gradient_kernels.composite_back(
-            3, entries, self.splats, self.splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
-        )
-        grown = np.array([1 / (1 - 0.9 ** (step + 1)), 1 / (1 - _BETA2 ** (step + 1))], np.float32)
-        rasterise_gradient_kernels.adam(
-            self.blocks, self.first, self.second, self.count, self.bands, camera, found, entries.first_slot,
-            self._rates(share), grown, np.float32(_BETA2),
+        target = level.photographs[view]
+        found = learn(
+            self.blocks, (self.first, self.second), self.count, self.bands, self.splats, target,
+            background=self.config.background, ssim=self.config.ssim, rates=self._rates(share), step=step,
         )  # fmt: skip
+        if not math.isfinite(found.l1 + found.ssim):
+            return None
         if (step + 1) % self.config.relocate_every == 0 and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, share)
+        height, width = level.height, level.width
         tall, wide = -(-height // LANES) * LANES, -(-width // LANES) * LANES
-        apart = (out - planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
+        apart = (found.image - target.planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
         squared = float(np.square(apart).mean())
-        return Step(l1, ssim, squared, self.count, width * height)
+        return Step(found.l1, found.ssim, squared, self.count, width * height)
 
     def _rates(self, share: float) -> Floats:
         """Learning rates of the rows of a block. They fall to a tenth, those of the means to a fiftieth."""

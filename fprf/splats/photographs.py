@@ -13,9 +13,10 @@ from ..datamanagers.scene import Scene
 from ..errors import DataError
 from ..ops.photometric import blurred, slack
 from ..ops.rasterise import Pinhole, camera_array
+from ..ops.rasterise_training import Target
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
 
-__all__ = ["Floats", "Level", "Photograph", "cover", "distorted", "make_levels", "pinhole", "undistorted"]
+__all__ = ["Floats", "Level", "cover", "distorted", "make_levels", "pinhole", "undistorted"]
 
 Floats = NDArray[np.float32]
 _PANORAMA = 3
@@ -23,24 +24,12 @@ _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 
 
-class Photograph(NamedTuple):
-    """One training view at one size, as the kernels take it."""
-
-    camera: Floats
-    planes: Floats
-    """Colours in [0, 1], [3, H16, W16] flat with slack."""
-    blurred: Floats
-    """What SSIM needs of them (`ops.photometric.blurred`)."""
-    valid: Floats | None
-    """1 where the photograph counts, 0 elsewhere, in the shape of the gradient; None = everywhere."""
-
-
 class Level(NamedTuple):
     """Training views of one size, by view."""
 
     width: int
     height: int
-    photographs: dict[int, Photograph]
+    photographs: dict[int, Target]
 
 
 def pinhole(cameras: Cameras, view: int, near: float) -> Pinhole:
@@ -104,8 +93,8 @@ def make_levels(
     views = scene.train.tolist()
     cameras = {view: cover(scene.cameras, view, near)[0] for view in views}
     width, height = max(each.width for each in cameras.values()), max(each.height for each in cameras.values())
-    fine: dict[int, Photograph] = {}
-    coarse: dict[int, Photograph] = {}
+    fine: dict[int, Target] = {}
+    coarse: dict[int, Target] = {}
     for view in views:
         camera = cameras[view]
         image, valid = undistorted(scene.cameras, view, images[view], camera)
@@ -128,7 +117,7 @@ def make_levels(
     return Level(width, height, fine), Level(max(1, width // 2), max(1, height // 2), coarse)
 
 
-def _photograph(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, width: int, height: int) -> Photograph:
+def _photograph(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, width: int, height: int) -> Target:
     """Pad a view to the size of its level; what is added does not count."""
     if (camera.width, camera.height) != (width, height):
         seen = np.zeros((height, width), np.bool_)
@@ -141,7 +130,7 @@ def _photograph(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | Non
     if used is not None:
         used = used[: _area(width, height) * 3 + 64]
     array = camera_array(camera._replace(width=width, height=height), True)
-    return Photograph(array, planes, blurred(planes, width, height), used)
+    return Target(width, height, array, planes, blurred(planes, width, height), used)
 
 
 def _area(width: int, height: int) -> int:

@@ -1,0 +1,119 @@
+"""One step of training Gaussians on compiled kernels, without torch; and how to have them compiled by another process.
+
+Numba keeps what it compiled in its cache. `python -m fprf.ops.rasterise_training BANDS PART` puts there what half of a step
+needs, in three seconds; a command starts these first and has its kernels when it has read its images.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from . import photometric, rasterise_gradient_kernels, rasterise_kernels
+from .rasterise_kernels import FIXED, SLOTS
+from .simd import LANES
+
+__all__ = ["Learnt", "Target", "compile_beside", "learn"]
+
+Floats = np.ndarray[Any, np.dtype[np.float32]]
+
+
+_PARTS = "forward", "backward"
+
+
+class Target(NamedTuple):
+    """One photograph at one size, as the kernels take it."""
+
+    width: int
+    height: int
+    camera: Floats
+    planes: Floats
+    """Colours in [0, 1], [3, H16, W16] flat with `photometric.slack`."""
+    blurred: Floats
+    """What SSIM needs of them (`photometric.blurred`)."""
+    valid: Floats | None
+    """1 where the photograph counts, 0 elsewhere, in the shape of the gradient; None = everywhere."""
+
+
+class Learnt(NamedTuple):
+    """What a step measured before it moved anything."""
+
+    l1: float
+    ssim: float
+    image: Floats
+    """Planes like those of the target."""
+
+
+def learn(
+    blocks: Floats,
+    moments: tuple[Floats, Floats],
+    count: int,
+    bands: int,
+    splats: Floats,
+    target: Target,
+    *,
+    background: tuple[float, float, float],
+    ssim: float,
+    rates: Floats,
+    step: int,
+) -> Learnt:
+    """Render `count` Gaussians, compare, and move them by a step of Adam, the first one being 0. Where the loss is not finite
+    nothing is changed. `splats` is room for SLOTS numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss.
+    """
+    width, height, camera, planes, blurred, valid = target
+    rasterise_kernels.project(blocks, count, bands, camera, width, height, splats)
+    entries = rasterise_kernels.bins(splats, count, width, height)
+    out, left = np.zeros(len(planes), np.float32), np.empty(len(planes) // 3, np.float32)
+    behind = np.array(background, np.float32)
+    rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, behind, width, height, out, left)
+    l1, similar, slope = photometric.loss(out, planes, blurred, width, height, ssim)
+    if not np.isfinite(l1 + similar):
+        return Learnt(l1, similar, out)
+    if valid is not None:
+        slope *= valid
+    found = rasterise_gradient_kernels.composite_back(
+        3, entries, splats, splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
+    )
+    rasterise_gradient_kernels.adam(
+        blocks, *moments, count, bands, camera, found, entries.first_slot, rates, step
+    )  # fmt: skip
+    return Learnt(l1, similar, out)
+
+
+def compile_beside(bands: int) -> "list[subprocess.Popen[bytes]]":
+    """Start compilation in two other processes, to be waited for before `learn`; none where numba's cache holds something."""
+    cache = Path(rasterise_gradient_kernels.cache_path(bands))
+    if any(cache.glob(f"{rasterise_gradient_kernels.__name__.rpartition('.')[2]}*.nbi")):
+        return []
+    quiet = subprocess.DEVNULL
+    line = [sys.executable, "-m", __name__, str(bands)]
+    return [subprocess.Popen([*line, part], stdin=quiet, stdout=quiet, stderr=quiet) for part in _PARTS]
+
+
+def _compile(bands: int, part: str) -> None:
+    size, rows = LANES, FIXED + 3 * bands
+    camera = np.array([1, 0, 0, 0, 1, 0, 0, 0, 1, *[0] * 10, -1, 1, -1, 1, 1, 0], np.float32)
+    planes, left = np.zeros(3 * size * size + photometric.slack(size), np.float32), np.zeros((size, size), np.float32)
+    blocks, first, second, splats = np.zeros((4, rows * LANES), np.float32)
+    nothing = np.zeros(0, np.int32)
+    entries = rasterise_kernels.Entries(
+        np.zeros(2, np.int32), nothing, nothing, nothing, np.zeros(size + LANES + 1, np.int32), nothing
+    )
+    if part == "forward":
+        rasterise_kernels.project(blocks, size, bands, camera, size, size, splats)
+        entries = rasterise_kernels.bins(splats, size, size, size)
+        rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, camera[:3], size, size, planes, left.reshape(-1))
+    else:
+        slope = photometric.loss(planes, planes, photometric.blurred(planes, size, size), size, size, 0.2)[2]
+        found = rasterise_gradient_kernels.composite_back(
+            3, entries, splats, splats, SLOTS, 6, size, size, planes, left.reshape(-1), slope, left.reshape(-1)
+        )  # fmt: skip
+        rasterise_gradient_kernels.adam(
+            blocks, first, second, size, bands, camera, found, entries.first_slot, np.zeros(rows, np.float32), 0
+        )  # fmt: skip
+
+
+if __name__ == "__main__":
+    _compile(int(sys.argv[1]), sys.argv[2])
