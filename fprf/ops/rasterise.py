@@ -217,10 +217,11 @@ def _view(
     antialiased: bool,
 ) -> _View:
     from . import rasterise_kernels as kernels
+    from .simd import aligned
 
     count, bands, seen = len(means), harmonics.shape[1], camera_array(camera, antialiased)
-    blocks = np.empty(-(-count // kernels.LANES) * kernels.LANES * (kernels.FIXED + 3 * bands), np.float32)
-    splats = np.empty(-(-count // kernels.LANES) * kernels.LANES * kernels.SLOTS, np.float32)
+    blocks = aligned(-(-count // kernels.LANES) * kernels.LANES * (kernels.FIXED + 3 * bands))
+    splats = aligned(-(-count // kernels.LANES) * kernels.LANES * kernels.SLOTS)
     plain = (x.detach().contiguous().numpy() for x in (means, quaternions, log_scales, logits, harmonics))
     kernels.pack(*plain, blocks)
     kernels.project(blocks, count, bands, seen, camera.width, camera.height, splats)

@@ -17,7 +17,7 @@ from .rasterise_kernels import (
     BLUR,
     FIXED,
     MAX_ALPHA,
-    ROWS,
+    SIDE,
     SLOTS,
     TILE,
     Entries,
@@ -25,23 +25,27 @@ from .rasterise_kernels import (
     alpha_of,
     axes,
     basis,
+    block_places,
     colour,
     direction,
     footprint,
+    from_first_block,
+    inside,
     jit,
-    log_alpha,
     opacity,
-    open_rows,
+    open_blocks,
 )
 from .simd import (
     LANES,
-    as_float,
+    aligned,
     load,
+    lowest_bit,
     splat,
     square_root,
     stack,
     store,
     sums,
+    swapped,
     take,
     traced,
     transposed,
@@ -62,21 +66,27 @@ _BLOCK = SUMS * LANES
 
 
 @traced
-def _begin_row(y, memory, channels, geometry, out, left, grad, grad_left, d, area):
-    """Transmittance 1, what is behind everything so far, in the direction of the gradient, and the gradient."""
-    store(memory, y * LANES, 1)
-    behind = load(grad_left, d) * load(left, d) if geometry else None
-    for c in range(channels):
-        g = load(grad, area * c + d)
-        store(memory, y * LANES + (2 + c) * TILE, g)
-        behind = behind + g * load(out, area * c + d) if geometry else None
+def _begin(row, memory, channels, geometry, bx, by, width, height, out, left, grad, grad_left, d, padded, area):
+    """Of four rows of pixels: transmittance; what is behind everything so far, times the gradient; the gradient."""
+    at, behind = row * (4 * LANES), []
+    for k in range(4):
+        x, y = bx + 4 * k, by + row * 4
+        store(memory, at + k * LANES, inside(memory, x, y, 0, width, height))
     if geometry:
-        store(memory, y * LANES + TILE, behind)
+        behind = [load(grad_left, d + padded * y) * load(left, d + padded * y) for y in range(4)]
+    for c in range(channels):
+        g = [load(grad, area * c + d + padded * y) for y in range(4)]
+        for k, each in enumerate(swapped(g)):
+            store(memory, at + k * LANES + (2 + c) * TILE, each)
+        if geometry:
+            behind = [behind[y] + g[y] * load(out, area * c + d + padded * y) for y in range(4)]
+    for k, each in enumerate(swapped(behind) if geometry else ()):
+        store(memory, at + k * LANES + TILE, each)
 
 
 @traced
 def _entry(splats_in, o, bx, by, values, at, channels):
-    return *log_alpha(splats_in, o, bx, by), *(values[at + c] for c in range(channels))
+    return *from_first_block(splats_in, o, bx, by), *(values[at + c] for c in range(channels))
 
 
 @traced
@@ -85,67 +95,74 @@ def _nothing(memory, count):
 
 
 @traced
-def _composite_row(entry, y, memory, found, geometry):
-    """Add a row to the sums of an entry: of channels, then of p, p dy, p dy^2."""
-    p0, p1, p2, _, my, *value = entry
-    dy, d = as_float(y) - my, y * LANES
-    power = p0 + dy * (p1 + p2 * dy)
+def _composite_block(entry, block, memory, places, found, geometry):
+    """Add a block to the sums of an entry: those of the shape, then of channels."""
+    dx, dy, a, b, c, d, *value = entry
+    dx, dy = dx + memory[block + places], dy + memory[block + places + LANES]
+    power = d + dx * (a * dx + b * dy) + c * dy * dy
     alpha = alpha_of(power)
-    passing = load(memory, d)
+    at = block * LANES
+    passing = load(memory, at)
     weight = alpha * passing
-    store(memory, d, passing - weight)
-    slope = [load(memory, d + (2 + c) * TILE) for c in range(len(value))]
-    summed = [each + weight * g for each, g in zip(found, slope, strict=False)]
+    store(memory, at, passing - weight)
+    slope = [load(memory, at + (2 + k) * TILE) for k in range(len(value))]
+    shape = found[:GEOMETRY] if geometry else ()
+    summed = [each + weight * g for each, g in zip(found[len(shape) :], slope, strict=True)]
     if not geometry:
         return summed
     gain = splat(memory, 0)
     for each, g in zip(value, slope, strict=True):
         gain = gain + each * g
     gain = weight * gain
-    behind = load(memory, d + TILE) - gain
-    store(memory, d + TILE, behind)
+    behind = load(memory, at + TILE) - gain
+    store(memory, at + TILE, behind)
     p = gain - behind * (alpha / (1 - alpha))
     p = where_greater(_LOG_MAX, power, p, 0)  # a cut alpha does not move
-    a0, a1, a2 = found[len(value) :]
-    return *summed, a0 + p, a1 + p * dy, a2 + p * (dy * dy)
+    px, py = p * dx, p * dy
+    moments = (p, px, px * dx, py, px * dy, py * dy)
+    return *(each + moment for each, moment in zip(shape, moments, strict=True)), *summed
 
 
 @traced
-def _keep(entry, sums_of_rows, channels, geometry, found, at):
-    dx = entry[3]
-    a0, a1, a2 = sums_of_rows[channels:] if geometry else [splat(dx, 0)] * 3
-    store(found, at, sums([a0, a0 * dx, a0 * dx * dx, a1, a1 * dx, a2, *sums_of_rows[:channels]]))
+def _keep(summed, geometry, found, at):
+    store(found, at, sums(summed if geometry else [*[splat(summed[0], 0)] * GEOMETRY, *summed]))
 
 
 def _composite_back(channels, geometry):
-    room, rows_summed = TILE * (2 + channels), channels + 3 * geometry
+    places, count = TILE * (2 + channels), channels + GEOMETRY * geometry
+    room = places + 2 * LANES
 
     @jit
     def composite_back(
-        counters, start, ids, slots, rows, splats_in, values, stride, offset, width, height, out, left, grad, grad_left, found
+        counters, start, ids, slots, blocks, splats_in, values, stride, offset, width, height, out, left, grad, grad_left, found
     ):  # fmt: skip
-        across, down = (width + LANES - 1) // LANES, (height + ROWS - 1) // ROWS
-        padded, area = across * LANES, across * LANES * down * ROWS
+        across, down = (width + SIDE - 1) // SIDE, (height + SIDE - 1) // SIDE
+        padded, area = across * SIDE, across * SIDE * down * SIDE
         memory = stack(room)
+        block_places(memory, places)
         while True:
             tile = take(counters, 0)
             if tile >= across * down:
                 break
-            bx, by = tile % across * LANES, tile // across * ROWS
-            for y in range(ROWS):
-                _begin_row(y, memory, channels, geometry, out, left, grad, grad_left, (by + y) * padded + bx, area)
-            low, high = 0, min(ROWS, height - by)
-            k, end = start[tile], start[tile + 1]
-            while k < end and low < high:
-                stop = min(k + 16, end)
+            bx, by = tile % across * SIDE, tile // across * SIDE
+            for row in range(4):
+                d = (by + 4 * row) * padded + bx
+                _begin(
+                    row, memory, channels, geometry, bx, by, width, height, out, left, grad, grad_left, d, padded, area
+                )  # fmt: skip
+            k, end, unsaturated = start[tile], start[tile + 1], 0xFFFF
+            while k < end and unsaturated != 0:
+                stop = min(k + 32, end)
                 for q in range(k, stop):
-                    entry = _entry(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
-                    summed = _nothing(memory, rows_summed)
-                    for y in range(max(rows[q] & 255, low), min(rows[q] >> 8, high)):
-                        summed = _composite_row(entry, y, memory, summed, geometry)
-                    _keep(entry, summed, channels, geometry, found, slots[q] * SUMS)
+                    todo, summed = blocks[q] & unsaturated, _nothing(memory, count)
+                    if todo != 0:
+                        entry = _entry(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
+                        while todo != 0:
+                            summed = _composite_block(entry, lowest_bit(todo), memory, places, summed, geometry)
+                            todo &= todo - 1
+                    _keep(summed, geometry, found, slots[q] * SUMS)
                 k = stop
-                low, high = open_rows(memory, low, high)
+                unsaturated = open_blocks(memory)
             for q in range(k, end):
                 store(found, slots[q] * SUMS, 0)
 
@@ -183,8 +200,8 @@ def lift(entries: Entries, splats_in: Floats, width: int, height: int, pixels: F
 
 
 def _summed(kernel: Any, entries: Entries, *args: Any) -> Floats:
-    found = np.empty((len(entries.ids) + 1) * SUMS, np.float32)
-    on_threads(kernel, entries.start, entries.ids, entries.slots, entries.rows, *args, found)
+    found = aligned((len(entries.ids) + 1) * SUMS)
+    on_threads(kernel, entries.start, entries.ids, entries.slots, entries.blocks, *args, found)
     return found
 
 

@@ -4,10 +4,11 @@ Blocks: parameters of LANES Gaussians lie together, one row of LANES numbers eac
 logit of the opacity 10, then harmonics [K 3]. A flat array of blocks, so that every load is one vector.
 
 Splats: SLOTS floats a Gaussian after projection: x y, A B C D with log2 alpha = A dx^2 + B dx dy + C dy^2 + D, red green blue,
-depth, half width and half height of the ellipse where alpha is 1/255, then what cuts it into rows: xy/xx, det/xx, 1/xx, and dx
-of its top. A half width of no more than 0 says why there is nothing to draw: FAINT, BEHIND, OUTSIDE, INVALID.
+depth, half width and half height of the ellipse where alpha is 1/255, then what cuts it into columns: xy/yy, det/yy, 1/yy, and
+dy of its right end. A half width of no more than 0 says why there is nothing to draw: FAINT, BEHIND, OUTSIDE, INVALID.
 
-Entries: a Gaussian in a tile, LANES pixels wide and ROWS high, with the rows that it may reach: first + 256 * (last + 1).
+Tiles of 16 x 16 pixels consist of 16 blocks of 4 x 4, row by row; a block is a vector. Entries: a Gaussian in a tile, with
+a bit for each block that it may reach.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
@@ -20,19 +21,25 @@ import numpy as np
 
 from .simd import (
     LANES,
+    added_in_fours,
     as_float,
     exp2,
     exp2_rough,
+    floor,
+    greater_bits,
     lanes,
     largest,
+    least,
     load,
     log2,
+    lowest_bit,
     maximum,
     minimum,
     splat,
     square_root,
     stack,
     store,
+    swapped,
     take,
     traced,
     transposed,
@@ -45,7 +52,7 @@ __all__ = [
     "FIXED",
     "MAX_ALPHA",
     "MIN_ALPHA",
-    "ROWS",
+    "SIDE",
     "SLOTS",
     "STOP",
     "Entries",
@@ -57,12 +64,13 @@ __all__ = [
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
-FIXED, SLOTS, ROWS = 11, 16, 16
+FIXED, SLOTS, SIDE = 11, 16, 16
+"""Rows of a block of Gaussians before its harmonics; numbers of a splat; pixels of a tile's side."""
 BLUR = 0.3
 """Variance in pixels that every projected Gaussian gets: the footprint of a pixel."""
 MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
 STOP = 1e-3
-"""Rows of a tile through which no more than this share of light passes are left alone."""
+"""Blocks of a tile through which no more than this share of light passes are left alone."""
 FAINT, BEHIND, OUTSIDE, INVALID = 0, 1, 2, 3
 
 jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
@@ -70,7 +78,7 @@ jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz"})
 _f = np.float32
 _LOG2E, _LN2 = 1 / math.log(2), math.log(2)
 LOG_MIN = _f(math.log2(MIN_ALPHA))
-_STOP = _f(STOP)
+_ZERO, _VECTOR = _f(0), LANES
 BLOCKS = 64
 """Blocks that a thread takes at a time."""
 _HUGE, _LARGE, _MOST_LOG, _MARK = 1e16, _f(1e15), _f(30), _f(-70)
@@ -234,10 +242,10 @@ def _project_block(blocks, at, bands, view, width, height, splats_out, to):
     shown = where_greater(logit, 0.5 * _MARK, shown, -INVALID)
     colours = (maximum(each, 0) for each in colour(blocks, at, basis(*direction(mean, view)[:3], bands)))
     k = -0.5 * _LOG2E * invert
-    inverse_xx = 1 / xx
+    inverse_yy = 1 / yy
     rows = [
         px, py, k * yy, -2 * k * xy, k * xx, highest, *colours, centre[2],
-        shown, half_height, xy * inverse_xx, det * inverse_xx, inverse_xx, xy / yy * half_height,
+        shown, half_height, xy * inverse_yy, det * inverse_yy, inverse_yy, xy / xx * half_width,
     ]  # fmt: skip
     for lane, each in enumerate(transposed(rows)):
         store(splats_out, to + lane * SLOTS, each)
@@ -277,55 +285,77 @@ class Entries(NamedTuple):
     ids: _Ints
     """Gaussian of each entry."""
     slots: _Ints
-    rows: _Ints
+    blocks: _Ints
     first_slot: Annotated[_Ints, "N+1+LANES"]
     """Where the slots of each Gaussian start."""
     skipped: _Ints
     """How many Gaussians were left out as FAINT, BEHIND, OUTSIDE, INVALID."""
 
 
+@traced
+def _bands(splats_in, o, row, height, width):
+    """First and last column of blocks that a Gaussian may reach in 16 rows of blocks, 1e9 and -1 where there is none.
+
+    Between the pixel centres of a row of blocks the ellipse is widest at its right and left end or where these are cut off.
+    """
+    mx, my, rx, ry = splats_in[o] - 0.5, splats_in[o + 1] - 0.5, splats_in[o + 10], splats_in[o + 11]
+    slope, part, inverse_yy, right = splats_in[o + 12], splats_in[o + 13], splats_in[o + 14], splats_in[o + 15]
+    y = as_float(row) * 4 + lanes(mx, range(0, 4 * LANES, 4))
+    above = maximum(y, maximum(-floor(ry - my), 0)) - my
+    below = minimum(y + 3, minimum(floor(my + ry), as_float(height) - 1)) - my
+    end, begin = minimum(maximum(right, above), below), minimum(maximum(-right, above), below)
+    reach = ry * ry * inverse_yy
+    far = mx + slope * end + square_root(maximum(part * (reach - end * end * inverse_yy), 0))
+    near = mx + slope * begin - square_root(maximum(part * (reach - begin * begin * inverse_yy), 0))
+    first = maximum(-floor(-maximum(near, mx - rx)), 0)
+    last = minimum(floor(minimum(far, mx + rx)), as_float(width) - 1)
+    reached = where_greater(above, below, splat(mx, 0), where_greater(first, last, splat(mx, 0), 1))
+    return where_greater(reached, 0, floor(first * 0.25), 1e9), where_greater(reached, 0, floor(last * 0.25), -1)
+
+
+@traced
+def _masks(first, last, column, memory):
+    """Of the four tiles in a column, the bits of the blocks that a Gaussian reaches, to memory[0, 4, 8, 12]."""
+    c, bits = as_float(column) * 4, splat(first, 0)
+    for k in range(4):
+        bits = bits + where_greater(first, c + k, splat(c, 0), where_greater(c + k, last, splat(c, 0), 2**k))
+    store(memory, 0, added_in_fours(bits * lanes(first, [16 ** (lane % 4) for lane in range(LANES)])))
+
+
 @jit
-def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of, rows_of, start, skipped):
+def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped):
     """Fill what has room; return how many entries and Gaussians there are, and the range of the keys."""
-    across = (width + LANES - 1) // LANES
+    across = (width + SIDE - 1) // SIDE
     visible, entries, room = 0, 0, len(tile_of)
     low, high = 0x7FFFFFFF, 0
-    half = _f(0.5)
+    memory = stack(_VECTOR)
     for i in range(count):
         first_slot[i] = entries
         o = i * SLOTS
-        rx = splats_in[o + 10]
-        if not rx > 0:
-            skipped[int(-rx)] += 1
+        if not splats_in[o + 10] > _ZERO:
+            skipped[int(-splats_in[o + 10])] += 1
             continue
-        mx, my, ry = splats_in[o], splats_in[o + 1], splats_in[o + 11]
-        x0, x1 = max(0, math.ceil(mx - rx - half)), min(width - 1, math.floor(mx + rx - half))
-        y0, y1 = max(0, math.ceil(my - ry - half)), min(height - 1, math.floor(my + ry - half))
-        if x0 > x1 or y0 > y1:
-            skipped[OUTSIDE] += 1
-            continue
-        c0, c1 = x0 // LANES, x1 // LANES
-        slope, part, inverse_xx, top = splats_in[o + 12], splats_in[o + 13], splats_in[o + 14], splats_in[o + 15]
-        reach, before = rx * rx * inverse_xx, entries
-        for c in range(c0, c1 + 1):
-            ya, yz = y0, y1
-            if c1 > c0:  # the rows that the ellipse covers between the first and the last pixel centre of the column
-                u0, u1 = max(_f(c * LANES) + half - mx, -rx), min(_f(c * LANES + LANES) - half - mx, rx)
-                ut, ub = min(max(top, u0), u1), min(max(-top, u0), u1)
-                yt = slope * ut + math.sqrt(max(_f(0), part * (reach - ut * ut * inverse_xx)))
-                yb = slope * ub - math.sqrt(max(_f(0), part * (reach - ub * ub * inverse_xx)))
-                ya, yz = max(y0, math.ceil(my + yb - half)), min(y1, math.floor(my + yt - half))
-            if ya > yz:
+        before = entries
+        top, bottom = splats_in[o + 1] - splats_in[o + 11], splats_in[o + 1] + splats_in[o + 11]
+        r0, r1 = int(top) // SIDE if top > _ZERO else 0, int(bottom) // SIDE if bottom < height else (height - 1) // SIDE
+        for r in range(r0, r1 + 1, 4):
+            first, last = _bands(splats_in, o, 4 * r, height, width)
+            begin, end = least(first), largest(last)
+            if begin > end:
                 continue
-            for r in range(ya // ROWS, yz // ROWS + 1):
-                if entries < room:
-                    tile_of[entries] = r * across + c
-                    rows_of[entries] = max(ya - r * ROWS, 0) | ((min(yz - r * ROWS, ROWS - 1) + 1) << 8)
-                    start[r * across + c + 1] += 1
-                entries += 1
+            for c in range(int(begin) // 4, int(end) // 4 + 1):
+                _masks(first, last, c, memory)
+                for k in range(4):
+                    mask = int(memory[4 * k])
+                    if mask != 0:
+                        if entries < room:
+                            tile = (r + k) * across + c
+                            tile_of[entries], blocks_of[entries] = tile, mask
+                            start[tile + 1] += 1
+                        entries += 1
         if entries > before:
             k = bits[o + 9]  # positive floats sort as their bits do
-            low, high = min(low, k), max(high, k)
+            low, high = k if k < low else low, k if k > high else high
             seen[visible], key[visible] = i, k
             visible += 1
         else:
@@ -336,7 +366,9 @@ def _find(splats_in, bits, count, width, height, first_slot, seen, key, tile_of,
 
 
 @jit
-def _sort(seen, key, visible, low, high, digits, other, other_key, first_slot, tile_of, rows_of, start, fill, ids, slots, rows):
+def _sort(
+    seen, key, visible, low, high, digits, other, other_key, first_slot, tile_of, blocks_of, start, fill, ids, slots, blocks
+):
     """Radix sort of the Gaussians by 22 bits of the depth's range, 11 at a time; then each one's entries to their tiles."""
     shift = 0
     while (high - low) >> shift >= 1 << 22:
@@ -367,39 +399,62 @@ def _sort(seen, key, visible, low, high, digits, other, other_key, first_slot, t
         for slot in range(first_slot[i], first_slot[i + 1]):
             at = fill[tile_of[slot]]
             fill[tile_of[slot]] = at + 1
-            ids[at], slots[at], rows[at] = i, slot, rows_of[slot]
+            ids[at], slots[at], blocks[at] = i, slot, blocks_of[slot]
 
 
 def bins(splats_in: Floats, count: int, width: int, height: int) -> Entries:
     """The Entries of `count` projected Gaussians in an image."""
-    tiles = ((width + LANES - 1) // LANES) * ((height + ROWS - 1) // ROWS)
+    tiles = ((width + SIDE - 1) // SIDE) * ((height + SIDE - 1) // SIDE)
     room = 4 * count + 1024
     first_slot, (seen, key, *others) = np.empty(count + 1 + LANES, np.int32), np.empty((4, count), np.int32)
     while True:
-        tile_of, rows_of = np.empty((2, room), np.int32)
+        tile_of, blocks_of = np.empty((2, room), np.int32)
         start, skipped = np.zeros(tiles + 1, np.int32), np.zeros(4, np.int32)
         entries, visible, low, high = _find(
-            splats_in, splats_in.view(np.int32), count, width, height, first_slot, seen, key, tile_of, rows_of, start, skipped
+            splats_in, splats_in.view(np.int32), count, width, height, first_slot, seen, key, tile_of, blocks_of, start, skipped
         )  # fmt: skip
         if entries <= room:
             break
         room = entries
-    digits, fill, (ids, slots, rows) = (
-        np.zeros((2, 2049), np.int32),
-        np.empty(tiles, np.int32),
-        np.empty((3, entries), np.int32),
+    digits, fill = np.zeros((2, 2049), np.int32), np.empty(tiles, np.int32)
+    ids, slots, blocks = np.empty((3, entries), np.int32)
+    _sort(seen, key, visible, low, high, digits, *others, first_slot, tile_of, blocks_of, start, fill, ids, slots, blocks)
+    return Entries(start, ids, slots, blocks, first_slot, skipped)
+
+
+TILE = SIDE * SIDE
+_X, _Y = [k % 4 for k in range(LANES)], [k // 4 for k in range(LANES)]
+
+
+def inside(like, bx, by, block, width, height):
+    """1 for the pixels of a block that are in the image, else 0."""
+    x, y = lanes(like, _X) + (as_float(bx) + block % 4 * 4), lanes(like, _Y) + (as_float(by) + block // 4 * 4)
+    return where_greater(as_float(width), x, where_greater(as_float(height), y, splat(like, 1), 0), 0)
+
+
+@traced
+def block_places(memory, at):
+    """Left and upper edges of the blocks of a tile, to memory."""
+    store(memory, at, lanes(memory, [4 * x for x in _X]))
+    store(memory, at + LANES, lanes(memory, [4 * y for y in _Y]))
+
+
+@traced
+def open_blocks(memory):
+    """A bit for each block of a tile through which light passes; memory begins with its transmittance."""
+    most, *others = transposed([load(memory, block * LANES) for block in range(LANES)])
+    for each in others:
+        most = maximum(most, each)
+    return greater_bits(most, STOP)
+
+
+def from_first_block(splats_in, o, bx, by):
+    """dx and dy of the pixels of a tile's first block, and the polynomial of log2 alpha."""
+    dx, dy = (
+        lanes(splats_in, _X) + 0.5 + as_float(bx) - splats_in[o],
+        lanes(splats_in, _Y) + 0.5 + as_float(by) - splats_in[o + 1],
     )
-    _sort(seen, key, visible, low, high, digits, *others, first_slot, tile_of, rows_of, start, fill, ids, slots, rows)
-    return Entries(start, ids, slots, rows, first_slot, skipped)
-
-
-TILE = ROWS * LANES
-
-
-def log_alpha(splats_in, o, bx, by):
-    """Of log2 alpha in a tile: the polynomial in dy of each column, then dx and the y of the centre."""
-    dx, my = lanes(splats_in) + as_float(bx) + 0.5 - splats_in[o], splats_in[o + 1] - 0.5 - as_float(by)
-    return splats_in[o + 2] * dx * dx + splats_in[o + 5], splats_in[o + 3] * dx, splats_in[o + 4], dx, my
+    return dx, dy, *(splats_in[o + k] for k in range(2, 6))
 
 
 def alpha_of(power):
@@ -407,78 +462,76 @@ def alpha_of(power):
     return where_greater(power, LOG_MIN, minimum(exp2_rough(power), MAX_ALPHA), 0)
 
 
-@jit
-def open_rows(memory, low, high):
-    """Those of the rows from low to high between which light passes; memory begins with the transmittance of a tile."""
-    while low < high and largest(memory, low * LANES) < _STOP:
-        low += 1
-    while low < high and largest(memory, (high - 1) * LANES) < _STOP:
-        high -= 1
-    return low, high
-
-
 @traced
 def _entry(splats_in, o, bx, by, values, at, channels):
-    p0, p1, p2, _, my = log_alpha(splats_in, o, bx, by)
-    return p0, p1, p2, my, *(values[at + c] for c in range(channels))
+    return *from_first_block(splats_in, o, bx, by), *(values[at + c] for c in range(channels))
 
 
 @traced
-def _composite_row(entry, y, memory):
-    p0, p1, p2, my, *value = entry
-    dy, d = as_float(y) - my, y * LANES
-    alpha = alpha_of(p0 + dy * (p1 + p2 * dy))
-    passing = load(memory, d)
+def _composite_block(entry, block, memory, places):
+    dx, dy, a, b, c, d, *value = entry
+    dx, dy = dx + memory[block + places], dy + memory[block + places + LANES]
+    alpha = alpha_of(d + dx * (a * dx + b * dy) + c * dy * dy)
+    at = block * LANES
+    passing = load(memory, at)
     weight = alpha * passing
-    store(memory, d, passing - weight)
-    for c, each in enumerate(value):
-        o = d + (c + 1) * TILE
+    store(memory, at, passing - weight)
+    for k, each in enumerate(value):
+        o = at + (k + 1) * TILE
         store(memory, o, load(memory, o) + weight * each)
 
 
 @traced
-def _begin_row(y, memory, channels):
-    store(memory, y * LANES, 1)
-    for c in range(channels):
-        store(memory, y * LANES + (c + 1) * TILE, 0)
+def _begin(memory, channels, bx, by, width, height):
+    for block in range(LANES):
+        store(memory, block * LANES, inside(memory, bx, by, block, width, height))
+        for c in range(channels):
+            store(memory, block * LANES + (c + 1) * TILE, 0)
 
 
 @traced
-def _finish_row(y, memory, background, channels, out, left, d, area):
-    passing = load(memory, y * LANES)
-    store(left, d, passing)
+def _finish(row, memory, background, channels, out, left, d, padded, area):
+    """Four rows of pixels."""
+    blocks = [load(memory, row * (4 * LANES) + k * LANES) for k in range(4)]
+    for y, each in enumerate(swapped(blocks)):
+        store(left, d + padded * y, each)
     for c in range(channels):
-        store(out, area * c + d, load(memory, y * LANES + (c + 1) * TILE) + passing * background[c])
+        seen = [load(memory, row * (4 * LANES) + k * LANES + (c + 1) * TILE) + blocks[k] * background[c] for k in range(4)]
+        for y, each in enumerate(swapped(seen)):
+            store(out, area * c + d + padded * y, each)
 
 
 def _composite(channels):
-    room = TILE * (1 + channels)
+    places = TILE * (1 + channels)
+    room = places + 2 * LANES
 
     @jit
-    def composite(counters, start, ids, rows, splats_in, values, stride, offset, background, width, height, out, left):
-        across, down = (width + LANES - 1) // LANES, (height + ROWS - 1) // ROWS
-        padded, area, skipped = across * LANES, across * LANES * down * ROWS, 0
-        memory = stack(room)  # transmittance and sums of the channels
+    def composite(counters, start, ids, blocks, splats_in, values, stride, offset, background, width, height, out, left):
+        across, down = (width + SIDE - 1) // SIDE, (height + SIDE - 1) // SIDE
+        padded, area, skipped = across * SIDE, across * SIDE * down * SIDE, 0
+        memory = stack(room)  # transmittance, sums of the channels, places of the blocks
+        block_places(memory, places)
         while True:
             tile = take(counters, 0)
             if tile >= across * down:
                 break
-            bx, by = tile % across * LANES, tile // across * ROWS
-            for y in range(ROWS):
-                _begin_row(y, memory, channels)
-            low, high = 0, min(ROWS, height - by)
-            k, end = start[tile], start[tile + 1]
-            while k < end and low < high:
-                stop = min(k + 16, end)
+            bx, by = tile % across * SIDE, tile // across * SIDE
+            _begin(memory, channels, bx, by, width, height)
+            k, end, unsaturated = start[tile], start[tile + 1], 0xFFFF
+            while k < end and unsaturated != 0:
+                stop = min(k + 32, end)
                 for q in range(k, stop):
-                    entry = _entry(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
-                    for y in range(max(rows[q] & 255, low), min(rows[q] >> 8, high)):
-                        _composite_row(entry, y, memory)
+                    todo = blocks[q] & unsaturated
+                    if todo != 0:
+                        entry = _entry(splats_in, ids[q] * SLOTS, bx, by, values, ids[q] * stride + offset, channels)
+                        while todo != 0:
+                            _composite_block(entry, lowest_bit(todo), memory, places)
+                            todo &= todo - 1
                 k = stop
-                low, high = open_rows(memory, low, high)
+                unsaturated = open_blocks(memory)
             skipped += end - k
-            for y in range(ROWS):
-                _finish_row(y, memory, background, channels, out, left, (by + y) * padded + bx, area)
+            for row in range(4):
+                _finish(row, memory, background, channels, out, left, (by + 4 * row) * padded + bx, padded, area)
         return skipped
 
     return composite
@@ -504,7 +557,7 @@ def composite(
     to whole tiles; returns how many entries were skipped because nothing passed any more. Channels: 3, 4 or 8 at once."""
     return sum(
         on_threads(
-            _COMPOSITE[channels], entries.start, entries.ids, entries.rows, splats_in, values, stride, offset, background,
+            _COMPOSITE[channels], entries.start, entries.ids, entries.blocks, splats_in, values, stride, offset, background,
             width, height, out, left,
         )
     )  # fmt: skip

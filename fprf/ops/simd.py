@@ -12,6 +12,8 @@ in pairs. A number among vectors counts in every lane.
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
+from typing import Any
+
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -22,13 +24,19 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 __all__ = [
     "LANES",
     "absolute",
+    "added_in_fours",
+    "aligned",
     "as_float",
     "exp2",
     "exp2_rough",
+    "floor",
+    "greater_bits",
     "lanes",
     "largest",
+    "least",
     "load",
     "log2",
+    "lowest_bit",
     "maximum",
     "minimum",
     "splat",
@@ -36,6 +44,7 @@ __all__ = [
     "stack",
     "store",
     "sums",
+    "swapped",
     "take",
     "total",
     "traced",
@@ -46,6 +55,7 @@ __all__ = [
 LANES = 16
 """Numbers of a vector."""
 
+_LINE = 64
 _FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _VECTOR, _INTS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
 _FUSE = ("contract", "arcp", "nsz")
@@ -180,6 +190,8 @@ def _wrapped(context, build, kind, value):
 def _kind_of(result):
     if result is None:
         return types.void
+    if isinstance(result, _Index):
+        return types.int64
     if isinstance(result, tuple | list):
         return types.UniTuple(_vector, len(result))
     return _vector if isinstance(result, Vector) else types.float32
@@ -232,14 +244,25 @@ def _call(vector, name, args, result=_VECTOR, flags=_FUSE):
     return (Vector if result is _VECTOR else _Float)(build, build.call(function, args, fastmath=flags))
 
 
+def aligned(count: int) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Room for `count` float32 that begins with a line of the cache."""
+    room = np.empty(count + _LINE // 4, np.float32)
+    first = -room.ctypes.data % _LINE // 4
+    return room[first : first + count]
+
+
 @intrinsic(prefer_literal=True)
 def stack(typing, count):
     """Memory for `count` float32, a constant, as long as the kernel runs."""
     if not isinstance(count, types.IntegerLiteral):
         return None
-    return types.CPointer(types.float32)(count), lambda context, build, sig, args: cgutils.alloca_once(
-        build, _FLOAT, ir.Constant(_LONG, sig.args[0].literal_value)
-    )
+
+    def generate(context, build, sig, args):
+        place = cgutils.alloca_once(build, _FLOAT, ir.Constant(_LONG, sig.args[0].literal_value))
+        place.align = _LINE  # else every vector lies in two lines of the cache
+        return place
+
+    return types.CPointer(types.float32)(count), generate
 
 
 @intrinsic
@@ -272,9 +295,9 @@ def splat(like, value):
     return Vector(like.build, _same(value))
 
 
-def lanes(like):
-    """0, 1, 2 ..."""
-    return Vector(like.build, ir.Constant(_VECTOR, [float(k) for k in range(LANES)]))
+def lanes(like, values=range(LANES)):
+    """0, 1, 2 ..., or a number for each lane."""
+    return Vector(like.build, ir.Constant(_VECTOR, [float(k) for k in values]))
 
 
 def as_float(index):
@@ -315,6 +338,23 @@ def absolute(x):
     return _call(x, f"llvm.fabs.v{LANES}f32", [x.value])
 
 
+def floor(x):
+    """The largest whole number that is not above x."""
+    return _call(x, f"llvm.floor.v{LANES}f32", [x.value])
+
+
+@traced
+def least(x):
+    """The smallest of the lanes."""
+    return _call(x, f"llvm.vector.reduce.fmin.v{LANES}f32", [x.value], _FLOAT)
+
+
+@traced
+def largest(x):
+    """The largest of the lanes."""
+    return _call(x, f"llvm.vector.reduce.fmax.v{LANES}f32", [x.value], _FLOAT)
+
+
 @traced
 def total(x):
     """The sum of the lanes."""
@@ -322,9 +362,15 @@ def total(x):
 
 
 @traced
-def largest(array, at):
-    """The largest of array[at : at + LANES]."""
-    return _call(array, f"llvm.vector.reduce.fmax.v{LANES}f32", [load(array, at).value], _FLOAT)
+def lowest_bit(bits):
+    """The number of the lowest 1 of an integer other than 0."""
+    return _Index(bits.build, bits.build.cttz(bits.value, ir.Constant(ir.IntType(1), 1)))
+
+
+def greater_bits(x, y):
+    """An integer: 1 << lane for each lane where x > y."""
+    bits = x.build.fcmp_ordered(">", x.value, y.value if isinstance(y, Vector) else _same(y))
+    return _Index(x.build, x.build.zext(x.build.bitcast(bits, ir.IntType(LANES)), _LONG))
 
 
 def _picked(x, y, mask):
@@ -344,6 +390,23 @@ def transposed(rows):
                     out[to] = _picked(rows[k], rows[k + width], mask)
         rows = out
     return rows
+
+
+def swapped(blocks):
+    """Four vectors of four quarters: the first quarters of all in one vector, and so on."""
+    found, quarter = [], LANES // 4
+    for k in range(4):
+        pair = [k * quarter + lane + side * LANES for side in (0, 1) for lane in range(quarter)] * 2
+        low, high = _picked(*blocks[:2], pair), _picked(*blocks[2:], pair)
+        found.append(_picked(low, high, [lane if lane < LANES // 2 else lane + LANES for lane in range(LANES)]))
+    return found
+
+
+def added_in_fours(x):
+    """The sum of four neighbouring lanes, in each of them."""
+    for step in (1, 2):
+        x = x + _picked(x, x, [lane ^ step for lane in range(LANES)])
+    return x
 
 
 def sums(values):

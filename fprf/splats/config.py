@@ -37,7 +37,7 @@ class GaussiansConfig(RunConfig):
     ssim: float = 0.2
     """Share of 1 - SSIM in the loss; the rest is the absolute error."""
     coarse: float = 0.3
-    """Share of training that sees the photographs at half their size."""
+    """Share of training that sees the photographs reduced: at half their size, large ones at less in the first third of it."""
     grow: float = 0.6
     """Share of training within which the number grows to `cap`."""
     relocate_every: int = 100

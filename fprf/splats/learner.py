@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..ops.rasterise_kernels import FIXED, SLOTS
 from ..ops.rasterise_training import learn
-from ..ops.simd import LANES
+from ..ops.simd import LANES, aligned
 from .config import GaussiansConfig
 from .gaussians import HARMONIC, Gaussians
 from .initial import Points, spacing, spatial_order
@@ -44,13 +44,13 @@ class Step(NamedTuple):
 class Learner:
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate."""
 
-    def __init__(self, config: GaussiansConfig, levels: tuple[Level, Level], reach: float, room: int) -> None:
-        self.config, self.fine, self.coarse, self.reach = config, *levels, reach
+    def __init__(self, config: GaussiansConfig, levels: list[Level], reach: float, room: int) -> None:
+        self.config, self.levels, self.reach = config, levels, reach
         self.bands = (config.degree + 1) ** 2
         self.room = -(-room // LANES) * LANES
         self.count = self.begun = 0
-        self.blocks, self.first, self.second = (np.zeros(self.room * self.rows, np.float32) for _ in range(3))
-        self.splats = np.zeros(self.room * SLOTS, np.float32)
+        self.blocks, self.first, self.second = (_blocks(np.zeros((self.rows, self.room), np.float32)) for _ in range(3))
+        self.splats = aligned(self.room * SLOTS)
 
     @property
     def rows(self) -> int:
@@ -73,7 +73,9 @@ class Learner:
 
     def step(self, step: int, share: float) -> Step | None:
         """Learn from one view; None where the loss was not finite, and nothing was changed."""
-        level = self.coarse if share < self.config.coarse else self.fine
+        # Half the size until `coarse`, a quarter until a third of that, and so on.
+        reduced = sum(share < self.config.coarse / 3**k for k in range(len(self.levels) - 1))
+        level = self.levels[reduced]
         views = list(level.photographs)
         epoch, turn = divmod(step, len(views))
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
@@ -165,7 +167,9 @@ def _rows(blocks: Floats, rows: int) -> Floats:
 
 
 def _blocks(rows: Floats) -> Floats:
-    return np.ascontiguousarray(rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)).reshape(-1)
+    found = aligned(rows.size)
+    found.reshape(-1, len(rows), LANES)[:] = rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)
+    return found
 
 
 def _shared(opacity: NDArray[np.float64], times: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -88,13 +88,17 @@ def distorted(image: Annotated[Tensor, "h w C"], place: Annotated[Tensor, "H W 2
 
 def make_levels(
     scene: Scene, images: list[Image], background: tuple[float, float, float], near: float, *, masks: bool
-) -> tuple[Level, Level]:
-    """The training views at their own size and at half of it, brought to the size of the largest one by padding."""
+) -> list[Level]:
+    """The training views at their own size, at half of it and so on, until the longer side has less than 240 pixels.
+
+    Views of a level are brought to the size of the largest one by padding.
+    """
     views = scene.train.tolist()
     cameras = {view: cover(scene.cameras, view, near)[0] for view in views}
     width, height = max(each.width for each in cameras.values()), max(each.height for each in cameras.values())
-    fine: dict[int, Target] = {}
-    coarse: dict[int, Target] = {}
+    levels = [
+        Level(max(1, width >> k), max(1, height >> k), {}) for k in range(max(2, (max(width, height) // 120).bit_length()))
+    ]
     for view in views:
         camera = cameras[view]
         image, valid = undistorted(scene.cameras, view, images[view], camera)
@@ -105,16 +109,16 @@ def make_levels(
             seen = undistorted(scene.cameras, view, white, camera)[0][..., 0] > 254
             valid = seen if valid is None else valid & seen
         colours: Floats = np.divide(image, 255, dtype=np.float32)
-        fine[view] = _photograph(camera, colours, valid, width, height)
-        small = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
-        half: Floats = np.asarray(cv2.resize(colours, small, interpolation=cv2.INTER_AREA), np.float32)
-        half_valid = (
-            None if valid is None else cv2.resize(valid.astype(np.float32), small, interpolation=cv2.INTER_AREA) > 0.999
-        )
-        shrink = torch.tensor([[small[0] / image.shape[1]], [small[1] / image.shape[0]], [1.0]], dtype=torch.float64)
-        halved = camera._replace(intrinsics=camera.intrinsics * shrink, width=small[0], height=small[1])
-        coarse[view] = _photograph(halved, half, half_valid, max(1, width // 2), max(1, height // 2))
-    return Level(width, height, fine), Level(max(1, width // 2), max(1, height // 2), coarse)
+        for k, level in enumerate(levels):
+            size = (max(1, camera.width >> k), max(1, camera.height >> k))
+            shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
+            small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
+            reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if k else colours
+            used = valid
+            if valid is not None and k:
+                used = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+            level.photographs[view] = _photograph(small, reduced, used, level.width, level.height)
+    return levels
 
 
 def _photograph(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, width: int, height: int) -> Target:

@@ -102,7 +102,7 @@ def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tm
 def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: Scene) -> None:
     learner = prepare(config, scene).learner
     before = learner.gaussians()
-    for photograph in learner.coarse.photographs.values():
+    for photograph in learner.levels[1].photographs.values():
         photograph.planes[:] = np.nan
     assert learner.step(0, 0.0) is None and equal(learner.gaussians(), before)
 
