@@ -97,13 +97,6 @@ class SemanticField(nn.Module, ABC):
     def penalties(self) -> dict[str, Tensor]:
         """Regularisers by name, as of `ContentField`."""
 
-    def projected(self, matrix: Annotated[Tensor, "D T"]) -> "SemanticField | None":
-        """A field of the products of these features with a matrix, for rendering alone: T channels; None = nothing is saved.
-
-        A field that ends with a linear map and no bias multiplies the two beforehand.
-        """
-        return None
-
 
 class Sampler(nn.Module, ABC):
     """Rays to sample edges. May own proposal fields, which live in the unit cube: `space.locate` leads there."""

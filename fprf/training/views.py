@@ -7,16 +7,15 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..interfaces import Stylizer
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
-from ..rendering.cameras import Cameras, pixel_grid, rays_through
+from ..rendering.cameras import Cameras, rays_through
 from ..rendering.pixel_rays import grid_rays
 from ..rendering.renderer import Restyle, composite, enlarged, march, render_rays
 from ..types import Rays, Rendered, View, Want
 from .model import Facts, Model, background_of
 
-__all__ = ["match_view", "on_host", "paint_pixels", "render_view", "view_rays"]
+__all__ = ["on_host", "paint_pixels", "render_view", "view_rays"]
 
 
 def view_rays(
@@ -101,17 +100,6 @@ def _rendered(
     metric = model.space.metric(origin, direction, torch.cat(depth).to(origin.device)).to(colour.device)
     shape = (height, width)
     return View(colour.view(*shape, 3), metric.view(shape), torch.cat(opacity).view(shape), kept / max(1, samples))
-
-
-@torch.inference_mode()
-def match_view(
-    model: Model, cameras: Cameras, view: int, config: RenderConfig, stylizer: Stylizer
-) -> Annotated[Tensor, "H W T"]:
-    """Which style code each pixel takes: the composited attention, scaled to sum to 1 (0 where nothing is)."""
-    asks = Want.SEMANTIC in stylizer.needs
-    attention, _ = paint_pixels(model, cameras, view, pixel_grid(cameras, view), config, stylizer.match, semantic=asks)
-    width, height = (int(v) for v in cameras.size[view])
-    return attention.view(height, width, -1)
 
 
 @torch.inference_mode()

@@ -38,9 +38,6 @@ def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     for name in styles:
         cached = rows[f"cached view restyled, {name}"]
         assert cached["error"] == 0 and cached["figure"] > 0 and "goal" not in cached, "goals are for views of full size"
-    for name in ("semantics and matching, dictionary folded", "the same from hidden units to shares, 20 x 4096 samples"):
-        assert rows[name]["error"] < 1e-5 and rows[name]["ratio"] > 0
-    assert rows[name]["ratio_goal"] == 1.5
     lookup = next(row for name, row in rows.items() if "grid_sample" in name)
     assert lookup["error"] < 1e-5 and lookup["peer_error"] < 1e-5
     assert 0 < document["counters"]["kept_samples_share"] <= 1

@@ -43,17 +43,3 @@ def test_it_is_planes_then_a_network() -> None:
 def test_values_out_of_range_are_refused(value: dict[str, object], name: str) -> None:
     with pytest.raises(ConfigError, match=rf"semantic\.field\.{name}"):
         SemanticPlanesConfig(**value)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("layers", [0, 1, 2])
-def test_projected_features_are_the_features_times_the_matrix(layers: int) -> None:
-    field = SemanticPlanesConfig(resolutions=(4, 9), channels=8, hidden=16, layers=layers).build(channels=7, seed=0)
-    draw = torch.Generator().manual_seed(1)
-    points, matrix = torch.empty(50, 3).uniform_(-1, 1, generator=draw), torch.randn(7, 3, generator=draw)
-    small = field.projected(matrix)
-    assert small is not None and small.projected(matrix) is None and small.penalties() == {}
-    assert not any(p.requires_grad for name, p in small.named_parameters() if name.startswith("maps"))
-    with torch.no_grad():
-        wanted = field(points) @ matrix
-        assert (small(points) - wanted).abs().max() <= 1e-5 * wanted.abs().max()
-    assert field.projected(torch.eye(7)) is None, "as many outputs as before"

@@ -15,9 +15,10 @@ from fprf.plugins.stylizers.config import (
     RegionOtConfig,
     StylizerConfig,
 )
+from fprf.rendering.cameras import pixel_grid
 from fprf.training.cached_view import cache_view, view_parts
 from fprf.training.restyle import restyle
-from fprf.training.views import match_view, render_view
+from fprf.training.views import render_view
 
 STYLIZERS = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
 
@@ -73,6 +74,6 @@ def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_m
     parts = view_parts(trained.model, known.facts, known.cameras, 2, config)
     first = next(parts)
     assert first.rays == 100 and first.semantic is not None
-    wanted = match_view(trained.model, known.cameras, 2, config, stylizer)
-    assert torch.allclose(first.mean(stylizer.match(first.semantic)), wanted.view(-1, wanted.shape[-1])[:100], atol=1e-6)
+    wanted, _ = trained.paint(known.cameras, 2, pixel_grid(known.cameras, 2)[:100], stylizer.match)
+    assert torch.allclose(first.mean(stylizer.match(first.semantic)), wanted, atol=1e-6)
     assert 100 + sum(part.rays for part in parts) == 32 * 24

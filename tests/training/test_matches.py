@@ -16,7 +16,7 @@ from fprf.style.files import StyleFile
 from fprf.training.loading import Trained
 from fprf.training.matches import MatchMap, clusters, match_map, match_pictures, summarize, write_pixels
 from fprf.training.restyle import Codes, Styled, apply_style
-from fprf.training.views import match_view, paint_pixels, render_view
+from fprf.training.views import paint_pixels, render_view
 
 
 def styled_by(world: World, stylizer: StylizerConfig | None = None, **wishes: object) -> tuple[Trained, Styled]:
@@ -29,8 +29,8 @@ def styled_by(world: World, stylizer: StylizerConfig | None = None, **wishes: ob
 def test_what_is_taken_is_the_stylizers_match(world: World, stylizer: StylizerConfig) -> None:
     trained, styled = styled_by(world, stylizer)
     found = match_map(trained, styled, 0)
-    expected = match_view(trained.model, trained.known.cameras, 0, trained.config.render, styled.restyle.stylizer)
-    assert torch.allclose(found.taken, expected, atol=1e-5) and float(found.kept.max()) < 1e-4
+    expected, _ = trained.paint(trained.cameras, 0, pixel_grid(trained.cameras, 0), styled.restyle.stylizer.match)
+    assert torch.allclose(found.taken.flatten(0, 1), expected, atol=1e-5) and float(found.kept.max()) < 1e-4
     picture = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render)
     assert torch.allclose(found.opacity, picture.opacity)
     assert float(found.score.abs().max()) <= 1 and bool(found.score.isfinite().all())

@@ -16,8 +16,9 @@ from fprf.plugins.stylizers.config import (
 from fprf.rendering.renderer import Restyle
 from fprf.style.scene import own_style
 from fprf.training.loading import load_style
+from fprf.training.matches import match_map
 from fprf.training.restyle import restyle
-from fprf.training.views import match_view, render_view
+from fprf.training.views import render_view
 
 STYLIZERS = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
 
@@ -112,7 +113,7 @@ def test_strength_lies_between(world: World) -> None:
 def test_matches_are_shares_of_the_codes(world: World, stylizer: StylizerConfig) -> None:
     trained = world.load()
     styled = restyle(trained, world.references, stylizer, clusters=3)
-    match = match_view(trained.model, trained.known.cameras, 0, trained.config.render, styled.restyle.stylizer)
+    match = match_map(trained, styled, 0).taken
     assert match.shape == (24, 32, len(styled.dictionary.keys)) and float(match.min()) >= 0
     assert torch.allclose(match.sum(-1), torch.ones(24, 32), atol=1e-4)
 
@@ -123,5 +124,5 @@ def test_empty_space_matches_nothing(world: World) -> None:
     with torch.no_grad():
         weight = trained.model.get_parameter("field.to_density.weight")
         weight.fill_(-1e6)
-    match = match_view(trained.model, trained.known.cameras, 0, trained.config.render, styled.restyle.stylizer)
+    match = match_map(trained, styled, 0).taken
     assert float(match.abs().max()) == 0

@@ -28,7 +28,6 @@ from fprf.style.dictionary import StyleDictionary, build_dictionary
 from fprf.style.files import StyleFile
 from fprf.style.references import Encoders, encode_photograph
 from fprf.training.cached_view import cache_view
-from fprf.training.folding import folded
 from fprf.training.loading import Trained, load_run
 from fprf.training.matches import match_map
 from fprf.training.poses import Poses
@@ -75,19 +74,14 @@ def here(world: World, made: dict[str, Here], device: str) -> Here:
 
 
 def shown(at: Here, stylizer: StylizerConfig, references: tuple[Path, ...]) -> list[torch.Tensor]:
-    """What a view shows in a look: rendered, from a cached view, folded, as a match map; and what is kept of it."""
+    """What a view shows in a look: rendered, from a cached view, as a match map; and what is kept of it."""
     trained, facts = at.trained, at.trained.known.facts
     cameras, config = trained.known.cameras, trained.config.render
     style = StyleConfig(references=references, stylizer=stylizer, keep=("0",), strength=0.8, luminance=0.2)
     styled = dress(trained, StyleFile(style), at.encoders, at.dictionary)
     view = render_view(trained.model, facts, cameras, 3, config, styled.restyle)
     again = cache_view(trained.model, facts, cameras, 3, config).restyled(styled.restyle)
-    found = [*view[:3], again.rgb, *match_map(trained, styled, 3)]
-    bare = dress(trained, StyleFile(StyleConfig(references=references, stylizer=stylizer)), at.encoders, at.dictionary)
-    small = folded(trained.model, bare, stylizer)
-    if small is not None:
-        found.append(render_view(small.model, facts, cameras, 3, config, small.look).rgb)
-    return found
+    return [*view[:3], again.rgb, *match_map(trained, styled, 3)]
 
 
 @pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda config: type(config).__name__)

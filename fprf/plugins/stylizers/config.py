@@ -49,11 +49,6 @@ class StylizerConfig(PluginConfig):
         between("stylizer.features", self.features, 0.0, 1.0)
         between("stylizer.colours", self.colours, 0.0, 1.0)
 
-    @property
-    def reads_products(self) -> bool:
-        """All that its stylizers read of semantics is a softmax of inner products with the keys of the dictionary."""
-        return False
-
     def smoothing(
         self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
     ) -> Annotated[Tensor, "K K"] | None:
@@ -104,11 +99,6 @@ class LocalAdainConfig(StylizerConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         positive("stylizer.temperature", self.temperature)
-
-    @property
-    def reads_products(self) -> bool:
-        """Where scores are dot products; a cosine asks for the length of the features as well."""
-        return self.similarity == "dot"
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """Local AdaIN towards these references."""
