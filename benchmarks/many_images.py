@@ -51,13 +51,13 @@ def part(folder: Path, cache: Path, limit: int, batches: int, held: bool) -> dic
     import torch
 
     from fprf.datamanagers import batches as module
-    from fprf.datamanagers.batches import room_for
+    from fprf.datamanagers.batches import allocate_pixels
     from fprf.datamanagers.config import RayBatchesConfig
     from fprf.datamanagers.parsers.config import parse_scene
 
     scene = parse_scene(folder, 1, None)
     if held:
-        module.room_for = lambda pixels, where: room_for(pixels, where, sys.maxsize)
+        module.room_for = lambda pixels, where: allocate_pixels(pixels, where, sys.maxsize)
     resource.setrlimit(resource.RLIMIT_DATA, (limit << 20, limit << 20))
     start = time.perf_counter()
     manager = RayBatchesConfig(rays=2048).build(scene=scene, content=None, semantic=None, dim=0, cache=cache, seed=0)

@@ -42,22 +42,22 @@ def run(args: list[str]) -> int:
     if find_spec("pycolmap") is None:
         raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
     from ..io.atomic import write_json
-    from ..reconstruction.colmap import Tables, find_features, find_matches, find_poses
-    from ..reconstruction.images import gather
-    from ..reconstruction.scene_folder import Place, State, report
+    from ..reconstruction.colmap import MatchTables, find_features, find_matches, find_poses
+    from ..reconstruction.images import gather_images
+    from ..reconstruction.scene_folder import SceneFolder, State, report
 
-    place = Place(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
+    place = SceneFolder(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
     state = State.load(place)
     models: list[dict[str, Any]] = []
     matching: str = config.matching
     with Display() as display:
-        gather(config.source, place, state, config, display.count)
+        gather_images(config.source, place, state, config, display.count)
         find_features(place, state, config, display.count)
         matching = find_matches(place, state, config, display.count)
         try:
             models = find_poses(place, state, config, display.count)
         finally:
-            content = report(asdict(state), matching, Tables(place.database), models, __version__)
+            content = report(asdict(state), matching, MatchTables(place.database), models, __version__)
             write_json(place.root / "process.json", content)
     _print(content, place.root)
     _check(place.root)
@@ -65,7 +65,7 @@ def run(args: list[str]) -> int:
 
 
 def _print(content: dict[str, Any], root: Path) -> None:
-    from ..reconstruction.scene_folder import summary
+    from ..reconstruction.scene_folder import summary_rows
 
     console = Console(highlight=False)
     images = content["images"]
@@ -75,7 +75,7 @@ def _print(content: dict[str, Any], root: Path) -> None:
         f"{sum(content['step_seconds'].values()):.0f} s",
         soft_wrap=True,
     )
-    rows = summary(content)
+    rows = summary_rows(content)
     if rows:
         table = Table(box=None, show_header=True, pad_edge=False, padding=(0, 3, 0, 0), header_style="dim")
         for head in ("lost in", "image", "why"):

@@ -91,7 +91,7 @@ def run(args: list[str]) -> int:
     description = "Fly through a trained scene, plain or restyled, to a film or frames."
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
     from ..datamanagers.images import load_image
-    from ..io.video import FILMS, missing, write_video
+    from ..io.video import FILMS, missing_frames, write_video
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
@@ -105,7 +105,7 @@ def run(args: list[str]) -> int:
     folder = config.output.with_suffix(".frames") if whole else config.output
     paths = [folder / f"{name}.{'png' if whole else config.format}" for name in names]
     key = _key(opened, config, cameras)
-    todo = missing(folder, key, paths)
+    todo = missing_frames(folder, key, paths)
     if len(todo) < len(paths):
         print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
     start = time.perf_counter()
@@ -132,7 +132,7 @@ def _render(
 ) -> None:
     """Render the frames that are missing, each written as soon as it is done."""
     from ..io.images import write_exr, write_image
-    from ..io.sheet import beside, wiped
+    from ..io.sheet import side_by_side, wipe
     from ..training.footage import limits_of, panels, planes
 
     eyes = config.eyes if config.lens == "stereo" else None
@@ -146,7 +146,7 @@ def _render(
             write_exr(path, planes(cameras, frame, takes, eyes))
             continue
         shown = panels(scene, cameras, frame, takes, config.show, limits, eyes)
-        write_image(path, wiped(shown, frame / len(cameras)) if config.layout == "wipe" else beside(shown))
+        write_image(path, wipe(shown, frame / len(cameras)) if config.layout == "wipe" else side_by_side(shown))
     display.count(len(todo), len(todo), "rendering")
 
 

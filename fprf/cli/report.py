@@ -40,7 +40,7 @@ def run(args: list[str]) -> int:
     config = parse(ReportConfig(), args, prog="fprf report", description=description, positional=("run",))
     if not config.run.is_dir():
         raise CheckpointError(f"{config.run}: no such folder; give a run folder, as `fprf train` makes it")
-    from ..io.report import bars, write_report
+    from ..io.report import bar_chart, write_report
     from ..training.events import read_history
 
     histories = read_history(config.run)
@@ -52,7 +52,7 @@ def run(args: list[str]) -> int:
         title=config.run.resolve().name,
         facts=_facts(config.run, histories),
         charts=_charts(histories),
-        parts=bars([(name, seconds, _clock(seconds)) for name, seconds in parts]),
+        parts=bar_chart([(name, seconds, _clock(seconds)) for name, seconds in parts]),
         notes=notes,
     )
     _print(histories, parts, notes)
@@ -67,7 +67,7 @@ def run(args: list[str]) -> int:
 
 def _charts(histories: "Sequence[History]") -> list[str]:
     """PSNR, speed, and every loss."""
-    from ..io.report import Series, lines
+    from ..io.report import Series, line_chart
 
     names = list(dict.fromkeys(name for history in histories for name in history.values))
     made = []
@@ -77,7 +77,7 @@ def _charts(histories: "Sequence[History]") -> list[str]:
         if name == "skipped_steps" and not any(value for each in series for value in each.y):
             continue
         title = f"{name.replace('_', ' ')} loss" if loss else _PLAIN[name]
-        made.append(lines(title, series, "step", "logarithmic" if loss else _UNITS.get(name, "running mean"), log=loss))
+        made.append(line_chart(title, series, "step", "logarithmic" if loss else _UNITS.get(name, "running mean"), log=loss))
     return [chart for chart in made if chart]
 
 
@@ -118,7 +118,7 @@ def _parts(run: Path, histories: "Sequence[History]") -> list[tuple[str, float]]
 
 def _print(histories: "Sequence[History]", parts: list[tuple[str, float]], notes: list[str]) -> None:
     from ..io.figures import number
-    from ..io.report import spark
+    from ..io.report import sparkline
 
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
     for history in histories:
@@ -130,7 +130,7 @@ def _print(histories: "Sequence[History]", parts: list[tuple[str, float]], notes
             if history.name:
                 label = f"{history.name}: {label}"
             table.add_row(
-                label.replace("_", " "), spark(values), f"{number(known[0])} → {number(known[-1])}", _UNITS.get(name, "")
+                label.replace("_", " "), sparkline(values), f"{number(known[0])} → {number(known[-1])}", _UNITS.get(name, "")
             )
     total = sum(seconds for _, seconds in parts) or 1.0
     for name, seconds in parts:

@@ -209,11 +209,11 @@ def _pictures(scene: "SplatScene", styles: "Sequence[SplatScene]", shown: int) -
 
 
 def _sheet(pictures: "list[tuple[str, list[Picture]]]", names: list[str]) -> "Picture":
-    from ..io.sheet import Tile, sheet
+    from ..io.sheet import Tile, contact_sheet
 
     titles = ["before", *(name or "after" for name in names)]
     tiles = [Tile(each, (f"view {view}: {title}",)) for view, row in pictures for title, each in zip(titles, row, strict=True)]
-    return sheet(tiles, len(titles))
+    return contact_sheet(tiles, len(titles))
 
 
 def _write_page(

@@ -142,14 +142,14 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     """Show a scene's regions with what they take: a table on standard output, explain.json and explain.png in `output`."""
     from ..io.atomic import write_json
     from ..io.images import write_image
-    from ..io.sheet import sheet
+    from ..io.sheet import contact_sheet
     from ..training.explain import explain, region_row, region_tile
 
     found = explain(regions, styled)
     names = styled.dictionary.names if styled is not None else ()
     _print_table([_HEAD if styled else _HEAD[:3], *(_cells(region) for region in found)])
     write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in found]})
-    write_image(output / "explain.png", sheet([region_tile(region, names) for region in found]))
+    write_image(output / "explain.png", contact_sheet([region_tile(region, names) for region in found]))
     print(f"the same with pictures in {output / 'explain.png'} and explain.json")
 
 

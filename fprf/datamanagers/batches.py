@@ -31,14 +31,14 @@ from .features import FeatureStore, Progress, extract
 from .images import load_image, load_images, load_mask
 from .scene import Scene, find_sightings
 
-__all__ = ["HELD", "RayBatches", "Runs", "generator_of", "room_for"]
+__all__ = ["HELD", "PixelRuns", "RayBatches", "allocate_pixels", "generator_of"]
 
 
 HELD = 512 * 2**20
 """Bytes of pixels that are simply held in memory."""
 
 
-def room_for(pixels: int, folder: Path, held: int = HELD) -> Annotated[Tensor, "P 3"]:
+def allocate_pixels(pixels: int, folder: Path, held: int = HELD) -> Annotated[Tensor, "P 3"]:
     """Space for so many pixels, uint8, to be written to; mapped from a file in `folder` above `held` bytes.
 
     Raises DataError where the disk has no room for it.
@@ -64,7 +64,7 @@ def _reserve(file: int, size: int) -> None:
         os.ftruncate(file, size)
 
 
-class Runs:
+class PixelRuns:
     """A set of numbers of 0 to 2^63, as K runs that neither touch nor overlap, in order."""
 
     def __init__(self, start: Annotated[Tensor, "K"], length: Annotated[Tensor, "K"]) -> None:
@@ -74,7 +74,7 @@ class Runs:
         self._count = int(self._after[-1]) if len(start) else 0
 
     @staticmethod
-    def of(masks: Iterable[tuple[int, Annotated[Tensor, "P"]]]) -> "Runs":
+    def of(masks: Iterable[tuple[int, Annotated[Tensor, "P"]]]) -> "PixelRuns":
         """Of masks, each with the number of its first entry, which rise; a run may go on from one mask to the next."""
         starts, ends = [], []
         for first, mask in masks:
@@ -87,13 +87,13 @@ class Runs:
         apart = torch.ones(len(start) + 1, dtype=torch.bool)
         apart[1:-1] = start[1:] != end[:-1]
         start, end = start[apart[:-1]], end[apart[1:]]
-        return Runs(start, end - start)
+        return PixelRuns(start, end - start)
 
     def __len__(self) -> int:
         """How many numbers there are."""
         return self._count
 
-    def to(self, device: torch.device) -> "Runs":
+    def to(self, device: torch.device) -> "PixelRuns":
         """The same set on a device."""
         there = copy.copy(self)
         there._start, there._after, there._before = (x.to(device) for x in (self._start, self._after, self._before))
@@ -151,9 +151,9 @@ class _Source(NamedTuple):
     """int64 width and height of each."""
     ends: Annotated[Tensor, "T"]
     """int64 pixels up to the end of each."""
-    chosen: Runs | None
+    chosen: PixelRuns | None
     """Pixels that may be drawn; None = all."""
-    sky: Runs | None
+    sky: PixelRuns | None
     marks: _Marks | None
 
     def to(self, device: torch.device) -> "_Source":
@@ -271,7 +271,7 @@ class RayBatches(DataManager):
         end = int(self._ends[slot])
         return self._pixels[end - width * height : end].reshape(height, width, 3)
 
-    def _choose(self, seen: Callable[[int], Tensor] | None, masks: Sequence[Path | None]) -> Runs:
+    def _choose(self, seen: Callable[[int], Tensor] | None, masks: Sequence[Path | None]) -> PixelRuns:
         """The pixels that `seen` and the capture's masks allow."""
 
         def allowed(view: int, width: int, height: int) -> Tensor:
@@ -279,12 +279,12 @@ class RayBatches(DataManager):
             path = masks[view] if masks else None
             return mask if path is None else mask & torch.from_numpy(load_mask(path, (width, height)))
 
-        found = Runs.of(self._each(allowed))
+        found = PixelRuns.of(self._each(allowed))
         if not len(found):
             raise DataError(f"{self._scene.name}: none of {len(self._views)} training views shows what is to be learnt")
         return found
 
-    def _skies(self, skies: Sequence[Path | None]) -> Runs:
+    def _skies(self, skies: Sequence[Path | None]) -> PixelRuns:
         """The pixels that show sky."""
 
         def sky(view: int, width: int, height: int) -> Tensor:
@@ -292,7 +292,7 @@ class RayBatches(DataManager):
             none = torch.zeros(height, width, dtype=torch.bool)
             return none if path is None else torch.from_numpy(load_mask(path, (width, height)))
 
-        return Runs.of(self._each(sky))
+        return PixelRuns.of(self._each(sky))
 
     def _each(self, mask: Callable[[int, int, int], Tensor]) -> Iterator[tuple[int, Annotated[Tensor, "P"]]]:
         """Mask of each training view, of its width and height, by the number of its first pixel."""
@@ -322,7 +322,7 @@ class RayBatches(DataManager):
 
     def _load(self, cache: Path) -> Annotated[Tensor, "P 3"]:
         """All training pixels, uint8, view after view; many of them mapped from a file."""
-        pixels = room_for(int(self._ends[-1]), cache)
+        pixels = allocate_pixels(int(self._ends[-1]), cache)
         filled = 0
         for first in range(0, len(self._views), DECODE):
             views = self._views[first : first + DECODE]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..rendering.cameras import Cameras, project
 
-__all__ = ["DIFFERENT", "GAMMA", "Scene", "Sightings", "differ", "find_sightings", "tile_of", "with_exposure"]
+__all__ = ["DIFFERENT", "GAMMA", "Scene", "Sightings", "exposures_differ", "find_sightings", "tile_of", "with_exposure"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +125,7 @@ DARK, BRIGHT = 0.03, 0.97
 """sRGB outside of which a pixel says nothing: noise, or clipped."""
 
 
-def differ(exposure: Annotated[Tensor, "V"] | None) -> bool:
+def exposures_differ(exposure: Annotated[Tensor, "V"] | None) -> bool:
     """Whether views were taken so differently that each needs a factor of its own; not where nothing is known."""
     return exposure is not None and len(exposure) > 1 and GAMMA * float(exposure.log().std()) > DIFFERENT
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.images import IMAGE_SUFFIXES, load_image
-from ..datamanagers.parsers.files import Record, read_bytes, read_json, read_npy, read_npz, record_of
-from ..datamanagers.parsers.views import rigid
+from ..datamanagers.parsers.files import Record, as_record, read_bytes, read_json, read_npy, read_npz
+from ..datamanagers.parsers.views import rigid_pose
 from ..errors import DataError
 from ..plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from ..rendering.cameras import Cameras, pixel_grid, rays_through
@@ -55,7 +55,7 @@ def read_cameras(path: Path, frames: Frames) -> Cameras:
     place by name. Pinholes alone. Raises DataError for what does not fit.
     """
     entries = {
-        Path(record.text("file_path") or "").stem: record for record in record_of(path, read_json(path)).records("frames")
+        Path(record.text("file_path") or "").stem: record for record in as_record(path, read_json(path)).records("frames")
     }
     chosen = [entries[name] for name in frames.names if name in entries]
     if not chosen and len(entries) == len(frames.names):
@@ -66,7 +66,7 @@ def read_cameras(path: Path, frames: Frames) -> Cameras:
         )
     views = [_camera(record, image.shape[1], image.shape[0]) for record, image in zip(chosen, frames.images, strict=True)]
     return Cameras(
-        pose=torch.stack([torch.from_numpy(rigid(r.where, r.matrix("transform_matrix"))) for r in chosen]),
+        pose=torch.stack([torch.from_numpy(rigid_pose(r.where, r.matrix("transform_matrix"))) for r in chosen]),
         focal=torch.tensor([focal for focal, _ in views], dtype=torch.float64),
         centre=torch.tensor([centre for _, centre in views], dtype=torch.float64),
         size=torch.tensor([[image.shape[1], image.shape[0]] for image in frames.images]),

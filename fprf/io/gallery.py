@@ -18,24 +18,10 @@ from .figures import Metrics, figures, number
 from .images import Picture, data_uri, shrink, to_uint8
 from .maps import palette
 
-__all__ = [
-    "MAP_SIDE",
-    "SMALL_SIDE",
-    "TINY_SIDE",
-    "VIEW_SIDE",
-    "Reference",
-    "Style",
-    "cards_of",
-    "compare",
-    "img",
-    "overview",
-    "ratio",
-    "styles_section",
-    "write_gallery",
-]
+__all__ = ["Reference", "Style", "write_gallery"]
 
 
-VIEW_SIDE, MAP_SIDE, SMALL_SIDE, TINY_SIDE = 1024, 512, 224, 80
+_VIEW_SIDE, _MAP_SIDE, _SMALL_SIDE, _TINY_SIDE = 1024, 512, 224, 80
 """Longest sides in pixels of embedded views, of maps and references, of the overview, and of thumbnails."""
 
 
@@ -61,7 +47,7 @@ class Style(NamedTuple):
     """What was measured of this style alone."""
 
 
-def img(picture: Picture, side: int, alt: str, *, eager: bool = False, of: str = "") -> str:
+def _img(picture: Picture, side: int, alt: str, *, eager: bool = False, of: str = "") -> str:
     """A picture as part of the page, its longest side at most `side` pixels; `of` is its class."""
     small = shrink(picture, side)
     height, width = small.shape[:2]
@@ -74,16 +60,16 @@ def img(picture: Picture, side: int, alt: str, *, eager: bool = False, of: str =
     )
 
 
-def ratio(picture: Picture) -> str:
+def _ratio(picture: Picture) -> str:
     """Width by height, for the style sheet."""
     return f"{picture.shape[1] / picture.shape[0]:.5f}"
 
 
-def cards_of(pictures: Sequence[Picture], view_names: Sequence[str], what: str, style: int | None = None) -> str:
+def _cards(pictures: Sequence[Picture], view_names: Sequence[str], what: str, style: int | None = None) -> str:
     """Small pictures of views with their names; the script finds match maps by their style."""
     cards = "\n".join(
-        f'<figure class="card" data-match="{"" if style is None else style}-{view}" style="--ratio:{ratio(picture)}">'
-        f"{img(picture, MAP_SIDE, f'View {name}, {what}')}<figcaption>{escape(name)}</figcaption></figure>"
+        f'<figure class="card" data-match="{"" if style is None else style}-{view}" style="--ratio:{_ratio(picture)}">'
+        f"{_img(picture, _MAP_SIDE, f'View {name}, {what}')}<figcaption>{escape(name)}</figcaption></figure>"
         for view, (name, picture) in enumerate(zip(view_names, pictures, strict=False))
     )
     return f'<div class="grid small">\n{cards}\n</div>'
@@ -93,14 +79,14 @@ _LEAST, _MOST = 760, 2.6
 """Width in pixels up to which any view is shown, and how often larger than it is otherwise."""
 
 
-def compare(
+def _compare(
     view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style], known: Mapping[str, Reference]
 ) -> str:
     """The stage with its choices: what lies left and right of the wipe, and of which view; nothing without styles."""
     if not styles:
         return ""
     first = originals[0]
-    most = max(_LEAST, _MOST * min(VIEW_SIDE, first.shape[1]))
+    most = max(_LEAST, _MOST * min(_VIEW_SIDE, first.shape[1]))
     picks = "\n".join(
         f'<button class="pick" type="button" data-style="{index}" aria-pressed="{str(index == 0).lower()}">'
         f"{_stack(style, known)}<span>{escape(style.name)}</span></button>"
@@ -108,14 +94,14 @@ def compare(
     )
     film = "\n".join(
         f'<button type="button" data-view="{index}" aria-pressed="{str(index == 0).lower()}" title="{escape(name)}">'
-        f"{img(picture, VIEW_SIDE, f'View {name}, original', eager=True)}</button>"
+        f"{_img(picture, _VIEW_SIDE, f'View {name}, original', eager=True)}</button>"
         for index, (name, picture) in enumerate(zip(view_names, originals, strict=True))
     )
     return f"""<section class="compare" id="compare" aria-label="Compare">
 <div class="stage">
-<figure class="wipe" style="--at:50%;--ratio:{ratio(first)};--most:{most:.0f}px">
-{img(styles[0].views[0], VIEW_SIDE, f"View {view_names[0]}, {styles[0].name}", eager=True, of="after")}
-{img(first, VIEW_SIDE, f"View {view_names[0]}, original", eager=True, of="before")}
+<figure class="wipe" style="--at:50%;--ratio:{_ratio(first)};--most:{most:.0f}px">
+{_img(styles[0].views[0], _VIEW_SIDE, f"View {view_names[0]}, {styles[0].name}", eager=True, of="after")}
+{_img(first, _VIEW_SIDE, f"View {view_names[0]}, original", eager=True, of="before")}
 <span class="tag one">Original</span><span class="tag two">{escape(styles[0].name)}</span>
 <input type="range" min="0" max="100" step="any" value="50" aria-label="How much of the original is shown">
 <span class="seam"></span>
@@ -148,11 +134,11 @@ def _left(styles: Sequence[Style]) -> str:
 
 
 def _stack(style: Style, known: Mapping[str, Reference]) -> str:
-    small = [img(known[name].image, TINY_SIDE, "", eager=True) for name in style.references[:3]]
+    small = [_img(known[name].image, _TINY_SIDE, "", eager=True) for name in style.references[:3]]
     return f'<span class="stack">{"".join(small)}</span>' if small else ""
 
 
-def overview(view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style]) -> str:
+def _overview(view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style]) -> str:
     """A table of thumbnails, views by styles; each goes to the stage. Nothing where it would repeat what is seen anyway."""
     if len(styles) < 2 or len(view_names) < 2:
         return ""
@@ -179,11 +165,11 @@ def overview(view_names: Sequence[str], originals: Sequence[Picture], styles: Se
 
 
 def _cell(picture: Picture, what: str, goes: str) -> str:
-    shown = img(picture, SMALL_SIDE, what)
-    return f'<td><button type="button" data-go="{goes}" style="--ratio:{ratio(picture)}">{shown}</button></td>'
+    shown = _img(picture, _SMALL_SIDE, what)
+    return f'<td><button type="button" data-go="{goes}" style="--ratio:{_ratio(picture)}">{shown}</button></td>'
 
 
-def styles_section(view_names: Sequence[str], styles: Sequence[Style], known: Mapping[str, Reference]) -> str:
+def _styles_section(view_names: Sequence[str], styles: Sequence[Style], known: Mapping[str, Reference]) -> str:
     """Each style with its references and figures beside its views, its match maps below."""
     if not styles:
         return ""
@@ -197,13 +183,13 @@ def styles_section(view_names: Sequence[str], styles: Sequence[Style], known: Ma
 
 def _style(index: int, style: Style, view_names: Sequence[str], known: Mapping[str, Reference]) -> str:
     cards = "\n".join(
-        f'<button class="card" type="button" data-shot="{index}-{view}" style="--ratio:{ratio(picture)}">'
-        f"{img(picture, VIEW_SIDE, f'View {name}, {style.name}')}<span>{escape(name)}</span></button>"
+        f'<button class="card" type="button" data-shot="{index}-{view}" style="--ratio:{_ratio(picture)}">'
+        f"{_img(picture, _VIEW_SIDE, f'View {name}, {style.name}')}<span>{escape(name)}</span></button>"
         for view, (name, picture) in enumerate(zip(view_names, style.views, strict=True))
     )
     matches = ""
     if style.matches:
-        maps = cards_of(style.matches, view_names, "reference of every place", index)
+        maps = _cards(style.matches, view_names, "reference of every place", index)
         matches = f'\n<div class="under"><p class="label">Which reference each place took its style from</p>\n{maps}\n</div>'
     return f"""<article class="style">
 <div><h3>{escape(style.name)}</h3>
@@ -229,7 +215,7 @@ def _sources(style: Style, known: Mapping[str, Reference]) -> str:
     for place, name in enumerate(style.references):
         chip = f'<i class="chip" style="background:rgb({",".join(map(str, colours[place]))})"></i>' if style.matches else ""
         share = f'<data value="{style.shares[place]:.4f}">{style.shares[place]:.0%}</data>' if style.shares else ""
-        image = img(known[name].image, MAP_SIDE, f"Reference {name}")
+        image = _img(known[name].image, _MAP_SIDE, f"Reference {name}")
         rows.append(f'<figure class="source">{image}<figcaption>{chip}<span>{escape(name)}</span>{share}</figcaption></figure>')
     return f'<div class="sources">{"".join(rows)}</div>' if rows else ""
 
@@ -261,9 +247,9 @@ def write_gallery(
     known = {reference.name: reference for reference in references}
     parts = [
         ("", _opening(title, scene)),
-        ("Compare", compare(view_names, originals, styles, known)),
-        ("Overview", overview(view_names, originals, styles)),
-        ("Styles", styles_section(view_names, styles, known)),
+        ("Compare", _compare(view_names, originals, styles, known)),
+        ("Overview", _overview(view_names, originals, styles)),
+        ("Styles", _styles_section(view_names, styles, known)),
         ("Geometry", _geometry(view_names, depth)),
         ("Flight", "" if video is None else _flight(video, path)),
         ("Figures", _figures(metrics or {})),
@@ -308,7 +294,7 @@ def _geometry(view_names: Sequence[str], depth: Sequence[Picture]) -> str:
     return f"""<section id="geometry">
 <h2>Geometry</h2>
 <p class="lead">Rendered depth: near is bright, far is dark, nothing is grey. All styles share it.</p>
-{cards_of(depth, view_names, "depth")}
+{_cards(depth, view_names, "depth")}
 </section>"""
 
 

@@ -15,7 +15,7 @@ from .figures import number
 if TYPE_CHECKING:
     from ..training.events import History
 
-__all__ = ["Series", "bars", "lines", "spark", "ticks", "write_report", "write_scalars"]
+__all__ = ["Series", "axis_ticks", "bar_chart", "line_chart", "sparkline", "write_report", "write_scalars"]
 
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 560, 260, 58, 12, 12, 34
@@ -33,7 +33,7 @@ class Series(NamedTuple):
     y: Sequence[float | None]
 
 
-def ticks(low: float, high: float, most: int = 5) -> list[float]:
+def axis_ticks(low: float, high: float, most: int = 5) -> list[float]:
     """Round numbers within [low, high], evenly spaced: 1, 2 or 5 times a power of ten apart; at most `most` + 1."""
     if not high > low:
         return [low]
@@ -44,7 +44,7 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def lines(title: str, series: Sequence[Series], x_label: str, y_label: str, *, log: bool = False) -> str:
+def line_chart(title: str, series: Sequence[Series], x_label: str, y_label: str, *, log: bool = False) -> str:
     """A chart of lines over a common axis. `log` spaces y by its logarithm and leaves out what is not above 0."""
     drawn = [(each.name, _points(each, log)) for each in series]
     drawn = [(name, points) for name, points in drawn if points]
@@ -62,12 +62,12 @@ def lines(title: str, series: Sequence[Series], x_label: str, y_label: str, *, l
         return _LEFT + (x - x0) * across, _HEIGHT - _BOTTOM - (y - y0) * up
 
     parts = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(title)}">']
-    for value in ticks(y0, y1):
+    for value in axis_ticks(y0, y1):
         _, y = place(x0, value)
         shown = number(10**value if log else value)
         parts.append(f'<line class="rule" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{shown}</text>')
-    for value in ticks(x0, x1):
+    for value in axis_ticks(x0, x1):
         x, _ = place(value, y0)
         parts.append(f'<text x="{x:.1f}" y="{_HEIGHT - _BOTTOM + 18}" text-anchor="middle">{value:,.4g}</text>')
     parts.append(f'<text class="axis" x="{_WIDTH - _RIGHT}" y="{_HEIGHT - 2}" text-anchor="end">{escape(x_label)}</text>')
@@ -79,7 +79,7 @@ def lines(title: str, series: Sequence[Series], x_label: str, y_label: str, *, l
     return f"<figure><figcaption>{escape(title)}, {escape(y_label)}</figcaption>{''.join(parts)}{_legend(drawn)}</figure>"
 
 
-def bars(rows: Sequence[tuple[str, float, str]]) -> str:
+def bar_chart(rows: Sequence[tuple[str, float, str]]) -> str:
     """Horizontal bars with (name, value, what is written beside it); lengths are relative to the largest value."""
     longest = max((value for _, value, _ in rows), default=0.0) or 1.0
     drawn = "".join(
@@ -90,7 +90,7 @@ def bars(rows: Sequence[tuple[str, float, str]]) -> str:
     return f'<dl class="bars">{drawn}</dl>' if rows else ""
 
 
-def spark(values: Sequence[float | None], width: int = 24) -> str:
+def sparkline(values: Sequence[float | None], width: int = 24) -> str:
     """A line of blocks, low to high, for a terminal; what is not known is left out."""
     known = [value for value in values if value is not None]
     if not known:
@@ -132,7 +132,7 @@ def write_report(
     parts: str,
     notes: Sequence[str],
 ) -> None:
-    """Write the page, whole or not at all. `charts` and `parts` are HTML of `lines` and `bars`; all else is shown as text."""
+    """Write the page, whole or not at all. `charts` and `parts` are HTML of this module; all else is shown as text."""
     shown = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(number(fact))}</dd></div>" for name, fact in facts.items())
     sections = [f'<section class="opening"><h1>{escape(title)}</h1><dl class="facts">{shown}</dl></section>']
     if charts:

@@ -13,7 +13,7 @@ from ..errors import DataError
 from .images import Picture, checked
 from .maps import palette
 
-__all__ = ["Tile", "beside", "highlight", "seams", "sheet", "wiped"]
+__all__ = ["Tile", "contact_sheet", "highlight", "seam_positions", "side_by_side", "wipe"]
 
 
 _SIDE = 240
@@ -47,7 +47,7 @@ def highlight(picture: Picture, inside: Annotated[Tensor, "H W"]) -> Picture:
     return np.asarray(cv2.drawContours(mixed, edges, -1, _OUTLINE, 1), dtype=np.uint8)
 
 
-def sheet(tiles: Sequence[Tile], columns: int = _COLUMNS) -> Picture:
+def contact_sheet(tiles: Sequence[Tile], columns: int = _COLUMNS) -> Picture:
     """The tiles in rows of four, or of as many as are asked for, in their order. Letters beyond ASCII are shown as '?'."""
     if not tiles:
         return np.full((_GAP, _GAP, 3), _PAPER, dtype=np.uint8)
@@ -100,7 +100,7 @@ _SEAM = 2
 """Pixels of the line between strips."""
 
 
-def beside(pictures: Sequence[Picture]) -> Picture:
+def side_by_side(pictures: Sequence[Picture]) -> Picture:
     """The pictures from left to right, with a thin line between them. Raises DataError where their heights differ."""
     if len({checked(picture).shape[0] for picture in pictures}) != 1:
         raise DataError(f"pictures of heights {[picture.shape[0] for picture in pictures]} cannot lie beside each other")
@@ -109,18 +109,18 @@ def beside(pictures: Sequence[Picture]) -> Picture:
     return np.concatenate(parts, axis=1)
 
 
-def seams(count: int, at: float) -> list[float]:
+def seam_positions(count: int, at: float) -> list[float]:
     """Where `count` strips meet, as shares of the width; over `at` in [0, 1] each seam swings by half a strip and back."""
     swing = math.sin(2 * math.pi * at) / (2 * count)
     return [k / count + swing for k in range(1, count)]
 
 
-def wiped(pictures: Sequence[Picture], at: float) -> Picture:
+def wipe(pictures: Sequence[Picture], at: float) -> Picture:
     """A strip of each picture in turn, in one picture. Raises DataError where sizes differ."""
     if len({checked(picture).shape for picture in pictures}) != 1:
         raise DataError(f"pictures of shapes {[picture.shape for picture in pictures]} cannot share one picture")
     width = pictures[0].shape[1]
-    edges = [0, *(round(seam * width) for seam in seams(len(pictures), at)), width]
+    edges = [0, *(round(seam * width) for seam in seam_positions(len(pictures), at)), width]
     whole = np.concatenate([p[:, a:b] for p, a, b in zip(pictures, edges[:-1], edges[1:], strict=True)], axis=1)
     for edge in edges[1:-1]:
         whole[:, max(0, edge - _SEAM // 2) : edge + _SEAM - _SEAM // 2] = 255

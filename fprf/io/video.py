@@ -17,7 +17,7 @@ from .images import Picture, checked, write_image
 if TYPE_CHECKING:
     from types import ModuleType
 
-__all__ = ["FILMS", "missing", "write_frames", "write_video"]
+__all__ = ["FILMS", "missing_frames", "write_frames", "write_video"]
 
 
 Codec = Literal["h264", "mp4v", "gif", "webp", "apng"]
@@ -151,7 +151,7 @@ def write_frames(folder: Path, names: Iterable[str], frames: Iterable[Picture]) 
 _RECORD = ".render.json"
 
 
-def missing(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
+def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     """Which of the frames are not there yet; all, where the folder was rendered from something else than `key` says.
 
     The key is written down at once, so that what is rendered from now on counts. Frames are whole or absent.

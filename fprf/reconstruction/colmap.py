@@ -26,23 +26,23 @@ from numpy.typing import NDArray
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json, write_text
 from .config import SfmConfig
-from .scene_folder import Place, State, key_of
-from .worker import ABSENT, NOTHING
+from .scene_folder import SceneFolder, State, step_key
+from .worker import NO_MODEL, NO_PYCOLMAP
 
 __all__ = [
+    "MatchTables",
     "Pair",
-    "Tables",
-    "counts",
+    "build_vocabulary",
+    "count_rows",
     "descriptors",
-    "exhaustive",
+    "exhaustive_pairs",
     "find_features",
     "find_matches",
     "find_poses",
-    "merged",
-    "sequential",
-    "similar",
-    "vectors",
-    "words",
+    "sequential_pairs",
+    "similar_pairs",
+    "union_of_pairs",
+    "vlad_vectors",
 ]
 
 
@@ -50,7 +50,7 @@ _MAX_IMAGES = 2147483647
 """A pair of images is stored as _MAX_IMAGES * smaller id + larger id."""
 
 
-class Tables:
+class MatchTables:
     """What a database says of images, by their names. Raises sqlite3.Error for what is no database of COLMAP's."""
 
     def __init__(self, path: Path) -> None:
@@ -74,7 +74,7 @@ class Tables:
         return sum(count >= least for pair, count in self.matches.items() if name in pair)
 
 
-def counts(path: Path) -> tuple[int, int]:
+def count_rows(path: Path) -> tuple[int, int]:
     """Images with features and pairs that were tried so far; zeros while the database cannot be read."""
     with contextlib.suppress(sqlite3.Error, OSError), _reading(path) as base:
         features = base.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0]
@@ -105,18 +105,18 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
 Pair: TypeAlias = tuple[int, int]
 
 
-def exhaustive(count: int) -> list[Pair]:
+def exhaustive_pairs(count: int) -> list[Pair]:
     """All with all: count (count - 1) / 2."""
     return [(a, b) for a in range(count) for b in range(a + 1, count)]
 
 
-def sequential(count: int, overlap: int) -> list[Pair]:
+def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     """Each with the next `overlap` ones, and with those at distances 2, 4, 8, ... up to 2 ** overlap."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(overlap + 1))})
     return [(a, a + step) for a in range(count) for step in steps if a + step < count]
 
 
-def similar(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
+def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> list[Pair]:
     """Each with those whose unit vectors are most like its own, by cosine; an image without a vector (all 0) with none."""
     likeness = vectors @ vectors.T
     empty = ~vectors.any(axis=1)
@@ -128,7 +128,7 @@ def similar(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) -> lis
     return sorted(found)
 
 
-def merged(*parts: Sequence[Pair]) -> list[Pair]:
+def union_of_pairs(*parts: Sequence[Pair]) -> list[Pair]:
     """Pairs of any of the parts."""
     return sorted({pair for part in parts for pair in part})
 
@@ -144,7 +144,7 @@ Words = Annotated[NDArray[np.float32], "W 128"]
 Reader = Callable[[int], Descriptors]
 
 
-def words(read: Reader, count: int, number: int, seed: int = 0) -> Words:
+def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Words:
     """`number` visual words, or fewer where there are fewer descriptors; `read(i)` gives those of image i of `count`."""
     rng = np.random.default_rng(seed)
     each = max(1, _SAMPLE // max(1, count))
@@ -163,7 +163,7 @@ def words(read: Reader, count: int, number: int, seed: int = 0) -> Words:
     return np.asarray(centres, dtype=np.float32)
 
 
-def vectors(read: Reader, count: int, vocabulary: Words) -> Annotated[NDArray[np.float32], "V X"]:
+def vlad_vectors(read: Reader, count: int, vocabulary: Words) -> Annotated[NDArray[np.float32], "V X"]:
     """A unit vector an image; 0 for an image without descriptors."""
     result = np.zeros((count, vocabulary.size), np.float32)
     for image in range(count):
@@ -200,7 +200,7 @@ _COMMAND = (sys.executable, "-m", "fprf.reconstruction.worker")
 Progress = Callable[[int, int, str], None]
 
 
-def find_features(place: Place, state: State, config: SfmConfig, progress: Progress) -> None:
+def find_features(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
     """Features of every image; those of an image that has changed or gone take all others with them."""
     settings = [config.lens, config.cameras, config.features, config.side, config.seed]
     hashes = {name: image["sha256"] for name, image in state.images.items()}
@@ -210,7 +210,7 @@ def find_features(place: Place, state: State, config: SfmConfig, progress: Progr
         for old in place.work.glob("database.db*"):
             old.unlink()
         write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
-    key = key_of(settings, hashes)
+    key = step_key(settings, hashes)
     if state.done.get("features") == key and place.database.is_file():
         return
     write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
@@ -225,40 +225,46 @@ def find_features(place: Place, state: State, config: SfmConfig, progress: Progr
         "features": config.features,
         "side": config.side,
     }
-    _run(place, state, config, job, _Watch(lambda: counts(place.database)[0], len(state.images), "finding features", progress))
+    _run(
+        place,
+        state,
+        config,
+        job,
+        _Watch(lambda: count_rows(place.database)[0], len(state.images), "finding features", progress),
+    )
     state.done["features"] = key
     state.save(place)
 
 
-def find_matches(place: Place, state: State, config: SfmConfig, progress: Progress) -> str:
+def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> str:
     """Matches of the pairs that `matching` says. Returns what it was decided to be."""
     names, video = list(state.images), "frames" in state.done
     kind = config.matching
     if kind == "auto":
         kind = "exhaustive" if len(names) <= _ALL_PAIRS else "similar"
-    key = key_of(state.done["features"], kind, config.overlap, config.neighbours)
+    key = step_key(state.done["features"], kind, config.overlap, config.neighbours)
     if state.done.get("matches") == key and place.database.is_file():
         return kind
     if kind == "exhaustive":
-        chosen = exhaustive(len(names))
+        chosen = exhaustive_pairs(len(names))
     elif kind == "sequential":
-        chosen = sequential(len(names), config.overlap)
+        chosen = sequential_pairs(len(names), config.overlap)
     else:
         # Neighbours by name help where things look alike everywhere; in a video they are neighbours for certain.
-        near = sequential(len(names), config.overlap if video else 2)
-        chosen = merged(near, _alike(place, names, config))
+        near = sequential_pairs(len(names), config.overlap if video else 2)
+        chosen = union_of_pairs(near, _similar_images(place, names, config))
     listed = place.work / "pairs.txt"
     write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
     job = {"step": "matches", "pairs": str(listed)}
-    _run(place, state, config, job, _Watch(lambda: counts(place.database)[1], len(chosen), "matching", progress))
+    _run(place, state, config, job, _Watch(lambda: count_rows(place.database)[1], len(chosen), "matching", progress))
     state.done["matches"] = key
     state.save(place)
     return kind
 
 
-def find_poses(place: Place, state: State, config: SfmConfig, progress: Progress) -> list[dict[str, Any]]:
+def find_poses(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> list[dict[str, Any]]:
     """The largest model in `sparse/0`; all of them described. Raises DataError where no two images fit together."""
-    key = key_of(state.done["matches"], "mapping")
+    key = step_key(state.done["matches"], "mapping")
     described = place.work / "models" / "models.json"
     if state.done.get("mapping") == key and (place.model / "images.bin").is_file() and described.is_file():
         return list(json.loads(described.read_text(encoding="utf-8")))
@@ -275,14 +281,14 @@ def find_poses(place: Place, state: State, config: SfmConfig, progress: Progress
     return list(json.loads(described.read_text(encoding="utf-8")))
 
 
-def _alike(place: Place, names: Sequence[str], config: SfmConfig) -> list[Pair]:
+def _similar_images(place: SceneFolder, names: Sequence[str], config: SfmConfig) -> list[Pair]:
     """Pairs of images that look alike."""
 
     def read(image: int) -> Any:
         return descriptors(place.database, names[image])
 
-    vocabulary = words(read, len(names), _WORDS, config.seed)
-    return similar(vectors(read, len(names), vocabulary), config.neighbours)
+    vocabulary = build_vocabulary(read, len(names), _WORDS, config.seed)
+    return similar_pairs(vlad_vectors(read, len(names), vocabulary), config.neighbours)
 
 
 class _Watch(NamedTuple):
@@ -294,7 +300,7 @@ class _Watch(NamedTuple):
     progress: Progress
 
 
-def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], watch: _Watch) -> None:
+def _run(place: SceneFolder, state: State, config: SfmConfig, job: dict[str, Any], watch: _Watch) -> None:
     """One step in its process. Raises UsageError where pycolmap is absent, DataError where COLMAP fails."""
     name, start = job["step"], time.perf_counter()
     path = place.work / f"{name}.job.json"
@@ -318,9 +324,9 @@ def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], wat
                 process.terminate()
                 process.wait()
     code = process.returncode
-    if code == ABSENT:
+    if code == NO_PYCOLMAP:
         raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'fprf[sfm]'")
-    if code == NOTHING:
+    if code == NO_MODEL:
         raise DataError(
             f"{place.root}: no two images fit together; take more views with more overlap, of places with texture "
             f"({place.log} has COLMAP's words)"
@@ -331,11 +337,11 @@ def _run(place: Place, state: State, config: SfmConfig, job: dict[str, Any], wat
     state.seconds[name] = round(time.perf_counter() - start, 2)
 
 
-def _progress_file(place: Place) -> Path:
+def _progress_file(place: SceneFolder) -> Path:
     return place.work / "progress.jsonl"
 
 
-def _registered(place: Place) -> int:
+def _registered(place: SceneFolder) -> int:
     """Images with a pose so far."""
     lines = [line for line in _progress_file(place).read_text(encoding="utf-8").splitlines() if line.startswith("{")]
     return len(lines) + 1 if lines else 0

@@ -22,19 +22,19 @@ from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image
 from ..errors import DataError, UsageError
 from ..io.atomic import atomic_path, write_bytes
 from .config import SfmConfig
-from .scene_folder import Place, State, key_of
+from .scene_folder import SceneFolder, State, step_key
 
 __all__ = [
     "VIDEO_SUFFIXES",
     "Choice",
     "Lens",
-    "choose",
+    "choose_frames",
     "frame_name",
     "frame_scores",
-    "gather",
-    "heic_exif",
-    "in_order",
+    "gather_images",
+    "heic_exif_block",
     "lens_of",
+    "natural_order",
     "read_lens",
     "save_frames",
     "sharpness",
@@ -65,7 +65,7 @@ def sharpness(image: Image) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 
-def choose(scores: Sequence[float], count: int, least: float) -> Choice:
+def choose_frames(scores: Sequence[float], count: int, least: float) -> Choice:
     """The sharpest frame of each of `count` windows of equal length; the first of equally sharp ones.
 
     A window whose best frame has less than `least` times the median sharpness of the windows around it gives none: all of
@@ -187,7 +187,7 @@ def read_lens(path: Path) -> Lens:
         return Lens()
 
 
-def heic_exif(path: Path) -> bytes:
+def heic_exif_block(path: Path) -> bytes:
     """The EXIF block of a HEIC file that can be decoded, for a JPEG of its pixels: without orientation, which these have had.
 
     Empty where there is none, it is longer than a JPEG takes, or the file is none.
@@ -254,7 +254,7 @@ _FOREIGN = frozenset({".heic", ".heif", ".hif", ".avif"})
 """Endings of formats that COLMAP does not read."""
 
 
-def gather(source: Path, place: Place, state: State, config: SfmConfig, progress: Progress) -> None:
+def gather_images(source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
     """Bring images into the folder, and describe them and what was dropped in `state`.
 
     Raises UsageError for a source that is neither a folder of images nor a video, or not the one that the folder was
@@ -276,11 +276,11 @@ def gather(source: Path, place: Place, state: State, config: SfmConfig, progress
     for name in set(state.images) - set(found):
         if place.images.resolve() != source.resolve():
             (place.images / name).unlink(missing_ok=True)
-    state.source, state.images = here, {name: found[name] for name in in_order(found)}
+    state.source, state.images = here, {name: found[name] for name in natural_order(found)}
     state.save(place)
 
 
-def in_order(names: Iterable[str]) -> list[str]:
+def natural_order(names: Iterable[str]) -> list[str]:
     """Names as people number them: 2 before 10."""
     return sorted(names, key=lambda name: [_rank(part) for part in _PARTS.findall(name)])
 
@@ -294,7 +294,7 @@ def _rank(part: str) -> tuple[bool, int, str]:
     return not number, int(part) if number else 0, part
 
 
-def _from_folder(source: Path, place: Place, state: State, progress: Progress) -> dict[str, dict[str, Any]]:
+def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progress) -> dict[str, dict[str, Any]]:
     """Every image below the folder that can be decoded, under its relative name without blanks.
 
     Formats that COLMAP does not read become JPEGs: IMG_1.heic is IMG_1.heic.jpg in the scene.
@@ -332,13 +332,15 @@ def _from_folder(source: Path, place: Place, state: State, progress: Progress) -
     return found
 
 
-def _from_video(source: Path, place: Place, state: State, config: SfmConfig, progress: Progress) -> dict[str, dict[str, Any]]:
+def _from_video(
+    source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress
+) -> dict[str, dict[str, Any]]:
     """Sharp frames, evenly over time."""
     about = source.stat()
-    key = key_of("frames", about.st_size, about.st_mtime_ns, config.frames, config.blurred)
+    key = step_key("frames", about.st_size, about.st_mtime_ns, config.frames, config.blurred)
     if state.done.get("frames") == key and all((place.images / name).is_file() for name in state.images):
         return state.images
-    choice = choose(frame_scores(source, progress), config.frames, config.blurred)
+    choice = choose_frames(frame_scores(source, progress), config.frames, config.blurred)
     save_frames(source, choice.chosen, place.images, progress)
     state.dropped = {f"frame {frame}": reason for frame, reason in choice.dropped.items()}
     state.done["frames"] = key
@@ -353,7 +355,7 @@ def _write_jpeg(path: Path, target: Path) -> None:
     """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be decoded."""
     pixels = cv2.cvtColor(load_image(path, upright=True), cv2.COLOR_RGB2BGR)
     options = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    data, exif = cv2.imencode(".jpg", pixels, options)[1].tobytes(), heic_exif(path)
+    data, exif = cv2.imencode(".jpg", pixels, options)[1].tobytes(), heic_exif_block(path)
     if exif:
         data = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
     write_bytes(target, data)

@@ -17,14 +17,14 @@ from typing import Any, NamedTuple, Protocol
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json
 
-__all__ = ["Drop", "Found", "Place", "State", "dropped", "key_of", "report", "summary"]
+__all__ = ["Drop", "Matches", "SceneFolder", "State", "dropped_images", "report", "step_key", "summary_rows"]
 
 
 _FORMAT = 1
 
 
 @dataclass(frozen=True)
-class Place:
+class SceneFolder:
     """The folder."""
 
     root: Path
@@ -71,7 +71,7 @@ class State:
     """What each step took when it was done."""
 
     @classmethod
-    def load(cls, place: Place) -> "State":
+    def load(cls, place: SceneFolder) -> "State":
         """The state of a folder; a new one where nothing was done. Raises UsageError for a folder of something else."""
         path = place.work / "state.json"
         if not path.is_file():
@@ -87,12 +87,12 @@ class State:
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise DataError(f"{path}: cannot be read ({error}); remove the folder {place.work} and start anew") from error
 
-    def save(self, place: Place) -> None:
+    def save(self, place: SceneFolder) -> None:
         """Write it."""
         write_json(place.work / "state.json", {"format": _FORMAT, **vars(self)})
 
 
-def key_of(*parts: object) -> str:
+def step_key(*parts: object) -> str:
     """A hash of what a step depends on."""
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -101,7 +101,7 @@ _LEAST = 15
 """Verified matches from which on COLMAP takes two images for neighbours."""
 
 
-class Found(Protocol):
+class Matches(Protocol):
     """What is known of matches (`database.Tables`)."""
 
     def features_of(self, name: str) -> int:
@@ -120,7 +120,9 @@ class Drop(NamedTuple):
     reason: str
 
 
-def dropped(names: Sequence[str], unused: Mapping[str, str], found: Found, models: Sequence[Mapping[str, Any]]) -> list[Drop]:
+def dropped_images(
+    names: Sequence[str], unused: Mapping[str, str], found: Matches, models: Sequence[Mapping[str, Any]]
+) -> list[Drop]:
     """Every image without a pose in the first of the `models`, in the order of the steps."""
     posed = set(models[0]["images"]) if models else set()
     drops = [Drop(name, "choosing", reason) for name, reason in unused.items()]
@@ -129,7 +131,7 @@ def dropped(names: Sequence[str], unused: Mapping[str, str], found: Found, model
     return drops + sorted(lost, key=lambda drop: order.index(drop.step))
 
 
-def _lost(name: str, found: Found, models: Sequence[Mapping[str, Any]]) -> Drop:
+def _lost(name: str, found: Matches, models: Sequence[Mapping[str, Any]]) -> Drop:
     features, partners = found.features_of(name), found.partners(name, _LEAST)
     if not features:
         return Drop(name, "features", "nothing with texture in it, or COLMAP cannot decode it")
@@ -143,11 +145,11 @@ def _lost(name: str, found: Found, models: Sequence[Mapping[str, Any]]) -> Drop:
 
 
 def report(
-    state: Mapping[str, Any], matching: str, found: Found, models: Sequence[Mapping[str, Any]], version: str
+    state: Mapping[str, Any], matching: str, found: Matches, models: Sequence[Mapping[str, Any]], version: str
 ) -> dict[str, Any]:
     """The content of process.json. `state` is that of `place.State`, as a mapping."""
     images = state["images"]
-    drops = dropped(list(images), state["dropped"], found, models)
+    drops = dropped_images(list(images), state["dropped"], found, models)
     main = models[0] if models else {"images": [], "points": 0, "error_pixels": None, "track_length": None}
     return {
         "format": 1,
@@ -164,7 +166,7 @@ def report(
     }
 
 
-def summary(content: Mapping[str, Any], most: int = 12) -> list[tuple[str, str, str]]:
+def summary_rows(content: Mapping[str, Any], most: int = 12) -> list[tuple[str, str, str]]:
     """Rows of (step, image, reason) for a table; a step with more than `most` images is told as a number."""
     rows: list[tuple[str, str, str]] = []
     many = Counter(drop["step"] for drop in content["dropped"])

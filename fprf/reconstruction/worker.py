@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-__all__ = ["ABSENT", "NOTHING", "main"]
+__all__ = ["NO_MODEL", "NO_PYCOLMAP", "main"]
 
-ABSENT, NOTHING = 3, 4
+NO_PYCOLMAP, NO_MODEL = 3, 4
 
 
 def main(job: dict[str, Any]) -> int:
@@ -25,7 +25,7 @@ def main(job: dict[str, Any]) -> int:
         pycolmap.FeatureExtractionOptions, pycolmap.ImportedPairingOptions  # noqa: B018 - absent before 4
     except (ImportError, AttributeError) as error:
         print(f"pycolmap: {error}", file=sys.stderr)
-        return ABSENT
+        return NO_PYCOLMAP
     return steps[job["step"]](pycolmap, job)
 
 
@@ -113,7 +113,7 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
         best.mkdir(exist_ok=True)
         models[0].write_binary(str(best))
     (out / "models.json").write_text(json.dumps(described), encoding="utf-8")
-    return 0 if models else NOTHING
+    return 0 if models else NO_MODEL
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from ..datamanagers.basis import Basis
 from ..datamanagers.batches import WHITE
 from ..datamanagers.features import FeatureStore
 from ..datamanagers.parsers.config import parse_scene
-from ..datamanagers.scene import Scene, differ, find_sightings, with_exposure
+from ..datamanagers.scene import Scene, exposures_differ, find_sightings, with_exposure
 from ..errors import PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..rendering.bounds import find_space
@@ -171,7 +171,7 @@ def exposure_of(
     if config.tones is False:
         return ()
     exposure = with_exposure(scene, image).exposure
-    return relative(exposure, len(scene.paths)) if config.tones or differ(exposure) else ()
+    return relative(exposure, len(scene.paths)) if config.tones or exposures_differ(exposure) else ()
 
 
 def reach_of(scene: Scene, space: Space) -> float:

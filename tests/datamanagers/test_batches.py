@@ -18,11 +18,11 @@ from tiny_world import World
 from torch import Tensor
 
 import fprf.datamanagers.batches as pixel_file
-from fprf.datamanagers.batches import RayBatches, Runs, generator_of, room_for
+from fprf.datamanagers.batches import PixelRuns, RayBatches, allocate_pixels, generator_of
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_mask
 from fprf.datamanagers.parsers.config import TransformsConfig
-from fprf.datamanagers.parsers.views import masks_beside
+from fprf.datamanagers.parsers.views import find_masks
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
 from fprf.interfaces import DataManager, Encoder
@@ -205,7 +205,7 @@ def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
         parts.append((start, torch.tensor(mask)))
         wanted += [start + k for k, each in enumerate(mask) if each]
         start += len(mask)
-    runs = Runs.of(parts)
+    runs = PixelRuns.of(parts)
     assert len(runs) == len(wanted)
     assert runs.pick(torch.arange(len(wanted))).tolist() == wanted
     everything = torch.arange(start + 3)
@@ -213,14 +213,14 @@ def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
 
 
 def test_nothing_is_a_set_too() -> None:
-    runs = Runs.of([])
+    runs = PixelRuns.of([])
     assert len(runs) == 0 and not runs.holds(torch.tensor([0, 5])).any()
-    assert len(Runs.of([(4, torch.zeros(9, dtype=torch.bool))])) == 0
+    assert len(PixelRuns.of([(4, torch.zeros(9, dtype=torch.bool))])) == 0
 
 
 @pytest.mark.parametrize("held", [0, 10**9])
 def test_what_is_written_is_read(tmp_path: Path, held: int) -> None:
-    pixels = room_for(1000, tmp_path / "cache", held)
+    pixels = allocate_pixels(1000, tmp_path / "cache", held)
     assert pixels.shape == (1000, 3) and pixels.dtype == torch.uint8
     given = torch.randint(256, (1000, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     pixels[:] = given
@@ -229,7 +229,7 @@ def test_what_is_written_is_read(tmp_path: Path, held: int) -> None:
 
 
 def test_the_file_has_no_name(tmp_path: Path) -> None:
-    pixels = room_for(5000, tmp_path, held=0)
+    pixels = allocate_pixels(5000, tmp_path, held=0)
     assert not list(tmp_path.iterdir())
     maps = Path("/proc/self/maps")
     if maps.is_file():
@@ -243,7 +243,7 @@ def test_a_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypa
 
     monkeypatch.setattr(pixel_file.os, "posix_fallocate", full, raising=False)
     with pytest.raises(DataError, match="No space left"):
-        room_for(1000, tmp_path, held=0)
+        allocate_pixels(1000, tmp_path, held=0)
 
 
 def manager(world: World, folder: Path, share: float, **fields: object) -> DataManager:
@@ -348,8 +348,8 @@ def test_folders_of_cameras_and_splits_have_theirs(tmp_path: Path) -> None:
         write_mask(tmp_path / "train/masks/7.png", np.ones((2, 2), np.uint8)),
         None,
     ]
-    assert list(masks_beside(tmp_path, images, "masks")) == wanted
-    assert masks_beside(tmp_path, images, "sky_masks") == ()
+    assert list(find_masks(tmp_path, images, "masks")) == wanted
+    assert find_masks(tmp_path, images, "sky_masks") == ()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import torch
 from tiny_world import World
 from torch import Tensor
 
-from fprf.datamanagers.scene import GAMMA, Scene, differ, find_sightings, with_exposure
+from fprf.datamanagers.scene import GAMMA, Scene, exposures_differ, find_sightings, with_exposure
 
 VIEWS = 10
 
@@ -56,11 +56,11 @@ def test_what_views_were_multiplied_by_is_found(world: World, wrong: float) -> N
     scene, image = capture(world, gain, wrong)
     found = measured(scene, image)
     torch.testing.assert_close(found[scene.train], centred(gain, scene)[scene.train], atol=0.02, rtol=0)
-    assert differ(with_exposure(scene, image).exposure)
+    assert exposures_differ(with_exposure(scene, image).exposure)
 
 
 def test_views_of_one_exposure_do_not_differ(world: World) -> None:
-    assert not differ(with_exposure(*capture(world, torch.zeros(VIEWS), 0.1)).exposure)
+    assert not exposures_differ(with_exposure(*capture(world, torch.zeros(VIEWS), 0.1)).exposure)
 
 
 def test_held_out_views_are_like_their_neighbours_where_neighbours_are_alike(world: World) -> None:
@@ -76,6 +76,6 @@ def test_nothing_is_known_without_shared_points(world: World) -> None:
     """None at all, or each seen by one view."""
     scene, image = capture(world, torch.zeros(VIEWS))
     bare = replace(scene, points=None)
-    assert with_exposure(bare, image) is bare and not differ(bare.exposure)
+    assert with_exposure(bare, image) is bare and not exposures_differ(bare.exposure)
     alone = replace(scene, seen=world.prepared.scene.seen)
     assert with_exposure(alone, image).exposure is None

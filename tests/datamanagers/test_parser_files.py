@@ -15,8 +15,8 @@ from capture_files import rotations, write_image
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.files import image_names, inside, read_json, read_npy, read_npz, record_of
-from fprf.datamanagers.parsers.views import View, assemble, every_eighth, indices, rigid
+from fprf.datamanagers.parsers.files import as_record, image_names, path_inside, read_json, read_npy, read_npz
+from fprf.datamanagers.parsers.views import View, assemble_scene, every_eighth, index_tensor, rigid_pose
 from fprf.errors import DataError
 
 
@@ -70,12 +70,12 @@ def test_plain_json_is_read_with_and_without_a_mark(tmp_path: Path) -> None:
 )
 def test_paths_that_leave_the_root_are_refused(text: str) -> None:
     with pytest.raises(DataError, match="here: the path"):
-        inside(Path("root"), "here", text)
+        path_inside(Path("root"), "here", text)
 
 
 def test_paths_inside_are_normalised() -> None:
     for text in ("images/a b.png", "./images/a b.png", "images//a b.png", ".\\images\\a b.png"):
-        assert inside(Path("root"), "here", text) == ("images/a b.png", Path("root/images/a b.png"))
+        assert path_inside(Path("root"), "here", text) == ("images/a b.png", Path("root/images/a b.png"))
 
 
 def test_folders_are_listed_by_name(tmp_path: Path) -> None:
@@ -171,21 +171,21 @@ def test_what_deflates_well_is_read(tmp_path: Path) -> None:
 
 
 def test_records_fall_back_and_name_the_place() -> None:
-    top = record_of("f.json", {"w": 5, "frames": [{"a": 1.5}, {"w": 7, "b": "x"}]})
+    top = as_record("f.json", {"w": 5, "frames": [{"a": 1.5}, {"w": 7, "b": "x"}]})
     first, second = top.records("frames")
     assert (first.number("w"), second.number("w"), first.number("a"), second.number("a")) == (5.0, 7.0, 1.5, None)
     assert second.text("b") == "x"
     for wrong in ({"a": "x"}, {"a": True}, {"a": 10**400}, {"a": [1]}):
         with pytest.raises(DataError, match=r"^here: a is "):
-            record_of("here", wrong).number("a")
+            as_record("here", wrong).number("a")
     for call, value in (("text", 3), ("texts", "x"), ("texts", [1]), ("matrix", [[1, 2, 3, 4]]), ("matrix", "abc")):
         with pytest.raises(DataError, match=r"^here: a "):
-            getattr(record_of("here", {"a": value}), call)("a")
+            getattr(as_record("here", {"a": value}), call)("a")
     with pytest.raises(DataError, match=r"frames\[1\]: 3 instead of an object"):
-        record_of("f", {"frames": [{}, 3]}).records("frames")
+        as_record("f", {"frames": [{}, 3]}).records("frames")
     for empty in ({}, {"frames": []}, {"frames": 3}):
         with pytest.raises(DataError, match="no list of frames"):
-            record_of("f", empty).records("frames")
+            as_record("f", empty).records("frames")
 
 
 def test_the_split_is_llff_s() -> None:
@@ -193,7 +193,7 @@ def test_the_split_is_llff_s() -> None:
     assert test.tolist() == [0, 8, 16] and sorted(train.tolist() + test.tolist()) == list(range(20))
     assert [part.tolist() for part in every_eighth(1)] == [[0], []]
     assert [part.tolist() for part in every_eighth(2)] == [[1], [0]]
-    assert indices([True, False, True]).tolist() == [0, 2]
+    assert index_tensor([True, False, True]).tolist() == [0, 2]
 
 
 @pytest.mark.parametrize("shape", ["(3)", "((3, 2))", "(3 2)", "(-3, 2)", "(3,, 2)", "3, 2", "(1e1,)"])
@@ -215,7 +215,7 @@ def test_rounded_rotations_are_repaired(seed: int, amount: float) -> None:
     exact = pose(seed)
     noisy = exact.copy()
     noisy[:, :3] += amount * np.random.default_rng(seed).uniform(-0.5, 0.5, (3, 3))
-    repaired = rigid("here", noisy)
+    repaired = rigid_pose("here", noisy)
     assert np.abs(repaired[:, :3].T @ repaired[:, :3] - np.eye(3)).max() < 1e-14
     assert np.abs(repaired - exact).max() <= 2 * amount + 1e-14
     assert np.array_equal(repaired[:, 3], exact[:, 3])
@@ -236,7 +236,7 @@ def test_rounded_rotations_are_repaired(seed: int, amount: float) -> None:
 )
 def test_other_matrices_are_refused(change: object, finding: str) -> None:
     with pytest.raises(DataError, match=f"^frame 7: .*{finding}"):
-        rigid("frame 7", change(pose()))  # type: ignore[operator]
+        rigid_pose("frame 7", change(pose()))  # type: ignore[operator]
 
 
 def view(folder: Path, name: str = "a.png", **fields: object) -> View:
@@ -248,7 +248,7 @@ def view(folder: Path, name: str = "a.png", **fields: object) -> View:
 
 def test_a_scene_has_what_its_views_have(tmp_path: Path) -> None:
     views = [view(tmp_path, f"{k}.png", depths=(1.0, 2.0 + k)) for k in range(9)]
-    scene = assemble(tmp_path, views, downscale=1, points=np.ones((4, 3)))
+    scene = assemble_scene(tmp_path, views, downscale=1, points=np.ones((4, 3)))
     assert scene.name == tmp_path.name and scene.paths == tuple(v.path for v in views)
     assert scene.cameras.focal[3].tolist() == [20.0, 21.0] and scene.cameras.centre[3].tolist() == [12.5, 8.0]
     assert scene.cameras.pose.dtype == torch.float64 and scene.cameras.size.dtype == torch.int64
@@ -259,7 +259,7 @@ def test_a_scene_has_what_its_views_have(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("downscale", [2, 3, 5, 1000])
 def test_downscaling_keeps_the_exact_ratio(tmp_path: Path, downscale: int) -> None:
-    cameras = assemble(tmp_path, [view(tmp_path)], downscale=downscale).cameras
+    cameras = assemble_scene(tmp_path, [view(tmp_path)], downscale=downscale).cameras
     size = [max(1, round(24 / downscale)), max(1, round(16 / downscale))]
     assert cameras.size[0].tolist() == size
     assert cameras.focal[0].tolist() == pytest.approx([20 * size[0] / 24, 21 * size[1] / 16], rel=1e-15)
@@ -268,7 +268,7 @@ def test_downscaling_keeps_the_exact_ratio(tmp_path: Path, downscale: int) -> No
 
 def test_reduced_images_scale_the_cameras(tmp_path: Path) -> None:
     whole = view(tmp_path, size=(97, 65), centre=(48.5, 32.5))
-    cameras = assemble(tmp_path, [whole], downscale=1, reduced=True).cameras
+    cameras = assemble_scene(tmp_path, [whole], downscale=1, reduced=True).cameras
     assert cameras.size[0].tolist() == [24, 16]
     assert cameras.centre[0].tolist() == [12.0, 8.0]
     assert cameras.focal[0].tolist() == pytest.approx([20 * 24 / 97, 21 * 16 / 65])
@@ -291,5 +291,5 @@ def test_reduced_images_scale_the_cameras(tmp_path: Path) -> None:
 )
 def test_views_that_cannot_be_are_named(tmp_path: Path, fields: dict[str, object], reduced: bool, finding: str) -> None:
     with pytest.raises(DataError, match=finding) as caught:
-        assemble(tmp_path, [view(tmp_path, **fields)], downscale=1, reduced=reduced)
+        assemble_scene(tmp_path, [view(tmp_path, **fields)], downscale=1, reduced=reduced)
     assert "a.png" in str(caught.value)

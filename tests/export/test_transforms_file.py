@@ -1,3 +1,5 @@
+"""Cameras as transforms.json, read back by our own parser and as Nerfstudio reads them."""
+
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -78,19 +78,6 @@ def gallery(tmp_path_factory: pytest.TempPathFactory) -> Page:
     return page_of(tmp_path_factory.mktemp("gallery") / "gallery.html")
 
 
-def test_everything_is_on_the_page(gallery: Page) -> None:
-    text = " ".join(gallery.text)
-    for shown in ("Town", "Photographs", "34", "40 × 30", "dusk", "plain", "city", "75%", "0003", "PSNR", "27.30", "dB", "–"):
-        assert shown in text
-    # thumbnails of references, the pair, the film strip, overview, style views, references, matches, depth
-    assert len(gallery.all("img")) == 2 + 2 + 3 + 9 + 6 + 2 + 2 + 3
-    assert [link["href"] for link in gallery.all("a") if "class" not in link] == [
-        "#compare", "#overview", "#styles", "#geometry", "#figures",
-    ]  # fmt: skip
-    anchors = {attrs["id"] for _, attrs in gallery.tags if "id" in attrs}
-    assert {link["href"][1:] for link in gallery.all("a")} <= anchors
-
-
 def test_nothing_is_loaded_from_anywhere(gallery: Page, tmp_path: Path) -> None:
     write_gallery(tmp_path / "g.html", **content())
     assert not re.search(r"(?i)https?:|//[a-z0-9-]+\.|@import|url\(", (tmp_path / "g.html").read_text("utf-8"))
@@ -193,8 +180,3 @@ def test_what_does_not_fit_is_named(tmp_path: Path, changes: dict[str, Any], mes
     with pytest.raises(DataError, match=message):
         write_gallery(tmp_path / "g.html", **content(**changes))
     assert not list(tmp_path.iterdir())
-
-
-def test_the_page_stays_small(tmp_path: Path) -> None:
-    write_gallery(tmp_path / "g.html", **content())
-    assert (tmp_path / "g.html").stat().st_size < 100_000

@@ -3,8 +3,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fprf.errors import DataError
 from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette
@@ -12,13 +10,6 @@ from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, 
 
 def lightness(picture: np.ndarray) -> np.ndarray:
     return picture.astype(float) @ np.array([0.2126, 0.7152, 0.0722])
-
-
-def test_near_is_brighter_than_far_everywhere() -> None:
-    depth = torch.linspace(1, 20, 64).repeat(4, 1)
-    picture = depth_image(depth, torch.ones(4, 64))
-    assert picture.shape == (4, 64, 3) and picture.dtype == np.uint8
-    assert (np.diff(lightness(picture)[0]) <= 1).all() and lightness(picture)[0, 0] > lightness(picture)[0, -1] + 100
 
 
 def test_depth_scale_does_not_matter_and_outliers_do_not_blind() -> None:
@@ -66,13 +57,6 @@ def test_the_palette_is_told_apart_by_the_colour_blind(kind: str) -> None:
     assert apart[:4, :4].min() > 0.2
 
 
-def test_the_palette_goes_on_without_repeating() -> None:
-    colours = palette(28)
-    assert colours.shape == (28, 3) and palette(0).shape == (0, 3)
-    assert float((torch.cdist(colours, colours) + torch.eye(28)).min()) > 0.03
-    assert torch.equal(palette(3), colours[:3])
-
-
 def certain(codes: torch.Tensor, count: int) -> torch.Tensor:
     return torch.nn.functional.one_hot(codes, count).float()
 
@@ -87,23 +71,6 @@ def test_match_map_shows_hue_shade_and_doubt() -> None:
     assert lightness(unsure)[0, 0] == pytest.approx(0.45 * lightness(sure)[0, 0], rel=0.05)
     empty = match_image(certain(torch.tensor([[0]]), 3), reference, ["a", "b"], torch.zeros(1, 1))
     assert np.ptp(empty[0, 0]) < 10
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 99))
-def test_match_summary_adds_up(codes: int, references: int, seed: int) -> None:
-    draw = torch.Generator().manual_seed(seed)
-    attention = torch.rand(6, 5, codes, generator=draw).softmax(-1)
-    reference = torch.randint(references, (codes,), generator=draw)
-    names = [f"r{index}" for index in range(references)]
-    cover = torch.rand(6, 5, generator=draw)
-    row = match_summary(attention, reference, names, cover)
-    shares = row["references"]
-    assert isinstance(shares, list)
-    assert [each["name"] for each in shares] == names
-    assert sum(each["share"] for each in shares) == pytest.approx(1)
-    assert 1 / codes - 1e-6 <= row["mean_score"] <= 1 and -1e-6 <= row["entropy_bits"] <= math.log2(codes) + 1e-6  # type: ignore[operator]
-    assert match_image(attention, reference, names, cover).shape == (6, 5, 3)
 
 
 def test_match_summary_in_closed_form() -> None:

@@ -1,4 +1,6 @@
 import base64
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -9,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, NumericsError
-from fprf.io.images import data_uri, encode, shrink, to_uint8, write_image
+from fprf.io.images import data_uri, encode, shrink, srgb_to_linear, to_uint8, write_exr, write_image
 
 
 def ramp(height: int = 40, width: int = 60) -> np.ndarray:
@@ -19,17 +21,6 @@ def ramp(height: int = 40, width: int = 60) -> np.ndarray:
 
 def read(path: Path) -> np.ndarray:
     return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-
-
-def test_every_8_bit_step_survives_the_trip_through_floats() -> None:
-    steps = torch.arange(256, dtype=torch.uint8).reshape(16, 16, 1).expand(16, 16, 3)
-    for kind in (torch.float32, torch.float64):
-        assert np.array_equal(to_uint8(steps.to(kind) / 255), steps.numpy())
-
-
-def test_floats_are_clipped_and_rounded_to_the_nearest() -> None:
-    found = to_uint8(torch.tensor([[[-1.0, 2.0, 0.49 / 255], [0.51 / 255, 254.4 / 255, 254.6 / 255]]]))
-    assert found.tolist() == [[[0, 255, 0], [1, 254, 255]]]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -73,3 +64,80 @@ def test_shrinking_keeps_the_shape_and_the_mean(height: int, width: int, side: i
     assert small.min() >= picture.min() and small.max() <= picture.max()
     if min(small.shape[:2]) > 8:
         assert np.abs(small.mean((0, 1)) - picture.mean((0, 1))).max() < 3
+
+
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """A reader by the specification, for what is written here."""
+    data = path.read_bytes()
+    assert data[:8] == struct.pack("<II", 20000630, 2)
+    at, attributes = 8, {}
+    while data[at] != 0:
+        name, kind, rest = data[at:].split(b"\0", 2)[0], data[at:].split(b"\0", 2)[1], 0
+        at += len(name) + len(kind) + 2
+        (size,) = struct.unpack_from("<I", data, at)
+        attributes[name.decode()] = data[at + 4 : at + 4 + size]
+        at += 4 + size + rest
+    at += 1
+    x0, y0, x1, y1 = struct.unpack("<4i", attributes["dataWindow"])
+    width, height = x1 - x0 + 1, y1 - y0 + 1
+    names, listed = [], attributes["channels"]
+    while listed[0] != 0:
+        name, _, listed = listed.partition(b"\0")
+        kind, _, sx, sy = struct.unpack("<IB3xII", listed[:16])
+        assert (kind, sx, sy) == (2, 1, 1)
+        names.append(name.decode())
+        listed = listed[16:]
+    found = {name: np.zeros((height, width), np.float32) for name in names}
+    for offset in struct.unpack_from(f"<{height}Q", data, at):
+        y, size = struct.unpack_from("<iI", data, offset)
+        body = data[offset + 8 : offset + 8 + size]
+        whole = width * 4 * len(names)
+        if size < whole:
+            steps = np.frombuffer(zlib.decompress(body), np.uint8).astype(np.int64)
+            flat = ((np.cumsum(steps) - 128 * np.arange(len(steps))) & 255).astype(np.uint8)
+            half = (len(flat) + 1) // 2
+            body = np.stack([flat[:half], flat[half:]], 1).tobytes()
+        row = np.frombuffer(body, "<f4").reshape(len(names), width)
+        for k, name in enumerate(names):
+            found[name][y] = row[k]
+    return found
+
+
+def planes(height: int = 9, width: int = 14) -> dict[str, np.ndarray]:
+    drawn = np.random.default_rng(0)
+    smooth = np.linspace(0, 3, height * width, dtype=np.float32).reshape(height, width)
+    noise = drawn.normal(0, 1e9, (height, width)).astype(np.float32)
+    return {"R": smooth, "G": smooth * 0, "B": noise, "Z": smooth + 7, "N.X": -smooth}
+
+
+def test_every_bit_comes_back(tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", planes())
+    found = read_exr(tmp_path / "a.exr")
+    assert list(found) == ["B", "G", "N.X", "R", "Z"], "channels are in the order of their names"
+    assert all(np.array_equal(found[name], plane) for name, plane in planes().items())
+
+
+def test_ffmpeg_reads_it(tmp_path: Path) -> None:
+    """A reader that is not ours."""
+    av = pytest.importorskip("av")
+    colours = {name: plane for name, plane in planes().items() if name in "RGB"}
+    write_exr(tmp_path / "a.exr", colours)
+    with av.open(str(tmp_path / "a.exr")) as container:
+        frame = next(container.decode(video=0))
+    assert (frame.format.name, frame.width, frame.height) == ("gbrpf32le", 14, 9)
+    for name, plane in zip("GBR", frame.planes, strict=True):
+        read_ = np.frombuffer(plane, np.float32).reshape(plane.height, plane.line_size // 4)[:, : plane.width]
+        assert np.array_equal(read_, colours[name]), name
+
+
+def test_light_is_srgb_to_linear() -> None:
+    assert srgb_to_linear(np.array([0.0, 0.04045, 0.5, 1.0], np.float32)) == pytest.approx(
+        [0, 0.0031308, 0.2140411, 1], abs=1e-6
+    )
+
+
+def test_planes_must_be_of_one_size(tmp_path: Path) -> None:
+    for wrong in ({}, {"R": np.zeros((2, 3), np.float32), "G": np.zeros((3, 2), np.float32)}):
+        with pytest.raises(DataError, match="channels of one size"):
+            write_exr(tmp_path / "a.exr", wrong)
+    assert not list(tmp_path.iterdir())

@@ -1,9 +1,15 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from fprf.errors import DataError
 from fprf.io.maps import match_image, palette, scale_image
-from fprf.io.sheet import Tile, highlight, sheet
+from fprf.io.sheet import Tile, contact_sheet, highlight, seam_positions, side_by_side, wipe
+from fprf.io.video import missing_frames
 
 
 def picture(height: int = 20, width: int = 30) -> np.ndarray:
@@ -20,34 +26,21 @@ def test_what_is_highlighted_keeps_its_colours_and_the_rest_loses_them() -> None
     assert np.array_equal(highlight(image, torch.ones(20, 30))[1:-1, 1:-1], image[1:-1, 1:-1])
 
 
-def test_a_small_map_highlights_a_large_picture() -> None:
-    assert highlight(picture(64, 96), torch.rand(4, 6)).shape == (64, 96, 3)
-
-
 @pytest.mark.parametrize("count", [0, 1, 4, 5, 9])
 def test_tiles_are_laid_out_in_rows(count: int) -> None:
-    page = sheet([Tile(picture(), ("0: 12 % of the scene", "größer.jpg 80 %"), (0.6, 0.2))] * count)
+    page = contact_sheet([Tile(picture(), ("0: 12 % of the scene", "größer.jpg 80 %"), (0.6, 0.2))] * count)
     assert page.dtype == np.uint8 and page.shape[2] == 3
     if count:
-        one = sheet([Tile(picture(), ("0: 12 % of the scene", "größer.jpg 80 %"), (0.6, 0.2))])
+        one = contact_sheet([Tile(picture(), ("0: 12 % of the scene", "größer.jpg 80 %"), (0.6, 0.2))])
         rows, columns = -(-count // 4), min(4, count)
         assert page.shape[0] == 8 + rows * (one.shape[0] - 8) and page.shape[1] == 8 + columns * (one.shape[1] - 8)
 
 
-def test_pictures_of_several_shapes_fit_one_sheet() -> None:
-    page = sheet([Tile(picture(60, 20), ("tall",)), Tile(picture(20, 900), ("wide",)), Tile(picture(1, 1), ())])
-    assert page.shape[0] > 3 * 200
-
-
 def test_shares_are_drawn_in_the_references_colours() -> None:
-    page = sheet([Tile(np.zeros((100, 240, 3), np.uint8), (), (0.25, 0.5))])
+    page = contact_sheet([Tile(np.zeros((100, 240, 3), np.uint8), (), (0.25, 0.5))])
     bar = page[8 + 100 + 2, 8 : 8 + 240].astype(int)
     first, second = (palette(2) * 255).round().int().tolist()
     assert bar[10].tolist() == first and bar[100].tolist() == second and bar[220].min() > 200
-
-
-def test_long_lines_stay_inside() -> None:
-    assert np.array_equal(sheet([Tile(picture(), ("x" * 400,))])[:, -8:], sheet([Tile(picture(), ("y",))])[:, -8:])
 
 
 def test_scales_are_fixed_and_ends_are_held() -> None:
@@ -67,3 +60,45 @@ def test_what_is_kept_is_pale_in_a_match_map() -> None:
     plain = match_image(attention, torch.tensor([0, 1]), ["a", "b"])
     assert np.array_equal(shown[0, 0], plain[0, 0]) and shown[0, 2].min() > 200
     assert shown[0, 0].sum() < shown[0, 1].sum() < shown[0, 2].sum()
+
+
+def flat(value: int, width: int = 40, height: int = 6) -> np.ndarray:
+    return np.full((height, width, 3), value, np.uint8)
+
+
+def test_beside_keeps_every_pixel() -> None:
+    whole = side_by_side([flat(10), flat(20, 30), flat(30, 5)])
+    assert whole.shape == (6, 40 + 2 + 30 + 2 + 5, 3)
+    assert (whole[:, :40] == 10).all() and (whole[:, 42:72] == 20).all() and (whole[:, 74:] == 30).all()
+    assert (whole[:, 40:42] == 255).all() and np.array_equal(side_by_side([flat(7)]), flat(7))
+    with pytest.raises(DataError, match="heights"):
+        side_by_side([flat(1), flat(2, height=7)])
+
+
+@settings(deadline=None)
+@given(st.integers(1, 6), st.floats(0, 1))
+def test_seams_are_in_order_and_inside(count: int, at: float) -> None:
+    found = seam_positions(count, at)
+    assert len(found) == count - 1 and found == sorted(found)
+    assert all(0 < seam < 1 for seam in found)
+
+
+def test_strips_show_their_pictures() -> None:
+    whole = wipe([flat(10), flat(20)], 0.0)
+    assert whole.shape == (6, 40, 3)
+    assert (whole[:, :19] == 10).all() and (whole[:, 19:21] == 255).all() and (whole[:, 21:] == 20).all()
+    assert (wipe([flat(10), flat(20)], 0.25)[:, :29] == 10).all()
+    assert np.array_equal(wipe([flat(3)], 0.3), flat(3))
+    with pytest.raises(DataError, match="shapes"):
+        wipe([flat(1), flat(2, 41)], 0)
+
+
+def test_missing_frames_are_those_not_there(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{k}.png" for k in range(3)]
+    assert missing_frames(tmp_path, "a", paths) == paths
+    paths[1].write_bytes(b"x")
+    (tmp_path / "mine.txt").write_text("stays")
+    assert missing_frames(tmp_path, "a", paths) == [paths[0], paths[2]]
+    assert missing_frames(tmp_path, "b", paths) == paths and not paths[1].exists() and (tmp_path / "mine.txt").is_file()
+    (tmp_path / ".render.json").write_text("damaged")
+    assert missing_frames(tmp_path, "b", paths) == paths

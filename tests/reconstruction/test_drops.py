@@ -1,6 +1,6 @@
 from typing import Any
 
-from fprf.reconstruction.scene_folder import Drop, dropped, report, summary
+from fprf.reconstruction.scene_folder import Drop, dropped_images, report, summary_rows
 
 
 class Matches:
@@ -31,7 +31,7 @@ STATE = {
 
 
 def test_every_image_has_its_reason() -> None:
-    found = dropped(list(STATE["images"]), STATE["dropped"], FOUND, MODELS)
+    found = dropped_images(list(STATE["images"]), STATE["dropped"], FOUND, MODELS)
     assert [(drop.image, drop.step) for drop in found] == [
         ("broken.jpg", "choosing"),
         ("bare", "features"),
@@ -53,14 +53,9 @@ def test_the_report_counts() -> None:
     assert content["dropped"][0] == Drop("broken.jpg", "choosing", "the JPEG is truncated")._asdict()
 
 
-def test_without_a_model_all_are_dropped() -> None:
-    content = report(STATE, "similar", FOUND, [], "1.2")
-    assert content["images"]["posed"] == 0 and len(content["dropped"]) == 7 and content["points"] == 0
-
-
 def test_many_of_a_step_are_told_as_a_number() -> None:
     drops = [Drop(f"frame {k}", "choosing", f"less sharp {k}")._asdict() for k in range(40)]
     drops += [Drop("x", "mapping", "why")._asdict()]
-    rows = summary({"dropped": drops}, most=12)
+    rows = summary_rows({"dropped": drops}, most=12)
     assert rows == [("choosing", "40 images", "for example frame 0: less sharp 0"), ("mapping", "x", "why")]
-    assert summary({"dropped": drops[-1:]}) == [("mapping", "x", "why")] and summary({"dropped": []}) == []
+    assert summary_rows({"dropped": drops[-1:]}) == [("mapping", "x", "why")] and summary_rows({"dropped": []}) == []

@@ -1,4 +1,5 @@
 import json
+import struct
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -6,14 +7,167 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from photo_files import HEIC
 
 from fprf.datamanagers.images import load_image
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
-from fprf.reconstruction.images import gather, in_order
-from fprf.reconstruction.scene_folder import Place, State, key_of
+from fprf.reconstruction.images import (
+    Lens,
+    choose_frames,
+    frame_name,
+    frame_scores,
+    gather_images,
+    lens_of,
+    natural_order,
+    read_lens,
+    save_frames,
+    sharpness,
+)
+from fprf.reconstruction.scene_folder import SceneFolder, State
+
+
+def noise(height: int = 60, width: int = 80, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def test_blur_lowers_it_step_by_step() -> None:
+    image = noise(240, 320)
+    scores = [sharpness(cv2.GaussianBlur(image, (0, 0), sigma)) for sigma in (0.5, 1, 2, 4)]
+    assert scores == sorted(scores, reverse=True) and scores[0] > 20 * scores[-1]
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0, 1e6), max_size=80), st.integers(1, 30), st.floats(0, 0.9))
+def test_every_frame_is_chosen_or_has_a_reason(scores: list[float], count: int, least: float) -> None:
+    choice = choose_frames(scores, count, least)
+    assert sorted([*choice.chosen, *choice.dropped]) == list(range(len(scores)))
+    assert len(choice.chosen) <= count and choice.chosen == sorted(choice.chosen)
+    assert all(choice.dropped.values())
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(1, 2), min_size=1, max_size=80), st.integers(1, 30))
+def test_windows_are_even_and_give_their_sharpest(scores: list[float], count: int) -> None:
+    chosen = choose_frames(scores, count, 0.3).chosen  # none can be below 0.3 of its neighbours
+    windows = min(count, len(scores))
+    edges = [round(k * len(scores) / windows) for k in range(windows + 1)]
+    assert len(chosen) == windows
+    for frame, low, high in zip(chosen, edges, edges[1:], strict=False):
+        assert low <= frame < high and scores[frame] == max(scores[low:high])
+
+
+def test_a_blurred_stretch_gives_no_frame() -> None:
+    scores = [100.0, 90, 110, 5, 4, 6, 95, 120, 80]
+    choice = choose_frames(scores, 3, 0.3)
+    assert choice.chosen == [2, 7]
+    assert choice.dropped[5] == "blurred, like all frames around it (sharpness 6, usual there is 115)"
+    assert choice.dropped[3] == "less sharp than frame 5 (5 < 6)"
+    assert choose_frames(scores, 3, 0.0).chosen == [2, 5, 7]
+
+
+BLURRED = (1, 2, 5)
+
+
+def frames(count: int = 8) -> list[np.ndarray]:
+    drawn = np.random.default_rng(0)
+    base = cv2.resize(drawn.integers(0, 256, (12, 16, 3), dtype=np.uint8), (160, 120), interpolation=cv2.INTER_NEAREST)
+    made = []
+    for k in range(count):
+        frame = np.roll(base, 5 * k, axis=1)
+        cv2.putText(frame, str(k), (20, 90), cv2.FONT_HERSHEY_SIMPLEX, 3, (255, 255, 255), 8)
+        made.append(cv2.GaussianBlur(frame, (0, 0), 4) if k in BLURRED else frame)
+    return made
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    write_video(tmp_path / "clip.mp4", frames(), 24, h264=False)
+    return tmp_path / "clip.mp4"
+
+
+def test_scores_tell_blurred_frames(video: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    scores = frame_scores(video, lambda done, total, what: seen.append((done, total)))
+    assert len(scores) == 8 and seen[-1] == (8, 8) and all(done <= total for done, total in seen)
+    assert max(scores[k] for k in BLURRED) < 0.5 * min(scores[k] for k in range(8) if k not in BLURRED)
+
+
+def test_saved_frames_are_those_asked_for(video: Path, tmp_path: Path) -> None:
+    save_frames(video, [0, 3, 7], tmp_path / "out", lambda *_: None)
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [frame_name(k) for k in (0, 3, 7)]
+    for k, truth in enumerate(frames()):
+        path = tmp_path / "out" / frame_name(k)
+        if path.is_file():
+            found = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+            assert np.abs(found.astype(int) - truth).mean() < 12, "coded twice, but the same picture"
+            assert sharpness(found) > 0
+
+
+def test_frames_that_are_there_stay(video: Path, tmp_path: Path) -> None:
+    (tmp_path / frame_name(3)).write_bytes(b"mine")
+    save_frames(video, [3, 4], tmp_path, lambda *_: None)
+    assert (tmp_path / frame_name(3)).read_bytes() == b"mine" and (tmp_path / frame_name(4)).is_file()
+    before = (tmp_path / frame_name(4)).stat().st_mtime_ns
+    save_frames(tmp_path / "gone.mp4", [3, 4], tmp_path, lambda *_: None)
+    assert (tmp_path / frame_name(4)).stat().st_mtime_ns == before
+
+
+def test_what_is_no_video_is_named(tmp_path: Path, video: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "no.mp4").write_bytes(b"nothing of the kind" * 100)
+    with pytest.raises(DataError, match=r"no\.mp4: no video that can be opened"):
+        frame_scores(tmp_path / "no.mp4", lambda *_: None)
+    with pytest.raises(DataError, match="frame 99 was there before"):
+        save_frames(video, [2, 99], tmp_path / "out", lambda *_: None)
+
+
+def tiff(order: str, model: bytes = b"Phone 9\0", focal: tuple[int, int] = (425, 100), short: int = 26) -> bytes:
+    """Header, a directory with the model and the inner directory, the inner one, and the values that don't fit."""
+    head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HI", 42, 8)
+    inner_at, model_at = 8 + 2 + 2 * 12 + 4, 8 + 2 + 2 * 12 + 4 + 2 + 2 * 12 + 4
+    first = struct.pack(order + "H", 2) + struct.pack(order + "HHII", 0x0110, 2, len(model), model_at)
+    first += struct.pack(order + "HHII", 0x8769, 4, 1, inner_at) + struct.pack(order + "I", 0)
+    inner = struct.pack(order + "H", 2) + struct.pack(order + "HHII", 0x920A, 5, 1, model_at + len(model))
+    inner += struct.pack(order + "HHIHH", 0xA405, 3, 1, short, 0) + struct.pack(order + "I", 0)
+    return head + first + inner + model + struct.pack(order + "II", *focal)
+
+
+JPEG = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+
+
+def with_exif(block: bytes) -> bytes:
+    return JPEG[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block + JPEG[2:]
+
+
+def photo_of(path: Path, block: bytes | None) -> Path:
+    path.write_bytes(JPEG if block is None else with_exif(block))
+    return path
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_model_and_focal_length_in_both_byte_orders(order: str, tmp_path: Path) -> None:
+    path = photo_of(tmp_path / "a.jpg", tiff(order))
+    assert read_lens(path) == Lens("Phone 9", 4.25, 26)
+    assert cv2.imread(str(path)).shape == (8, 8, 3), "still a photograph"
+
+
+def test_files_that_say_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    assert (
+        read_lens(tmp_path / "a.png") == read_lens(photo_of(tmp_path / "a.jpg", None)) == read_lens(tmp_path / "gone") == Lens()
+    )
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=200))
+def test_no_damage_makes_it_fail(noise: bytes) -> None:
+    whole = tiff("<")
+    for block in (noise, whole[: len(noise)], whole[:20] + noise, whole[:8] + noise + whole[8:]):
+        assert isinstance(lens_of(with_exif(block)), Lens)
+    assert isinstance(lens_of(noise), Lens) and lens_of(b"") == Lens()
 
 
 def photo(path: Path, seed: int = 0, size: tuple[int, int] = (24, 16)) -> Path:
@@ -29,22 +183,22 @@ def photos(tmp_path: Path) -> Path:
     return tmp_path / "in"
 
 
-def gathered(source: Path, place: Place, **knobs: object) -> State:
+def gathered(source: Path, place: SceneFolder, **knobs: object) -> State:
     state = State.load(place)
-    gather(source, place, state, SfmConfig(**knobs), lambda *_: None)  # type: ignore[arg-type]
+    gather_images(source, place, state, SfmConfig(**knobs), lambda *_: None)  # type: ignore[arg-type]
     return state
 
 
-def names(place: Place) -> list[str]:
-    return in_order([p.relative_to(place.images).as_posix() for p in place.images.rglob("*") if p.is_file()])
+def names(place: SceneFolder) -> list[str]:
+    return natural_order([p.relative_to(place.images).as_posix() for p in place.images.rglob("*") if p.is_file()])
 
 
 def test_numbers_are_in_peoples_order() -> None:
-    assert in_order(["b1", "a10", "a2", "a", "10", "9"]) == ["9", "10", "a", "a2", "a10", "b1"]
+    assert natural_order(["b1", "a10", "a2", "a", "10", "9"]) == ["9", "10", "a", "a2", "a10", "b1"]
 
 
 def test_images_are_copied_as_they_are(photos: Path, tmp_path: Path) -> None:
-    place = Place(tmp_path / "scene")
+    place = SceneFolder(tmp_path / "scene")
     state = gathered(photos, place)
     assert list(state.images) == names(place) == ["IMG_1.jpg", "IMG_2.jpg", "IMG_10.jpg"]
     for name, about in state.images.items():
@@ -60,7 +214,7 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(photos: Path, tmp_path: 
     (photos / "half.jpg").write_bytes(whole[: len(whole) // 2])
     (photos / "notes.txt").write_text("not an image at all")
     photo(photos / ".hidden" / "x.jpg")
-    state = gathered(photos, Place(tmp_path / "scene"))
+    state = gathered(photos, SceneFolder(tmp_path / "scene"))
     assert len(state.images) == 3
     assert state.dropped.keys() == {"empty.jpg", "text.png", "half.jpg"}
     assert state.dropped["half.jpg"] == "the JPEG is truncated (no end-of-image marker)"
@@ -74,9 +228,9 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "pillow_heif", None)
         with pytest.raises(DataError, match=r"0 usable images.*IMG 0\.HEIC: is HEIC.*pip install 'fprf\[heic\]'"):
-            gathered(source, Place(tmp_path / "without"))
+            gathered(source, SceneFolder(tmp_path / "without"))
     pytest.importorskip("pillow_heif")
-    place = Place(tmp_path / "scene")
+    place = SceneFolder(tmp_path / "scene")
     state = gathered(source, place)
     assert names(place) == list(state.images) == [f"IMG_{k}.HEIC.jpg" for k in range(3)]
     assert state.images["IMG_0.HEIC.jpg"] | {"sha256": ""} == {
@@ -94,20 +248,11 @@ def test_a_folder_of_other_files_is_told_by_what_it_holds(tmp_path: Path) -> Non
     for name in ("a.dng", "b.DNG", "c.txt"):
         (tmp_path / name).write_bytes(b"x")
     with pytest.raises(DataError, match=r"0 usable images.*holds \.dng \.txt files.*convert"):
-        gathered(tmp_path, Place(tmp_path / "scene"))
-
-
-def test_folders_below_and_blanks_in_names(photos: Path, tmp_path: Path) -> None:
-    photo(photos / "left side" / "a b.jpg", 5)
-    place = Place(tmp_path / "scene")
-    assert "left_side/a_b.jpg" in gathered(photos, place).images and "left_side/a_b.jpg" in names(place)
-    photo(photos / "left_side" / "a_b.jpg", 6)
-    with pytest.raises(UsageError, match="so that no other is called left_side/a_b"):
-        gathered(photos, place)
+        gathered(tmp_path, SceneFolder(tmp_path / "scene"))
 
 
 def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) -> None:
-    place = Place(tmp_path / "scene")
+    place = SceneFolder(tmp_path / "scene")
     before = {name: (place.images / name).stat().st_mtime_ns for name in gathered(photos, place).images}
     photo(photos / "IMG_2.jpg", 99)
     photo(photos / "IMG_3.jpg", 3)
@@ -119,7 +264,7 @@ def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) ->
 
 
 def test_images_may_lie_in_the_scene_already(tmp_path: Path) -> None:
-    place = Place(tmp_path / "scene")
+    place = SceneFolder(tmp_path / "scene")
     for k in range(4):
         photo(place.images / f"{k}.png", k)
     assert len(gathered(place.images, place).images) == 4
@@ -136,7 +281,7 @@ def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
     frames = [np.roll(base, 3 * k, 1) for k in range(12)]
     frames = [frame if k % 3 == 1 else cv2.GaussianBlur(frame, (0, 0), 3) for k, frame in enumerate(frames)]
     write_video(tmp_path / "clip.mp4", frames, 12, h264=False)
-    place = Place(tmp_path / "scene")
+    place = SceneFolder(tmp_path / "scene")
     state = gathered(tmp_path / "clip.mp4", place, frames=4)
     assert names(place) == list(state.images) == [f"frame_{k:06d}.jpg" for k in (1, 4, 7, 10)]
     assert len(state.dropped) == 8 and state.dropped["frame 0"].startswith("less sharp than frame 1")
@@ -147,7 +292,7 @@ def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
 
 
 def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
-    place = Place(tmp_path / "scene")
+    place = SceneFolder(tmp_path / "scene")
     with pytest.raises(UsageError, match="neither a folder of images nor a video"):
         gathered(tmp_path / "absent", place)
     with pytest.raises(UsageError, match="neither a folder of images nor a video"):
@@ -162,15 +307,10 @@ def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=f"was begun with {photos}"):
         gathered(tmp_path / "other", place)
     with pytest.raises(UsageError, match="holds something else"):
-        State.load(Place(tmp_path))
+        State.load(SceneFolder(tmp_path))
     (place.work / "state.json").write_text(json.dumps({"format": 1, "wrong": 3}))
     with pytest.raises(DataError, match=r"state\.json: cannot be read"):
         State.load(place)
     for knob, value in {"frames": 2, "blurred": 1.5, "features": 5, "side": 9, "overlap": 0, "threads": 0}.items():
         with pytest.raises(ConfigError, match=knob):
             SfmConfig(**{knob: value})
-
-
-def test_keys_differ_where_anything_does() -> None:
-    assert key_of("a", 1, {"x": 2, "y": 3}) == key_of("a", 1, {"y": 3, "x": 2})
-    assert len({key_of("a"), key_of("b"), key_of("a", "b"), key_of(["a", "b"]), key_of("a", 0), key_of("a", False)}) == 6

@@ -31,7 +31,7 @@ from ...rendering.lens import OPENCV
 from ..scene import Scene
 from .config import BlockNerfConfig
 from .town import cache_folder
-from .views import View, assemble, indices, rigid
+from .views import View, assemble_scene, index_tensor, rigid_pose
 
 __all__ = [
     "BlockNerfParser",
@@ -417,9 +417,9 @@ class BlockNerfParser(DataParser):
         self._check(data, chosen)
         views = [_view(folder, entry) for entry in chosen]
         held = [bool(entry["held"]) for entry in chosen]
-        split = (indices([not each for each in held]), indices(held)) if any(held) and not all(held) else None
+        split = (index_tensor([not each for each in held]), index_tensor(held)) if any(held) and not all(held) else None
         exposure = [float(entry["exposure"]) for entry in chosen]
-        scene = assemble(data, views, downscale=downscale, split=split)
+        scene = assemble_scene(data, views, downscale=downscale, split=split)
         return _exposed(scene, exposure)
 
     def _check(self, data: Path, entries: list[dict[str, Any]]) -> None:
@@ -503,7 +503,7 @@ def _view(folder: Path, entry: dict[str, Any]) -> View:
     return View(
         name=str(entry["name"]),
         path=folder / "images" / f"{entry['name']}.png",
-        pose=rigid(str(entry["name"]), np.array(entry["pose"], dtype=np.float64)),
+        pose=rigid_pose(str(entry["name"]), np.array(entry["pose"], dtype=np.float64)),
         size=(int(entry["size"][0]), int(entry["size"][1])),
         focal=(float(entry["focal"][0]), float(entry["focal"][1])),
         centre=(float(entry["centre"][0]), float(entry["centre"][1])),

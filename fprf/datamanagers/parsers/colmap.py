@@ -24,8 +24,8 @@ from ...interfaces import DataParser
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ..scene import Scene
 from .config import ColmapConfig
-from .files import inside, read_bytes, read_npz
-from .views import View, assemble, rigid
+from .files import path_inside, read_bytes, read_npz
+from .views import View, assemble_scene, rigid_pose
 
 __all__ = [
     "MODELS",
@@ -34,9 +34,9 @@ __all__ = [
     "ColmapImage",
     "ColmapModel",
     "ColmapParser",
-    "beside",
+    "cloud_of_images",
+    "cloud_of_model",
     "model_folder",
-    "pairs",
     "read_cloud",
     "read_model",
 ]
@@ -293,7 +293,7 @@ Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 """Finite points [P 3], and pairs [O 2] where known."""
 
 
-def pairs(model: ColmapModel, images: Sequence[ColmapImage]) -> Cloud:
+def cloud_of_images(model: ColmapModel, images: Sequence[ColmapImage]) -> Cloud:
     """Finite points of a model, and the pairs of its images in the order given."""
     finite = np.isfinite(model.points).all(1)
     ids = model.point_ids[finite]
@@ -308,7 +308,7 @@ def pairs(model: ColmapModel, images: Sequence[ColmapImage]) -> Cloud:
     return model.points[finite], np.concatenate(found).astype(np.int64) if found else np.zeros((0, 2), np.int64)
 
 
-def beside(folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float64]]) -> Cloud | None:
+def cloud_of_model(folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float64]]) -> Cloud | None:
     """The points of a model whose images are these views, by file name and place; None where it is another's."""
     model = read_model(folder)
     images = {PurePosixPath(image.name).name: image for image in model.images}
@@ -320,7 +320,7 @@ def beside(folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float6
     with np.errstate(over="ignore", invalid="ignore"):
         apart = np.abs(np.stack([_centre(image) for image in ordered]) - here).max()
     extent = np.ptp(here, axis=0).max() if len(here) > 1 else 1.0
-    return pairs(model, ordered) if apart <= _APART * extent else None
+    return cloud_of_images(model, ordered) if apart <= _APART * extent else None
 
 
 def read_cloud(path: Path, views: int) -> Cloud:
@@ -374,10 +374,10 @@ class ColmapParser(DataParser):
         model = read_model(folder)
         if not model.images:
             raise DataError(f"{folder}: the model has no images; run COLMAP's mapper again")
-        name, root = inside(data, "parser.images", self.config.images)
+        name, root = path_inside(data, "parser.images", self.config.images)
         index = dict(zip(model.point_ids.tolist(), range(len(model.point_ids)), strict=True))
         lenses = {id_: _lens(f"{folder}: camera {id_}", camera) for id_, camera in model.cameras.items()}
-        images = sorted(model.images, key=lambda image: inside(root, f"{folder}: image {image.name!r}", image.name)[0])
+        images = sorted(model.images, key=lambda image: path_inside(root, f"{folder}: image {image.name!r}", image.name)[0])
         views = []
         for image in images:
             where = f"{folder}: image {image.name!r}"
@@ -385,7 +385,7 @@ class ColmapParser(DataParser):
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
             camera = model.cameras[image.camera]
             focal, centre, distortion, lens = lenses[image.camera]
-            inner, path = inside(root, where, image.name)
+            inner, path = path_inside(root, where, image.name)
             pose = _pose(where, image)
             views.append(
                 View(
@@ -403,8 +403,8 @@ class ColmapParser(DataParser):
         twice = [inner for inner, times in Counter(view.name for view in views).items() if times > 1]
         if twice:
             raise DataError(f"{folder}: the image {twice[0]!r} is registered twice; export the model again")
-        points, seen = pairs(model, images)
-        return assemble(data, views, downscale=downscale, points=points, seen=seen, reduced=name != "images")
+        points, seen = cloud_of_images(model, images)
+        return assemble_scene(data, views, downscale=downscale, points=points, seen=seen, reduced=name != "images")
 
 
 def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
@@ -421,10 +421,10 @@ def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
         ]
     )
     back = rotation.T
-    # A damaged translation may overflow; `rigid` refuses what is not finite.
+    # A damaged translation may overflow; `rigid_pose` refuses what is not finite.
     with np.errstate(over="ignore", invalid="ignore"):
         centre = -back @ np.array(image.translation)
-    return rigid(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
+    return rigid_pose(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
 
 
 def _lens(where: str, camera: ColmapCamera) -> _Lens:

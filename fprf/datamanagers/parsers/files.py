@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ..images import IMAGE_SUFFIXES
 
-__all__ = ["Json", "Record", "image_names", "inside", "name_of", "read_bytes", "read_json", "read_npy", "read_npz", "record_of"]
+__all__ = [
+    "Json",
+    "Record",
+    "as_record",
+    "image_names",
+    "name_of",
+    "path_inside",
+    "read_bytes",
+    "read_json",
+    "read_npy",
+    "read_npz",
+]
 
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
@@ -81,7 +92,7 @@ def read_json(path: Path) -> Json:
     return value
 
 
-def inside(root: Path, where: str, text: str) -> tuple[str, Path]:
+def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
     """A path that a file gives relative to `root`: its normal form with slashes, and the whole path.
 
     Raises DataError for absolute paths, drive letters, `..`, empty and unprintable ones. `where` opens the message.
@@ -216,10 +227,10 @@ class Record:
         value = self.own.get(key)
         if not isinstance(value, list) or not value:
             raise DataError(f"{self.where}: no list of {key}, or an empty one; an entry for each image is needed")
-        return [record_of(f"{self.where}: {key}[{k}]", item, self.own) for k, item in enumerate(value)]
+        return [as_record(f"{self.where}: {key}[{k}]", item, self.own) for k, item in enumerate(value)]
 
 
-def record_of(where: str | Path, value: Json, common: _Object | None = None) -> Record:
+def as_record(where: str | Path, value: Json, common: _Object | None = None) -> Record:
     """A record of a JSON value, which must be an object."""
     if not isinstance(value, dict):
         raise DataError(f"{where}: {_short(value)} instead of an object in braces; correct it")

@@ -13,8 +13,8 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
 from .config import LlffConfig
-from .files import image_names, inside, read_bytes, read_npy
-from .views import View, assemble, rigid
+from .files import image_names, path_inside, read_bytes, read_npy
+from .views import View, assemble_scene, rigid_pose
 
 __all__ = ["LlffParser"]
 
@@ -50,19 +50,19 @@ class LlffParser(DataParser):
                 View(
                     name=name,
                     path=folder / name,
-                    pose=rigid(f"{file}: row {number} ({name})", turned),
+                    pose=rigid_pose(f"{file}: row {number} ({name})", turned),
                     size=size,
                     focal=(float(focal), float(focal)),
                     centre=(size[0] / 2, size[1] / 2),
                     depths=(float(row[15]), float(row[16])),
                 )
             )
-        return assemble(data, views, downscale=downscale, reduced=True)
+        return assemble_scene(data, views, downscale=downscale, reduced=True)
 
 
 def _folder(data: Path, wanted: str) -> Path:
     if wanted:
-        return inside(data, "parser.images", wanted)[1]
+        return path_inside(data, "parser.images", wanted)[1]
     if (data / "images").is_dir():
         return data / "images"
     reduced = {}

@@ -17,7 +17,7 @@ from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
 from .config import MegaNerfConfig
 from .files import name_of
-from .views import View, assemble, indices, rigid
+from .views import View, assemble_scene, index_tensor, rigid_pose
 
 __all__ = ["MegaNerfParser"]
 
@@ -49,8 +49,8 @@ class MegaNerfParser(DataParser):
         if twice:
             raise DataError(f"{name_of(data)}: {views[twice[0]].name} is in train and in val; remove it from one")
         held = [held[k] for k in order]
-        split_of = (indices([not each for each in held]), indices(held)) if any(held) else None
-        return assemble(data, [views[k] for k in order], downscale=downscale, split=split_of, reduced=True)
+        split_of = (index_tensor([not each for each in held]), index_tensor(held)) if any(held) else None
+        return assemble_scene(data, [views[k] for k in order], downscale=downscale, split=split_of, reduced=True)
 
 
 def _unit(data: Path) -> float:
@@ -103,4 +103,6 @@ def _view(file: Path, images: Path, unit: float) -> View:
     path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
     if path is None:
         raise DataError(f"{file}: no image {images / file.stem}.jpg beside it; copy the images there")
-    return View(name=file.stem, path=path, pose=rigid(str(file), pose), size=(width, height), focal=(fx, fy), centre=(cx, cy))
+    return View(
+        name=file.stem, path=path, pose=rigid_pose(str(file), pose), size=(width, height), focal=(fx, fy), centre=(cx, cy)
+    )

@@ -21,8 +21,8 @@ from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ..images import read_header
 from ..scene import Scene
 from .config import OdmConfig
-from .files import Json, Record, inside, read_json, record_of
-from .views import View, assemble, found, rigid
+from .files import Json, Record, as_record, path_inside, read_json
+from .views import View, assemble_scene, check_images_exist, rigid_pose
 
 __all__ = ["OdmParser", "project_file"]
 
@@ -61,17 +61,17 @@ class OdmParser(DataParser):
         if file is None:
             raise DataError(f"{data}: neither {_RECONSTRUCTION} nor {_SHOTS}; give the folder of an ODM project")
         shots, points = _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
-        folder = inside(data, "parser.images", self.config.images)[1]
-        named = sorted((*inside(folder, str(file), shot.name), shot) for shot in shots)
-        found(folder, [path for _, path, _ in named])
+        folder = path_inside(data, "parser.images", self.config.images)[1]
+        named = sorted((*path_inside(folder, str(file), shot.name), shot) for shot in shots)
+        check_images_exist(folder, [path for _, path, _ in named])
         views = [_view(str(file), name, path, shot) for name, path, shot in named]
-        return assemble(data, views, downscale=downscale, points=points)
+        return assemble_scene(data, views, downscale=downscale, points=points)
 
 
 def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
     """Shots and points of the largest part."""
     whole = read_json(file)
-    parts = [record_of(f"{file}: [{k}]", part) for k, part in enumerate(whole)] if isinstance(whole, list) else []
+    parts = [as_record(f"{file}: [{k}]", part) for k, part in enumerate(whole)] if isinstance(whole, list) else []
     largest = max(parts, key=lambda part: len(_objects(part, "shots")), default=None)
     if largest is None or not _objects(largest, "shots"):
         raise DataError(f"{file}: no list of reconstructions with shots; run ODM again")
@@ -90,10 +90,10 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
 def _shots(data: Path, file: Path) -> list[_Shot]:
     """Shots of a report, with the cameras beside it."""
     beside = data / "cameras.json"
-    cameras = _objects(record_of(beside, {"cameras": read_json(beside)}), "cameras")
+    cameras = _objects(as_record(beside, {"cameras": read_json(beside)}), "cameras")
     shots = []
-    for feature in record_of(file, read_json(file)).records("features"):
-        record = record_of(f"{feature.where}: properties", feature.own.get("properties"))
+    for feature in as_record(file, read_json(file)).records("features"):
+        record = as_record(f"{feature.where}: properties", feature.own.get("properties"))
         name, key = record.text("filename"), record.text("camera")
         if name is None:
             raise DataError(f"{record.where}: filename is missing; each shot names its image")
@@ -126,7 +126,7 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
     return View(
         name=name,
         path=path,
-        pose=rigid(f"{where} ({name})", turned),
+        pose=rigid_pose(f"{where} ({name})", turned),
         size=(header.width, header.height),
         focal=(fx * longest, (fx if fy is None else fy) * longest),
         # OpenSfM counts pixels from the middle of the first one, we from its corner: the half cancels.
@@ -159,5 +159,5 @@ def _objects(record: Record, key: str) -> Mapping[str, Record]:
     value = record.own.get(key)
     if value is None:
         return {}
-    whole = record_of(f"{record.where}: {key}", value)
-    return {name: record_of(f"{whole.where}[{name!r}]", each) for name, each in whole.own.items()}
+    whole = as_record(f"{record.where}: {key}", value)
+    return {name: as_record(f"{whole.where}[{name!r}]", each) for name, each in whole.own.items()}

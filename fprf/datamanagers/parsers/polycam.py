@@ -13,8 +13,8 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
 from .config import PolycamConfig
-from .files import Record, image_names, read_json, record_of
-from .views import View, assemble, rigid
+from .files import Record, as_record, image_names, read_json
+from .views import View, assemble_scene, rigid_pose
 
 __all__ = ["PolycamParser", "keyframes"]
 
@@ -48,11 +48,11 @@ class PolycamParser(DataParser):
         views = [_view(image, file) for image, file in named if file.is_file()]
         if not views:
             raise DataError(f"{cameras}: no file has the name of an image in {images}; export the raw data again")
-        return assemble(data, views, downscale=downscale)
+        return assemble_scene(data, views, downscale=downscale)
 
 
 def _view(image: Path, file: Path) -> View:
-    record = record_of(file, read_json(file))
+    record = as_record(file, read_json(file))
     rows = [[_number(record, f"t_{row}{column}") for column in range(4)] for row in range(3)]
     width, height, fx, fy, cx, cy = (_number(record, key) for key in ("width", "height", "fx", "fy", "cx", "cy"))
     if not (1 <= width <= _MOST and 1 <= height <= _MOST):
@@ -60,7 +60,7 @@ def _view(image: Path, file: Path) -> View:
     return View(
         name=image.name,
         path=image,
-        pose=rigid(str(file), np.array(rows)),
+        pose=rigid_pose(str(file), np.array(rows)),
         size=(round(width), round(height)),
         focal=(fx, fy),
         centre=(cx, cy),

@@ -17,8 +17,8 @@ from ...interfaces import DataParser
 from ...rendering.splines import rotations
 from ..scene import Scene
 from .config import Record3DConfig
-from .files import Json, image_names, read_json, record_of
-from .views import View, assemble, rigid
+from .files import Json, as_record, image_names, read_json
+from .views import View, assemble_scene, rigid_pose
 
 __all__ = ["Record3DParser", "recording"]
 
@@ -46,7 +46,7 @@ class Record3DParser(DataParser):
         if found is None:
             raise DataError(f"{data}: no metadata.json with rgb/; export from Record3D as EXR and JPG, or unpack its .r3d")
         file, folder = found
-        record = record_of(file, read_json(file))
+        record = as_record(file, read_json(file))
         poses = _table(file, "poses", record.get("poses"), 7)
         numbered = sorted((int(Path(name).stem), name) for name in image_names(folder) if _numbered(name))
         if not numbered or numbered[-1][0] >= len(poses):
@@ -72,7 +72,7 @@ class Record3DParser(DataParser):
                     centre=(cx, cy),
                 )
             )
-        return assemble(data, views, downscale=downscale)
+        return assemble_scene(data, views, downscale=downscale)
 
 
 def _numbered(name: str) -> bool:
@@ -86,7 +86,7 @@ def _pose(where: str, row: _Rows) -> _Rows:
         raise DataError(f"{where}: a quaternion of length {length:.3g} is no rotation; export the recording again")
     x, y, z, w = row[:4] / length
     turn = rotations(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
-    return rigid(where, np.concatenate([turn, row[4:, None]], 1))
+    return rigid_pose(where, np.concatenate([turn, row[4:, None]], 1))
 
 
 def _lenses(file: Path, each: Json, all_: Json, count: int) -> _Rows:

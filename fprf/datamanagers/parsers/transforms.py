@@ -20,10 +20,10 @@ from ...interfaces import DataParser
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ..images import read_header
 from ..scene import Scene
-from .colmap import beside, read_cloud
+from .colmap import cloud_of_model, read_cloud
 from .config import TransformsConfig
-from .files import Record, inside, read_json, record_of
-from .views import View, assemble, found, indices, rigid
+from .files import Record, as_record, path_inside, read_json
+from .views import View, assemble_scene, check_images_exist, index_tensor, rigid_pose
 
 __all__ = ["TransformsParser"]
 
@@ -60,7 +60,7 @@ class TransformsParser(DataParser):
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the size that the file's intrinsics belong to."""
         files = self._files(data)
-        tops = [record_of(file, read_json(file)) for file, _ in files]
+        tops = [as_record(file, read_json(file)) for file, _ in files]
         entries = []
         for top, (_, role) in zip(tops, files, strict=True):
             entries += [_entry(data, record, role) for record in top.records("frames")]
@@ -68,14 +68,14 @@ class TransformsParser(DataParser):
         for first, second in pairwise(entries):
             if first.name == second.name:
                 raise DataError(f"{second.record.where}: the image {second.name} occurs twice; remove one of the frames")
-        found(data, [entry.path for entry in entries])
+        check_images_exist(data, [entry.path for entry in entries])
         views = [_view(entry) for entry in entries]
         points, seen = _cloud(data, views)
-        return assemble(data, views, downscale=downscale, split=_split(data, tops, entries), points=points, seen=seen)
+        return assemble_scene(data, views, downscale=downscale, split=_split(data, tops, entries), points=points, seen=seen)
 
     def _files(self, data: Path) -> list[tuple[Path, str]]:
         if self.config.file:
-            return [(inside(data, "parser.file", self.config.file)[1], "")]
+            return [(path_inside(data, "parser.file", self.config.file)[1], "")]
         single = data / "transforms.json"
         train, test = data / "transforms_train.json", data / "transforms_test.json"
         if single.is_file():
@@ -93,7 +93,7 @@ def _cloud(data: Path, views: list[View]) -> tuple[NDArray[np.float64] | None, N
     cloud, model = data / "points.npz", data / "sparse" / "0"
     points, seen = read_cloud(cloud, len(views)) if cloud.is_file() else (None, None)
     if seen is None and ((model / "cameras.bin").is_file() or (model / "cameras.txt").is_file()):
-        found = beside(model, [view.name for view in views], [view.pose for view in views])
+        found = cloud_of_model(model, [view.name for view in views], [view.pose for view in views])
         return (points, None) if found is None else found
     return points, seen
 
@@ -102,7 +102,7 @@ def _entry(data: Path, record: Record, role: str) -> _Entry:
     text = record.text("file_path")
     if text is None:
         raise DataError(f"{record.where}: file_path is missing; each frame names its image")
-    name, path = inside(data, record.where, text)
+    name, path = path_inside(data, record.where, text)
     if not path.is_file():
         for suffix in _SUFFIXES:
             if path.with_name(path.name + suffix).is_file():
@@ -126,7 +126,7 @@ def _view(entry: _Entry) -> View:
     return View(
         name=entry.name,
         path=entry.path,
-        pose=rigid(f"{record.where} ({entry.name})", record.matrix("transform_matrix")),
+        pose=rigid_pose(f"{record.where} ({entry.name})", record.matrix("transform_matrix")),
         size=size,
         focal=_focal(record, size),
         centre=(size[0] / 2 if cx is None else cx, size[1] / 2 if cy is None else cy),
@@ -142,7 +142,7 @@ def _named(entry: _Entry, key: str) -> Path | None:
     text = entry.record.own.get(key)
     if text is None:
         return None
-    return inside(entry.data, entry.record.where, entry.record.text(key) or "")[1]
+    return path_inside(entry.data, entry.record.where, entry.record.text(key) or "")[1]
 
 
 def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
@@ -180,7 +180,7 @@ def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, floa
 def _split(data: Path, tops: list[Record], entries: list[_Entry]) -> tuple[Tensor, Tensor] | None:
     """Blender's two files, or the lists of file names of the one; None: the rule decides."""
     if len(tops) > 1:
-        return indices([e.role == "train" for e in entries]), indices([e.role == "test" for e in entries])
+        return index_tensor([e.role == "train" for e in entries]), index_tensor([e.role == "test" for e in entries])
     top = tops[0]
     train, test = top.texts("train_filenames"), top.texts("test_filenames")
     if train is None and test is None:
@@ -188,7 +188,7 @@ def _split(data: Path, tops: list[Record], entries: list[_Entry]) -> tuple[Tenso
     names = {entry.name for entry in entries}
     listed = []
     for key, texts in (("train_filenames", train), ("test_filenames", test)):
-        members = {inside(data, f"{top.where}: {key}", text)[0] for text in texts or ()}
+        members = {path_inside(data, f"{top.where}: {key}", text)[0] for text in texts or ()}
         if not members <= names:
             raise DataError(f"{top.where}: {key} has {min(members - names)!r}, which no frame is; remove it there")
         listed.append(members)
@@ -197,4 +197,4 @@ def _split(data: Path, tops: list[Record], entries: list[_Entry]) -> tuple[Tenso
         raise DataError(f"{top.where}: {min(both)!r} is in train_filenames and in test_filenames; remove it from one")
     learned = names - listed[1] if train is None else listed[0]
     held = names - listed[0] - set(top.texts("val_filenames") or ()) if test is None else listed[1]
-    return indices([e.name in learned for e in entries]), indices([e.name in held for e in entries])
+    return index_tensor([e.name in learned for e in entries]), index_tensor([e.name in held for e in entries])

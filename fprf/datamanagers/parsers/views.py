@@ -21,14 +21,24 @@ from ..images import read_header
 from ..scene import Scene
 from .files import name_of
 
-__all__ = ["MASKS", "SKY_MASKS", "View", "assemble", "every_eighth", "found", "indices", "masks_beside", "rigid"]
+__all__ = [
+    "MASKS",
+    "SKY_MASKS",
+    "View",
+    "assemble_scene",
+    "check_images_exist",
+    "every_eighth",
+    "find_masks",
+    "index_tensor",
+    "rigid_pose",
+]
 
 
 MASKS, SKY_MASKS = "masks", "sky_masks"
 """Names of the folders."""
 
 
-def masks_beside(data: Path, images: Sequence[Path], name: str) -> tuple[Path | None, ...]:
+def find_masks(data: Path, images: Sequence[Path], name: str) -> tuple[Path | None, ...]:
     """The mask of each image, None where there is none; nothing at all where the capture has none of that name."""
     known: dict[Path, bool] = {}
     found = tuple(_mask(data, image, name, known) for image in images)
@@ -61,7 +71,7 @@ def every_eighth(count: int) -> tuple[Tensor, Tensor]:
     return index[~test], index[test]
 
 
-def indices(members: Sequence[bool]) -> Tensor:
+def index_tensor(members: Sequence[bool]) -> Tensor:
     """The int64 positions of the members."""
     return torch.tensor([k for k, member in enumerate(members) if member], dtype=torch.int64)
 
@@ -93,7 +103,7 @@ class View:
     sky_mask: Path | None = None
 
 
-def found(root: Path, paths: Sequence[Path]) -> None:
+def check_images_exist(root: Path, paths: Sequence[Path]) -> None:
     """Raise DataError unless every image is there, naming the first and how many are missing."""
     missing = [path for path in paths if not os.path.isfile(path)]
     if missing:
@@ -103,7 +113,7 @@ def found(root: Path, paths: Sequence[Path]) -> None:
         )
 
 
-def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """A camera-to-world pose [3 4] from [3 4] or [4 4], its rotation made orthonormal to rounding.
 
     Raises DataError, opened by `where`, for anything that is not a rotation and a finite position within 1e-3.
@@ -124,7 +134,7 @@ def rigid(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([left @ right, matrix[:3, 3:]], 1)
 
 
-def assemble(
+def assemble_scene(
     data: Path,
     views: Sequence[View],
     *,
@@ -139,7 +149,7 @@ def assemble(
     The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder holds
     smaller copies of the same shape, which the cameras are then scaled to.
     """
-    found(data, [view.path for view in views])
+    check_images_exist(data, [view.path for view in views])
     alpha = False
     sizes = []
     for view in views:
@@ -176,8 +186,8 @@ def assemble(
 def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str) -> tuple[Path | None, ...]:
     """Those that the capture names, or where it names none, those that lie beside the images."""
     if not any(named):
-        return masks_beside(data, [view.path for view in views], folder)
-    found(data, [path for path in named if path is not None])
+        return find_masks(data, [view.path for view in views], folder)
+    check_images_exist(data, [path for path in named if path is not None])
     return tuple(named)
 
 

@@ -1,3 +1,5 @@
+"""Which views see a point best, and how much light is expected from it."""
+
 import math
 
 import pytest
@@ -6,7 +8,7 @@ from analytic import RADIUS, globe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.export.colours import best_views, expected_presence, single_view
+from fprf.export.colours import best_views, expected_presence
 from fprf.export.depth_maps import depth_gaps, ray_quantile
 
 
@@ -37,20 +39,6 @@ def test_witnesses_are_the_best_of_those_that_see_a_point(seed: int, count: int)
             assert torch.allclose(seen.weight[n][used], wanted, rtol=1e-6)
         else:
             assert used.tolist() == [True] + [False] * (count - 1), "somebody must speak for it"
-
-
-def test_the_first_witness_does_not_depend_on_how_many_are_asked() -> None:
-    maps, point = globe(6), sphere(50, 1)
-    one, many = (best_views(maps, point, point.float(), 0.05, count) for count in (1, 99))
-    assert one.view.shape == (50, 1) and many.view.shape == (50, 6), "never more than there are views"
-    several = many.weight[:, 1] > 0  # where nobody sees a point, any view may speak for it
-    assert int(several.sum()) > 20 and torch.equal(one.view[several, 0], many.view[several, 0])
-    assert bool((many.weight.diff(dim=1) <= 0).all()) and bool((many.weight <= 1).all())
-
-
-def test_alone() -> None:
-    seen = single_view(torch.tensor([3, 1]))
-    assert seen.view.tolist() == [[3], [1]] and seen.weight.tolist() == [[1.0], [1.0]]
 
 
 @pytest.mark.parametrize("extinction", [0.5, 3.0, 200.0])

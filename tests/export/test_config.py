@@ -1,20 +1,48 @@
+"""What is exported, to which files, in which styles."""
+
 from pathlib import Path
 
 import pytest
 from tiny_world import World
 
 from fprf.errors import UsageError
-from fprf.export.config import Named, make_looks, named_styles, style_name
+from fprf.export.config import KINDS, Named, make_looks, named_styles, plan
 from fprf.style.config import StyleConfig
-from fprf.style.files import StyleFile, write_style
+from fprf.style.files import StyleFile
 
 
-def test_names_of_styles() -> None:
-    assert style_name([Path("a/autumn day.jpg"), Path("night.png")], None) == "autumn_day+night"
-    assert style_name([], Path("x/dusk/style.json")) == "dusk"
-    assert style_name([], Path("x/dusk/mine.json")) == "mine"
-    assert len(style_name([Path("long_name.jpg")] * 50, None)) <= 60
-    assert style_name([Path("äö.png")], None) == "style"
+def test_a_folder_takes_all_kinds_or_those_that_are_named(tmp_path: Path) -> None:
+    assert plan([], tmp_path) == (tuple(KINDS), tmp_path, None)
+    assert plan(["splat", "ply", "splat"], Path("out")) == (("splat", "ply"), Path("out"), None)
+    assert plan(["splats", "mesh", "points", "glb"], Path("out")).kinds == ("splat", "glb", "ply"), (
+        "by what they are called, too"
+    )
+
+
+@pytest.mark.parametrize(
+    ("kinds", "name", "kind"),
+    [
+        ([], "a.ply", "ply"),
+        (["splat"], "a.ply", "splat"),
+        ([], "a.SPLAT", "splat"),
+        ([], "t.json", "cameras"),
+    ],
+)
+def test_a_file_holds_what_its_ending_says(kinds: list[str], name: str, kind: str) -> None:
+    assert plan(kinds, Path("to") / name) == ((kind,), Path("to"), Path("to") / name)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "output", "told"),
+    [
+        (["spalt"], "out", r"'spalt' is nothing to export; did you mean 'splat'|'spalt' is nothing to export.*splat"),
+        (["cameras"], "a.ply", r"a single \.ply file holds ply or splat or glb, not cameras"),
+        (["ply", "splat"], "a.ply", r"not ply and splat; name a folder"),
+    ],
+)
+def test_mistakes(kinds: list[str], output: str, told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        plan(kinds, Path(output))
 
 
 def test_photographs_take_the_other_settings_and_leave_what_names_photographs() -> None:
@@ -24,13 +52,6 @@ def test_photographs_take_the_other_settings_and_leave_what_names_photographs() 
     assert one.file.style.references == (Path("b.jpg"),) and two.file.style.references == (Path("c.jpg"), Path("d.jpg"))
     assert two.file.style.strength == 0.5 and two.file.style.keep == ("1",)
     assert two.file.style.weights == () and two.file.style.pin == ()
-
-
-def test_style_files(world: World, tmp_path: Path) -> None:
-    saved = StyleConfig(references=(world.references[0],), strength=0.25)
-    write_style(tmp_path / "mine.json", StyleFile(saved), {})
-    [found] = named_styles([f"mine={tmp_path / 'mine.json'}"], StyleFile(StyleConfig()))
-    assert found.file.style.strength == 0.25 and found.file.style.references[0].name == "dusk.png"
 
 
 @pytest.mark.parametrize("text", ["dusk", "=a.jpg", "dusk=", "du sk=a.jpg", "../x=a.jpg"])

@@ -1,4 +1,4 @@
-"""Meshes of a sphere of exact depths: closed, in its place, and read again by trimesh and drawn by a renderer of triangles."""
+"""Meshes of a sphere of exact depths: closed, in its place, and read again by trimesh."""
 
 from pathlib import Path
 
@@ -7,7 +7,6 @@ import pytest
 import torch
 import trimesh
 from analytic import RADIUS, globe
-from rasters import draw_points, draw_triangles, psnr
 
 from fprf.errors import DataError
 from fprf.export.mesh import (
@@ -17,7 +16,6 @@ from fprf.export.mesh import (
     integrate,
     lattice_near,
     surface_nets,
-    vertex_normals,
     write_mesh_glb,
     write_mesh_ply,
 )
@@ -47,12 +45,6 @@ def test_surface_nets_of_a_ball_are_closed_and_turned_outwards(radius: float) ->
     assert found.is_watertight and found.is_winding_consistent and found.euler_number == 2
     assert np.abs(np.linalg.norm(found.vertices, axis=1) - radius).max() < 0.2
     assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.12), "negative if it were inside out"
-
-
-def test_surface_nets_without_a_surface_are_empty() -> None:
-    cell = torch.cartesian_prod(*(torch.arange(4),) * 3)
-    at, face = surface_nets(cell, torch.ones(64))
-    assert at.shape == (0, 3) and face.shape == (0, 3)
 
 
 def test_distances_are_positive_outside() -> None:
@@ -100,12 +92,6 @@ def test_components_of_three_balls() -> None:
     assert label == [top(k) for k in range(len(parts))] and len(set(label)) == 3
 
 
-def test_vertex_normals_of_a_box_point_out_of_its_corners() -> None:
-    box = trimesh.creation.box()
-    normal = vertex_normals(torch.tensor(np.array(box.vertices)), torch.from_numpy(np.array(box.faces))).numpy()
-    assert ((normal * box.vertices).sum(1) > 0.5).all()
-
-
 def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     colour = torch.rand(len(mesh.point), 3, generator=torch.Generator().manual_seed(0))
     write_mesh_ply(tmp_path / "m.ply", mesh, colour, ZERO)
@@ -122,34 +108,3 @@ def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     assert np.abs(shade[:, :3] / 65535 - srgb_to_linear(colour.double().numpy())).max() < 1e-5, "glTF's colours are linear"
     document = (tmp_path / "m.glb").read_bytes()
     assert document[:4] == b"glTF" and int.from_bytes(document[8:12], "little") == len(document)
-
-
-def test_a_mesh_drawn_from_its_file_is_the_sphere(mesh: Mesh, tmp_path: Path) -> None:
-    """White on black from a place that no view had: the outline is the sphere's, to a pixel."""
-    write_mesh_ply(tmp_path / "m.ply", mesh, torch.ones(len(mesh.point), 3), ZERO)
-    found = trimesh.load(tmp_path / "m.ply", process=False)
-    pose = np.array([[1, 0, 0, 0], [0, 0, -1, -4.0], [0, 1, 0, 0]], dtype=float)
-    image, covered = draw_triangles(found.vertices, found.faces, found.visual.vertex_colors[:, :3] / 255, pose, 60.0, (64, 48))
-    assert np.array_equal(image, np.repeat(covered[..., None], 3, 2).astype(float))
-    y, x = np.mgrid[:48, :64] + 0.5
-    way = np.stack([(x - 32) / 60, np.ones_like(x), (24 - y) / 60], -1)
-    miss = 4 * np.sqrt(1 - (way[..., 1] / np.linalg.norm(way, axis=-1)) ** 2)
-    assert covered[miss < 0.93].all() and not covered[miss > 1.07].any()
-    dots, there = draw_points(found.vertices, np.ones((len(found.vertices), 3)), pose, 60.0, (64, 48))
-    assert there[miss < 0.9].mean() > 0.98 and psnr(dots, image) > 10
-
-
-def test_the_judge_of_triangles_is_right_about_depth_and_perspective() -> None:
-    """A wall that leans away, with colours straight in the world, and a nearer card before it."""
-    wall = np.array([[-2, -1.5, -2.0], [2, -1.5, -6.0], [2, 1.5, -6.0], [-2, 1.5, -2.0]])
-    card = np.array([[-0.2, -0.2, -1.5], [0.2, -0.2, -1.5], [0.0, 0.2, -1.5]])
-    point, face = np.concatenate([wall, card]), np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]])
-    colour = np.concatenate([np.repeat((wall[:, :1] + 2) / 4, 3, 1), np.ones((3, 3))])
-    pose = np.concatenate([np.eye(3), np.zeros((3, 1))], 1)
-    image, covered = draw_triangles(point, face, colour, pose, 40.0, (60, 40))
-    way = (np.arange(60) + 0.5 - 30) / 40  # x / -z
-    place = 4 * way / (1 - way)  # where the ray meets x = -z - 4 ... the wall's plane z = -(x + 4)
-    row = np.abs(place) < 1.9
-    assert np.allclose(image[2, row & covered[2], 0], ((place + 2) / 4)[row & covered[2]], atol=1e-9)
-    assert (image[20, 28:32] == 1).all(), "the card is in front"
-    assert psnr(image, image) == pytest.approx(99, abs=0.1)

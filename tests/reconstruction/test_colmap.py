@@ -1,0 +1,140 @@
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fprf.reconstruction.colmap import (
+    MatchTables,
+    build_vocabulary,
+    count_rows,
+    descriptors,
+    exhaustive_pairs,
+    sequential_pairs,
+    similar_pairs,
+    vlad_vectors,
+)
+
+MOST = 2147483647
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Path:
+    """Images a, b, c and e; b has no features; a-c fit by 30 matches, c-e by 5."""
+    path = tmp_path / "the database.db"
+    base = sqlite3.connect(path)
+    base.executescript(
+        """CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT, camera_id INTEGER);
+        CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB);
+        CREATE TABLE descriptors (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB);
+        CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY, rows INTEGER);
+        INSERT INTO images VALUES (1, 'a', 1), (2, 'b', 1), (5, 'sub/c', 1), (9, 'e', 1);
+        INSERT INTO keypoints VALUES (1, 70, 6, ''), (2, 0, 6, ''), (5, 60, 6, '');"""
+    )
+    base.execute("INSERT INTO descriptors VALUES (1, 2, 128, ?)", (bytes(range(128)) * 2,))
+    base.executemany(
+        "INSERT INTO two_view_geometries VALUES (?, ?)", [(1 * MOST + 5, 30), (5 * MOST + 9, 5), (7 * MOST + 8, 50)]
+    )
+    base.commit()
+    base.close()
+    return path
+
+
+def test_what_is_known_of_images(database: Path) -> None:
+    found = MatchTables(database)
+    assert [found.features_of(name) for name in ("a", "b", "sub/c", "e", "absent")] == [70, 0, 60, 0, 0]
+    assert found.matches == {("a", "sub/c"): 30, ("sub/c", "e"): 5}, "a pair of unknown images is left out"
+    assert [found.partners(name, 15) for name in ("a", "b", "sub/c", "e")] == [1, 0, 1, 0]
+    assert found.partners("sub/c", 5) == 2
+
+
+def test_progress_and_descriptors(database: Path, tmp_path: Path) -> None:
+    assert count_rows(database) == (3, 3)
+    assert np.array_equal(descriptors(database, "a"), np.arange(128, dtype=np.uint8)[None].repeat(2, 0))
+    assert descriptors(database, "b").shape == (0, 128)
+    assert count_rows(tmp_path / "absent.db") == (0, 0) and not (tmp_path / "absent.db").exists()
+    (tmp_path / "other.db").write_bytes(b"no database at all" * 99)
+    assert count_rows(tmp_path / "other.db") == (0, 0)
+    with pytest.raises(sqlite3.Error):
+        MatchTables(tmp_path / "other.db")
+
+
+def test_reading_while_another_writes(database: Path) -> None:
+    base = sqlite3.connect(database)
+    base.execute("PRAGMA journal_mode=WAL")
+    base.execute("BEGIN IMMEDIATE")
+    base.execute("INSERT INTO keypoints VALUES (9, 10, 6, '')")
+    assert count_rows(database) == (3, 3)
+    base.commit()
+    assert count_rows(database) == (4, 3)
+    base.close()
+
+
+def proper(pairs: list[tuple[int, int]], count: int) -> bool:
+    return all(0 <= a < b < count for a, b in pairs) and pairs == sorted(set(pairs))
+
+
+@settings(deadline=None)
+@given(st.integers(0, 30), st.integers(1, 12))
+def test_pairs_are_sorted_and_each_once(count: int, overlap: int) -> None:
+    assert proper(exhaustive_pairs(count), count) and len(exhaustive_pairs(count)) == count * (count - 1) // 2
+    assert proper(sequential_pairs(count, overlap), count)
+
+
+def test_sequential_reaches_neighbours_and_powers_of_two() -> None:
+    apart = {b - a for a, b in sequential_pairs(200, 5)}
+    assert apart == {1, 2, 3, 4, 5, 8, 16, 32}
+    assert set(sequential_pairs(6, 10)) == set(exhaustive_pairs(6)), "an overlap beyond the end is all with all"
+
+
+@settings(deadline=None)
+@given(st.integers(0, 20), st.integers(1, 8), st.integers(0, 99))
+def test_similar_finds_the_nearest_by_angle(count: int, nearest: int, seed: int) -> None:
+    vectors = np.random.default_rng(seed).normal(size=(count, 6)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    pairs = similar_pairs(vectors, nearest)
+    assert proper(pairs, count)
+    for a in range(count):
+        others = sorted((b for b in range(count) if b != a), key=lambda b: -float(vectors[a] @ vectors[b]))
+        assert all((min(a, b), max(a, b)) in pairs for b in others[:nearest])
+
+
+def places(count: int, views: int, seed: int = 0) -> list[np.ndarray]:
+    """Descriptors of `views` images of each of some places: a place has features of its own, seen with noise."""
+    drawn = np.random.default_rng(seed)
+    images = []
+    for _ in range(count):
+        own = drawn.gamma(0.6, 40, (120, 128))
+        for _ in range(views):
+            seen = own[drawn.permutation(120)[:80]] + drawn.normal(0, 6, (80, 128))
+            other = drawn.gamma(0.6, 40, (30, 128))
+            images.append(np.concatenate([seen, other]).clip(0, 255).astype(np.uint8))
+    return images
+
+
+def test_images_of_one_place_are_alike() -> None:
+    images = places(8, 3)
+    vocabulary = build_vocabulary(lambda i: images[i], len(images), 16)
+    found = vlad_vectors(lambda i: images[i], len(images), vocabulary)
+    assert vocabulary.shape == (16, 128) and found.shape == (24, 16 * 128)
+    assert np.allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+    pairs = similar_pairs(found, 2)
+    same = [(a, b) for a in range(24) for b in range(a + 1, 24) if a // 3 == b // 3]
+    assert len(set(pairs) & set(same)) >= 0.9 * len(same), "of each image's two nearest"
+
+
+def test_images_without_features() -> None:
+    nothing = np.zeros((0, 128), np.uint8)
+    assert not vlad_vectors(lambda _: nothing, 2, np.ones((4, 128), np.float32)).any()
+    assert build_vocabulary(lambda _: nothing, 2, 4).shape == (0, 128) and build_vocabulary(lambda _: nothing, 0, 4).shape == (
+        0,
+        128,
+    )
+    few = np.ones((3, 128), np.uint8)
+    assert build_vocabulary(lambda _: few, 1, 64).shape == (3, 128)
+    many = np.random.default_rng(0).integers(0, 255, (5001, 128), dtype=np.uint8)
+    assert np.linalg.norm(vlad_vectors(lambda _: many, 1, build_vocabulary(lambda _: many, 1, 4))[0]) == pytest.approx(
+        1, abs=1e-5
+    )
