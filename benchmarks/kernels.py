@@ -1,12 +1,11 @@
 """What each compiled kernel of `fprf.ops` brings, end to end: steps and views with one at a time switched to plain torch.
 
-    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python benchmarks/kernels.py RUN [--data DIR] [--repeats 7] [--output FILE.json]
+    OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks kernels RUN [--data DIR] [--repeats 7] [--output FILE.json]
 
 Every form does the same work on the same model in one process, in turn, by the processor's clock. The fastest of all rounds
 counts, which other programs on the machine disturb least.
 """
 
-import argparse
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,18 +15,15 @@ from types import SimpleNamespace
 from unittest import mock
 
 import torch
-from fprf.benchmarking.config import SpeedConfig
-from fprf.benchmarking.report import machine
-from fprf.benchmarking.speed import STYLES
-from fprf.benchmarking.subject import Subject, find, fresh_model, test_view
-from fprf.benchmarking.timing import Watch
-from fprf.benchmarking.training import loop_of, stepper
 from torch import Tensor
 
 from fprf.config import RenderConfig
 from fprf.datamanagers.features import FeatureStore
+from fprf.evaluation.config import SpeedConfig
+from fprf.evaluation.report import Watch
+from fprf.evaluation.speed import STYLES
+from fprf.evaluation.subject import Subject, find, fresh_model, loop_of, stepper, test_view
 from fprf.fields import proposal as field_proposal
-from fprf.io.atomic import write_json
 from fprf.ops import backend, dense, march, mixture, triplane, triplane_numba
 from fprf.rendering import renderer, space
 from fprf.rendering.cameras import Cameras
@@ -35,6 +31,8 @@ from fprf.style import matching
 from fprf.style.look import Restyle
 from fprf.training.restyle import restyle
 from fprf.training.views import render_view
+
+from .common import RESULTS, arguments, report
 
 Patches = Sequence[tuple[object, str, object]]
 
@@ -117,14 +115,14 @@ def drawn(subject: Subject, camera: Cameras, render: RenderConfig, look: Restyle
     return render_view(trained.model, trained.known.facts, camera, 0, render, look).rgb
 
 
-def main() -> None:
+def main(argv: list[str]) -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = arguments("kernels", __doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--output", type=Path, default=Path("benchmarks/results/kernels.json"))
-    args = parser.parse_args()
+    parser.add_argument("--output", type=Path, default=RESULTS / "kernels.json")
+    args = parser.parse_args(argv)
     config = SpeedConfig(run=args.run, data=args.data, repeats=args.repeats, clock="processor", device="cpu")
     names = ["", *SWITCHES, "all"]
     rows: dict[str, dict[str, object]] = {name: {} for name in names}
@@ -141,8 +139,4 @@ def main() -> None:
                 print(f"{task:24}{name or 'every kernel':48}{rows[name][task]}", flush=True)
     about = {"scene": subject.trained.known.name, "step": subject.trained.step, "rounds": args.repeats, "clock": "processor"}
     forms = {name or "every kernel": row for name, row in rows.items()}
-    write_json(args.output, {"machine": machine(torch.device("cpu")), "run": about, "without": forms})
-
-
-if __name__ == "__main__":
-    main()
+    report(args.output, {"run": about, "without": forms})

@@ -1,4 +1,4 @@
-"""`fprf bench scaling`: what a part of the work costs against how much there is of it: images, pixels, references, points."""
+"""Scaling: what a part of the work costs against how much there is of it: images, pixels, references, points."""
 
 import math
 from collections.abc import Callable, Sequence

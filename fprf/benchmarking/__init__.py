@@ -1,1 +1,0 @@
-"""Benchmarks of a run: speed, where time goes, time against error, memory, scaling."""

@@ -1,1 +1,0 @@
-"""Adversarial inputs for every stage, each against a reference and a bound: the report of `fprf bench stress`."""
