@@ -18,6 +18,7 @@ BENCHMARKS = {
     "fuzz_guided": "every reader under libFuzzer",
     "gallery": "the pictures and figures of docs/gallery",
     "gaussians": "the rasteriser of 3D Gaussians: time and error",
+    "hosts": "a cluster of two hosts that loses one",
     "kernels": "what each compiled kernel brings end to end",
     "kills": "training that is killed a hundred times",
     "large_scene": "a town of 400 images in blocks: quality, seams, memory, time",
