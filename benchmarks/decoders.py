@@ -27,9 +27,8 @@ from fprf.plugins.decoders.mlp import MlpDecoder
 from fprf.plugins.encoders.config import BundledContentConfig, EncoderConfig, Vgg19Config
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.pretraining.decoder import LONGEST, decoder_report, pretrain_decoder, restyling_report
-from fprf.pretraining.perceptual import StyleNetwork, load_style_network
 from fprf.pretraining.photos import find_photos
-from fprf.pretraining.restyling import Crops, prepare_crops
+from fprf.pretraining.restyling import Crops, StyleNetwork, load_style_network, prepare_crops
 
 from .common import RESULTS, SHARED, arguments, report
 

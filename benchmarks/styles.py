@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
@@ -20,18 +21,19 @@ from torch import Tensor
 
 from fprf.checks import at_least
 from fprf.cli.parsing import parse
+from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.images import load_image
 from fprf.errors import FprfError
 from fprf.evaluation.restyle import STYLIZERS
-from fprf.evaluation.single_image import cells_basis, encoded, flat_look, flat_reference, flat_scene, painted, render_flat
+from fprf.evaluation.single_image import encoded, flat_look, flat_scene, render_flat
 from fprf.interfaces import Decoder, Encoder
 from fprf.io.images import shrink, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, RandomConfig, Vgg19Config
 from fprf.plugins.encoders.segmenter_config import DeepLabConfig
 from fprf.plugins.stylizers.config import IdentityConfig
-from fprf.style.dictionary import build_dictionary
+from fprf.style.dictionary import Reference, build_dictionary
 
 from . import style_runs
 from .common import RESULTS, SHARED, report
@@ -42,6 +44,33 @@ from .style_runs import GOALS, PLAIN, RECOMMENDED, Exhibit, Row, colour_baseline
 DIM, REGIONS, CLUSTERS = 32, 16, 20
 """Of `fprf-lite`: semantic components, regions of a scene, codes of a reference."""
 SOURCES = ("painted", "encoder")
+
+
+@torch.no_grad()
+def cells_basis(image: Annotated[Tensor, "H W 3"], encoder: Encoder, dim: int) -> Basis:
+    """The principal components of the encoder's features on a photograph: what a scene fits on its training views."""
+    maps: Tensor = encoder(image.permute(2, 0, 1)[None])[0].float()
+    return fit_basis(maps.flatten(1).T, dim)
+
+
+def painted(regions: Annotated[Tensor, "H W"], kinds: int, size: tuple[int, int]) -> Annotated[Tensor, "N D"]:
+    """One channel a region, 1 where a pixel of a picture of `size` (height, width) lies in it: the nearest painted one."""
+    near = F.interpolate(regions[None, None].double(), size, mode="nearest-exact")[0, 0].long()
+    return F.one_hot(near.flatten(), kinds).float()
+
+
+def flat_reference(
+    name: str,
+    content: Annotated[Tensor, "N C"],
+    semantic: Annotated[Tensor, "N D"] | None,
+    colour: Annotated[Tensor, "N 3"] | None = None,
+    *,
+    samples: int = 20_000,
+) -> Reference:
+    """A photograph's features, and its colours, as a reference; about `samples` pixels of it, in even steps."""
+    some = slice(0, None, max(1, len(content) // samples))
+    parts = content.new_zeros(len(content[some]), 0) if semantic is None else semantic[some]
+    return Reference(name, content[some], parts, colour=None if colour is None else colour[some])
 
 
 @dataclass(frozen=True)

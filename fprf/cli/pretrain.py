@@ -53,7 +53,7 @@ def _run(
     begun = time.monotonic()
     found = pretrain(config, config.output, _say)
     report = {"weights": str(config.output), **found, "seed": config.seed, "seconds": round(time.monotonic() - begun, 1)}
-    from ..pretraining.report import write_report
+    from ..pretraining.loop import write_report
 
     write_report(config.output, kind, report)
     print(json.dumps(report, indent=2))

@@ -34,19 +34,7 @@ from torch.nn.functional import grid_sample
 from ..errors import DataError, NumericsError
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
 
-__all__ = [
-    "LONG",
-    "SHORT",
-    "Steadiness",
-    "Warped",
-    "consistency",
-    "path_consistency",
-    "path_pairs",
-    "published",
-    "sharpness",
-    "steadiness",
-    "warp",
-]
+__all__ = ["consistency", "path_pairs", "published", "sharpness", "steadiness", "warp"]
 
 
 SHORT, LONG = 1, 7
@@ -135,16 +123,6 @@ def consistency(
 def path_pairs(frames: int, gap: int) -> list[tuple[int, int]]:
     """All (t, t + gap) of a path; none where it is too short."""
     return [(t, t + gap) for t in range(frames - gap)]
-
-
-def path_consistency(
-    images: Sequence[Annotated[Tensor, "H W 3"]], depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras
-) -> dict[str, dict[str, float | int | None]]:
-    """`consistency` of a path at short (t, t + 1) and long (t, t + 7) range."""
-    return {
-        name: consistency(images, depths, cameras, path_pairs(len(images), gap))
-        for name, gap in (("short", SHORT), ("long", LONG))
-    }
 
 
 def _at(image: Annotated[Tensor, "H W C"], place: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:

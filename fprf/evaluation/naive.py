@@ -21,7 +21,6 @@ from .report import Row, ratio, spread
 from .subject import watch_of
 
 __all__ = [
-    "Lookup",
     "draw_points",
     "forward_backward",
     "grid_sample_lookup",

@@ -22,7 +22,7 @@ from .metrics import delta_e, image_metrics, mean_metrics, structure
 from .report import words
 from .style_distance import matched_regions, style_distances
 
-__all__ = ["Along", "Frames", "peer", "peer_page", "read_cameras", "read_depths", "read_pictures"]
+__all__ = ["peer", "peer_page", "read_cameras", "read_depths", "read_pictures"]
 
 
 Along = Literal["ray", "axis"]

@@ -31,7 +31,7 @@ from .naive import replaced
 from .report import Outcome, Spread, Watch, document, table
 from .subject import attempt, find, fresh_model, loop_of, settings, stepper, test_view, view_rays, watch_of
 
-__all__ = ["PREFIX", "REST", "Event", "Parts", "Range", "attribute", "exclusive", "labelled", "profile", "take_apart"]
+__all__ = ["PREFIX", "REST", "Range", "attribute", "exclusive", "labelled", "profile"]
 
 
 PREFIX = "fprf."

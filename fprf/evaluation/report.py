@@ -27,7 +27,6 @@ from ..io.images import Picture, to_uint8
 from ..training.prepare import device_of
 
 __all__ = [
-    "Clock",
     "Column",
     "Outcome",
     "Row",

@@ -1,38 +1,33 @@
 """Restyling of single pictures: a photograph as a scene of one point a pixel, and colour transfer between pictures.
 
-For `flat_*`, what tells pixels apart is given from outside, as features: those of an encoder (`encoded`), or painted regions
-(`painted`). `reinhard` and `histogram_matching` are the baselines of restyling; colours [N 3] are sRGB in [0, 1], `style` is
-any set of pixels.
+What tells pixels apart is given from outside, as features (`encoded`). `reinhard` and `histogram_matching` are the baselines of
+restyling; colours [N 3] are sRGB in [0, 1], `style` is any set of pixels.
 """
 
 from typing import Annotated, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from kornia.color import lab_to_rgb, rgb_to_lab
 from torch import Tensor
 
-from ..datamanagers.basis import Basis, fit_basis
+from ..datamanagers.basis import Basis
 from ..datamanagers.config import GuidedConfig
 from ..errors import DataError
 from ..interfaces import Decoder, Encoder
 from ..ops.guided import upsample
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import colour_maps
-from ..style.dictionary import Reference, StyleDictionary
+from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.scene import SceneStyle, scene_style
 from ..types import Want
 
 __all__ = [
     "Flat",
-    "cells_basis",
     "encoded",
     "flat_look",
-    "flat_reference",
     "flat_scene",
     "histogram_matching",
-    "painted",
     "reinhard",
     "render_flat",
 ]
@@ -68,19 +63,6 @@ def encoded(
     return upsample(maps, image, radius=radius, eps=guided.eps, stride=min(guided.stride, _CELL)).flatten(0, 1)
 
 
-@torch.no_grad()
-def cells_basis(image: Annotated[Tensor, "H W 3"], encoder: Encoder, dim: int) -> Basis:
-    """The principal components of the encoder's features on a photograph: what a scene fits on its training views."""
-    maps: Tensor = encoder(image.permute(2, 0, 1)[None])[0].float()
-    return fit_basis(maps.flatten(1).T, dim)
-
-
-def painted(regions: Annotated[Tensor, "H W"], kinds: int, size: tuple[int, int]) -> Annotated[Tensor, "N D"]:
-    """One channel a region, 1 where a pixel of a picture of `size` (height, width) lies in it: the nearest painted one."""
-    near = F.interpolate(regions[None, None].double(), size, mode="nearest-exact")[0, 0].long()
-    return F.one_hot(near.flatten(), kinds).float()
-
-
 def flat_scene(
     content: Annotated[Tensor, "N C"],
     semantic: Annotated[Tensor, "N D"] | None,
@@ -94,20 +76,6 @@ def flat_scene(
     parts = None if semantic is None else semantic[some]
     style = scene_style(content[some], parts, content.new_ones(len(content[some])), None, regions, seed)
     return Flat(content, semantic, size, style)
-
-
-def flat_reference(
-    name: str,
-    content: Annotated[Tensor, "N C"],
-    semantic: Annotated[Tensor, "N D"] | None,
-    colour: Annotated[Tensor, "N 3"] | None = None,
-    *,
-    samples: int = 20_000,
-) -> Reference:
-    """A photograph's features, and its colours, as a reference; about `samples` pixels of it, in even steps."""
-    some = slice(0, None, max(1, len(content) // samples))
-    parts = content.new_zeros(len(content[some]), 0) if semantic is None else semantic[some]
-    return Reference(name, content[some], parts, colour=None if colour is None else colour[some])
 
 
 def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder) -> Restyle:

@@ -41,7 +41,7 @@ from .subject import (
     watch_of,
 )
 
-__all__ = ["CACHED", "cached_rows", "speed"]
+__all__ = ["speed"]
 
 
 CACHED = 135 * 240

@@ -34,8 +34,6 @@ from .report import Watch
 
 __all__ = [
     "LOOKS",
-    "Counts",
-    "Difference",
     "Subject",
     "attempt",
     "batch_rays",

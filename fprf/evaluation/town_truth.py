@@ -42,13 +42,10 @@ from .single_image import encoded
 __all__ = [
     "KINDS",
     "PARTS",
-    "Labelled",
     "Matched",
-    "Place",
     "Reference",
     "Row",
     "Stage",
-    "Truth",
     "best_class_maps",
     "code_classes",
     "interior",

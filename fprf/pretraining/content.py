@@ -1,9 +1,11 @@
-"""Distils the content encoder: a slim network learns the principal components of normalised VGG-19 relu2_1.
+"""Distillation of the content encoder: a slim network learns the principal components of normalised VGG-19 relu2_1.
 
 The components are those of guided-filtered features, which is what scenes learn; the student imitates the raw ones.
+Components are accumulated in float64.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,15 +22,50 @@ from ..plugins.encoders.students import ContentStudent
 from ..plugins.encoders.vgg_weights import build_vgg19
 from ..plugins.weightfiles import write_weights
 from ..training.prepare import device_of
-from .basis import Basis, fit_basis
 from .config import DistilConfig
-from .filtered import filtered_at, filtered_whole, random_pixels
-from .loop import generator_of, train
-from .photos import crop, find_photos, load_photo, split
-from .prepared import prepared, prepared_path
-from .toning import toned
+from .loop import generator_of, prepared, prepared_path, train
+from .photos import crop, filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split, toned
 
-__all__ = ["content_report", "pretrain_content"]
+__all__ = ["Basis", "content_report", "fit_basis", "pretrain_content"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Basis:
+    """y = (x - mean) @ axes.T / scale. One scale for all channels: distances keep their proportions."""
+
+    mean: Annotated[Tensor, "F"]
+    axes: Annotated[Tensor, "C F"]
+    """Orthonormal rows, most energy first."""
+    scale: float
+    """Makes the mean variance per channel 1."""
+    kept: float
+    """Share of the centred energy on the axes."""
+
+    def project(self, x: Annotated[Tensor, "B F h w"]) -> Annotated[Tensor, "B C h w"]:
+        """Feature maps on the axes."""
+        centred = x - self.mean.to(x).view(1, -1, 1, 1)
+        return torch.einsum("cf,bfhw->bchw", self.axes.to(x) / self.scale, centred)
+
+
+def fit_basis(samples: Annotated[Tensor, "N F"], choices: tuple[int, ...], energy: float) -> Basis:
+    """The fewest channels among `choices` that keep `energy` of the centred variance (or the most, if none does)."""
+    x = double(samples)
+    mean = x.mean(0)
+    centred = x - mean
+    values, vectors = torch.linalg.eigh(centred.T @ centred / len(x))
+    values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
+    shares = values.cumsum(0) / values.sum()
+    enough = [n for n in sorted(choices) if n <= len(values) and float(shares[n - 1]) >= energy]
+    channels = enough[0] if enough else min(max(choices), len(values))
+    axes = vectors[:, :channels].T
+    axes = axes * axes.sum(1, keepdim=True).sign()  # eigenvectors have no sign of their own
+    return Basis(
+        mean=mean.float(),
+        axes=axes.float(),
+        scale=float((values[:channels].mean()).sqrt()),
+        kept=float(shares[channels - 1]),
+    )
+
 
 CHOICES = (24, 32, 48)
 ENERGY = 0.99

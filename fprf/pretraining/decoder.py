@@ -20,12 +20,9 @@ from ..plugins.weightfiles import write_weights
 from ..style.statistics import deviation, double
 from ..training.prepare import device_of
 from .config import PretrainDecoderConfig
-from .filtered import filtered_at, filtered_whole, random_pixels
-from .loop import generator_of, train
-from .perceptual import StyleNetwork, load_style_network
-from .photos import find_photos, load_photo, split
-from .report import sheet
-from .restyling import Crops, adain, prepare_crops, restyling_losses
+from .loop import generator_of, sheet, train
+from .photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
+from .restyling import Crops, StyleNetwork, adain, load_style_network, prepare_crops, restyling_losses
 
 __all__ = ["decoder_report", "pretrain_decoder", "restyling_report"]
 

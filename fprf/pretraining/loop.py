@@ -1,12 +1,13 @@
-"""The training loop of every pretraining: Adam, one cosine to zero by time or steps, a checkpoint to resume from.
+"""The training loop of every pretraining: Adam, one cosine to zero by time or steps, checkpoints, report and sample pictures.
 
-A batch is a function of (seed, step), so that a resumed run goes on as the interrupted one would have.
+A batch is a function of (seed, step), so that a resumed run goes on as the interrupted one would have. Prepared crops and
+targets are kept beside the output until the run is finished.
 """
 
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -14,12 +15,57 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
+from ..io.atomic import write_json
 from ..io.images import to_uint8, write_image
 from ..plugins.weightfiles import read_weights, write_weights
-from .config import PretrainConfig
-from .report import samples_folder
+from .config import DistilConfig, PretrainConfig
 
-__all__ = ["checkpoint_path", "generator_of", "train"]
+__all__ = [
+    "checkpoint_path",
+    "generator_of",
+    "prepared",
+    "prepared_path",
+    "report_path",
+    "samples_folder",
+    "sheet",
+    "train",
+    "write_report",
+]
+
+
+GAP = 4
+"""Pixels between the pictures of a sheet."""
+
+
+def report_path(output: Path) -> Path:
+    """Where the report of these weights lies."""
+    return output.with_name(output.stem + ".report.json")
+
+
+def samples_folder(output: Path) -> Path:
+    """Where the sample pictures of these weights lie."""
+    return output.with_name(output.stem + ".samples")
+
+
+def write_report(output: Path, kind: str, report: Mapping[str, float | int | str]) -> Path:
+    """Write the report, whole or not at all; the weights by their bare name, since both may be moved."""
+    path = report_path(output)
+    write_json(path, {"kind": kind, **report, "weights": output.name})
+    return path
+
+
+def sheet(rows: Sequence[Sequence[Annotated[Tensor, "H W 3"]]]) -> Annotated[Tensor, "H W 3"]:
+    """Pictures of any sizes in rows, on white, aligned at their top left corners: one picture of all."""
+    height = [max(picture.shape[0] for picture in row) for row in rows]
+    width = [max(row[i].shape[1] for row in rows if i < len(row)) for i in range(max(len(row) for row in rows))]
+    whole = torch.ones(sum(height) + GAP * (len(rows) - 1), sum(width) + GAP * (len(width) - 1), 3)
+    for y, row in enumerate(rows):
+        top = sum(height[:y]) + GAP * y
+        for x, picture in enumerate(row):
+            left = sum(width[:x]) + GAP * x
+            whole[top : top + picture.shape[0], left : left + picture.shape[1]] = picture.detach().to(whole)
+    return whole
+
 
 WARM_UP = 0.02
 """Share of the run in which the rate rises."""
@@ -128,3 +174,29 @@ def _resume(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainCon
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     step, seconds = json.loads(metadata["progress"])
     return _Progress(step=step, seconds=seconds)
+
+
+Pair = tuple[Tensor, Tensor]
+
+
+def prepared_path(output: Path) -> Path:
+    """Where the crops of an unfinished run lie."""
+    return output.with_name(output.name + ".prepared")
+
+
+def prepared(make: Callable[[], Pair], config: DistilConfig, output: Path) -> Pair:
+    """Inputs and targets: those of an interrupted run that would prepare the same, or made anew and kept."""
+    path = prepared_path(output)
+    if path.is_file():
+        tensors, metadata = read_weights(path)
+        if metadata.get("key") == _crops_key(config):
+            return tensors["inputs"], tensors["targets"]
+    inputs, targets = make()
+    write_weights(path, {"inputs": inputs, "targets": targets}, {"key": _crops_key(config)})
+    return inputs, targets
+
+
+def _crops_key(config: DistilConfig) -> str:
+    """What the crops depend on: a run may be made longer without preparing them again."""
+    free = replace(config, output=None, minutes=1.0, steps=None, batch=1, rate=1.0, samples=0.0, device="auto")
+    return repr(free)

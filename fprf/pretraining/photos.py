@@ -1,4 +1,7 @@
-"""Photographs to learn from: found, split, loaded, cropped. Every draw is a function of a generator."""
+"""Photographs to learn from: found, split, cropped, shown in another light, and their guided-filtered features.
+
+Every draw is a function of a generator.
+"""
 
 import hashlib
 import math
@@ -10,10 +13,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import load_image
 from ..errors import DataError
+from ..interfaces import Encoder
+from ..ops.guided import apply, coefficients, upsample
 
-__all__ = ["crop", "find_photos", "load_photo", "split"]
+__all__ = [
+    "crop",
+    "filtered_at",
+    "filtered_crop",
+    "filtered_whole",
+    "find_photos",
+    "load_photo",
+    "nightfall",
+    "random_pixels",
+    "split",
+    "toned",
+]
+
 
 SUFFIXES = (".jpg", ".jpeg", ".png")
 HELD_OUT = 12
@@ -64,3 +82,83 @@ def crop(
         piece = F.interpolate(piece, (size, size), mode="bilinear", align_corners=False, antialias=smaller)
     piece = piece[0].clamp(0, 1)
     return piece.flip(-1) if draw[3] < 0.5 else piece
+
+
+LUMA = (0.299, 0.587, 0.114)
+
+
+def toned(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Annotated[Tensor, "3 H W"]:
+    """Random gamma, contrast, saturation, hue and tint; one in four times night, one in five times none at all."""
+    kind = float(torch.rand(1, generator=generator))
+    draw = (2 * torch.rand(8, generator=generator) - 1).tolist()
+    if kind < 0.2:
+        return image
+    image = torch.pow(image, 2 ** (0.8 * draw[0]))
+    image = 0.5 + (image - 0.5) * (1 + 0.4 * draw[1]) + 0.15 * draw[2]
+    luma = torch.tensor(LUMA, dtype=image.dtype).view(3, 1, 1)
+    grey = (image * luma).sum(0, keepdim=True)
+    image = grey + (image - grey) * (1 + 0.8 * draw[3])
+    image = _turned(image, 0.5 * draw[4])
+    tint = 1 + 0.25 * torch.tensor(draw[5:8])
+    image = (image * tint.view(3, 1, 1)).clamp(0, 1)
+    return nightfall(image, generator) if kind > 0.75 else image
+
+
+def nightfall(image: Annotated[Tensor, "3 H W"], generator: torch.Generator) -> Annotated[Tensor, "3 H W"]:
+    """Dark, bluish or orange, grainy: day as a night photograph shows it."""
+    draw = torch.rand(4, generator=generator).tolist()
+    cold = torch.tensor([0.7, 0.85, 1.3]) if draw[1] < 0.6 else torch.tensor([1.3, 0.95, 0.6])
+    dark = torch.pow(image, 1.2 + draw[2]) * (0.25 + 0.4 * draw[0]) * cold.view(3, 1, 1)
+    grain = 0.03 * draw[3] * torch.randn(image.shape, generator=generator)
+    return torch.clamp(dark + grain, 0, 1)
+
+
+def _turned(image: Tensor, angle: float) -> Tensor:
+    """Colours turned about the grey axis by `angle` in radians (Rodrigues)."""
+    axis = torch.full((3,), 3**-0.5)
+    cross = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) * 3**-0.5
+    cosine, sine = torch.cos(torch.tensor(angle)), torch.sin(torch.tensor(angle))
+    matrix = cosine * torch.eye(3) + sine * cross + (1 - cosine) * torch.outer(axis, axis)
+    return torch.einsum("ij,jhw->ihw", matrix, image)
+
+
+def random_pixels(photo: Annotated[Tensor, "H W 3"], count: int, generator: torch.Generator) -> Annotated[Tensor, "N 2"]:
+    """Row and column indices, int64, drawn with replacement."""
+    height, width = photo.shape[:2]
+    index = torch.randint(0, height * width, (count,), generator=generator)
+    return torch.stack([index // width, index % width], 1)
+
+
+@torch.no_grad()
+def filtered_at(
+    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], pixels: Annotated[Tensor, "N 2"], guided: GuidedConfig
+) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
+    """Features and colours at pixels (row, column)."""
+    height, width = photo.shape[:2]
+    pixels = pixels.to(photo.device)
+    features = encoder(photo.permute(2, 0, 1)[None])[0]
+    coefs = coefficients(features, photo, radius=_radius(photo, guided), eps=guided.eps, stride=guided.stride)
+    rgb = photo[pixels[:, 0], pixels[:, 1]]
+    return apply(coefs, pixels.flip(1) + 0.5, rgb, (height, width)), rgb
+
+
+@torch.no_grad()
+def filtered_crop(
+    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], side: int, guided: GuidedConfig, generator: torch.Generator
+) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
+    """Features and colours of a random square of the photograph, row by row; the whole of it was encoded."""
+    top, left = (int(torch.randint(0, size - side + 1, (), generator=generator)) for size in photo.shape[:2])
+    rows, columns = torch.meshgrid(top + torch.arange(side), left + torch.arange(side), indexing="ij")
+    return filtered_at(encoder, photo, torch.stack([rows.flatten(), columns.flatten()], 1), guided)
+
+
+@torch.no_grad()
+def filtered_whole(encoder: Encoder, photo: Annotated[Tensor, "H W 3"], guided: GuidedConfig) -> Annotated[Tensor, "N C"]:
+    """Features at every pixel, row by row."""
+    features = encoder(photo.permute(2, 0, 1)[None])[0]
+    radius = _radius(photo, guided)
+    return upsample(features, photo, radius=radius, eps=guided.eps, stride=guided.stride).flatten(0, 1)
+
+
+def _radius(photo: Annotated[Tensor, "H W 3"], guided: GuidedConfig) -> int:
+    return round(guided.radius * min(photo.shape[:2]))

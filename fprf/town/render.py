@@ -21,7 +21,6 @@ from .surface import fractal2, hashed, labels, noise2, step
 
 __all__ = [
     "FIELD_OF_VIEW",
-    "Hits",
     "Picture",
     "View",
     "cast",

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.consistency import consistency, path_consistency, path_pairs, warp
+from fprf.evaluation.consistency import consistency, path_pairs, warp
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.paths import look_at
 
@@ -112,15 +112,16 @@ def test_a_consistent_path_scores_zero_and_flicker_its_own_size() -> None:
     cameras = row_of_cameras(10, step=0.05)
     views = [seen(cameras, view) for view in range(10)]
     images, depths = [image for image, _ in views], [depth for _, depth in views]
-    rows = path_consistency(images, depths, cameras)
-    assert rows["short"]["pairs"] == 9 and rows["long"]["pairs"] == 3
-    for row in rows.values():
+    rows = [consistency(images, depths, cameras, path_pairs(10, gap)) for gap in (1, 7)]
+    assert [row["pairs"] for row in rows] == [9, 3]
+    for row in rows:
         assert row["rmse"] is not None and row["rmse"] < 1e-3
         assert row["relative"] is not None and row["relative"] < 5e-3
         assert row["valid_share"] is not None and row["valid_share"] > 0.8
     # Every other frame brighter by 0.1: short pairs differ by exactly that, as do pairs 7 apart.
     flicker = [image + 0.1 * (index % 2) for index, image in enumerate(images)]
-    for row in path_consistency(flicker, depths, cameras).values():
+    for gap in (1, 7):
+        row = consistency(flicker, depths, cameras, path_pairs(10, gap))
         assert row["rmse"] == pytest.approx(0.1, abs=1e-3)
 
 

@@ -2,9 +2,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.styles import cells_basis, flat_reference, painted
 from fprf.datamanagers.config import GuidedConfig
 from fprf.evaluation.metrics import psnr
-from fprf.evaluation.single_image import Flat, cells_basis, encoded, flat_reference, flat_scene, painted, render_flat
+from fprf.evaluation.single_image import Flat, encoded, flat_scene, render_flat
 from fprf.interfaces import Decoder, Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, RandomConfig

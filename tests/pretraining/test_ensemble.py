@@ -8,8 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from photo_folder import teacher_files
 
-from fprf.pretraining.ensemble import COMPONENTS, LOOKS, Ensemble, look, semantic_ensemble, taught
-from fprf.pretraining.teachers import MobileNetTeacher, load_teacher
+from fprf.pretraining.semantic import (
+    COMPONENTS,
+    LOOKS,
+    Ensemble,
+    MobileNetTeacher,
+    load_teacher,
+    look,
+    semantic_ensemble,
+    taught,
+)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.weightfiles import read_weights
 from fprf.pretraining.config import PretrainDecoderConfig
-from fprf.pretraining.report import report_path, samples_folder
+from fprf.pretraining.loop import report_path, samples_folder
 from fprf.training.decoder import build_decoder
 
 ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]

@@ -11,12 +11,20 @@ from photo_folder import photo_folder
 from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import ConfigError, DataError
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.pretraining.basis import fit_basis
 from fprf.pretraining.config import DistilConfig, PretrainDecoderConfig
-from fprf.pretraining.filtered import filtered_at, filtered_whole, random_pixels
-from fprf.pretraining.photos import crop, find_photos, load_photo, split
-from fprf.pretraining.prepared import prepared, prepared_path
-from fprf.pretraining.toning import nightfall, toned
+from fprf.pretraining.content import fit_basis
+from fprf.pretraining.loop import prepared, prepared_path
+from fprf.pretraining.photos import (
+    crop,
+    filtered_at,
+    filtered_whole,
+    find_photos,
+    load_photo,
+    nightfall,
+    random_pixels,
+    split,
+    toned,
+)
 
 
 @pytest.fixture(scope="module")

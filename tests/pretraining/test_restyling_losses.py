@@ -13,11 +13,18 @@ from safetensors.torch import save_file
 from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import WeightsError
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.pretraining.filtered import filtered_crop, filtered_whole
-from fprf.pretraining.perceptual import CONTENT, StyleNetwork, load_style_network, style_distance, style_statistics
-from fprf.pretraining.photos import find_photos, load_photo
-from fprf.pretraining.report import GAP, sheet
-from fprf.pretraining.restyling import adain, prepare_crops, restyling_losses
+from fprf.pretraining.loop import GAP, sheet
+from fprf.pretraining.photos import filtered_crop, filtered_whole, find_photos, load_photo
+from fprf.pretraining.restyling import (
+    CONTENT,
+    StyleNetwork,
+    adain,
+    load_style_network,
+    prepare_crops,
+    restyling_losses,
+    style_distance,
+    style_statistics,
+)
 
 WIDTHS = (3, 4, 4, 6, 6, 8, 8, 8, 8, 10)
 

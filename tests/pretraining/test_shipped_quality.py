@@ -11,8 +11,7 @@ from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, Vgg19Config
 from fprf.pretraining.content import content_basis, content_report
 from fprf.pretraining.decoder import decoder_report
-from fprf.pretraining.photos import find_photos, load_photo, split
-from fprf.pretraining.toning import nightfall
+from fprf.pretraining.photos import find_photos, load_photo, nightfall, split
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,17 @@ import pytest
 import torch
 from photo_folder import teacher_files
 
-from fprf.pretraining.ensemble import Ensemble, semantic_ensemble, taught
-from fprf.pretraining.teachers import load_teacher
-from fprf.pretraining.towns import FIRST_SEED, VIEWS, Streets, render_streets, street_targets
+from fprf.pretraining.semantic import (
+    FIRST_SEED,
+    VIEWS,
+    Ensemble,
+    Streets,
+    load_teacher,
+    render_streets,
+    semantic_ensemble,
+    street_targets,
+    taught,
+)
 from fprf.town.palettes import PALETTES
 from fprf.town.surface import CLASSES
 

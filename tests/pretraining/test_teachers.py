@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fprf.errors import WeightsError
 from fprf.pretraining.photos import crop, load_photo
-from fprf.pretraining.teachers import load_teacher
+from fprf.pretraining.semantic import load_teacher
 
 
 def unfolded(tensors: dict[str, Tensor], image: Tensor) -> Tensor:
