@@ -21,14 +21,14 @@ from ..types import Batch, Rays, Site
 __all__ = ["batch", "capture", "dictionary", "normal", "parts", "points", "rays", "scene", "site", "space", "uniform"]
 
 
-def uniform(*shape: int) -> Tensor:
-    """In [0, 1]."""
-    return torch.rand(shape, generator=torch.Generator().manual_seed(1))
+def uniform(*shape: int, seed: int = 1) -> Tensor:
+    """In [0, 1]. Inputs of one function take different seeds, so that swapped arguments are seen."""
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def normal(*shape: int) -> Tensor:
-    """Mean 0, deviation 1."""
-    return torch.randn(shape, generator=torch.Generator().manual_seed(2))
+def normal(*shape: int, seed: int = 2) -> Tensor:
+    """Mean 0, deviation 1; seeds as in `uniform`."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
 def points(count: int) -> Annotated[Tensor, "N 3"]:
@@ -86,7 +86,7 @@ def parts() -> Parts:
 def batch(count: int) -> Batch:
     """Targets of `rays` for `parts`; semantics of the first half."""
     view, pixel = torch.zeros(count, dtype=torch.int64), torch.full((count, 2), 0.5)
-    return Batch(view, pixel, uniform(count, 3), normal(count, 7), normal(count // 2, 5))
+    return Batch(view, pixel, uniform(count, 3), normal(count, 7, seed=3), normal(count // 2, 5, seed=4))
 
 
 class _Sigmoid(Decoder):
@@ -105,9 +105,9 @@ class _Sigmoid(Decoder):
 def dictionary(codes: int, channels: int, dims: int) -> StyleDictionary:
     """Style codes of one reference."""
     return StyleDictionary(
-        keys=normal(codes, dims),
-        mean=normal(codes, channels),
-        covariance=_covariances(codes, channels),
+        keys=normal(codes, dims, seed=5),
+        mean=normal(codes, channels, seed=6),
+        covariance=_covariances(codes, channels, seed=7),
         share=torch.full((codes,), 1 / codes),
         reference=torch.zeros(codes, dtype=torch.int64),
         weight=torch.ones(codes),
@@ -117,12 +117,12 @@ def dictionary(codes: int, channels: int, dims: int) -> StyleDictionary:
 
 def scene(regions: int, channels: int, dims: int) -> SceneStyle:
     """A scene of equally large regions."""
-    covariances = _covariances(regions + 1, channels)
+    covariances = _covariances(regions + 1, channels, seed=8)
     return SceneStyle(
-        mean=normal(channels),
+        mean=normal(channels, seed=9),
         covariance=covariances[-1],
-        keys=normal(regions, dims),
-        region_mean=normal(regions, channels),
+        keys=normal(regions, dims, seed=10),
+        region_mean=normal(regions, channels, seed=11),
         region_covariance=covariances[:-1],
         share=torch.full((regions,), 1 / regions),
         semantic_mean=torch.zeros(dims),
@@ -130,6 +130,6 @@ def scene(regions: int, channels: int, dims: int) -> SceneStyle:
     )
 
 
-def _covariances(count: int, channels: int) -> Annotated[Tensor, "N C C"]:
-    factor = normal(count, channels, channels)
+def _covariances(count: int, channels: int, seed: int) -> Annotated[Tensor, "N C C"]:
+    factor = normal(count, channels, channels, seed=seed)
     return factor @ factor.mT / channels + 0.1 * torch.eye(channels)

@@ -113,13 +113,13 @@ def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None
     decoder, name = config.build(encoder=encoder, channels=channels), type(config).__name__
     require(isinstance(decoder, Decoder), f"{name}: build() gives {type(decoder).__name__}, not an fprf.interfaces.Decoder")
     same_parameters(decoder, config.build(encoder=encoder, channels=channels), name)
-    content = torch.cat([cases.normal(9, channels), cases.normal(9, channels) * 1e3])
+    content = torch.cat([cases.normal(9, channels), cases.normal(9, channels, seed=12) * 1e3])
     colour = decoder(content)
     tensor(colour, (18, 3), name)
     require(bool(((colour >= 0) & (colour <= 1)).all()), f"{name}: colours must lie in [0, 1], for any features")
     pointwise(lambda points: decoder(points), content, name)
     styled = content.flip(0)
-    for strength in (0.0, 0.3, 1.0, cases.uniform(18, 1)):
+    for strength in (0.0, 0.3, 1.0, cases.uniform(18, 1, seed=15)):
         restyled = decoder.restyled(content, styled, strength)
         tensor(restyled, (18, 3), f"{name}.restyled")
         require(bool(((restyled >= 0) & (restyled <= 1)).all()), f"{name}.restyled: colours must lie in [0, 1]")
@@ -149,7 +149,7 @@ def check_stylizer(config: StylizerConfig) -> None:
         require(Want.CONTENT in stylizer.needs, f"{name}: needs must hold Want.CONTENT")
         allowed = Want.CONTENT | Want.SEMANTIC
         require(stylizer.needs | allowed == allowed, f"{name}: may need content and semantics, and nothing else")
-        content, semantic = cases.normal(11, 8), cases.normal(11, dims)
+        content, semantic = cases.normal(11, 8), cases.normal(11, dims, seed=13)
         given = semantic if Want.SEMANTIC in stylizer.needs else None
         styled = stylizer(content, given)
         tensor(styled, (11, 8), name)
@@ -206,7 +206,7 @@ def check_content_field(config: ContentFieldConfig) -> None:
     field, name = config.build(channels=7, seed=0), type(config).__name__
     require(isinstance(field, ContentField), f"{name}: build() gives {type(field).__name__}, not a ContentField")
     same_parameters(field, config.build(channels=7, seed=0), name)
-    points, view = cases.points(13), nn.functional.normalize(cases.normal(13, 3), dim=1)
+    points, view = cases.points(13), nn.functional.normalize(cases.normal(13, 3, seed=14), dim=1)
     sample = field.density(points)
     tensor(sample.density, (13,), f"{name}: density")
     require(bool((sample.density >= 0).all()), f"{name}: density must be at least 0")
