@@ -2,7 +2,7 @@
 
     python -m benchmarks false_edges RUN ... --styles DIR [--references NAME ...] [--output JSON] [--sheets DIR]
 
-false_edges: share of the pairs of pixels on one even surface that the style moves apart (`fprf/evaluation/false_edges.py`).
+false_edges: share of the pairs of pixels on one even surface that the style moves apart (`benchmarks/false_edges.py`).
 structure: what the style keeps of the luminance's structure. palette: distance of the pictures' colours (means and deviations
 of the channels) to the reference's, over the same of the plain render. change: mean difference to the plain render.
 Runs must be of a version that measures contacts between regions. Sheets show other people's photographs.

@@ -25,7 +25,7 @@ Make it again after installing a plug-in."""
 
 _WORDS = {
     "pretrain": ("content", "semantic", "decoder"),
-    "bench": ("speed", "profile", "pareto", "memory", "scaling"),
+    "bench": ("speed", "profile", "memory", "restyle", "peer"),
     "export": ("ply", "splat", "glb", "cameras", "lut"),
     "completion": ("bash", "zsh", "fish"),
 }

@@ -46,7 +46,7 @@ VERBS = {
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("RUN", "in the browser: drop a photograph on the scene to restyle it"),
     "report": Verb("RUN", "how training went: charts of loss, PSNR, speed, time per part"),
-    "bench": Verb("speed|profile|pareto|... [RUN]", "time and error, where time goes, memory, scaling"),
+    "bench": Verb("speed|profile|memory|... [RUN]", "time and error, where time goes, memory, restyling"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
     "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),
     "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
