@@ -7,15 +7,15 @@ needs, in three seconds; a command starts these first and has its kernels when i
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from . import photometric, rasterise_gradient_kernels, rasterise_kernels
-from .rasterise_kernels import FIXED, SLOTS
+from .rasterise_kernels import FIXED, SIDE, SLOTS
 from .simd import LANES
 
-__all__ = ["Learnt", "Target", "compile_beside", "learn"]
+__all__ = ["Learnt", "Target", "compile_beside", "errors", "learn"]
 
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -63,11 +63,7 @@ def learn(
     nothing is changed. `splats` is room for SLOTS numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss.
     """
     width, height, camera, planes, blurred, valid = target
-    rasterise_kernels.project(blocks, count, bands, camera, width, height, splats)
-    entries = rasterise_kernels.bins(splats, count, width, height)
-    out, left = np.zeros(len(planes), np.float32), np.empty(len(planes) // 3, np.float32)
-    behind = np.array(background, np.float32)
-    rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, behind, width, height, out, left)
+    entries, out, left = _render(blocks, count, bands, splats, target, background)
     l1, similar, slope = photometric.loss(out, planes, blurred, width, height, ssim)
     if not np.isfinite(l1 + similar):
         return Learnt(l1, similar, out)
@@ -80,6 +76,34 @@ def learn(
         blocks, *moments, count, bands, camera, found, entries.first_slot, rates, step
     )  # fmt: skip
     return Learnt(l1, similar, out)
+
+
+def errors(
+    blocks: Floats, count: int, bands: int, splats: Floats, target: Target, background: tuple[float, float, float]
+) -> Annotated[Floats, "count"]:
+    """What each Gaussian has to do with the errors of a view: the sum over pixels of its weight times |render - photograph|."""
+    entries, out, _ = _render(blocks, count, bands, splats, target, background)
+    area = -(-target.width // SIDE) * SIDE * -(-target.height // SIDE) * SIDE
+    apart = np.abs(out - target.planes)[: 3 * area]
+    if target.valid is not None:
+        apart *= target.valid[: 3 * area]
+    pixels, found = np.zeros(8 * area, np.float32), np.empty((count, 8), np.float32)
+    pixels[:area] = apart.reshape(3, area).sum(0)
+    summed = rasterise_gradient_kernels.lift(entries, splats, target.width, target.height, pixels)
+    rasterise_gradient_kernels.lift_values(summed, entries.first_slot, count, found.reshape(-1), 8, 0, 8)
+    return found[:, 0]
+
+
+def _render(
+    blocks: Floats, count: int, bands: int, splats: Floats, target: Target, background: tuple[float, float, float]
+) -> tuple[rasterise_kernels.Entries, Floats, Floats]:
+    width, height = target.width, target.height
+    rasterise_kernels.project(blocks, count, bands, target.camera, width, height, splats)
+    entries = rasterise_kernels.bins(splats, count, width, height)
+    out, left = np.zeros(len(target.planes), np.float32), np.empty(len(target.planes) // 3, np.float32)
+    behind = np.array(background, np.float32)
+    rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, behind, width, height, out, left)
+    return entries, out, left
 
 
 def compile_beside(bands: int) -> "list[subprocess.Popen[bytes]]":

@@ -36,12 +36,12 @@ class GaussiansConfig(RunConfig):
     """Degree of the harmonics of view-dependent colours, 0 to 3."""
     ssim: float = 0.2
     """Share of 1 - SSIM in the loss; the rest is the absolute error."""
-    coarse: float = 0.3
+    coarse: float = 0.6
     """Share of training that sees the photographs reduced: at half their size, large ones at less in the first third of it."""
     grow: float = 0.6
     """Share of training within which the number grows to `cap`."""
     relocate_every: int = 100
-    """Steps between moves of transparent Gaussians to where opaque ones are."""
+    """Steps between moves of transparent Gaussians to where views err."""
     rate: float = 1.0
     """Factor of all learning rates."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Training 3D Gaussians step by step, on the CPU: one view a step, Adam, relocation of what became transparent (3DGS-MCMC).
+"""Training 3D Gaussians step by step, on the CPU: one view a step, Adam, splits where views err.
 
 The parameters live in the blocks of `ops.rasterise_kernels`, padded to a fixed room; Adam's moments beside them. Every draw is
 a function of (seed, step), so parameters, moments and the step are all the state there is.
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..ops.rasterise_kernels import FIXED, SLOTS
-from ..ops.rasterise_training import learn
+from ..ops.rasterise_training import errors, learn
 from ..ops.simd import LANES, aligned
+from ..rendering.splines import rotations
 from .config import GaussiansConfig
 from .gaussians import HARMONIC, Gaussians
 from .initial import Points, spacing, spatial_order
@@ -26,8 +27,11 @@ _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
 _SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
 """Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
+_JUDGES = 8
+"""Views whose errors say where Gaussians are split."""
+_SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
+"""Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE = 0.3, 0.7
-_BINOMIALS = [[math.comb(i, k) for k in range(i + 1)] for i in range(11)]
 
 
 class Step(NamedTuple):
@@ -87,7 +91,7 @@ class Learner:
         if not math.isfinite(found.l1 + found.ssim):
             return None
         if (step + 1) % self.config.relocate_every == 0 and step >= _SETTLE and share < max(self.config.grow, _LAST):
-            self._relocate(step, share)
+            self._relocate(step, level, share)
         height, width = level.height, level.width
         tall, wide = -(-height // LANES) * LANES, -(-width // LANES) * LANES
         apart = (found.image - target.planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
@@ -104,32 +108,43 @@ class Learner:
         found: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return found
 
-    def _relocate(self, step: int, share: float) -> None:
-        """Move the transparent to places of others, drawn by opacity, and grow towards the cap in the same way.
+    def _relocate(self, step: int, level: Level, share: float) -> None:
+        """Split Gaussians where views err: as many as became transparent, which move there, and as the number grows by.
 
-        Of n in one place each gets the opacity and size with which together they look as the one did (3DGS-MCMC, Eq. 9).
+        They are drawn by opacity times what they have to do with the errors of some views. Each becomes two along its
+        longest axis.
         """
         draw = np.random.default_rng((self.config.seed, step, 1))
+        views = draw.permutation(list(level.photographs))[:_JUDGES]
+        chance = np.zeros(self.count)
+        for view in views:
+            target, background = level.photographs[view], self.config.background
+            chance += errors(self.blocks, self.count, self.bands, self.splats, target, background)
         parts = [_rows(each, self.rows) for each in (self.blocks, self.first, self.second)]
         rows, first, second = parts
         opacity = 1 / (1 + np.exp(-rows[10, : self.count].astype(np.float64)))
         dead = np.flatnonzero(opacity < _DEAD)
+        chance = np.nan_to_num(chance * opacity)
+        chance[dead] = 0
         cap = max(self.config.cap, self.begun)
         wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))
         more = max(wanted - self.count, 0)
-        chance = opacity.copy()
-        chance[dead] = 0
-        if (len(dead) or more) and chance.sum() > 0:
-            picked = draw.choice(self.count, len(dead) + more, p=chance / chance.sum())
-            origin, times = np.unique(picked, return_counts=True)
-            each, factor = _shared(opacity[origin], times + 1)
-            each = np.clip(each, _DEAD, 0.995)
-            rows[10, origin] = np.log(each / (1 - each))
-            rows[3:6, origin] += np.log(np.clip(factor, 0.2, 1.2))
-            first[:, origin], second[:, origin] = 0, 0.5 * second[:, origin]
-            to = np.concatenate([dead, np.arange(self.count, self.count + more)])
-            rows[:, to], first[:, to], second[:, to] = rows[:, picked], 0, second[:, picked]
-            self.count += more
+        many = min(len(dead) + more, int(np.count_nonzero(chance)))
+        if many > 0:
+            picked = draw.choice(self.count, many, replace=False, p=chance / chance.sum())
+            to = np.concatenate([dead, np.arange(self.count, self.count + more)])[:many]
+            longest: NDArray[np.int64] = np.asarray(rows[3:6, picked].argmax(0))
+            turns: Floats = rotations(torch.from_numpy(rows[6:10, picked].T)).numpy()
+            across = turns[np.arange(many), :, longest].T * np.exp(rows[3 + longest, picked])
+            rows[3 + longest, picked] += math.log(_SPLIT_SIZE)
+            each = np.clip(_SPLIT_OPACITY * opacity[picked], _DEAD, 0.995)
+            rows[10, picked] = np.log(each / (1 - each))
+            first[:, picked], second[:, picked] = 0, 0.5 * second[:, picked]
+            for part in parts:
+                part[:, to] = part[:, picked]
+            rows[:3, picked] += _SPLIT_DISTANCE * across
+            rows[:3, to] -= _SPLIT_DISTANCE * across
+            self.count += max(0, many - len(dead))
         if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * self.count:
             order = spatial_order(rows[:3, : self.count].T)
             for part in parts:
@@ -170,14 +185,3 @@ def _blocks(rows: Floats) -> Floats:
     found = aligned(rows.size)
     found.reshape(-1, len(rows), LANES)[:] = rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)
     return found
-
-
-def _shared(opacity: NDArray[np.float64], times: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Opacity and factor of the size of each of `times` Gaussians (10 at most) that stand for one."""
-    times = np.minimum(times, 10)
-    each = 1 - (1 - opacity) ** (1 / times)
-    total = np.zeros_like(opacity)
-    for i in range(1, 11):
-        term = sum(_BINOMIALS[i - 1][k] * (-1) ** k / math.sqrt(k + 1) * each ** (k + 1) for k in range(i))
-        total += np.where(i <= times, term, 0)
-    return each, opacity / total

@@ -74,7 +74,7 @@ def test_it_learns_views_that_it_has_not_seen(config: GaussiansConfig, scene: Sc
 
     before = quality(prepare(config, scene).learner.gaussians())
     assert quality(trained.gaussians()) > before + 3
-    assert len(trained.gaussians()) == 600
+    assert 590 <= len(trained.gaussians()) <= 600
 
 
 def test_it_goes_on_bit_for_bit(config: GaussiansConfig, scene: Scene, trained: Learner) -> None:
