@@ -1,7 +1,7 @@
 """`fprf restyle CAPTURE --references A.jpg B.jpg --output OUT`: new colours for a finished capture of 3D Gaussians."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,15 +17,13 @@ from .style_flags import read_flags
 from .stylize import print_explained
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from ..interfaces import Encoder
     from ..io.images import Picture
     from ..splats.files import Capture
     from ..splats.scene import SplatScene
     from ..training.restyle import Styled
 
-__all__ = ["RestyleConfig", "run"]
+__all__ = ["RestyleConfig", "run", "seen_capture"]
 
 _KEPT = 24
 """Captures of which the cache keeps what was found out."""
@@ -84,7 +82,10 @@ def run(args: list[str]) -> int:
     capture, encoder = read_capture(config.capture), BundledSemanticConfig().build()
     finite = capture.gaussians.finite
     with Display() as display:
-        scene = _known(capture, finite, encoder, config, display)
+        look = LookConfig(up=config.up, inside=config.inside, views=config.views, size=config.size, regions=config.regions)
+        scene = seen_capture(
+            capture, encoder, look, config.cache, lambda done, total: display.count(done, total, "looking"), display.say
+        )
         looked = time.perf_counter() - begun
         named, made, encoders = _styles(config, file), [], scene.encoders()
         for i, (name, each) in enumerate(named):
@@ -156,27 +157,32 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
     return alone
 
 
-def _known(capture: "Capture", finite: "Tensor", encoder: "Encoder", config: RestyleConfig, display: Display) -> "SplatScene":
-    """Return the views and features of a capture from the cache; compute and store them where they are absent."""
+def seen_capture(
+    capture: "Capture",
+    encoder: "Encoder",
+    look: LookConfig,
+    cache: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda text: None,
+) -> "SplatScene":
+    """The finite Gaussians of a capture with views and features from the cache; computed and stored where they are absent."""
     from ..splats.scene import cache_name, load_scene, look_at_capture, scene_tensors
     from ..training.prepare import cache_folder
     from ..training.tensorfiles import load_sealed, save_sealed
 
-    look = LookConfig(up=config.up, inside=config.inside, views=config.views, size=config.size, regions=config.regions)
-    folder = config.cache or cache_folder() / "captures"
+    folder = cache or cache_folder() / "captures"
     path = folder / cache_name(capture.data, encoder.identity, look)
+    finite = capture.gaussians.finite
     gaussians = capture.gaussians if bool(finite.all()) else capture.gaussians.select(finite)
     if path.is_file():
         try:
             scene = load_scene(load_sealed(path), gaussians, capture.antialiased)
         except CheckpointError as error:
-            display.say(f"looking again: {error}")
+            say(f"looking again: {error}")
         else:
             path.touch()
             return scene
-    scene = look_at_capture(
-        gaussians, capture.antialiased, encoder, look, lambda done, total: display.count(done, total, "looking")
-    )
+    scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress)
     save_sealed(path, scene_tensors(scene))
     for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_KEPT]:
         old.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""`fprf view RUN`: the scene in the browser; drop a photograph on it and it is restyled."""
+"""`fprf view RUN` or `fprf view CAPTURE.ply`: the scene in the browser; drop a photograph on it and it is restyled."""
 
 import importlib.util
 import os
@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
 from ..errors import CheckpointError, UsageError
-from ..training.quality import QualityConfig, at_quality
+from ..training.quality import QualityConfig
 from .parsing import parse
 from .style_flags import say
 
 if TYPE_CHECKING:
-    from ..training.loading import Trained
+    from ..viewer.session import Viewed
 
 __all__ = ["ViewConfig", "run"]
 
@@ -28,7 +28,11 @@ class ViewConfig(QualityConfig):
     """Which run to show, and to whom."""
 
     run: Path = Path()
-    """Run folder."""
+    """Run folder, or a capture of 3D Gaussians: .ply .compressed.ply .splat .spz .sog, or a SOG folder."""
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    """Direction that points up in a capture's own axes."""
+    inside: bool | None = None
+    """Look at a capture from within, as in rooms and streets, or around an object; none = found out."""
     references: tuple[Path, ...] = ()
     """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"
@@ -60,7 +64,7 @@ def run(args: list[str]) -> int:
 
     access = make_access(config.host, config.token)
     with ViewerServer(access, config.port) as server:
-        if not (config.run / "config.json").is_file():
+        if not (_is_capture(config.run) or (config.run / "config.json").is_file()):
             raise CheckpointError(f"{config.run}: no config.json here, so it is no run folder; `fprf train` makes one")
         references = _photographs(config.references)
         print(server.address, flush=True)
@@ -85,7 +89,28 @@ def _photographs(references: Sequence[Path]) -> Sequence[Path]:
     return photographs(references, say)
 
 
-def _load(config: ViewConfig) -> "Trained":
-    from ..training.loading import load_run
+def _is_capture(path: Path) -> bool:
+    return (
+        path.suffix.lower() in (".ply", ".splat", ".spz", ".sog") or path.name == "meta.json" or (path / "meta.json").is_file()
+    )
 
-    return at_quality(load_run(config.run, config.device, config.max_memory), config)
+
+def _load(config: ViewConfig) -> "Viewed":
+    from ..viewer.session import Viewed, view_of_run
+
+    if not _is_capture(config.run):
+        from ..training.loading import open_run
+
+        run = open_run(config.run, config.device, config)
+        return view_of_run(run.scene, run.run, run.known)
+    from ..plugins.encoders.config import BundledSemanticConfig
+    from ..plugins.stylizers.config import RegionToneConfig
+    from ..splats.files import read_capture
+    from ..splats.look_config import LookConfig
+    from .restyle import seen_capture
+
+    scene = seen_capture(
+        read_capture(config.run), BundledSemanticConfig().build(), LookConfig(up=config.up, inside=config.inside)
+    )
+    name = config.run.resolve().name.partition(".")[0]
+    return Viewed(scene, name, 0, stylizer=RegionToneConfig(centred=False))

@@ -18,18 +18,17 @@ import torch
 from ..checks import between
 from ..cli.keyframes import keyed_looks, read_keyframes
 from ..errors import FprfError, UsageError
+from ..interfaces import Scene
 from ..io.atomic import write_json
-from ..io.images import Picture, to_uint8
+from ..io.images import Picture
 from ..io.video import write_video
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
-from ..training.cached_view import view_parts
-from ..training.loading import Trained
 from .cameras import CameraState, PageTransform
 from .render_worker import RenderWorker
-from .renderer import CHUNK, RenderRequest
+from .renderer import RenderRequest, SceneRenderer
 from .state import FilmProgress, Key, Look, interpolate_looks, simplified, style_config
 
 if TYPE_CHECKING:
@@ -102,20 +101,14 @@ def write_film_files(folder: Path, transform: PageTransform, plan: FilmPlan, enc
 
 
 def film_frames(
-    folder: Path, trained: Trained, out: "Queue[Picture | None]", progress: Callable[[int, int], None]
+    folder: Path, scene: Scene, renderer: SceneRenderer, out: "Queue[Picture | None]", progress: Callable[[int, int], None]
 ) -> Iterator[None]:
-    """Render the frames of a film's folder into a queue, at last None, a step each chunk; `progress(done, total)` of each."""
+    """Render the frames of a film's folder into a queue, at last None, step by step; `progress(done, total)` of each."""
     try:
         cameras, _ = read_camera_path(folder / "path.json")
-        looks = keyed_looks(trained, read_keyframes(folder / "keys.json"))
-        config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
+        looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
         for frame in range(len(cameras)):
-            look, rows = looks(frame), []
-            for part in view_parts(trained.model, trained.known.facts, cameras, frame, config):
-                rows.append(part.colour(trained.model.decoder, look))
-                yield
-            width, height = (int(v) for v in cameras.size[frame])
-            picture = to_uint8(torch.cat(rows).view(height, width, 3))
+            picture = yield from renderer.frame(cameras, frame, looks(frame))
             while not _put(out, picture):
                 yield
             progress(frame + 1, len(cameras))
@@ -182,7 +175,8 @@ class FilmRecorder:
                 # As fast as pictures come: where a newer camera replaced each older one, none would be seen.
                 until = time.monotonic() + _PREVIEW_TIMEOUT
                 while not over.wait(1 / PREVIEW_FPS) and session.picture(client) is before and time.monotonic() < until:
-                    pass
+                    if session.in_browser:
+                        break
         except FprfError as error:
             session.notify(str(error), client)
         finally:
@@ -194,17 +188,21 @@ class FilmRecorder:
             session.update(lambda state: replace(state, playing=flying))
 
     def _record(self, plan: FilmPlan, client: Hashable | None) -> None:
-        session, trained = self._session, self._session.trained
+        session = self._session
 
         def progress(done: int, total: int) -> None:
             session.update(lambda state: replace(state, film=FilmProgress(done, total)))
 
         try:
-            folder = new_folder(trained.run.root)
-            write_film_files(folder, session.transform, plan, trained.known.facts.semantic_encoder)
+            if session.viewed.root is None:
+                raise UsageError("a capture has no run folder to put it in; films are made of runs")
+            folder = new_folder(session.viewed.root)
+            write_film_files(folder, session.transform, plan, session.viewed.scene.semantic_encoder)
             frames: Queue[Picture | None] = Queue(2)
             failed: list[Exception] = []
-            self._worker.run_when_idle(_noting(film_frames(folder, trained, frames, progress), failed))
+            self._worker.run_when_idle(
+                _noting(film_frames(folder, session.viewed.scene, session.renderer, frames, progress), failed)
+            )
             write_video(folder / "film.mp4", queued_frames(frames), plan.fps)
             if failed:
                 raise failed[0]

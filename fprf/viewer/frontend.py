@@ -10,6 +10,7 @@ import threading
 from collections.abc import Hashable
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +18,13 @@ import viser
 from numpy.typing import NDArray
 
 from ..errors import FprfError
+from ..io.images import to_uint8
 from ..rendering.cameras import pixel_grid
+from ..splats.scene import SplatScene
 from ..training.lay_out import load_boxes
 from .cameras import CameraState, Segments, box_edges, camera_frustums, checked_camera, path_segments
 from .film import film_cameras
+from .gaussian_renderer import Colours, page_gaussians
 from .page import Page
 from .panel import Panel
 from .renderer import RenderedFrame
@@ -55,10 +59,11 @@ class ViserFrontend(Frontend):
             self._viser = _ViserServer(host=_random_loopback(), port=0, verbose=False)
         self.address = (self._viser.get_host(), self._viser.get_port())
         self._viser.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
-        self._viser.gui.set_panel_label(session.trained.known.name)
+        self._viser.gui.set_panel_label(session.viewed.name)
         self._viser.scene.set_up_direction(session.transform.up)
         self._viser.scene.world_axes.visible = False
         self._home = self._set_home()
+        self._splats = self._add_gaussians(session.viewed.scene) if isinstance(session.viewed.scene, SplatScene) else None
         self._lock = threading.Lock()
         self.panel = Panel(self._viser.gui, session, self._move_camera, self._camera_of, self.draw_lines)
         self._viser.on_client_connect(self._connected)
@@ -83,6 +88,15 @@ class ViserFrontend(Frontend):
             depth=self._page_depth(frame) if lined else None,
         )
         handle.flush()
+
+    def recolour(self, colours: Colours) -> None:
+        """Send the Gaussians again with other colours."""
+        if self._splats is not None:
+            packed = self._splats.buffer.copy()
+            rgba = packed[:, 7:].view(np.uint8)  # red, green, blue, opacity
+            rgba[:, :3] = colours
+            self._splats.buffer = packed
+            self._viser.flush()
 
     def changed(self, before: State, now: State) -> None:
         """Bring controls and page up to date."""
@@ -134,14 +148,26 @@ class ViserFrontend(Frontend):
         client.flush()
 
     def _set_home(self) -> CameraState:
-        """Let new clients begin at a captured view, the middle one of those that training did not see."""
-        known, transform = self._session.trained.known, self._session.transform
-        views = known.test or known.train
-        state = transform.camera_state(known.cameras, views[len(views) // 2])
+        """Let new clients begin at a captured view."""
+        viewed, transform = self._session.viewed, self._session.transform
+        state = transform.camera_state(viewed.scene.cameras, viewed.home)
         camera = self._viser.initial_camera  # where "reset view" leads
         camera.position, camera.look_at = np.asarray(state.position), self._look_at(state)
         camera.up, camera.fov = np.asarray(transform.up), state.fov
         return state
+
+    def _add_gaussians(self, scene: SplatScene) -> Any:
+        """Let browsers draw the Gaussians over the scene's background."""
+        background = np.array(scene.background, np.float32)
+        self._viser.scene.set_background_image(to_uint8(torch.tensor(background)[None, None]), format="png")
+        means, covariances = page_gaussians(scene.gaussians, self._session.transform)
+        return self._viser.scene.add_gaussian_splats(
+            "/gaussians",
+            means.numpy(),
+            covariances.numpy(),
+            scene.gaussians.colours.clamp(0, 1).numpy(),
+            scene.gaussians.opacities[:, None].numpy(),
+        )
 
     def _look_at(self, state: CameraState) -> NDArray[np.float64]:
         pose = self._session.transform.cameras([state], (16, 16)).pose[0]
@@ -150,12 +176,12 @@ class ViserFrontend(Frontend):
     def draw_lines(self, panel: Panel) -> None:
         """Draw the lines over the scene that the controls ask for."""
         session = self._session
-        known, transform = session.trained.known, session.transform
-        cameras = known.cameras.select(torch.tensor(known.train)) if panel.cameras else None
+        viewed, transform = session.viewed, session.transform
+        cameras = viewed.scene.cameras.select(torch.tensor(viewed.captured)) if panel.cameras and viewed.captured else None
         self._lines("cameras", None if cameras is None else camera_frustums(transform, cameras, 0.04), _BLUE)
         boxes = None
-        if panel.blocks and known.facts.space.kind == "open":
-            boxes = box_edges(transform, known.facts.space, load_boxes(session.trained.run.root))
+        if panel.blocks and viewed.root is not None and viewed.space is not None and viewed.space.kind == "open":
+            boxes = box_edges(transform, viewed.space, load_boxes(viewed.root))
         elif panel.blocks:
             self.notify("this scene is not cut into blocks")
         self._lines("blocks", boxes, _YELLOW)

@@ -26,10 +26,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 from ..errors import FprfError, UsageError
 
 if TYPE_CHECKING:
+    from ..training.loading import Trained
     from ..training.model import Model
     from ..training.trainer import Report
     from .server import Access, ViewerServer
-    from .session import Session
+    from .session import Session, Viewed
     from .state import TrainingProgress
 
 __all__ = ["LiveViewer", "TrainingFollower", "ViewAddress", "main"]
@@ -225,6 +226,7 @@ class TrainingFollower:
         self._run: _TrainingRun | None = None
         self._shown: _TrainingRun | None = None
         self._session: Session | None = None
+        self._trained: Trained | None = None
         self._looking = self._wanted = self._ended = False
         self._last_seen = self._last_new = 0.0
 
@@ -277,31 +279,37 @@ class TrainingFollower:
         from safetensors.torch import load_file
 
         from .restyler import load_unfinished, measure_encoders, set_parameters
+        from .session import view_of_run
         from .state import TrainingProgress
 
         tensors = load_file(path)
         self._wanted, self._last_new = False, time.monotonic()
         run, session = self._run, self._session
         assert run is not None
+        if self._trained is None or run != self._shown:
+            self._trained = load_unfinished(run.root, run.device, run.block)
+        trained, self._shown = self._trained, run
+
+        def load() -> Viewed:
+            set_parameters(trained, tensors)
+            return view_of_run(trained, trained.run, trained.known)
+
         if session is None:
-            trained = set_parameters(load_unfinished(run.root, run.device, run.block), tensors)
-            self._session = self._server.open(lambda: trained, (), 640, measure_encoders)
+            self._session = self._server.open(load, (), 640, lambda before: measure_encoders(trained, before))
             self._set_progress(TrainingProgress(what=run.what))
-        elif run == self._shown:
-            session.reload(lambda: set_parameters(session.trained, tensors))
         else:
-            session.reload(lambda: set_parameters(load_unfinished(run.root, run.device, run.block), tensors))
-        self._shown = run
+            session.reload(load, lambda before: measure_encoders(trained, before))
 
     def _load_finished(self) -> None:
         """Show the run as it was saved, with the style that training measured."""
         if self._session is None or self._run is None:
             return
         from ..training.loading import load_run
+        from .session import view_of_run
         from .state import TrainingProgress
 
         last = load_run(self._run.root, self._run.device)
-        self._session.reload(lambda: last, lambda trained, before: trained.encoders())
+        self._session.reload(lambda: view_of_run(last, last.run, last.known), lambda before: last.encoders())
         self._set_progress(TrainingProgress(last.step, 1.0))
 
     def _set_progress(self, training: "TrainingProgress") -> None:

@@ -128,9 +128,10 @@ class Panel:
         self._on_change(self._drop_mode, lambda value: lambda state: replace(state, drop_mode=_drop_mode(value)))
 
     def _add_view_controls(self, state: State) -> None:
-        names = self._session.trained.known.names
+        names, drawn_there = self._session.viewed.scene.names, self._session.in_browser
+        maps = MAPS[:-1] if drawn_there else MAPS
         with self._gui.add_folder("Show"):
-            self._map = self._gui.add_dropdown("map", MAPS, initial_value=state.map, hint=_HINTS["map"])
+            self._map = self._gui.add_dropdown("map", maps, initial_value=state.map, hint=_HINTS["map"])
             self._map_opacity = self._gui.add_slider("map covers", 0.0, 1.0, 0.05, state.map_opacity)
             self._wipe = self._gui.add_checkbox("before/after", state.wipe is not None, hint="drag the line on the picture")
             self._picking = self._gui.add_checkbox("pick a region", state.picking, hint=_HINTS["picking"])
@@ -139,6 +140,8 @@ class Panel:
             self._pixels = self._gui.add_slider(
                 "sharpness", MIN_PIXELS, MAX_PIXELS, 32, state.pixels, hint="longest side in pixels"
             )
+            for control in (self._wipe, self._blocks, self._pixels):  # what needs pictures that are rendered here, or fields
+                control.visible = not drawn_there
             view = self._gui.add_slider("fly to view", 0, max(1, len(names) - 1), 1, 0)
         self._on_change(self._map, lambda value: lambda state: replace(state, map=cast(Map, value)))
         self._on_change(self._map_opacity, lambda value: lambda state: replace(state, map_opacity=float(value)))
@@ -150,7 +153,7 @@ class Panel:
 
         def fly(event: Any) -> None:
             if event.client is not None and 0 <= int(view.value) < len(names):
-                cameras = self._session.trained.known.cameras
+                cameras = self._session.viewed.scene.cameras
                 self._move_camera(event.client, self._session.transform.camera_state(cameras, int(view.value)))
 
         view.on_update(fly)

@@ -1,4 +1,4 @@
-"""Pictures for clients, rendered here: coarse to sharp, in layers, with what can be kept kept.
+"""Pictures of fields for clients: coarse to sharp, in layers, with what can be kept kept.
 
 A moving camera must see something at once, a camera at rest everything: the first picture is the finest one that can be had
 within `FIRST_SECONDS`, as fast as this machine has been so far, and each next one has four times the pixels. Layers (the look,
@@ -7,10 +7,11 @@ of a client's last view are kept, so that a slider that is moved while the camer
 """
 
 import time
+from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Generator, Hashable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from torch import Tensor
 from ..interfaces import Decoder
 from ..io.images import Picture, to_uint8
 from ..io.maps import depth_image, match_image, palette
+from ..rendering.cameras import Cameras
+from ..style.look import Restyle
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..training.cached_view import Part, view_parts
@@ -36,8 +39,11 @@ __all__ = [
     "ProgressiveRenderer",
     "RenderRequest",
     "RenderedFrame",
+    "SceneRenderer",
     "Speed",
     "composite_layers",
+    "first_speeds",
+    "region_colours",
     "resolutions",
 ]
 
@@ -113,6 +119,11 @@ class Speed:
         return max(fits, default=0)
 
 
+def first_speeds() -> tuple[Speed, Speed]:
+    """Of new views and of kept ones until something was measured: 100 000 rays a second, and a fifth of the time."""
+    return Speed(1e-5), Speed(2e-6)
+
+
 @dataclass
 class _ClientCache:
     camera: CameraState | None = None
@@ -121,8 +132,24 @@ class _ClientCache:
     """The sharpest picture that was finished, and for what."""
 
 
-class ProgressiveRenderer:
-    """Renders requests of all clients of one scene; `show` receives the pictures. Runs on the render worker."""
+class SceneRenderer(ABC):
+    """Serves the requests of all clients of one scene. Runs on the render worker."""
+
+    @abstractmethod
+    def render(self, client: Hashable, request: RenderRequest) -> Iterator[None]:
+        """Show a client what it requests, step by step; the client None is nobody."""
+
+    @abstractmethod
+    def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
+        """Render one frame of a film, step by step, and return it."""
+
+    @abstractmethod
+    def forget(self, client: Hashable) -> None:
+        """Drop what is kept for a client."""
+
+
+class ProgressiveRenderer(SceneRenderer):
+    """Renders fields; `show` receives the pictures."""
 
     def __init__(
         self,
@@ -130,20 +157,24 @@ class ProgressiveRenderer:
         restyler: Restyler,
         transform: PageTransform,
         show: Callable[[Hashable, RenderedFrame], None],
+        speeds: "tuple[Speed, Speed] | None" = None,
     ) -> None:
         self._trained, self._restyler, self._transform, self._show = trained, restyler, transform, show
         self._caches: OrderedDict[Hashable, _ClientCache] = OrderedDict()
-        # Until something was measured: 100 000 rays a second, and a fifth of the time for a view that is kept.
-        self._speed, self._cached_speed = Speed(1e-5), Speed(2e-6)
+        self._speed, self._cached_speed = speeds or first_speeds()
 
     def forget(self, client: Hashable) -> None:
-        """Drop what is kept for a client."""
+        """Drop the kept features of a client's view."""
         self._caches.pop(client, None)
 
-    def reload(self, trained: Trained) -> None:
-        """Replace the scene."""
-        self._trained = trained
-        self._caches.clear()
+    def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
+        """Render a view, a step each chunk of rays."""
+        rows = []
+        for part in self._parts(cameras, view):
+            rows.append(part.colour(self._trained.model.decoder, look))
+            yield
+        width, height = (int(v) for v in cameras.size[view])
+        return to_uint8(torch.cat(rows).view(height, width, 3))
 
     def render(self, client: Hashable, request: RenderRequest) -> Iterator[None]:
         """Show ever sharper pictures, a step each chunk of rays."""
@@ -185,10 +216,12 @@ class ProgressiveRenderer:
             yield
 
     def _march(self, camera: CameraState, size: tuple[int, int]) -> Iterator[Part]:
+        return self._parts(self._transform.cameras([camera], size), 0)
+
+    def _parts(self, cameras: Cameras, view: int) -> Iterator[Part]:
         trained = self._trained
-        cameras = self._transform.cameras([camera], size)
         config = replace(trained.config.render, chunk=min(CHUNK, trained.config.render.chunk))
-        return view_parts(trained.model, trained.known.facts, cameras, 0, config)
+        return view_parts(trained.model, trained.known.facts, cameras, view, config)
 
     def _keep(self, cache: _ClientCache, size: tuple[int, int], parts: tuple[Part, ...]) -> None:
         """Keep the sharpest views that fit together, those of the latest client first."""
@@ -267,10 +300,7 @@ class LayerRenderer:
         return _row(match_image(attention[None], codes.reference, codes.names, part.opacity[None], kept.clamp(0, 1)[None]))
 
     def _regions(self, part: Part) -> Picture:
-        share = self._memberships(part)
-        most, region = share.max(-1)
-        light = (_UNSURE + (1 - _UNSURE) * most) * part.opacity
-        return _row(to_uint8((palette(share.shape[1])[region] * light[:, None])[None]))
+        return _row(to_uint8(region_colours(self._memberships(part), part.opacity)[None]))
 
     def _memberships(self, part: Part) -> Tensor:
         """How much each pixel belongs to each region."""
@@ -281,6 +311,13 @@ class LayerRenderer:
 
     def _add(self, name: str, rows: Picture) -> None:
         self._rows.setdefault(name, []).append(rows)
+
+
+def region_colours(memberships: Annotated[Tensor, "N K"], opacity: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N 3"]:
+    """A colour for each region, darker where something belongs to many."""
+    most, region = memberships.max(-1)
+    light = (_UNSURE + (1 - _UNSURE) * most) * opacity
+    return palette(memberships.shape[1])[region] * light[:, None]
 
 
 def _row(picture: Picture) -> Picture:

@@ -15,14 +15,15 @@ from torch import Tensor
 from ..datamanagers.basis import Basis
 from ..datamanagers.images import load_image
 from ..errors import CheckpointError, UsageError
+from ..interfaces import Scene
 from ..io.images import shrink
+from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.references import Encoders, encode_photograph
-from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..style.wishes import labels
 from ..training import tensorfiles
@@ -32,10 +33,10 @@ from ..training.lay_out import RAYS, load_boxes
 from ..training.loading import Trained, encoders_of
 from ..training.model import build_model
 from ..training.prepare import device_of
+from ..training.regions import memberships
 from ..training.restyle import Styled, dress, mixed
 from ..training.run import Run
 from ..training.style_pass import measure_style
-from ..training.views import paint_pixels
 from .state import Look, Photograph, RegionInfo, simplified, style_config
 
 __all__ = [
@@ -48,7 +49,7 @@ __all__ = [
     "set_parameters",
 ]
 
-OpenEncoders: TypeAlias = Callable[[Trained, Encoders | None], Encoders]
+OpenEncoders: TypeAlias = Callable[[Encoders | None], Encoders]
 """Opens the encoders of a scene with its style, given those that were opened before."""
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -66,9 +67,12 @@ _RAYS = 2**14
 class Restyler:
     """Looks as styles on one scene; encoders are opened when they are first needed."""
 
-    def __init__(self, trained: Trained, open_encoders: OpenEncoders | None = None) -> None:
-        self.trained = trained
-        self._open: OpenEncoders = open_encoders or (lambda trained, before: trained.encoders())
+    def __init__(
+        self, scene: Scene, open_encoders: OpenEncoders | None = None, stylizer: RegionToneConfig | None = None
+    ) -> None:
+        self.scene = scene
+        self._open: OpenEncoders = open_encoders or (lambda before: scene.encoders())
+        self._stylizer = stylizer
         self._encoders: Encoders | None = None
         self._stale = False
         self._photographs = 0
@@ -79,13 +83,13 @@ class Restyler:
     def encoders(self) -> Encoders:
         """Encoders of the scene. Raises WeightsError where those at hand are others."""
         if self._encoders is None or self._stale:
-            self._encoders = self._open(self.trained, self._encoders)
+            self._encoders = self._open(self._encoders)
             self._stale = False
         return self._encoders
 
-    def reload(self, trained: Trained, open_encoders: OpenEncoders | None = None) -> SceneStyle | None:
+    def reload(self, scene: Scene, open_encoders: OpenEncoders | None = None) -> SceneStyle | None:
         """Replace the scene, and with it its style; return the style from before, if there was one."""
-        self.trained, self._open = trained, open_encoders or self._open
+        self.scene, self._open = scene, open_encoders or self._open
         self._stale = True
         self._styles.clear()
         return None if self._encoders is None else self._encoders.scene
@@ -126,10 +130,8 @@ class Restyler:
         width, height = cameras.size[0].tolist()
         if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
             raise UsageError(f"pixel {pixel[0]:.0f},{pixel[1]:.0f}: outside of the view of {width}x{height}")
-        weight = RegionWeight(self.encoders.scene, torch.eye(self.regions)).to(self.trained.model.device)
         place = torch.tensor([pixel], dtype=torch.float64)
-        config = self.trained.config.render
-        share, opacity = paint_pixels(self.trained.model, cameras, 0, place, config, weight, semantic=weight.divided)
+        share, opacity = memberships(self.scene, self.encoders.scene, cameras, 0, place)
         return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
 
     def region_info(self, look: Look, region: int) -> RegionInfo:
@@ -139,7 +141,7 @@ class Restyler:
         if styled is not None:
             look = simplified(look)
             names = [photograph.name for photograph, _ in (*look.mix, *(look.towards.mix if look.towards else ()))]
-            attention = styled.restyle.match(scene.keys[region : region + 1].to(self.trained.model.device))[0].cpu()
+            attention = styled.restyle.match(scene.keys[region : region + 1].to(self.scene.device))[0].cpu()
             shares = torch.zeros(len(styled.codes.names)).index_add_(0, styled.codes.reference, attention.float())
             taken = sorted(zip(names, shares.tolist(), strict=True), key=lambda row: -row[1])
         return RegionInfo(region, float(scene.share[region]), tuple(taken))
@@ -151,15 +153,15 @@ class Restyler:
             return None
         if look not in self._styles:
             parts = [self._dictionary(photograph, look.clusters, look.blend) for photograph, _ in look.mix]
-            style = style_config(look)
+            style = style_config(look, self._stylizer)
             dictionary = concatenate(parts, labels(style.references), [weight for _, weight in look.mix])
-            self._styles[look] = dress(self.trained, StyleFile(style), self.encoders, dictionary)
+            self._styles[look] = dress(self.scene, StyleFile(style), self.encoders, dictionary)
         return _use(self._styles, look)
 
     def _dictionary(self, photograph: Photograph, clusters: int, blend: float) -> StyleDictionary:
         key = (photograph, clusters, blend)
         if key not in self._dictionaries:
-            seed = self.trained.config.seed
+            seed = self.encoders.seed
             self._dictionaries[key] = build_dictionary([photograph.reference], clusters=clusters, blend=blend, seed=seed)
         return _use(self._dictionaries, key)
 

@@ -26,9 +26,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ..errors import DataError, FprfError, UsageError
 
 if TYPE_CHECKING:
-    from ..training.loading import Trained
     from .restyler import OpenEncoders
-    from .session import Session
+    from .session import Session, Viewed
 
 __all__ = ["COOKIE", "Access", "HttpServer", "Request", "Response", "ViewerServer", "make_access"]
 
@@ -299,7 +298,7 @@ class ViewerServer:
 
     def open(
         self,
-        load: "Callable[[], Trained]",
+        load: "Callable[[], Viewed]",
         references: Sequence[Path],
         pixels: int,
         open_encoders: "OpenEncoders | None" = None,
@@ -308,19 +307,18 @@ class ViewerServer:
 
         Raises what `load` raises, and DataError for an unreadable photograph.
         """
-        trained = load()
+        viewed = load()
         from .frontend import ViserFrontend, page_of
         from .message_validation import check_message
         from .page import Page
         from .session import Session
         from .state import State
 
-        session = Session(
-            trained, State(pixels=pixels, drop_mode="in the mix" if len(references) > 1 else "alone"), open_encoders
-        )
+        state = State(pixels=pixels, drop_mode="in the mix" if len(references) > 1 else "alone")
+        session = Session(viewed, state, open_encoders)
         session.__enter__()
         self._closers.append(session.close)
-        page = Page(session, page_of(trained.known.name))
+        page = Page(session, page_of(viewed.name))
         frontend = ViserFrontend(session, page)
         self._closers.append(frontend.close)
         self._http.relay_to(page.routes, frontend.address, check_message)

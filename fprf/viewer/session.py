@@ -7,28 +7,58 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import FprfError, UsageError
+from ..interfaces import Scene
 from ..io.images import Picture, encode, shrink
+from ..plugins.stylizers.config import RegionToneConfig
+from ..rendering.space import Space
+from ..splats.scene import SplatScene
 from ..training.loading import Trained
+from ..training.run import Known, Run
 from .cameras import CameraState, PageTransform, page_transform
 from .film import FilmPlan, FilmRecorder
+from .gaussian_renderer import Colours, GaussianRenderer
 from .render_worker import RenderWorker
-from .renderer import ProgressiveRenderer, RenderedFrame, RenderRequest
+from .renderer import ProgressiveRenderer, RenderedFrame, RenderRequest, SceneRenderer, first_speeds
 from .restyler import OpenEncoders, Restyler, matching_regions
 from .state import Look, Photograph, State, Thumbnail, ViewSettings, add_photograph, only, renumber_regions
 from .uploads import Uploads, shown_name
 
-__all__ = ["Frontend", "Session"]
+__all__ = ["Frontend", "Session", "Viewed", "view_of_run"]
 
 _POLL = 0.5
 """Seconds between looks whether the worker is closed."""
 _THUMBNAIL = 192
 """Longest side of a key's picture."""
+
+
+@dataclass(frozen=True)
+class Viewed:
+    """A scene with what the page says of it."""
+
+    scene: Scene
+    name: str
+    home: int
+    """View at which clients begin."""
+    captured: tuple[int, ...] = ()
+    """Views from which it was trained."""
+    root: Path | None = None
+    """Its run folder; None = a capture has none."""
+    space: Space | None = None
+    """Of fields, in which blocks lie."""
+    stylizer: RegionToneConfig | None = None
+    """What a look is based on; None = the default."""
+
+
+def view_of_run(scene: Scene, run: Run, known: Known) -> Viewed:
+    """A run, beginning at the middle one of the views that training did not see."""
+    views = known.test or known.train
+    return Viewed(scene, known.name, views[len(views) // 2], tuple(known.train), run.root, known.facts.space)
 
 
 class Frontend(ABC):
@@ -37,6 +67,10 @@ class Frontend(ABC):
     @abstractmethod
     def show(self, client: Hashable, frame: RenderedFrame) -> None:
         """Show a picture to a client."""
+
+    @abstractmethod
+    def recolour(self, colours: Colours) -> None:
+        """Show Gaussians in other colours to all clients."""
 
     @abstractmethod
     def changed(self, before: State, now: State) -> None:
@@ -50,21 +84,24 @@ class Frontend(ABC):
 class Session:
     """Use as a context manager, which ends its threads and processes."""
 
-    def __init__(self, trained: Trained, state: State, open_encoders: OpenEncoders | None = None) -> None:
-        self.trained = trained
-        self.transform: PageTransform = page_transform(trained.known.cameras)
-        self.restyler = Restyler(trained, open_encoders)
-        self.uploads = Uploads()
+    def __init__(self, viewed: Viewed, state: State, open_encoders: OpenEncoders | None = None) -> None:
+        self.viewed = viewed
+        self.transform: PageTransform = page_transform(viewed.scene.cameras)
+        self.restyler = Restyler(viewed.scene, open_encoders, viewed.stylizer)
         self.state = state
         self._frontend: Frontend | None = None
         self._cameras: dict[Hashable, CameraState] = {}
         self._photographs: frozenset[Photograph] = frozenset()
         self._lock = threading.RLock()
-        self._renderer = ProgressiveRenderer(trained, self.restyler, self.transform, self._show)
-        self._worker: RenderWorker[RenderRequest] = RenderWorker(self._renderer.render, self._on_error)
+        self._speeds = first_speeds()
+        self.renderer = self._make_renderer()
+        self._worker: RenderWorker[RenderRequest] = RenderWorker(
+            lambda client, request: self.renderer.render(client, request), self._on_error
+        )
         self._films = FilmRecorder(self, self._worker)
         self._pictures: dict[Hashable, Picture] = {}
         self._thumbnails = 0
+        self.uploads = Uploads()
 
     def __enter__(self) -> "Session":
         self._worker.start()
@@ -97,9 +134,9 @@ class Session:
             look = only(State().look, photograph)
             self.restyler.styled(look)
             yield
-            camera = self.transform.camera_state(self.trained.known.cameras, 0)
-            yield from self._renderer.render(None, RenderRequest(camera, replace(State(), look=look).view, 32))
-            self._renderer.forget(None)
+            camera = self.transform.camera_state(self.viewed.scene.cameras, 0)
+            yield from self.renderer.render(None, RenderRequest(camera, replace(State(), look=look).view, 32))
+            self.renderer.forget(None)
             self.restyler.retain(self.state.photographs)
 
         self._worker.run_when_idle(work())
@@ -119,7 +156,7 @@ class Session:
             self._pictures.pop(client, None)
         self._films.stop(client)
         self._worker.forget(client)
-        self._worker.run(("forget", client), lambda: self._renderer.forget(client))
+        self._worker.run(("forget", client), lambda: self.renderer.forget(client))
 
     @property
     def has_clients(self) -> bool:
@@ -127,17 +164,22 @@ class Session:
         return bool(self._cameras)
 
     @property
+    def in_browser(self) -> bool:
+        """Whether the clients' browsers draw the scene, not this machine."""
+        return isinstance(self.viewed.scene, SplatScene)
+
+    @property
     def idle(self) -> bool:
         """Whether all clients have their sharpest picture."""
         return self._worker.idle
 
-    def reload(self, load: Callable[[], Trained], open_encoders: OpenEncoders | None = None) -> None:
+    def reload(self, load: Callable[[], Viewed], open_encoders: OpenEncoders | None = None) -> None:
         """Replace the scene by another state of its training, between two steps of the worker."""
 
         def job() -> None:
-            self.trained = trained = load()
-            self._renderer.reload(trained)
-            before = self.restyler.reload(trained, open_encoders)
+            self.viewed = load()
+            before = self.restyler.reload(self.viewed.scene, open_encoders)
+            self.renderer = self._make_renderer()
             if before is not None and self.state.names_regions:
                 regions = matching_regions(before, self.restyler.encoders.scene).tolist()
                 self.update(lambda state: renumber_regions(state, regions))
@@ -227,7 +269,7 @@ class Session:
     def preview(self, client: Hashable, camera: CameraState, look: Look) -> None:
         """Show one client another look than that of all."""
         with self._lock:
-            if client in self._cameras:
+            if client in self._cameras and not self.in_browser:  # there all clients have one look
                 self._cameras[client] = camera = camera._replace(aspect=self._cameras[client].aspect)
                 self._worker.request(client, RenderRequest(camera, ViewSettings(look), self.state.pixels))
 
@@ -248,6 +290,14 @@ class Session:
             return None
         self._thumbnails += 1
         return Thumbnail(self._thumbnails, shrink(picture, _THUMBNAIL))
+
+    def _make_renderer(self) -> SceneRenderer:
+        scene = self.viewed.scene
+        if isinstance(scene, SplatScene):
+            return GaussianRenderer(scene, self.restyler, self._recolour)
+        if isinstance(scene, Trained):
+            return ProgressiveRenderer(scene, self.restyler, self.transform, self._show, self._speeds)
+        raise UsageError(f"{self.viewed.name}: the viewer shows runs of fields and Gaussians, not {type(scene).__name__}")
 
     def _delete_unused(self, added: Photograph) -> None:
         """Delete photographs that left the shelf and that no look needs, with what was made of them: some 6 MB each."""
@@ -285,6 +335,10 @@ class Session:
         if self._frontend is not None and client is not None:  # the warm-up has no client
             self._pictures[client] = frame.picture
             self._frontend.show(client, frame)
+
+    def _recolour(self, colours: Colours) -> None:
+        if self._frontend is not None:
+            self._frontend.recolour(colours)
 
     def _on_error(self, client: Hashable | None, error: Exception) -> None:
         expected = isinstance(error, FprfError)

@@ -10,7 +10,7 @@ from queue import Queue
 import cv2
 import numpy as np
 import pytest
-from photographs import encoded
+from photographs import encoded, viewed
 from test_session import Listener
 from tiny_world import World
 
@@ -27,7 +27,7 @@ from fprf.viewer.state import Key, Look, State, set_rule
 
 
 def plan_of(restyler: Restyler, looks: list[Look], seconds: float = 0.1, fps: float = 30.0) -> FilmPlan:
-    transform, cameras = page_transform(restyler.trained.known.cameras), restyler.trained.known.cameras
+    transform, cameras = page_transform(restyler.scene.known.cameras), restyler.scene.known.cameras
     keys = tuple(Key(transform.camera_state(cameras, view), look) for view, look in enumerate(looks))
     return FilmPlan(keys, seconds, fps, (32, 24))
 
@@ -40,12 +40,10 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(world: World, tmp_path
     between = Look(mix=((b, 1.0),), clusters=3, towards=Look(mix=((a, 1.0),), clusters=3), at=0.5)
     plan = plan_of(restyler, [Look(), one, between])
     folder = new_folder(tmp_path / "run")
-    write_film_files(
-        folder, page_transform(restyler.trained.known.cameras), plan, restyler.trained.known.facts.semantic_encoder
-    )
+    write_film_files(folder, page_transform(restyler.scene.known.cameras), plan, restyler.scene.known.facts.semantic_encoder)
     out: Queue[Picture | None] = Queue()
     told: list[tuple[int, int]] = []
-    for _ in film_frames(folder, restyler.trained, out, lambda done, total: told.append((done, total))):
+    for _ in film_frames(folder, restyler.scene, out, lambda done, total: told.append((done, total))):
         pass
     frames = list(queued_frames(out))
     assert len(frames) == 7 and told == [(i + 1, 7) for i in range(7)]
@@ -61,9 +59,7 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(world: World, tmp_path
 def test_files_name_no_path_of_this_machine(world: World, tmp_path: Path) -> None:
     restyler = Restyler(world.load())
     a, _ = encoded(restyler, world)
-    write_film_files(
-        tmp_path, page_transform(restyler.trained.known.cameras), plan_of(restyler, [Look(mix=((a, 1.0),))] * 2), ""
-    )
+    write_film_files(tmp_path, page_transform(restyler.scene.known.cameras), plan_of(restyler, [Look(mix=((a, 1.0),))] * 2), "")
     keys = json.loads((tmp_path / "keys.json").read_text())
     assert keys["keyframes"] == [{"frame": 0, "style": "style-1/style.json"}, {"frame": 3, "style": "style-1/style.json"}]
     style = json.loads((tmp_path / "style-1" / "style.json").read_text())
@@ -74,14 +70,14 @@ def test_a_fade_to_the_scene_as_it_is_is_written_as_less_strength(world: World, 
     restyler = Restyler(world.load())
     a, _ = encoded(restyler, world)
     look = Look(mix=((a, 1.0),), towards=Look(), at=0.25)
-    write_film_files(tmp_path, page_transform(restyler.trained.known.cameras), plan_of(restyler, [look]), "")
+    write_film_files(tmp_path, page_transform(restyler.scene.known.cameras), plan_of(restyler, [look]), "")
     style = json.loads((tmp_path / "style-1" / "style.json").read_text())["style"]
     assert style["strength"] == 0.75 and style["between"] is None
 
 
 def test_paths_pass_through_their_keys(world: World) -> None:
     restyler = Restyler(world.load())
-    transform = page_transform(restyler.trained.known.cameras)
+    transform = page_transform(restyler.scene.known.cameras)
     plan = plan_of(restyler, [Look()] * 4, seconds=0.2, fps=25)
     path = film_cameras(transform, plan)
     assert len(path) == 3 * 5 + 1 and path.size[0].tolist() == [32, 24]
@@ -95,7 +91,7 @@ def test_films_that_cannot_be_are_refused(world: World, change: dict[str, object
     restyler = Restyler(world.load())
     plan = plan_of(restyler, [Look()] * 4)._replace(**change)  # type: ignore[arg-type]
     with pytest.raises((UsageError, ConfigError)):
-        film_cameras(page_transform(restyler.trained.known.cameras), plan)
+        film_cameras(page_transform(restyler.scene.known.cameras), plan)
 
 
 def test_folders_are_numbered(tmp_path: Path) -> None:
@@ -114,7 +110,7 @@ def test_looks_that_differ_get_folders_of_their_own(world: World, tmp_path: Path
     a, _ = encoded(restyler, world)
     look = Look(mix=((a, 1.0),))
     write_film_files(
-        tmp_path, page_transform(restyler.trained.known.cameras), plan_of(restyler, [look, replace(look, blend=0.9)]), ""
+        tmp_path, page_transform(restyler.scene.known.cameras), plan_of(restyler, [look, replace(look, blend=0.9)]), ""
     )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["keys.json", "path.json", "style-1", "style-2"]
 
@@ -123,14 +119,14 @@ def test_looks_that_differ_get_folders_of_their_own(world: World, tmp_path: Path
 def opened(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Session, Listener]]:
     monkeypatch.setattr(film, "PREVIEW_FPS", 50.0)
     shutil.copytree(world.run, tmp_path / "run")
-    with Session(load_run(tmp_path / "run", "cpu"), State(pixels=64)) as session:
+    with Session(viewed(load_run(tmp_path / "run", "cpu")), State(pixels=64)) as session:
         listener = Listener()
         session.attach(listener)
         yield session, listener
 
 
 def flight(session: Session, looks: list[Look], seconds: float = 0.2) -> FilmPlan:
-    cameras = session.trained.known.cameras
+    cameras = session.viewed.scene.cameras
     return FilmPlan(
         tuple(Key(session.transform.camera_state(cameras, view), look) for view, look in enumerate(looks)),
         seconds,
@@ -152,7 +148,7 @@ def test_a_flight_goes_from_the_first_key_to_the_last_for_one_client_alone(
     session, listener = opened
     card = session.upload(world.references[0].read_bytes(), "dusk.png")
     styled = session.state.look
-    cameras = session.trained.known.cameras
+    cameras = session.viewed.scene.cameras
     for client in (1, 2):
         session.move_camera(client, session.transform.camera_state(cameras, 5))
     listener.until(lambda: {c for c, f in listener.frames if f.final} == {1, 2})
@@ -172,7 +168,7 @@ def test_a_flight_goes_from_the_first_key_to_the_last_for_one_client_alone(
 
 def test_moves_of_the_client_s_own_do_not_count_while_it_flies(opened: tuple[Session, Listener]) -> None:
     session, _ = opened
-    here = session.transform.camera_state(session.trained.known.cameras, 5)
+    here = session.transform.camera_state(session.viewed.scene.cameras, 5)
     session.move_camera(1, here)
     gate, flown = threading.Event(), list[CameraState]()
 
@@ -193,7 +189,7 @@ def test_moves_of_the_client_s_own_do_not_count_while_it_flies(opened: tuple[Ses
 
 def test_who_leaves_or_plays_again_ends_the_flight(opened: tuple[Session, Listener]) -> None:
     session, _ = opened
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 5))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 5))
     long, flown = flight(session, [Look(), Look()], seconds=300.0), list[CameraState]()
     session.play_flight(1, long, flown.append)
     until(lambda: bool(flown))
@@ -208,7 +204,7 @@ def test_who_leaves_or_plays_again_ends_the_flight(opened: tuple[Session, Listen
 
 def test_a_flight_of_nothing_is_told(opened: tuple[Session, Listener]) -> None:
     session, listener = opened
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 5))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 5))
     session.play_flight(1, FilmPlan((), 1.0, 24.0, (32, 24)), lambda eye: None)
     listener.until(lambda: any("no keys" in text for text in listener.said))
     until(lambda: not session._films._flights)
@@ -217,7 +213,7 @@ def test_a_flight_of_nothing_is_told(opened: tuple[Session, Listener]) -> None:
 def test_a_thumbnail_is_what_was_seen_last(opened: tuple[Session, Listener]) -> None:
     session, listener = opened
     assert session.thumbnail(1) is None
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 5))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 5))
     listener.until(lambda: any(frame.final for _, frame in listener.frames))
     first, second = session.thumbnail(1), session.thumbnail(1)
     assert first is not None and second is not None and first != second and first.number < second.number

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from photographs import viewed
 from tiny_world import World
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
@@ -20,7 +21,7 @@ from fprf.viewer.state import State
 
 @pytest.fixture
 def served(world: World) -> Iterator[tuple[Session, ViserFrontend]]:
-    with Session(world.load(), State(pixels=64)) as session:
+    with Session(viewed(world.load()), State(pixels=64)) as session:
         frontend = ViserFrontend(session, Page(session, b"<html>"))
         yield session, frontend
         frontend.close()
@@ -50,10 +51,10 @@ def test_controls_lines_and_clicks_follow_the_state(served: tuple[Session, Viser
 
 def test_a_client_that_has_gone_is_shown_nothing(served: tuple[Session, ViserFrontend]) -> None:
     session, frontend = served
-    camera = session.transform.camera_state(session.trained.known.cameras, 0)
+    camera = session.transform.camera_state(session.viewed.scene.cameras, 0)
     frames: list[Any] = []
-    session._renderer._show = lambda client, frame: frames.append(frame)
-    for _ in session._renderer.render(9, RenderRequest(camera, session.state.view, 32)):
+    session.renderer._show = lambda client, frame: frames.append(frame)
+    for _ in session.renderer.render(9, RenderRequest(camera, session.state.view, 32)):
         pass
     frontend.show(9, frames[-1])
     frontend.show("no client", frames[-1])

@@ -104,10 +104,10 @@ def test_who_comes_before_the_run_has_begun_waits_for_it(told: Told) -> None:
 
 def test_new_parameters_are_wanted_when_everybody_has_seen_the_old_ones(told: Told) -> None:
     session = told.begin()
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 0))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 0))
     assert told.tick(0.1) == [] and told.tick(1.0) == []  # a picture stays for a while
     session._worker.close()  # whoever looks now waits for ever
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 1))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 1))
     assert told.tick(2.0) == [] and not session.idle
     assert told.tick(8.0) == [{"want": True}]  # all the same, after a while
     assert told.tick(8.0) == []  # it has not come yet
@@ -115,14 +115,14 @@ def test_new_parameters_are_wanted_when_everybody_has_seen_the_old_ones(told: To
 
 def test_the_look_follows_training(told: Told, world: World) -> None:
     session = told.begin()
-    model = session.trained.model
+    model = session.viewed.scene.model
     told.follower.receive({"report": [30, 0.25, 19.5, 10.0]})
     assert session.state.training == TrainingProgress(30, 0.25, 19.5, 30.0)
     spoilt = {name: tensor * 0 for name, tensor in model.state_dict().items()}
     save_file(spoilt, told.newest)
     told.follower.receive({"snapshot": str(told.newest)})
     settle(session)
-    assert session.trained.model is model and all(not tensor.any() for tensor in model.state_dict().values())
+    assert session.viewed.scene.model is model and all(not tensor.any() for tensor in model.state_dict().values())
 
 
 def test_a_photograph_can_be_dropped_before_training_has_measured_the_scene(told: Told, world: World) -> None:
@@ -140,18 +140,18 @@ def test_at_the_end_the_run_is_what_was_saved(told: Told, world: World) -> None:
     shutil.copy(world.run / "style.safetensors", told.run)
     told.follower.receive({"done": True})
     settle(session)
-    assert session.state.training == TrainingProgress(15, 1.0) and session.trained.step == 15
+    assert session.state.training == TrainingProgress(15, 1.0) and session.viewed.scene.step == 15
     assert told.tick(0.5) == [] and not told.follower.over  # somebody looks still
     assert told.tick(60) == [{"looking": False}] and told.follower.over
 
 
 def test_another_block_is_another_model(told: Told) -> None:
     session = told.begin()
-    before = session.trained
+    before = session.viewed.scene
     told.follower.receive({"run": str(told.run), "device": "cpu", "block": None, "what": "block 01"})
     told.follower.receive({"snapshot": str(told.newest)})
     settle(session)
-    assert session.trained is not before and session.restyler.trained is session.trained is session._renderer._trained
+    assert session.viewed.scene is not before and session.restyler.scene is session.viewed.scene is session.renderer._trained
     told.follower.receive({"report": [3, 0.5, 19.5, 10.0]})
     assert session.state.training == TrainingProgress(3, 0.5, 19.5, 10.0, "block 01")
 

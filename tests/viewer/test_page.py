@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from photographs import viewed
 from tiny_world import World
 
 from fprf.errors import DataError, UsageError
@@ -19,7 +20,7 @@ from fprf.viewer.state import Key, Look, Photograph, RegionInfo, State, Thumbnai
 
 @pytest.fixture
 def page(world: World) -> Iterator[Page]:
-    with Session(world.load(), State(pixels=64)) as session:
+    with Session(viewed(world.load()), State(pixels=64)) as session:
         yield Page(session, b"<html>")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from fake_gui import Client, Gui
+from photographs import viewed
 from test_session import Listener
 from tiny_world import World
 
@@ -36,7 +37,7 @@ class Room:
     def __init__(self, session: Session) -> None:
         self.session, self.gui, self.face, self.client = session, Gui(), Face(), Client(1)
         self.drawn = 0
-        here = session.transform.camera_state(session.trained.known.cameras, 2)
+        here = session.transform.camera_state(session.viewed.scene.cameras, 2)
         self.client.cameras.append(here)
         self.face.panel = self.panel = Panel(
             self.gui,  # type: ignore[arg-type]
@@ -77,7 +78,7 @@ class Room:
 def room(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Room]:
     monkeypatch.setattr(film, "PREVIEW_FPS", 50.0)
     shutil.copytree(world.run, tmp_path / "run")
-    with Session(load_run(tmp_path / "run", "cpu"), State(pixels=64)) as session:
+    with Session(viewed(load_run(tmp_path / "run", "cpu")), State(pixels=64)) as session:
         yield Room(session)
 
 
@@ -151,7 +152,7 @@ def test_what_is_shown(room: Room) -> None:
 
 def test_the_camera_flies_to_captured_views(room: Room) -> None:
     room.move("fly to view", 4)
-    assert room.camera == room.session.transform.camera_state(room.session.trained.known.cameras, 4)
+    assert room.camera == room.session.transform.camera_state(room.session.viewed.scene.cameras, 4)
     room.move("fly to view", 999)
     room.gui["fly to view"].moved(3, None)  # nobody's
     assert len(room.client.cameras) == 2

@@ -134,7 +134,7 @@ def test_a_fast_machine_begins_sharp(watched: Watched) -> None:
 
 
 def painted(restyler: Restyler, shown: ViewSettings, chunk: int = 100) -> Layers:
-    trained = restyler.trained
+    trained = restyler.scene
     known, config = trained.known, replace(trained.config.render, chunk=chunk)
     layers_of = LayerRenderer(trained.model.decoder, restyler.encoders.scene, restyler.styled(shown.look), shown, (32, 24))
     steps = list(layers_of.render(view_parts(trained.model, known.facts, known.cameras, 2, config)))
@@ -151,7 +151,7 @@ def test_layers_are_what_the_command_line_renders(restyler: Restyler, world: Wor
     a, b = encoded(restyler, world)
     look = set_rule(Look(mix=((a, 1.0), (b, 1.0)), clusters=3), 0, "keep")
     layers = painted(restyler, ViewSettings(look, "matches", wipe=0.5))
-    trained, styled = restyler.trained, restyler.styled(look)
+    trained, styled = restyler.scene, restyler.styled(look)
     assert styled is not None
     known, config = trained.known, trained.config.render
     for name, restyle in (("look", styled.restyle), ("plain", None)):

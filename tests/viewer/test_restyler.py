@@ -22,7 +22,7 @@ from fprf.viewer.state import Look, set_rule, style_config
 
 
 def seen(restyler: Restyler, restyle: Restyle | None) -> torch.Tensor:
-    trained = restyler.trained
+    trained = restyler.scene
     return render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle).rgb
 
 
@@ -30,7 +30,7 @@ def test_a_look_is_the_style_that_the_command_line_makes(world: World) -> None:
     restyler = Restyler(world.load())
     a, b = encoded(restyler, world)
     look = set_rule(Look(mix=((a, 1.0), (b, 0.5)), strength=0.8, clusters=3, luminance=0.2), 1, "pin", b)
-    wanted = apply_style(restyler.trained, StyleFile(style_config(look)))
+    wanted = apply_style(restyler.scene, StyleFile(style_config(look)))
     assert torch.allclose(seen(restyler, restyler.restyle(look)), seen(restyler, wanted.restyle), atol=2e-5)
 
 
@@ -85,7 +85,7 @@ def test_styles_are_kept_and_bounded(world: World) -> None:
 
 def test_a_click_finds_the_region_that_is_there(world: World) -> None:
     restyler = Restyler(world.load())
-    trained = restyler.trained
+    trained = restyler.scene
     _, *_ = encoded(restyler, world)
     cameras = trained.known.cameras.select(torch.tensor([2]))
     from fprf.training.regions import Regions

@@ -5,11 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from photographs import viewed
 from tiny_world import World
 
 from fprf.errors import DataError, UsageError
 from fprf.training.loading import load_run
 from fprf.viewer.film import FilmPlan
+from fprf.viewer.gaussian_renderer import Colours
 from fprf.viewer.renderer import RenderedFrame
 from fprf.viewer.session import Frontend, Session
 from fprf.viewer.state import SHELF, Key, Look, State
@@ -21,6 +23,7 @@ class Listener(Frontend):
     def __init__(self) -> None:
         self.frames: list[tuple[Hashable, RenderedFrame]] = []
         self.states: list[State] = []
+        self.colours: list[Colours] = []
         self.said: list[str] = []
         self.news = threading.Condition()
         self.deaf = False
@@ -30,6 +33,11 @@ class Listener(Frontend):
             raise RuntimeError("the client has gone")
         with self.news:
             self.frames.append((client, frame))
+            self.news.notify_all()
+
+    def recolour(self, colours: Colours) -> None:
+        with self.news:
+            self.colours.append(colours)
             self.news.notify_all()
 
     def changed(self, before: State, now: State) -> None:
@@ -50,7 +58,7 @@ class Listener(Frontend):
 @pytest.fixture
 def opened(world: World, tmp_path: Path) -> Iterator[tuple[Session, Listener]]:
     shutil.copytree(world.run, tmp_path / "run")
-    with Session(load_run(tmp_path / "run", "cpu"), State(pixels=64)) as session:
+    with Session(viewed(load_run(tmp_path / "run", "cpu")), State(pixels=64)) as session:
         listener = Listener()
         session.attach(listener)
         yield session, listener
@@ -58,7 +66,7 @@ def opened(world: World, tmp_path: Path) -> Iterator[tuple[Session, Listener]]:
 
 def test_a_drop_restyles_what_every_client_sees(opened: tuple[Session, Listener], world: World) -> None:
     session, listener = opened
-    cameras = session.trained.known.cameras
+    cameras = session.viewed.scene.cameras
     for client in (1, 2):
         session.move_camera(client, session.transform.camera_state(cameras, client))
     listener.until(lambda: {c for c, f in listener.frames if f.final} == {1, 2})
@@ -91,7 +99,7 @@ def test_a_state_that_cannot_be_is_told_to_who_wanted_it(opened: tuple[Session, 
 def test_a_click_picks_a_region_and_what_it_takes_follows_the_look(opened: tuple[Session, Listener], world: World) -> None:
     session, listener = opened
     session.pick(9, (0.5, 0.5))  # a client that nobody knows
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 2))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 2))
     session.pick(1, (0.5, 0.8))
     listener.until(lambda: session.state.picked is not None)
     assert session.state.picked is not None and session.state.picked.taken == ()
@@ -108,13 +116,13 @@ def test_a_click_picks_a_region_and_what_it_takes_follows_the_look(opened: tuple
 
 def test_a_film_is_made_while_others_look(opened: tuple[Session, Listener]) -> None:
     session, listener = opened
-    cameras = session.trained.known.cameras
+    cameras = session.viewed.scene.cameras
     keys = tuple(Key(session.transform.camera_state(cameras, view), Look()) for view in (0, 1))
     session.record_film(FilmPlan(keys, 0.1, 30.0, (32, 24)))
     session.move_camera(1, session.transform.camera_state(cameras, 2))
     listener.until(lambda: session.state.film.path is not None)
     path = session.state.film.path
-    assert path is not None and path.stat().st_size > 500 and path.parent.parent == session.trained.run.root / "films"
+    assert path is not None and path.stat().st_size > 500 and path.parent.parent == session.viewed.root / "films"
     assert session.state.film.done == session.state.film.total == 4
     assert (path.parent / "path.json").is_file() and any("film.mp4" in text for text in listener.said)
 
@@ -137,10 +145,10 @@ def test_who_drops_while_the_viewer_ends_is_not_left_waiting(opened: tuple[Sessi
 def test_faults_of_ours_are_told_and_nothing_stops(opened: tuple[Session, Listener]) -> None:
     session, listener = opened
     listener.deaf = True
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 2))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 2))
     listener.until(lambda: any("should not have happened" in text for text in listener.said))
     listener.deaf = False
-    session.move_camera(1, session.transform.camera_state(session.trained.known.cameras, 3))
+    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 3))
     listener.until(lambda: any(f.final for _, f in listener.frames))
     session.disconnect(1)
     session.disconnect(1)

@@ -1,0 +1,124 @@
+"""Gaussians in the viewer: browsers get the colours of the scene in its look, and nothing while cameras move."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from splat_ball import ball
+from test_session import Listener
+from tiny_world import World
+
+from fprf.errors import UsageError
+from fprf.io.images import to_uint8
+from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.plugins.stylizers.config import RegionToneConfig
+from fprf.splats.look_config import LookConfig
+from fprf.splats.scene import SplatScene, look_at_capture
+from fprf.style.files import StyleFile
+from fprf.training.restyle import apply_style
+from fprf.viewer.cameras import page_transform
+from fprf.viewer.film import FilmPlan
+from fprf.viewer.gaussian_renderer import page_gaussians
+from fprf.viewer.session import Session, Viewed
+from fprf.viewer.state import Key, Look, State, set_rule, style_config
+
+TONE = RegionToneConfig(centred=False)
+
+
+@pytest.fixture(scope="module")
+def scene() -> SplatScene:
+    return look_at_capture(ball(400), False, BundledSemanticConfig().build(), LookConfig(views=6, size=(96, 72), regions=4))
+
+
+@pytest.fixture
+def opened(scene: SplatScene, tmp_path: Path) -> Iterator[tuple[Session, Listener]]:
+    with Session(Viewed(scene, "ball", 0, root=tmp_path, stylizer=TONE), State(pixels=64)) as session:
+        listener = Listener()
+        session.attach(listener)
+        session.move_camera(1, session.transform.camera_state(scene.cameras, 0))
+        yield session, listener
+
+
+def test_a_drop_sends_the_colours_of_the_restyled_scene(
+    opened: tuple[Session, Listener], scene: SplatScene, world: World
+) -> None:
+    session, listener = opened
+    photograph = session.upload(world.references[0].read_bytes(), "dusk.png")
+    listener.until(lambda: len(listener.colours) == 1)
+    wanted = scene.restyled(apply_style(scene, StyleFile(style_config(session.state.look, TONE))).restyle)
+    assert np.abs(listener.colours[0].astype(int) - to_uint8(wanted.shown.colours.clamp(0, 1)[None])[0]).max() <= 1
+    session.move_camera(1, session.transform.camera_state(scene.cameras, 1))
+    session.update(lambda state: replace(state, look=set_rule(state.look, 0, "keep")))
+    listener.until(lambda: len(listener.colours) == 2)  # none for the camera alone
+    belongs = torch.zeros(len(scene.gaussians), dtype=torch.bool)
+    belongs[(listener.colours[1] != listener.colours[0]).any(1)] = True
+    assert belongs.any()
+    session.update(lambda state: replace(state, look=Look(mix=((photograph, 1.0),), strength=0.0)))
+    listener.until(lambda: len(listener.colours) == 3)
+    assert np.array_equal(listener.colours[2], to_uint8(scene.gaussians.colours.clamp(0, 1)[None])[0])
+    assert listener.frames == []
+
+
+def test_maps_and_a_picked_region_are_colours_too(opened: tuple[Session, Listener], scene: SplatScene) -> None:
+    session, listener = opened
+    for number, name in enumerate(("regions", "matches"), 1):
+        session.update(lambda state, name=name: replace(state, map=name, map_opacity=1.0))  # type: ignore[misc]
+        listener.until(lambda number=number: len(listener.colours) == number)  # type: ignore[misc]
+    assert len(np.unique(listener.colours[0], axis=0)) > 3 and (listener.colours[1] == 128).all()
+    session.pick(1, (0.5, 0.5))  # the ball is in the middle
+    listener.until(lambda: session.state.picked is not None and len(listener.colours) == 3)
+    session.update(lambda state: replace(state, map="none"))
+    listener.until(lambda: len(listener.colours) == 4)
+    plain = to_uint8(scene.gaussians.colours.clamp(0, 1)[None])[0]
+    same = (np.abs(listener.colours[3].astype(int) - plain) <= 1).all(1)
+    assert 0 < same.mean() < 1  # the region stands out, the others are dimmed
+
+
+def test_films_are_rasterised_here_and_captures_have_none(opened: tuple[Session, Listener], scene: SplatScene) -> None:
+    session, listener = opened
+    keys = tuple(Key(session.transform.camera_state(scene.cameras, view), Look()) for view in (0, 1))
+    plan = FilmPlan(keys, 0.1, 30.0, (32, 24))
+    session.record_film(plan)
+    listener.until(lambda: session.state.film.path is not None)
+    path = session.state.film.path
+    assert path is not None
+    film = cv2.VideoCapture(str(path))
+    shown = film.read()[1][..., ::-1].astype(int)
+    cameras = session.transform.cameras([keys[0].camera], (32, 24))
+    assert np.abs(shown - to_uint8(scene.render(cameras, 0).rgb)).mean() < 6  # what the codec leaves
+    session.viewed = replace(session.viewed, root=None)
+    session.record_film(plan)
+    listener.until(lambda: any("no run folder" in text for text in listener.said))
+
+
+def test_a_flight_moves_the_browser_s_camera(opened: tuple[Session, Listener], scene: SplatScene) -> None:
+    session, listener = opened
+    keys = tuple(Key(session.transform.camera_state(scene.cameras, view), Look()) for view in (0, 1))
+    flown: list[object] = []
+    session.play_flight(1, FilmPlan(keys, 0.5, 24.0, (32, 24)), flown.append)
+    listener.until(lambda: any(state.playing for state in listener.states) and not session.state.playing)
+    assert len(flown) > 2 and listener.frames == [] and session.thumbnail(1) is None
+
+
+def test_gaussians_on_the_page_have_their_places_and_shapes(scene: SplatScene) -> None:
+    transform = page_transform(scene.cameras)
+    means, covariances = page_gaussians(scene.gaussians, transform)
+    assert torch.allclose(means.double(), transform.to_page(scene.gaussians.means), atol=1e-5)
+    lengths, wanted = torch.linalg.eigvalsh(covariances.double()).clamp_min(0).sqrt(), scene.gaussians.log_scales.double().exp()
+    assert torch.allclose(
+        lengths, transform.scale * wanted.sort(1).values, rtol=1e-3, atol=1e-5
+    )
+
+
+def test_scenes_of_another_kind_are_refused() -> None:
+    class Other:
+        cameras = look_at_capture(
+            ball(50), False, BundledSemanticConfig().build(), LookConfig(views=2, size=(48, 36), regions=1)
+        ).cameras
+
+    with pytest.raises(UsageError, match="Other"):
+        Session(Viewed(Other(), "other", 0), State())  # type: ignore[arg-type]
