@@ -23,7 +23,7 @@ from safetensors.torch import load_file
 
 from fprf.interfaces import Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
-from fprf.plugins.decoders.mlp import MlpDecoder
+from fprf.plugins.decoders.decoders import MlpDecoder
 from fprf.plugins.encoders.config import BundledContentConfig, EncoderConfig, Vgg19Config
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.pretraining.decoder import LONGEST, decoder_report, pretrain_decoder, restyling_report

@@ -22,9 +22,8 @@ from fprf.errors import DataError
 from fprf.evaluation.metrics import structure
 from fprf.io.images import shrink, write_image
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.style.config import StyleConfig
+from fprf.style.config import PRESETS, StyleConfig, with_preset
 from fprf.style.files import StyleFile
-from fprf.style.presets import PRESETS, with_preset
 from fprf.training.cached_view import cache_view
 from fprf.training.loading import load_run
 from fprf.training.restyle import apply_style

@@ -244,15 +244,12 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/style/controls.py": ("style/test_controls.py",),
     "fprf/style/matching.py": ("style/test_matching.py", "ops/test_mixture.py"),
     "fprf/style/regional.py": ("style/test_regional.py",),
-    "fprf/style/statistics.py": ("style/test_statistics.py",),
-    "fprf/style/transport.py": ("style/test_transport.py",),
+    "fprf/style/statistics.py": ("style/test_statistics.py", "style/test_transport.py"),
     "fprf/rendering/stepfun.py": ("rendering/test_stepfun.py", "rendering/test_stepfun_edges.py"),
     "fprf/rendering/space.py": ("rendering/test_space.py", "rendering/test_space_plain.py", "ops/test_march.py"),
     "fprf/rendering/renderer.py": ("rendering/test_renderer.py", "rendering/test_renderer_edges.py"),
-    "fprf/rendering/cameras.py": ("rendering/test_cameras.py",),
+    "fprf/rendering/cameras.py": ("rendering/test_cameras.py", "rendering/test_pixel_rays.py", "rendering/test_normals.py"),
     "fprf/rendering/lens.py": ("rendering/test_lens.py", "rendering/test_cameras.py"),
-    "fprf/rendering/pixel_rays.py": ("rendering/test_pixel_rays.py",),
-    "fprf/rendering/normals.py": ("rendering/test_normals.py",),
     "fprf/rendering/splines.py": ("rendering/test_splines.py",),
 }
 """Each numerics module and its tests."""

@@ -22,7 +22,7 @@ from fprf.evaluation.report import Column, markdown, provenance, words
 from fprf.evaluation.town_truth import Row, mean_rows, town_folder
 from fprf.interfaces import Decoder
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
-from fprf.plugins.decoders.residual import ColourHead
+from fprf.plugins.decoders.decoders import ColourHead
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from fprf.style.references import Encoders
 from fprf.training.loading import Trained, encoders_of, load_run
@@ -44,7 +44,7 @@ class SceneDecoderConfig(DecoderConfig):
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         """As large as the shipped decoder of that encoder; starts from the seed."""
-        from fprf.plugins.decoders.mlp import load_decoder
+        from fprf.plugins.decoders.decoders import load_decoder
 
         hidden = load_decoder(MlpDecoderConfig().weights, encoder=encoder, channels=channels).first.out_features
         return SceneDecoder(channels, hidden, torch.Generator().manual_seed(seed))

@@ -30,8 +30,14 @@ from fprf.evaluation.single_image import encoded, flat_look, flat_scene, render_
 from fprf.interfaces import Decoder, Encoder
 from fprf.io.images import shrink, write_image
 from fprf.plugins.decoders.config import MlpDecoderConfig
-from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, RandomConfig, Vgg19Config
-from fprf.plugins.encoders.segmenter_config import DeepLabConfig
+from fprf.plugins.encoders.config import (
+    BundledContentConfig,
+    BundledSemanticConfig,
+    DeepLabConfig,
+    EncoderConfig,
+    RandomConfig,
+    Vgg19Config,
+)
 from fprf.plugins.stylizers.config import IdentityConfig
 from fprf.style.dictionary import Reference, build_dictionary
 

@@ -25,12 +25,10 @@ from .io.images import Picture, to_uint8, write_image
 from .plugins.registry import nearest
 from .plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from .rendering.cameras import Cameras
-from .rendering.motions import make_path, upwards
-from .rendering.paths import look_at, pinhole
-from .style.config import StyleConfig
+from .rendering.paths import look_at, make_path, pinhole, upwards
+from .style.config import StyleConfig, with_preset
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
-from .style.presets import with_preset
 from .style.references import Encoders
 from .training.loading import LoadedRun, open_run
 from .training.matches import MatchMap, match_map
@@ -148,7 +146,7 @@ class TrainedScene:
     ) -> "TrainedScene":
         """The scene in the style of photographs, or of all in a folder; all arguments but `preset` are fields of `StyleConfig`.
 
-        A preset, such as "gentle", replaces what it sets (`fprf.style.presets.PRESETS`).
+        A preset, such as "gentle", replaces what it sets (`fprf.style.config.PRESETS`).
 
         Raises UsageError for no references, an unknown preset or wishes that the scene does not know, DataError for
         unreadable photographs, WeightsError where the encoders at hand are not the scene's.

@@ -13,7 +13,7 @@ from torch import Tensor
 from fprf.ops import dense, guided, march, mixture, triplane
 from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
-from fprf.style import alignment, clusters, controls, dictionary, matching, scene, statistics, transport
+from fprf.style import clusters, controls, dictionary, matching, scene, statistics
 
 __all__ = ["CASES", "Case"]
 
@@ -165,11 +165,11 @@ CASES = [
          lambda p, t, g: triplane.point_slopes_reference(p, t, (8, 16), g), tolerance=1e-4, slack=1e-3),
     Case("triplane.variation", lambda n: (_draw(triplane.rows((n,)), 8),), lambda t: triplane.variation(t, (_side(t),)),
          slopes=(0,), sizes=(2, 3, 37, 128)),
-    Case("alignment.match_keys", lambda n: (_draw(n, 6), _unit(n) + 0.1, _draw(5, 6), _unit(5) + 0.1),
-         lambda k, s, l, r: alignment.match_keys(alignment.Keys(k, s), alignment.Keys(l, r),
-                                                 alignment.Matching(1.0), torch.ones(5)), sizes=(1, 37, 500)),
-    Case("alignment.whitener", lambda n: (_draw(n, 6), _unit(n) + 0.1),
-         lambda k, s: alignment.whitener(alignment.Keys(k, s), 0.5), sizes=(1, 37, 500)),
+    Case("matching.match_keys", lambda n: (_draw(n, 6), _unit(n) + 0.1, _draw(5, 6), _unit(5) + 0.1),
+         lambda k, s, l, r: matching.match_keys(matching.Keys(k, s), matching.Keys(l, r),
+                                                 matching.Matching(1.0), torch.ones(5)), sizes=(1, 37, 500)),
+    Case("matching.whitener", lambda n: (_draw(n, 6), _unit(n) + 0.1),
+         lambda k, s: matching.whitener(matching.Keys(k, s), 0.5), sizes=(1, 37, 500)),
     Case("clusters.kmeans", lambda n: (_draw(n, 4) + 20 * (_unit(n, 1) * 3).floor(),), lambda x: clusters.kmeans(x, 3, seed=0)),
     Case("controls.blend_strength", lambda n: (_draw(n, 9), _draw(n, 9, seed=5), _unit(n, 1)), controls.blend_strength,
          slopes=(0, 1)),
@@ -197,10 +197,10 @@ CASES = [
     Case("statistics.mix", _code, statistics.mix, sizes=(1, 37, 500)),
     Case("statistics.deviation", lambda n: (_draw(n, 6), _unit(n, 6)), statistics.deviation),
     Case("statistics.dead_channels", lambda n: (_draw(n, 6), _unit(n, 6)), statistics.dead_channels, slack=1e-3),
-    Case("transport.symmetric_root", lambda n: (_covariances(n, 6),), transport.symmetric_root, sizes=(0, 1, 37, 500)),
-    Case("transport.monge", lambda n: (_covariances(n, 6), _covariances(n, 6) + 1),
-         lambda c, s: transport.monge(c, s, gain=8.0), sizes=(0, 1, 37, 500), tolerance=1e-4),
-    Case("transport.limit_gain", lambda n: (_covariances(n, 6),), lambda c: transport.limit_gain(c, 3.0),
+    Case("statistics.symmetric_root", lambda n: (_covariances(n, 6),), statistics.symmetric_root, sizes=(0, 1, 37, 500)),
+    Case("statistics.monge", lambda n: (_covariances(n, 6), _covariances(n, 6) + 1),
+         lambda c, s: statistics.monge(c, s, gain=8.0), sizes=(0, 1, 37, 500), tolerance=1e-4),
+    Case("statistics.limit_gain", lambda n: (_covariances(n, 6),), lambda c: statistics.limit_gain(c, 3.0),
          sizes=(0, 1, 37, 500)),
     Case("cameras.rays_through", _cameras, _through),
     Case("cameras.project", _cameras, _projected),

@@ -13,8 +13,7 @@ from fprf.api import TrainedScene
 from fprf.cli import main as cli
 from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
 from fprf.rendering.cameras import project
-from fprf.style.config import StyleConfig
-from fprf.style.presets import with_preset
+from fprf.style.config import StyleConfig, with_preset
 
 
 @pytest.fixture(scope="module")

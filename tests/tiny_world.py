@@ -17,7 +17,7 @@ from fprf.interfaces import DataManager
 from fprf.io.images import write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
-from fprf.rendering.pixel_rays import PixelRays
+from fprf.rendering.cameras import PixelRays
 from fprf.town.write import write_town
 from fprf.training.loading import Trained, load_run
 from fprf.training.prepare import Prepared, prepare

@@ -4,19 +4,142 @@
 surroundings. `Blend` is for rendering: weights of `windows`, whose smooth change from block to block leaves no seam. It looks
 points up in a table of the ground plan, so its cost does not grow with the number of blocks, and names only the blocks that
 the points need: the others are never loaded.
+
+Windows: A block reaches a margin m beyond its cell. Along each axis its window rises by a smoothstep from 0 on the border of
+that reach to 1 two margins inside, so it is 1/2 on the cell's face; neighbours that share a face have windows S and 1 - S
+there. Where windows sum to less than 1 the surroundings have the rest; where cells overlap (bends) they sum to more and are
+scaled. The weights are continuous, and so is whatever is blended by them.
+
+Charts: A block's chart is affine: its cell with the margin fills the cube, so that no node of its planes lies where it has no
+say. The chart of the surroundings contracts: all blocks together fill the inner half, everything else the rest.
 """
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
+from ..rendering.space import contract
 from ..types import Boxes
-from .charts import Chart, chart_of, surroundings_of
-from .windows import window
 
-__all__ = ["SLIGHT", "Blend", "Everywhere", "Group", "Inset", "Router"]
+__all__ = [
+    "SLIGHT",
+    "Blend",
+    "Chart",
+    "Everywhere",
+    "Group",
+    "Inset",
+    "Router",
+    "aligned",
+    "chart_of",
+    "local",
+    "shares",
+    "surroundings_of",
+    "window",
+]
+
+
+def aligned(turn: Annotated[Tensor, "3 3"]) -> bool:
+    """Return whether axes are those of the space."""
+    return bool((turn == torch.eye(3, dtype=turn.dtype, device=turn.device)).all())
+
+
+def local(points: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "3 3"] | None) -> Annotated[Tensor, "N 3"]:
+    """Points in the axes of a cell; None = those of the space."""
+    if turn is None or (turn.device.type == "cpu" and aligned(turn)):
+        return points
+    turn = turn.to(points)
+    if points.device.type == "cpu":
+        return points @ turn.T
+    # No product of matrices: in TF32 a coordinate would be off by a two thousandth of itself.
+    return (points[:, None] * turn).sum(-1)
+
+
+def window(points: Annotated[Tensor, "N 3"], boxes: Boxes, block: int) -> Annotated[Tensor, "N"]:
+    """Window of a block at points of the space, in [0, 1]; without a margin it is that of the bare cell."""
+    x = local(points, boxes.turn[block])
+    low, high = boxes.low[block].to(x), boxes.high[block].to(x)
+    if boxes.margin <= 0:
+        return ((x >= low) & (x <= high)).all(-1).to(x)
+    # Distances are taken from the face before they are divided: a large scene must not lose them.
+    rise = torch.minimum(x - low, high - x) / (2 * boxes.margin) + 0.5
+    rise = rise.clamp(0, 1)
+    return (rise * rise * (3 - 2 * rise)).prod(-1)
+
+
+def shares(points: Annotated[Tensor, "N 3"], boxes: Boxes) -> Annotated[Tensor, "N Z+1"]:
+    """Weight of every block at every point, the surroundings last; rows are at least 0 and sum to 1."""
+    if not len(boxes.low):
+        return points.new_ones(len(points), 1)
+    windows = torch.stack([window(points, boxes, block) for block in range(len(boxes.low))], -1)
+    total = windows.sum(-1, keepdim=True)
+    return torch.cat([windows / total.clamp_min(1), (1 - total).clamp_min(0)], -1)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Where low becomes -1 and high becomes 1 (or, contracted, -1/2 and 1/2), in turned axes."""
+
+    low: Annotated[Tensor, "3"]
+    high: Annotated[Tensor, "3"]
+    turn: Annotated[Tensor, "3 3"]
+    contracted: bool = False
+
+    def locate(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+        """Points of the space to the cube; a block's chart takes those inside its box alone to points inside the cube."""
+        there = self._placed(points)
+        x = local(points, there.turn)
+        # The middle is taken off before anything is scaled: float32 keeps what is left of a large coordinate.
+        y = (x - there.middle) / there.half
+        return contract(y) if self.contracted else y
+
+    def inside(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """Whether points lie in the box."""
+        there = self._placed(points)
+        x = local(points, there.turn)
+        return ((x >= there.low) & (x <= there.high)).all(-1)
+
+    @cached_property
+    def _numbers(self) -> "dict[tuple[torch.dtype, torch.device], _Placed]":
+        return {}
+
+    def _placed(self, points: Tensor) -> "_Placed":
+        """The chart's tensors with the dtype and device of points, copied once, not in each training step."""
+        key = (points.dtype, points.device)
+        if key not in self._numbers:
+            with torch.inference_mode(False):
+                middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+                turn = None if aligned(self.turn) else self.turn.to(points)
+                self._numbers[key] = _Placed(turn, *(x.to(points) for x in (middle, half, self.low, self.high)))
+        return self._numbers[key]
+
+
+class _Placed(NamedTuple):
+    turn: Tensor | None
+    """None for the axes of the space."""
+    middle: Tensor
+    half: Tensor
+    low: Tensor
+    high: Tensor
+
+
+def chart_of(boxes: Boxes, block: int) -> Chart:
+    """The chart of a block: its cell and the margin around it."""
+    return Chart(boxes.low[block] - boxes.margin, boxes.high[block] + boxes.margin, boxes.turn[block])
+
+
+def surroundings_of(boxes: Boxes) -> Chart:
+    """The chart of what no block holds: contracted around the bounds of all blocks, in the axes of the space."""
+    bits = (torch.arange(8)[:, None] >> torch.arange(3)) & 1
+    ends = torch.stack([boxes.low, boxes.high], 1)
+    corners = torch.stack([ends[:, bits[:, a], a] for a in range(3)], -1)
+    world = corners @ boxes.turn
+    flat = world.reshape(-1, 3)
+    return Chart(flat.amin(0), flat.amax(0), torch.eye(3, dtype=boxes.low.dtype), contracted=True)
+
 
 SLIGHT = 1e-6
 """A member of at most this weight is left out; it changes density and colour by as much."""

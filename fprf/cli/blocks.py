@@ -108,7 +108,7 @@ def show_plan(config: "TrainConfig", method: str, output: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from ..blocks.picture import top_view
+    from ..blocks.plan import top_view
     from ..io.atomic import write_json
     from ..io.images import write_image
     from ..training.estimate import estimates

@@ -152,8 +152,7 @@ def _render(
 
 def _all_round(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras") -> "Cameras":
     """Panoramas in place of the path's cameras. Raises UsageError where the scene lies in front of its cameras alone."""
-    from ..rendering.motions import upwards
-    from ..rendering.panorama import panoramas
+    from ..rendering.paths import panoramas, upwards
 
     if opened.known.facts.space.kind == "ndc":
         raise UsageError(f"--lens {config.lens}: this scene was captured from one side (space ndc); there is nothing all round")
@@ -214,7 +213,7 @@ def _styled_take(scene: "Scene", name: str, file: "StyleFile") -> "Take":
 
 def camera_path(known: "Known", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
     """Cameras of the path and a name for each frame; captured views keep the stem of their image."""
-    from ..rendering.motions import make_path
+    from ..rendering.paths import make_path
 
     views = known.split(config.split)
     cameras = make_path(known.cameras, views, config.path, config.frames)

@@ -230,7 +230,7 @@ def _write_page(
 ) -> None:
     from ..datamanagers.images import load_image
     from ..io.gallery import Reference, Style, write_gallery
-    from ..style.wishes import labels
+    from ..style.config import labels
 
     assert config.page is not None
     names = labels(config.references)

@@ -38,7 +38,7 @@ class Shown(NamedTuple):
 
 def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display) -> list[Shown]:
     """Each style on the views, with match maps and how well the views agree with each other."""
-    from ..style.wishes import labels
+    from ..style.config import labels
     from ..training.matches import match_map, match_pictures, summarize
     from ..training.restyle import apply_style
 

@@ -6,9 +6,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..style.config import StyleConfig
+from ..style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
-from ..style.presets import PRESETS, preset_flags, with_preset
 from .parsing import parse
 
 __all__ = ["read_flags", "read_preset", "say", "with_presets_named"]

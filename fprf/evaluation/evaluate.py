@@ -16,8 +16,7 @@ from torch import Tensor
 from ..datamanagers.images import load_image, load_mask
 from ..datamanagers.scene import Scene
 from ..memory import peak
-from ..rendering.cameras import Cameras
-from ..rendering.pixel_rays import PixelRays
+from ..rendering.cameras import Cameras, PixelRays
 from ..rendering.renderer import render_rays
 from ..training.loading import Trained
 from ..training.model import background_of

@@ -20,12 +20,11 @@ from ..plugins.stylizers.config import (
     RegionToneConfig,
     StylizerConfig,
 )
-from ..style.config import StyleConfig
+from ..style.config import StyleConfig, labels
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.references import Encoders, encode_photograph
-from ..style.wishes import labels
 from ..training.cached_view import CachedView
 from ..training.loading import Trained, load_run
 from ..training.restyle import dress

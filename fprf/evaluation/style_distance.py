@@ -25,8 +25,7 @@ from ..errors import DataError
 from ..interfaces import Encoder
 from ..style.clusters import kmeans
 from ..style.matching import unit
-from ..style.statistics import covariance, moments
-from ..style.transport import symmetric_root
+from ..style.statistics import covariance, moments, symmetric_root
 
 __all__ = [
     "MIXED",

@@ -16,8 +16,7 @@ from ..config import RenderConfig, TrainConfig
 from ..errors import FprfError, UsageError, WeightsError
 from ..io.images import write_image
 from ..ops import backend
-from ..rendering.cameras import Cameras, pixel_grid, rays_through
-from ..rendering.pixel_rays import PixelRays
+from ..rendering.cameras import Cameras, PixelRays, pixel_grid, rays_through
 from ..rendering.renderer import Parts, march, render_rays
 from ..style.look import Restyle
 from ..town.layout import build_town

@@ -27,7 +27,7 @@ from ..errors import DataError, UsageError
 from ..rendering.cameras import Cameras
 from ..style.dictionary import StyleDictionary
 from ..style.references import Encoders
-from ..style.transport import monge
+from ..style.statistics import monge
 from ..town.layout import Town, build_town
 from ..town.palettes import palette
 from ..town.render import View, geometry, render, walk

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..memory import chunk_size
 from ..plugins.samplers.config import UniformConfig
-from ..plugins.samplers.uniform import UniformSampler
+from ..plugins.samplers.samplers import UniformSampler
 from ..rendering.cameras import Cameras, project
 from ..rendering.renderer import March, Parts, Restyle, composite, march
 from ..training.model import Facts, Model, background_of

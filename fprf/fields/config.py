@@ -59,7 +59,7 @@ class PlanesConfig(ContentFieldConfig):
 
     def build(self, *, channels: int, seed: int) -> ContentField:
         """The field."""
-        from .content import PlanesField
+        from .fields import PlanesField
 
         return PlanesField(self, channels=channels, seed=seed)
 
@@ -83,7 +83,7 @@ class SemanticPlanesConfig(SemanticFieldConfig):
 
     def build(self, *, channels: int, seed: int) -> SemanticField:
         """The field."""
-        from .semantic import SemanticPlanes
+        from .fields import SemanticPlanes
 
         return SemanticPlanes(self, channels=channels, seed=seed)
 

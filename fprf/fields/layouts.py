@@ -38,7 +38,7 @@ class SingleConfig(LayoutConfig):
 
     def build(self) -> BlockLayout:
         """The layout."""
-        from ..blocks.single import SingleLayout
+        from ..blocks.layouts import SingleLayout
 
         return SingleLayout()
 
@@ -63,7 +63,7 @@ class GridConfig(LayoutConfig):
 
     def build(self) -> BlockLayout:
         """The layout."""
-        from ..blocks.grid import GridLayout
+        from ..blocks.layouts import GridLayout
 
         return GridLayout(self)
 
@@ -87,7 +87,7 @@ class AdaptiveConfig(LayoutConfig):
 
     def build(self) -> BlockLayout:
         """The layout."""
-        from ..blocks.adaptive import AdaptiveLayout
+        from ..blocks.layouts import AdaptiveLayout
 
         return AdaptiveLayout(self)
 
@@ -111,7 +111,7 @@ class StreetConfig(LayoutConfig):
 
     def build(self) -> BlockLayout:
         """The layout."""
-        from ..blocks.street import StreetLayout
+        from ..blocks.layouts import StreetLayout
 
         return StreetLayout(self)
 

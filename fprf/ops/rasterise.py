@@ -2,8 +2,8 @@
 
 `rasterise_reference` defines what is computed, in plain torch; on the CPU in float32 compiled kernels do (`rasterise_kernels`).
 These skip and count: Gaussians whose opacity stays below 1/255, behind the camera, outside the image, or not finite (exact:
-the reference gives them nothing either), and what lies behind blocks of 4 x 4 pixels through which less than 1/1000 of the light
-passes (an error of at most 1/1000 of the largest value). Their exponential errs by 1.1e-4 of alpha.
+the reference gives them nothing either), and what lies behind blocks of 4 x 4 pixels through which less than 1/1000 of the
+light passes (an error of at most 1/1000 of the largest value). Their exponential errs by 1.1e-4 of alpha.
 """
 
 # The checker takes compiled functions to have one argument.

@@ -17,10 +17,9 @@ from ..datamanagers.config import GuidedConfig
 from ..errors import UsageError
 from ..interfaces import Encoder
 from ..ops.precision import double
-from ..plugins.encoders.bundled import CONTENT_KIND, load_content_encoder
-from ..plugins.encoders.students import ContentStudent
-from ..plugins.encoders.vgg_weights import build_vgg19
-from ..plugins.weightfiles import write_weights
+from ..plugins.encoders.bundled import CONTENT_KIND, ContentStudent, load_content_encoder
+from ..plugins.encoders.vgg import build_vgg19
+from ..plugins.weights import write_weights
 from ..training.prepare import device_of
 from .config import DistilConfig
 from .loop import generator_of, prepared, prepared_path, train

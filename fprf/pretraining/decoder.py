@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from ..datamanagers.config import GuidedConfig
 from ..interfaces import Decoder, Encoder
-from ..plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder
-from ..plugins.weightfiles import write_weights
+from ..plugins.decoders.decoders import DECODER_KIND, MlpDecoder, load_decoder
+from ..plugins.weights import write_weights
 from ..style.statistics import deviation, double
 from ..training.prepare import device_of
 from .config import PretrainDecoderConfig

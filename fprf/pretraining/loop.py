@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ..io.atomic import write_json
 from ..io.images import to_uint8, write_image
-from ..plugins.weightfiles import read_weights, write_weights
+from ..plugins.weights import read_weights, write_weights
 from .config import DistilConfig, PretrainConfig
 
 __all__ = [

@@ -19,11 +19,10 @@ from torch import Tensor
 from ..errors import UsageError, WeightsError
 from ..interfaces import Encoder
 from ..ops.precision import double
-from ..plugins.encoders.bundled import SEMANTIC_KIND, load_semantic_encoder
+from ..plugins.encoders.bundled import SEMANTIC_KIND, SemanticStudent, load_semantic_encoder
 from ..plugins.encoders.frozen import replicate_to_multiple
 from ..plugins.encoders.mobilenet import CLASSIFIER, DEEPLAB, TENSORFLOW_EPS, MobileNetV2, fold
-from ..plugins.encoders.students import SemanticStudent
-from ..plugins.weightfiles import read_weights, write_weights
+from ..plugins.weights import read_weights, write_weights
 from ..town.layout import build_town
 from ..town.palettes import PALETTES
 from ..town.render import geometry, render, walk

@@ -2,10 +2,13 @@
 
 World metres (or whatever unit the capture has), float64 throughout: the space that fields live in is recentred from it.
 Axes are OpenGL's: x right, y up, the camera looks along -z. Pixel centres lie at +0.5.
+
+Undistortion takes a dozen Newton steps a pixel; training asks for the same pixels over and over. Captures with one camera
+need one table (24 bytes a pixel). Above `LIMIT` bytes, for thousands of different lenses, rays are solved as they come.
 """
 
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import torch
@@ -13,7 +16,7 @@ from torch import Tensor
 
 from .lens import bend, lens_reach, unbend
 
-__all__ = ["Cameras", "pixel_grid", "project", "rays_through", "sees"]
+__all__ = ["LIMIT", "Cameras", "PixelRays", "grid_rays", "normals", "pixel_grid", "project", "rays_through", "sees"]
 
 
 @dataclass(frozen=True)
@@ -121,3 +124,116 @@ def project(
     turned = torch.stack([local[:, 0], -local[:, 1], -local[:, 2]], -1)
     plane = bend(cameras.distortion[view], cameras.lens[view], cameras.reach[view], turned)
     return plane * cameras.focal[view] + cameras.centre[view], turned[:, 2]
+
+
+LIMIT = 256 * 2**20
+"""Bytes of tables that are kept at most."""
+
+
+class PixelRays:
+    """`rays_through` for pixels at their centres (+0.5), equal to it within float64 rounding."""
+
+    def __init__(self, cameras: Cameras, *, limit: int = LIMIT) -> None:
+        self.cameras = cameras
+        described = torch.cat(
+            [cameras.focal, cameras.centre, cameras.distortion, cameras.size.double(), cameras.lens[:, None].double()], -1
+        )
+        kinds, self.kind = torch.unique(described, dim=0, return_inverse=True)
+        first = torch.stack([(self.kind == k).nonzero()[0, 0] for k in range(len(kinds))])
+        area = cameras.size[first].prod(-1)
+        self.start = area.cumsum(0) - area
+        self.table: Tensor | None = None
+        if int(area.sum()) * 24 <= limit:
+            self.table = torch.cat([self._solve(int(view)) for view in first])
+
+    @property
+    def device(self) -> torch.device:
+        """Device on which rays are made; views and pixels must be on it."""
+        return self.start.device
+
+    def to(self, device: torch.device) -> "PixelRays":
+        """Move to a device."""
+        self.cameras, self.kind, self.start = self.cameras.to(device), self.kind.to(device), self.start.to(device)
+        self.table = None if self.table is None else self.table.to(device)
+        return self
+
+    def __call__(
+        self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"]
+    ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
+        """Origin and unit direction in the world, float64."""
+        if self.table is None:
+            return rays_through(self.cameras, view, pixel)
+        x, y = pixel.long().unbind(-1)
+        local = self.table[self.start[self.kind[view]] + y * self.cameras.size[view, 0] + x]
+        pose = self.cameras.pose[view]
+        return pose[:, :, 3], (pose[:, :, :3] @ local[:, :, None])[:, :, 0]
+
+    def _solve(self, view: int) -> Annotated[Tensor, "P 3"]:
+        """Unit directions in camera axes of all pixels of a view."""
+        pixel = pixel_grid(self.cameras, view)
+        _, world = rays_through(self.cameras, torch.full((len(pixel),), view), pixel)
+        return world @ self.cameras.pose[view, :, :3]
+
+
+def grid_rays(
+    cameras: Cameras, view: int, device: torch.device | None = None
+) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"]]:
+    """`rays_through` all pixels of a view (`pixel_grid`), within float64 rounding; on a device, else where the cameras lie.
+
+    The frames of a path, and mostly the views of a capture, look through one lens: the last two are remembered.
+    """
+    numbers = (cameras.focal, cameras.centre, cameras.distortion)
+    width, height = cameras.size[view].tolist()
+    pose = cameras.pose[view].to(device)
+    local = _local(*(tuple(x[view].tolist()) for x in numbers), width, height, int(cameras.lens[view]), pose.device)
+    direction = local @ pose[:, :3].T
+    return pose[:, 3].expand_as(direction), direction
+
+
+@lru_cache(maxsize=2)
+def _local(
+    focal: tuple[float, ...],
+    centre: tuple[float, ...],
+    distortion: tuple[float, ...],
+    width: int,
+    height: int,
+    lens: int,
+    device: torch.device,
+) -> Annotated[Tensor, "N 3"]:
+    """Unit directions in camera axes: a function of the lens alone."""
+    still = torch.cat([torch.eye(3, dtype=torch.float64), torch.zeros(3, 1, dtype=torch.float64)], 1)
+    focals, centres, bends = (torch.tensor([x], dtype=torch.float64) for x in (focal, centre, distortion))
+    camera = Cameras(still[None], focals, centres, torch.tensor([[width, height]]), bends, torch.tensor([lens]))
+    pixel = pixel_grid(camera, 0)
+    return rays_through(camera, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1].to(device)
+
+
+def normals(cameras: Cameras, view: int, depth: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W 3"]:
+    """Unit normals in world axes, facing the camera; 0 where depth is not positive and finite, or there is no neighbour.
+
+    `depth` is the distance along the unit ray. Of the two neighbours in each direction the nearer one in space counts, so
+    that an edge belongs to one of its sides.
+    """
+    pixel = pixel_grid(cameras, view)
+    origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+    height, width = depth.shape
+    solid = torch.isfinite(depth) & (depth > 0)
+    far = torch.where(solid, depth, torch.zeros_like(depth)).double()
+    points = origin.view(height, width, 3) + direction.view(height, width, 3) * far[..., None]
+    # Steps follow the pixels' order, so that of what a camera sees they turn as its pixels do: the normal faces it. Where
+    # there is no step the product is 0, and stays so.
+    normal = torch.linalg.cross(_step(points, solid, 0), _step(points, solid, 1))
+    return torch.nn.functional.normalize(normal, dim=-1, eps=1e-300).float()
+
+
+def _step(points: Tensor, solid: Tensor, axis: int) -> Tensor:
+    """From each point to the next one along an axis, or from the one before, whichever is shorter; 0 where there is none."""
+    count = points.shape[axis]
+    both = (solid.narrow(axis, 1, count - 1) & solid.narrow(axis, 0, count - 1))[..., None]
+    gaps = points.narrow(axis, 1, count - 1) - points.narrow(axis, 0, count - 1)
+    gaps = torch.where(both, gaps, torch.full_like(gaps, torch.inf))
+    edge = torch.full_like(points.narrow(axis, 0, 1), torch.inf)
+    ahead, behind = torch.cat([gaps, edge], axis), torch.cat([edge, gaps], axis)
+    shorter = ahead.norm(dim=-1, keepdim=True) <= behind.norm(dim=-1, keepdim=True)
+    step = torch.where(shorter, ahead, behind)
+    return torch.where(torch.isfinite(step), step, torch.zeros_like(step))

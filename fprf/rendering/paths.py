@@ -2,21 +2,42 @@
 
 World units and OpenGL axes as in `rendering.cameras`; float64. Every path stays where the training cameras were: a
 radiance field knows nothing of places that no camera has seen.
+
+A stereo panorama has no single centre: each eye moves on a circle as the head turns, and every column of the picture is
+seen from where the eye is when it looks there (omnidirectional stereo: Peleg, Ben-Ezra and Pritch, 2001). It is rendered as
+strips of columns, each a camera of its own.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated
 
 import torch
 from torch import Tensor
 
 from ..errors import UsageError
+from .camera_path import read_camera_path
 from .cameras import Cameras
-from .lens import PINHOLE
+from .lens import PANORAMA, PINHOLE
 from .splines import catmull_rom, quaternions, rotations, slerp
 
-__all__ = ["dataset", "interpolate", "look_at", "orbit", "pinhole", "spiral", "tour"]
+__all__ = [
+    "MOTIONS",
+    "STRIP",
+    "dataset",
+    "eye_strips",
+    "interpolate",
+    "look_at",
+    "make_path",
+    "orbit",
+    "panoramas",
+    "pinhole",
+    "spiral",
+    "tour",
+    "upwards",
+]
 
 
 def dataset(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Cameras:
@@ -244,3 +265,73 @@ def _sweep(azimuth: Annotated[Tensor, "V"], frames: int) -> Annotated[Tensor, "F
         return first + 2 * math.pi * phase
     arc = 2 * math.pi - float(gaps[widest])
     return first + arc * (1 - torch.cos(2 * math.pi * phase)) / 2
+
+
+MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
+
+
+def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int) -> Cameras:
+    """Cameras of a motion, or of a camera-path JSON file.
+
+    `interpolate` and `dataset` go through `views` of the captured `cameras`. `frames` are those of a spiral or orbit, and
+    about those of an interpolation; a file and the captured views bring their own number. Raises UsageError for what is
+    neither, DataError for a file that is no camera path.
+    """
+    chosen = torch.tensor(list(views), dtype=torch.int64)
+    if motion == "dataset":
+        return dataset(cameras, chosen)
+    if motion == "spiral":
+        return spiral(cameras, frames)
+    if motion == "orbit":
+        return orbit(cameras, frames)
+    if motion == "interpolate":
+        order = tour(cameras, chosen)
+        between = max(0, round((frames - 1) / max(1, len(order) - 1)) - 1)
+        return interpolate(cameras, order, between)
+    file = Path(motion)
+    if not file.is_file():
+        raise UsageError(f"--path {motion}: neither a file nor one of {', '.join(MOTIONS)}")
+    return read_camera_path(file)[0]
+
+
+def upwards(cameras: Cameras) -> Annotated[Tensor, "3"]:
+    """The mean of the cameras' up, or, where they look straight down, against their view; world axes, not of unit length."""
+    up = cameras.pose[:, :, 1].mean(dim=0)
+    return cameras.pose[:, :, 2].mean(dim=0) if float(up.norm()) < 0.3 else up
+
+
+STRIP = 4
+"""Columns that share an eye's place."""
+
+
+def panoramas(cameras: Cameras, width: int, up: Annotated[Tensor, "3"]) -> Cameras:
+    """Level panoramas at the cameras' places, `width` x `width` / 2 pixels, the middle where each camera looks."""
+    ahead = -cameras.pose[:, :, 2]
+    upright = torch.nn.functional.normalize(up, dim=0)
+    level = ahead - (ahead @ upright)[:, None] * upright
+    # A camera that looks straight up or down: its own up is ahead, or behind.
+    level = torch.where(level.norm(dim=-1, keepdim=True) < 1e-3, cameras.pose[:, :, 1], level)
+    place, count = cameras.pose[:, :, 3], len(cameras)
+    size = torch.tensor([width, max(1, width // 2)])
+    return Cameras(
+        pose=look_at(place, place + level, upright),
+        focal=torch.full((count, 2), width / (2 * math.pi), dtype=torch.float64),
+        centre=(size.double() / 2).repeat(count, 1),
+        size=size.repeat(count, 1),
+        distortion=torch.zeros(count, 6, dtype=torch.float64),
+        lens=torch.full((count,), PANORAMA),
+    )
+
+
+def eye_strips(panorama: Cameras, offset: float) -> Cameras:
+    """The strips of one eye of one panorama, left to right; `offset` from the middle to the right, in world units."""
+    width, height = (int(side) for side in panorama.size[0])
+    starts = torch.arange(0, width, STRIP)
+    widths = (width - starts).clamp(max=STRIP)
+    many = panorama.select(torch.zeros(len(starts), dtype=torch.int64))
+    angle = (starts + widths / 2 - float(panorama.centre[0, 0])) / float(panorama.focal[0, 0])
+    right, back = panorama.pose[0, :, 0], panorama.pose[0, :, 2]
+    across = angle.cos()[:, None] * right + angle.sin()[:, None] * back
+    pose = torch.cat([many.pose[:, :, :3], (many.pose[:, :, 3] + offset * across)[:, :, None]], -1)
+    centre = torch.stack([many.centre[:, 0] - starts, many.centre[:, 1]], -1)
+    return replace(many, pose=pose, centre=centre, size=torch.stack([widths, torch.full_like(widths, height)], -1))

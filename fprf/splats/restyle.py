@@ -13,7 +13,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..fields.harmonics import harmonics as harmonic_functions
+from ..fields.planes import harmonics as harmonic_functions
 from ..interfaces import Encoder, Stylizer
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import ColourMaps, carried_colours

@@ -22,8 +22,7 @@ from ..types import Want
 from .controls import blend_strength
 from .dictionary import StyleDictionary, blend_codes
 from .scene import SceneStyle, membership, region_units
-from .statistics import double, mix
-from .transport import monge, symmetric_root
+from .statistics import double, mix, monge, symmetric_root
 
 __all__ = ["ColourMaps", "carried_colours", "colour_maps", "decoded_colours"]
 

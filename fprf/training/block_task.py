@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..blocks.visibility import pixel_mask
+from ..blocks.plan import pixel_mask
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene

@@ -21,12 +21,8 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..blocks.charts import Chart, chart_of, surroundings_of
-from ..blocks.field import BlockedField, BlockedSemantic
-from ..blocks.inherit import inherit
-from ..blocks.members import Held, Member, Members
-from ..blocks.routing import Everywhere, Inset, Router
-from ..blocks.sampler import BlockedSampler
+from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, inherit
+from ..blocks.routing import Chart, Everywhere, Inset, Router, chart_of, surroundings_of
 from ..config import TrainConfig
 from ..errors import CheckpointError
 from ..interfaces import Decoder

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from ..interfaces import Scene
 from ..io.images import Picture, srgb_to_linear, to_uint8
 from ..io.maps import depth_image, depth_limits
-from ..rendering.cameras import Cameras
-from ..rendering.normals import normals
-from ..rendering.panorama import eye_strips
+from ..rendering.cameras import Cameras, normals
+from ..rendering.paths import eye_strips
 from ..types import View
 from .matches import match_map, match_pictures
 from .restyle import Styled

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..blocks.charts import chart_of, surroundings_of
 from ..blocks.plan import Plan, boxes_from, boxes_to, make_plan
+from ..blocks.routing import chart_of, surroundings_of
 from ..config import RESUMABLE, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.features import extract

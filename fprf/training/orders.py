@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from ..errors import UsageError
-from ..style.config import StyleConfig
+from ..style.config import StyleConfig, find_reference, labels, parse_strength, parse_wish
 from ..style.controls import allowed_references
 from ..style.dictionary import StyleDictionary
 from ..style.files import StyleFile
 from ..style.matching import scores, unit
 from ..style.scene import SceneStyle
-from ..style.wishes import find_reference, labels, parse_strength, parse_wish
 from .regions import Found, Regions, find_regions, key_of
 
 __all__ = ["Orders", "region_scores", "take_orders"]

@@ -121,7 +121,7 @@ def _tone(trained: "Trained", texts: tuple[str, ...]) -> tuple[float, float, flo
 
 
 def _resampled(trained: "Trained", samples: float) -> "Trained":
-    from ..blocks.sampler import BlockedSampler
+    from ..blocks.fields import BlockedSampler
     from .model import Model
 
     old = trained.model.sampler

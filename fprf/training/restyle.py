@@ -10,7 +10,7 @@ from torch import Tensor
 from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
-from ..style.config import NO_MASK, StyleConfig
+from ..style.config import NO_MASK, StyleConfig, labels
 from ..style.dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
 from ..style.files import StyleFile, check_photographs, read_style
 from ..style.look import Restyle
@@ -18,7 +18,6 @@ from ..style.matching import unit
 from ..style.references import Encoders, encode_photograph
 from ..style.regional import RegionWeight, regional
 from ..style.scene import SceneStyle
-from ..style.wishes import labels
 from .first_use import check_stylizer
 from .orders import Orders, take_orders
 from .regions import Regions

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import torch
 
-from ..blocks.charts import chart_of
-from ..blocks.members import Member, Members
+from ..blocks.fields import Member, Members
+from ..blocks.routing import chart_of
 from ..types import Boxes
 from .blocks import folder_of, load_finished, restore
 

@@ -19,7 +19,7 @@ from ..errors import NumericsError
 from ..interfaces import DataManager
 from ..memory import free_memory, out_of_memory, shortage
 from ..ops.precision import tf32
-from ..rendering.pixel_rays import PixelRays
+from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays
 from . import checkpoint

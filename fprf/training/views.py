@@ -9,8 +9,7 @@ from torch import Tensor
 from ..config import RenderConfig
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
-from ..rendering.cameras import Cameras, rays_through
-from ..rendering.pixel_rays import grid_rays
+from ..rendering.cameras import Cameras, grid_rays, rays_through
 from ..rendering.renderer import Restyle, composite, enlarged, march, render_rays
 from ..types import Rays, Rendered, View, Want
 from .model import Facts, Model, background_of

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
-from ..style.presets import PRESETS, preset_flags
+from ..style.config import PRESETS, preset_flags
 from .cameras import CameraState, picture_size
 from .film import FilmPlan, film_cameras
 from .session import Session

@@ -19,13 +19,13 @@ from ..interfaces import Scene
 from ..io.images import shrink
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.cameras import Cameras
+from ..style.config import labels
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.references import Encoders, encode_photograph
 from ..style.scene import SceneStyle
-from ..style.wishes import labels
 from ..training import tensorfiles
 from ..training.block_task import built_block
 from ..training.blocks import folder_of

@@ -13,9 +13,8 @@ from ..checks import at_least, between, positive
 from ..errors import UsageError
 from ..io.images import Picture
 from ..plugins.stylizers.config import RegionToneConfig
-from ..style.config import StyleConfig
+from ..style.config import PRESETS, StyleConfig
 from ..style.dictionary import Reference
-from ..style.presets import PRESETS
 from .cameras import CameraState
 
 __all__ = [

@@ -7,12 +7,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from fprf.blocks.charts import chart_of, surroundings_of
-from fprf.blocks.field import BlockedField, BlockedSemantic, emission
-from fprf.blocks.members import Held, Member, Members
-from fprf.blocks.routing import Blend, Everywhere, Inset
-from fprf.blocks.sampler import BlockedSampler
-from fprf.blocks.windows import shares
+from fprf.blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, emission
+from fprf.blocks.routing import Blend, Everywhere, Inset, chart_of, shares, surroundings_of
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
 from fprf.rendering.space import Space

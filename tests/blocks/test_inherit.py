@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from fprf.blocks.charts import Chart, chart_of, surroundings_of
-from fprf.blocks.inherit import inherit, relay
-from fprf.blocks.members import Member
+from fprf.blocks.fields import Member, inherit, relay
+from fprf.blocks.routing import Chart, chart_of, surroundings_of
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.fields.planes import Planes
 from fprf.interfaces import SemanticField

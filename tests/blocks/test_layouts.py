@@ -7,9 +7,9 @@ import torch
 from block_scenes import drone, street
 from torch import Tensor
 
-from fprf.blocks.region import REACH, bounds, within
-from fprf.blocks.space import open_space, site_of
-from fprf.blocks.windows import shares
+from fprf.blocks.layouts import REACH, bounds, within
+from fprf.blocks.plan import open_space, site_of
+from fprf.blocks.routing import shares
 from fprf.datamanagers.scene import Scene, find_sightings
 from fprf.errors import ConfigError
 from fprf.fields.layouts import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig, StreetConfig

@@ -7,9 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.blocks.charts import Chart, chart_of, surroundings_of
-from fprf.blocks.routing import SLIGHT, Blend, Everywhere, Group, Inset
-from fprf.blocks.windows import shares
+from fprf.blocks.routing import SLIGHT, Blend, Chart, Everywhere, Group, Inset, chart_of, shares, surroundings_of
 from fprf.types import Boxes
 
 

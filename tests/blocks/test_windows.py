@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
-from fprf.blocks.windows import local, shares, window
+from fprf.blocks.routing import local, shares, window
 from fprf.types import Boxes
 
 

@@ -8,9 +8,8 @@ import pytest
 from fprf.cli.style_flags import read_flags
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
-from fprf.style.config import StyleConfig
+from fprf.style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from fprf.style.files import StyleFile, write_style
-from fprf.style.presets import PRESETS, preset_flags, with_preset
 
 
 @dataclass(frozen=True, kw_only=True)

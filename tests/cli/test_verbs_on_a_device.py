@@ -17,7 +17,7 @@ import fprf.methods
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import TownConfig
 from fprf.ops import backend
-from fprf.plugins.weightfiles import read_weights
+from fprf.plugins.weights import read_weights
 
 VIEW = ["--views", "0000"]
 QUICK = ["--clusters", "3"]

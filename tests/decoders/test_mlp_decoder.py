@@ -11,9 +11,9 @@ from safetensors.torch import save_file
 
 from fprf.errors import WeightsError
 from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
-from fprf.plugins.decoders.mlp import DECODER_KIND, MlpDecoder, load_decoder
+from fprf.plugins.decoders.decoders import DECODER_KIND, MlpDecoder, load_decoder
 from fprf.plugins.encoders.config import BundledContentConfig, EncoderConfig, Vgg19Config
-from fprf.plugins.weightfiles import write_weights
+from fprf.plugins.weights import write_weights
 
 
 def file_of(path: Path, encoder: str, channels: int = 6, hidden: int = 4) -> Path:

@@ -12,11 +12,11 @@ from fprf.config import TrainConfig
 from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
-from fprf.plugins.decoders.mlp import DECODER_KIND, MlpDecoder
+from fprf.plugins.decoders.decoders import DECODER_KIND, MlpDecoder
 from fprf.plugins.decoders.remedy import pretrain_line
 from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, EncoderConfig, RandomConfig, Vgg19Config
 from fprf.plugins.typed_json import Missing
-from fprf.plugins.weightfiles import write_weights
+from fprf.plugins.weights import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.training.decoder import build_decoder
 from fprf.training.prepare import prepare
@@ -49,7 +49,7 @@ def test_defaults_are_left_out() -> None:
 
 
 def test_encoders_within_encoders() -> None:
-    composed = pytest.importorskip("fprf.plugins.encoders.composed_config")
+    composed = pytest.importorskip("fprf.plugins.encoders.config")
     inner = Vgg19Config(layer="relu1_2", weights=Path("w"))
     encoder = composed.ConcatConfig(first=inner, third=composed.AveragedConfig(flip=False), weights=(1.0, 0.5))
     words = shlex.split(pretrain_line(encoder))

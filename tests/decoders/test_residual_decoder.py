@@ -14,8 +14,7 @@ from tiny_world import World, parameters, rays_of, trained_for
 from fprf.config import TrainConfig
 from fprf.errors import ConfigError
 from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
-from fprf.plugins.decoders.mlp import MlpDecoder
-from fprf.plugins.decoders.residual import ResidualDecoder, residual_share
+from fprf.plugins.decoders.decoders import MlpDecoder, ResidualDecoder, residual_share
 from fprf.plugins.encoders.config import BundledContentConfig
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.rendering.renderer import Parts, Restyle, render_rays

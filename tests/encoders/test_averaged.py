@@ -11,9 +11,8 @@ from torch import Tensor
 
 from fprf.errors import ConfigError
 from fprf.interfaces import Encoder
-from fprf.plugins.encoders.averaged import AveragedEncoder
-from fprf.plugins.encoders.composed_config import AveragedConfig
-from fprf.plugins.encoders.config import RandomConfig
+from fprf.plugins.encoders.composed import AveragedEncoder
+from fprf.plugins.encoders.config import AveragedConfig, RandomConfig
 
 
 class Slope(Encoder):

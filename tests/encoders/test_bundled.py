@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from fprf.errors import WeightsError
-from fprf.plugins.decoders.mlp import FOLDER as DECODERS
-from fprf.plugins.encoders.bundled import CONTENT_KIND, FOLDER
+from fprf.plugins.decoders.decoders import FOLDER as DECODERS
+from fprf.plugins.encoders.bundled import CONTENT_KIND, FOLDER, ContentStudent, SemanticStudent
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig
-from fprf.plugins.encoders.students import ContentStudent, SemanticStudent
-from fprf.plugins.weightfiles import read_weights, write_weights
+from fprf.plugins.weights import read_weights, write_weights
 
 
 def test_everything_that_ships_stays_below_three_megabytes_and_says_what_it_is() -> None:

@@ -14,11 +14,17 @@ from fprf.cli.parsing import parse
 from fprf.errors import ConfigError, WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import from_json, to_json
-from fprf.plugins.encoders.calibration import street
-from fprf.plugins.encoders.composed_config import AveragedConfig, ConcatConfig
-from fprf.plugins.encoders.concat import ConcatEncoder, unit_of
-from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, RandomConfig
-from fprf.plugins.encoders.segmenter_config import DeepLabConfig
+from fprf.plugins.encoders.composed import ConcatEncoder, unit_of
+from fprf.plugins.encoders.config import (
+    AveragedConfig,
+    BundledContentConfig,
+    BundledSemanticConfig,
+    ConcatConfig,
+    DeepLabConfig,
+    EncoderConfig,
+    RandomConfig,
+)
+from fprf.plugins.encoders.frozen import street
 
 
 def length(features: Tensor) -> Tensor:

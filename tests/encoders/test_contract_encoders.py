@@ -11,16 +11,19 @@ from network_files import deeplab_file, espnet_file, mobilenet_file
 from vgg_files import vgg_file
 
 from fprf.interfaces import Encoder
-from fprf.plugins.encoders.composed_config import AveragedConfig, ConcatConfig
 from fprf.plugins.encoders.config import (
+    AveragedConfig,
     BundledContentConfig,
     BundledSemanticConfig,
+    ConcatConfig,
+    DeepLabConfig,
     EncoderConfig,
+    EspNetConfig,
+    MobileNetV2Config,
     RandomConfig,
     Vgg16Config,
     Vgg19Config,
 )
-from fprf.plugins.encoders.segmenter_config import DeepLabConfig, EspNetConfig, MobileNetV2Config
 from fprf.testing import check_encoder
 
 Make = Callable[[Path], EncoderConfig]

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from fprf.errors import WeightsError
-from fprf.plugins.encoders.segmenter_config import EspNetConfig
+from fprf.plugins.encoders.config import EspNetConfig
 
 STRIDES = {"level1": 2, "level2": 4, "level3": 8, "level4": 16}
 MEAN, STD = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])

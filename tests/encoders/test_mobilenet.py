@@ -12,8 +12,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from fprf.errors import WeightsError
+from fprf.plugins.encoders.config import DeepLabConfig, MobileNetV2Config
 from fprf.plugins.encoders.mobilenet import CLASSIFIER, DEEPLAB, fold, stride_at
-from fprf.plugins.encoders.segmenter_config import DeepLabConfig, MobileNetV2Config
 
 STRIDES = (1, 2, 1, 2, 1, 1, 2, 1, 1, 1, 1, 1, 1, 2, 1, 1, 1)
 IMAGENET = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], dtype=torch.float64).view(2, 3, 1, 1)

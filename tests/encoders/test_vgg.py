@@ -14,11 +14,10 @@ from torch import Tensor, nn
 from vgg_files import LAYERS, deep_vgg_file, vgg_file, vgg_tensors
 
 from fprf.errors import WeightsError
-from fprf.plugins.encoders import weight_sources
-from fprf.plugins.encoders.calibration import street
+from fprf.plugins import weights
 from fprf.plugins.encoders.config import Vgg16Config, Vgg19Config
-from fprf.plugins.encoders.vgg import CONVOLUTIONS, reaches, vgg_activations
-from fprf.plugins.encoders.vgg_weights import SOURCES
+from fprf.plugins.encoders.frozen import street
+from fprf.plugins.encoders.vgg import CONVOLUTIONS, SOURCES, reaches, vgg_activations
 
 Grid = list[list[list[float]]]
 
@@ -28,7 +27,7 @@ def _no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise urllib.error.URLError("no network in tests")
 
-    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", refuse)
+    monkeypatch.setattr(weights.urllib.request, "urlopen", refuse)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
 
 
@@ -131,7 +130,7 @@ def test_deeper_layers_of_the_two_networks_lie_elsewhere(tmp_path: Path) -> None
 
 
 def test_caffes_files_are_turned_to_rgb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(weight_sources, "_expected", lambda _: None)
+    monkeypatch.setattr(weights, "_expected", lambda _: None)
     tensors = vgg_tensors(means=True)
     torch.save(tensors, tmp_path / "vgg16-00b39a1b.pth")
     found = Vgg16Config(layer="conv1_1", weights=tmp_path / "vgg16-00b39a1b.pth", normalise=False).build()
@@ -190,7 +189,7 @@ def test_absent_weights_say_what_to_put_where(tmp_path: Path, kind: type[Vgg19Co
 
 
 def test_a_download_of_another_hash_is_refused_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", lambda *_, **__: io.BytesIO(b"not the weights"))
+    monkeypatch.setattr(weights.urllib.request, "urlopen", lambda *_, **__: io.BytesIO(b"not the weights"))
     with pytest.raises(WeightsError, match="promises dcbb9e9d"):
         Vgg19Config(layer="relu3_1").build()
     assert not list((tmp_path / "home/.cache/fprf/weights").iterdir())
@@ -205,8 +204,8 @@ def test_a_download_is_kept_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
         calls.append(url)
         return io.BytesIO(buffer.getvalue())
 
-    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", serve)
-    monkeypatch.setattr(weight_sources, "_expected", lambda _: None)
+    monkeypatch.setattr(weights.urllib.request, "urlopen", serve)
+    monkeypatch.setattr(weights, "_expected", lambda _: None)
     config = Vgg19Config(layer="relu3_1")
     assert config.build().identity == config.build().identity
     assert calls == [SOURCES["vgg19"].origin]

@@ -10,11 +10,10 @@ from network_files import deeplab_file, mobilenet_tensors
 from safetensors.torch import save_file
 
 from fprf.errors import WeightsError
-from fprf.plugins.encoders import weight_sources
-from fprf.plugins.encoders.config import EncoderConfig
-from fprf.plugins.encoders.deeplab import SOURCE as DEEPLAB
-from fprf.plugins.encoders.segmenter_config import DeepLabConfig, EspNetConfig, MobileNetV2Config
-from fprf.plugins.encoders.weight_sources import WeightSource, find_weights, read_tensors, stated_triple, torchvision_file
+from fprf.plugins import weights
+from fprf.plugins.encoders.config import DeepLabConfig, EncoderConfig, EspNetConfig, MobileNetV2Config
+from fprf.plugins.encoders.mobilenet import DEEPLAB_SOURCE as DEEPLAB
+from fprf.plugins.weights import WeightSource, find_weights, read_tensors, stated_triple, torchvision_file
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +23,7 @@ def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     def refuse(*_: object, **__: object) -> None:
         raise urllib.error.URLError("no network in tests")
 
-    monkeypatch.setattr(weight_sources.urllib.request, "urlopen", refuse)
+    monkeypatch.setattr(weights.urllib.request, "urlopen", refuse)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     return tmp_path / "home"
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import WeightsError
-from fprf.plugins.weightfiles import read_weights, tensors_hash, write_weights
+from fprf.plugins.weights import read_weights, tensors_hash, write_weights
 
 
 @settings(max_examples=15, deadline=None)

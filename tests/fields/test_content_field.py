@@ -6,9 +6,8 @@ from torch import Tensor
 
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig
-from fprf.fields.content import PlanesField
-from fprf.fields.density import density
-from fprf.fields.harmonics import harmonics
+from fprf.fields.fields import PlanesField
+from fprf.fields.planes import density, harmonics
 from fprf.testing import check_content_field
 
 SMALL = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16)

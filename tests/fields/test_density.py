@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.fields.density import LIMIT, density
+from fprf.fields.planes import LIMIT, density
 
 U = 2.0**-24
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fprf.errors import ConfigError
-from fprf.fields.harmonics import MAX_DEGREE, count, harmonics
+from fprf.fields.planes import MAX_DEGREE, count, harmonics
 
 
 def quadrature() -> tuple[Tensor, Tensor]:

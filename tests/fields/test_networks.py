@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from fprf.fields.networks import linear, mlp
+from fprf.fields.planes import linear, mlp
 
 
 def draw(seed: int = 0) -> torch.Generator:

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from fprf.fields.fields import ProposalField
 from fprf.fields.planes import Planes
-from fprf.fields.proposal import ProposalField
 from fprf.ops import triplane
 
 

@@ -7,7 +7,7 @@ import torch
 
 from fprf.errors import ConfigError
 from fprf.fields.config import SemanticPlanesConfig
-from fprf.fields.semantic import SemanticPlanes
+from fprf.fields.fields import SemanticPlanes
 from fprf.testing import check_semantic_field
 
 SMALL = SemanticPlanesConfig(resolutions=(4, 9), channels=8, hidden=16)

@@ -13,7 +13,7 @@ import fprf
 from benchmarks.readers import targets
 from fprf.datamanagers.parsers.files import read_npy, read_npz
 from fprf.errors import FprfError
-from fprf.plugins.encoders.weight_sources import WeightSource, read_tensors
+from fprf.plugins.weights import WeightSource, read_tensors
 
 
 class Canary:

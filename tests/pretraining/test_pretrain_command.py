@@ -15,7 +15,7 @@ from fprf.cli.pretrain import run
 from fprf.errors import UsageError
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig
-from fprf.plugins.weightfiles import read_weights
+from fprf.plugins.weights import read_weights
 from fprf.pretraining.config import PretrainConfig
 from fprf.pretraining.loop import checkpoint_path, generator_of, train
 

@@ -16,7 +16,7 @@ from fprf.errors import ConfigError, WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.plugins.weightfiles import read_weights
+from fprf.plugins.weights import read_weights
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.pretraining.loop import report_path, samples_folder
 from fprf.training.decoder import build_decoder

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from fprf.cli.pretrain import run
 from fprf.ops import backend
-from fprf.plugins.weightfiles import read_weights
+from fprf.plugins.weights import read_weights
 
 SMALL = ["--steps", "2", "--batch", "2", "--samples", "1e9"]
 

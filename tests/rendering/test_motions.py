@@ -7,8 +7,7 @@ import torch
 from fprf.errors import DataError, UsageError
 from fprf.rendering.camera_path import write_camera_path
 from fprf.rendering.cameras import Cameras, project
-from fprf.rendering.motions import MOTIONS, make_path, upwards
-from fprf.rendering.paths import interpolate, look_at, orbit, pinhole, spiral, tour
+from fprf.rendering.paths import MOTIONS, interpolate, look_at, make_path, orbit, pinhole, spiral, tour, upwards
 
 
 def around(count: int = 12) -> Cameras:

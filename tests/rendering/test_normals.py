@@ -1,10 +1,8 @@
 import pytest
 import torch
 
-from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
-from fprf.rendering.normals import normals
-from fprf.rendering.panorama import panoramas
-from fprf.rendering.paths import look_at, pinhole
+from fprf.rendering.cameras import Cameras, normals, pixel_grid, rays_through
+from fprf.rendering.paths import look_at, panoramas, pinhole
 
 
 def camera(width: int = 40, height: int = 30) -> Cameras:

@@ -5,8 +5,7 @@ import torch
 
 from fprf.rendering.cameras import Cameras, pixel_grid, project, rays_through, sees
 from fprf.rendering.lens import PANORAMA
-from fprf.rendering.panorama import eye_strips, panoramas
-from fprf.rendering.paths import look_at, pinhole
+from fprf.rendering.paths import eye_strips, look_at, panoramas, pinhole
 
 UP = torch.tensor([0.0, 0, 2], dtype=torch.float64)
 

@@ -7,9 +7,8 @@ import torch
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
-from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
+from fprf.rendering.cameras import LIMIT, Cameras, PixelRays, grid_rays, pixel_grid, rays_through
 from fprf.rendering.lens import FISHEYE, OPENCV, PINHOLE
-from fprf.rendering.pixel_rays import LIMIT, PixelRays, grid_rays
 
 K = {PINHOLE: [0.0] * 6, OPENCV: [0.05, -0.08, 0.01, 0.0, -0.001, 0.0002], FISHEYE: [0.05, -0.01, 0.002, 0.0, 0.0, 0.0]}
 

@@ -11,7 +11,7 @@ from splat_ball import ball
 
 from fprf.cli import main as cli
 from fprf.errors import CheckpointError, DataError, UsageError
-from fprf.fields.harmonics import harmonics as functions
+from fprf.fields.planes import harmonics as functions
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig

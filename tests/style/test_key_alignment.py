@@ -5,8 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.style.alignment import Keys, Matching, match_keys, whitener
-from fprf.style.matching import attention, score_spread, unit
+from fprf.style.matching import Keys, Matching, attention, match_keys, score_spread, unit, whitener
 
 FRAMES = [Matching(0.3), Matching(0.3, whitening=0.5), Matching(0.3, whitening=1.0), Matching(0.3, "cosine", 0.5, 5)]
 

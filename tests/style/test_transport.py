@@ -3,7 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.style.transport import limit_gain, monge, symmetric_root
+from fprf.style.statistics import limit_gain, monge, symmetric_root
 
 LOOSE = 1e12
 

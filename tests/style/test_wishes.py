@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import ConfigError, UsageError
-from fprf.style.wishes import Pixel, Wish, find_reference, labels, parse_strength, parse_wish, pixel_of
+from fprf.style.config import Pixel, Wish, find_reference, labels, parse_strength, parse_wish, pixel_of
 
 PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from block_world import BlockWorld
 
-from fprf.blocks.charts import chart_of, surroundings_of
+from fprf.blocks.routing import chart_of, surroundings_of
 from fprf.errors import CheckpointError, PluginError
 from fprf.fields.config import PlanesConfig
-from fprf.fields.content import PlanesField
+from fprf.fields.fields import PlanesField
 from fprf.training.blocks import (
     SURROUNDINGS,
     folder_of,

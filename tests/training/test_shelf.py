@@ -8,7 +8,7 @@ import pytest
 import torch
 from block_world import BlockWorld
 
-from fprf.blocks.charts import chart_of
+from fprf.blocks.routing import chart_of
 from fprf.errors import CheckpointError
 from fprf.training.blocks import SURROUNDINGS, folder_of, load_finished, restore, surroundings
 from fprf.training.lay_out import load_boxes

@@ -109,9 +109,7 @@ def test_gaussians_on_the_page_have_their_places_and_shapes(scene: SplatScene) -
     means, covariances = page_gaussians(scene.gaussians, transform)
     assert torch.allclose(means.double(), transform.to_page(scene.gaussians.means), atol=1e-5)
     lengths, wanted = torch.linalg.eigvalsh(covariances.double()).clamp_min(0).sqrt(), scene.gaussians.log_scales.double().exp()
-    assert torch.allclose(
-        lengths, transform.scale * wanted.sort(1).values, rtol=1e-3, atol=1e-5
-    )
+    assert torch.allclose(lengths, transform.scale * wanted.sort(1).values, rtol=1e-3, atol=1e-5)
 
 
 def test_scenes_of_another_kind_are_refused() -> None:

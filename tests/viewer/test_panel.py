@@ -13,8 +13,7 @@ from test_session import Listener
 from tiny_world import World
 
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.style.config import StyleConfig
-from fprf.style.presets import with_preset
+from fprf.style.config import StyleConfig, with_preset
 from fprf.training.loading import load_run
 from fprf.viewer import film
 from fprf.viewer.cameras import CameraState

@@ -48,7 +48,7 @@ class MlpDecoderConfig(DecoderConfig):
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
         """The decoder whose file names this encoder."""
-        from .mlp import load_decoder
+        from .decoders import load_decoder
 
         return load_decoder(self.weights, encoder=encoder, channels=channels, objective=self.objective)
 
@@ -76,8 +76,7 @@ class ResidualDecoderConfig(DecoderConfig):
         """The decoder whose file names this encoder, with a head that changes nothing yet."""
         import torch
 
-        from .mlp import load_decoder
-        from .residual import ResidualDecoder
+        from .decoders import ResidualDecoder, load_decoder
 
         frozen = load_decoder(self.weights, encoder=encoder, channels=channels)
         generator = torch.Generator().manual_seed(seed)

@@ -7,9 +7,9 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from ...checks import at_least
+from ...checks import at_least, positive
 from ...errors import ConfigError
 from ..config import Need, PluginConfig, absent_file
 
@@ -17,12 +17,17 @@ if TYPE_CHECKING:
     from ...interfaces import Encoder
 
 __all__ = [
+    "AveragedConfig",
     "BundledContentConfig",
     "BundledSemanticConfig",
+    "ConcatConfig",
+    "DeepLabConfig",
     "DinoConfig",
     "Dinov2Config",
     "Dinov3Config",
     "EncoderConfig",
+    "EspNetConfig",
+    "MobileNetV2Config",
     "RandomConfig",
     "Vgg16Config",
     "Vgg19Config",
@@ -94,14 +99,14 @@ class Vgg16Config(EncoderConfig):
 
     def needs(self) -> tuple[Need, ...]:
         """The weights."""
-        from .vgg_weights import SOURCES
-        from .weight_sources import weights_needed
+        from ..weights import weights_needed
+        from .vgg import SOURCES
 
         return weights_needed(SOURCES["vgg16"], self.weights)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or end before the layer."""
-        from .vgg_weights import build_vgg16
+        from .vgg import build_vgg16
 
         return build_vgg16(self.layer, weights=self.weights, normalise=self.normalise)
 
@@ -125,15 +130,15 @@ class Vgg19Config(EncoderConfig):
 
     def needs(self) -> tuple[Need, ...]:
         """The weights, beyond the layers that ship."""
-        from .vgg_weights import BUNDLED_LAYERS, SOURCES
-        from .weight_sources import weights_needed
+        from ..weights import weights_needed
+        from .vgg import BUNDLED_LAYERS, SOURCES
 
         ships = self.weights is None and self.layer[4:] in BUNDLED_LAYERS
         return () if ships else weights_needed(SOURCES["vgg19"], self.weights)
 
     def build(self) -> Encoder:
         """The encoder. Raises WeightsError where weights are missing or end before the layer."""
-        from .vgg_weights import build_vgg19
+        from .vgg import build_vgg19
 
         return build_vgg19(self.layer, weights=self.weights, normalise=self.normalise)
 
@@ -231,7 +236,7 @@ class RandomConfig(EncoderConfig):
 
     def build(self) -> Encoder:
         """The encoder."""
-        from .random import RandomEncoder
+        from .bundled import RandomEncoder
 
         return RandomEncoder(channels=self.channels, stride=self.stride, seed=self.seed)
 
@@ -252,3 +257,136 @@ def _transformer_needs(model: str) -> tuple[Need, ...]:
     if not cached and not (Path(model) / "config.json").is_file():
         found.append(Need(f"the model {model}", f"hf download {model}", downloaded=True))
     return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MobileNetV2Config(EncoderConfig):
+    """MobileNetV2 of ImageNet. torchvision's weights are downloaded once, unless named."""
+
+    layer: str = "features.13"
+    """features.N, N in 0..18; pixels per feature: 2 to N = 1, 4 to 3, 8 to 6, 16 to 13, then 32."""
+    weights: Path | None = None
+    """torchvision's mobilenet_v2-b0353104.pth, or a safetensors file with its keys, whose metadata may name another mean,
+    std, bn_eps and padding. By default the download cache."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"features\.(\d|1[0-8])", self.layer):
+            raise ConfigError(f"layer: {self.layer!r} is no layer of MobileNetV2; allowed are features.0 ... features.18")
+
+    def needs(self) -> tuple[Need, ...]:
+        """The weights."""
+        from ..weights import weights_needed
+        from .mobilenet import SOURCE
+
+        return weights_needed(SOURCE, self.weights)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where weights are missing or end before the layer."""
+        from .mobilenet import build_mobilenet
+
+        return build_mobilenet(self.layer, weights=self.weights)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeepLabConfig(EncoderConfig):
+    """DeepLabv3 on MobileNetV2, trained on the things of PASCAL VOC."""
+
+    layer: str = "backbone.17"
+    """backbone.N, N in 0..17, or logits (one score a class); pixels per feature: 2 to N = 1, 4 to 3, 8 to 6, then 16."""
+    weights: Path | None = None
+    """A safetensors file with the keys that docs/encoders.md names. By default the one in the weights cache."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"backbone\.(\d|1[0-7])|logits", self.layer):
+            raise ConfigError(
+                f"layer: {self.layer!r} is no layer of DeepLabv3; allowed are backbone.0 ... backbone.17 and logits"
+            )
+
+    def needs(self) -> tuple[Need, ...]:
+        """The weights."""
+        from ..weights import weights_needed
+        from .mobilenet import DEEPLAB_SOURCE
+
+        return weights_needed(DEEPLAB_SOURCE, self.weights)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where weights are missing or lack the layer."""
+        from .mobilenet import build_deeplab
+
+        return build_deeplab(self.layer, weights=self.weights)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EspNetConfig(EncoderConfig):
+    """ESPNetv2, trained on streets or on PASCAL VOC, as its weights were."""
+
+    layer: Literal["level1", "level2", "level3", "level4", "logits"] = "level4"
+    """Level of the base network, with 2, 4, 8 or 16 pixels per feature, or the scores of the classes, with 2."""
+    weights: Path | None = None
+    """EdgeNets' espnetv2_s_2.0_city_1024x512.pth or espnetv2_s_2.0_pascal_384x384.pth, or a safetensors file with their keys.
+    By default the second, in the weights cache."""
+
+    def needs(self) -> tuple[Need, ...]:
+        """The weights."""
+        from ..weights import weights_needed
+        from .espnet import SOURCE
+
+        return weights_needed(SOURCE, self.weights)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where weights are missing or lack the layer."""
+        from .espnet import build_espnet
+
+        return build_espnet(self.layer, weights=self.weights)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AveragedConfig(EncoderConfig):
+    """Any encoder, averaged over the mirrored image and over several sizes of the image."""
+
+    inner: EncoderConfig = BundledSemanticConfig()
+    """The encoder that looks."""
+    flip: bool = True
+    """Average with the mirrored image's features, mirrored back."""
+    scales: tuple[float, ...] = (1.0,)
+    """Sizes at which the image is seen, as shares of its own; 2 halves the encoder's stride. The finest one's cells stay."""
+
+    def __post_init__(self) -> None:
+        if not self.scales:
+            raise ConfigError("scales: needs at least one, as a share of the image's own size")
+        for scale in self.scales:
+            positive("scales", scale)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where the inner one's weights are missing."""
+        from .composed import AveragedEncoder
+
+        return AveragedEncoder(self.inner.build(), flip=self.flip, scales=self.scales)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConcatConfig(EncoderConfig):
+    """Two or three encoders side by side, each of unit length times its weight, at the finest one's stride."""
+
+    first: EncoderConfig = BundledSemanticConfig()
+    """An encoder."""
+    second: EncoderConfig = BundledContentConfig()
+    """Another one; `concat` itself for more than three."""
+    third: EncoderConfig | None = None
+    """A third one; none = two."""
+    weights: tuple[float, ...] = ()
+    """Weight of each, in their order: the root mean square length of its centred features; 1 for those left out."""
+
+    def __post_init__(self) -> None:
+        for weight in self.weights:
+            positive("weights", weight)
+
+    def build(self) -> Encoder:
+        """The encoder. Raises WeightsError where a part's weights are missing, ConfigError for more weights than parts."""
+        from .composed import build_concat
+
+        parts = [part for part in (self.first, self.second, self.third) if part is not None]
+        if len(self.weights) > len(parts):
+            raise ConfigError(f"weights: {len(self.weights)} for {len(parts)} encoders; give one each at most")
+        weights = (*self.weights, *(1.0,) * (len(parts) - len(self.weights)))
+        return build_concat([part.build() for part in parts], weights)

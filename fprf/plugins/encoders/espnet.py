@@ -6,7 +6,8 @@ made up for here: with the image a quarter cell further on, features of mirrored
 0.69 (cosine; cities, level 4). The decoder makes up for all of it by itself.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,13 +15,90 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .espnet_layers import convolve, norm, normed_activation, prelu
-from .espnet_scores import class_scores
-from .frozen import FrozenTensors
-from .network import NetworkEncoder, fitting
-from .weight_sources import IMAGENET_MEAN, IMAGENET_STD, WeightSource, find_weights, read_tensors, stated_triple
+from ..weights import IMAGENET_MEAN, IMAGENET_STD, WeightSource, find_weights, read_tensors, stated_triple
+from .frozen import FrozenTensors, NetworkEncoder, fitting
 
-__all__ = ["SOURCE", "EspNet", "build_espnet"]
+__all__ = ["SOURCE", "EspNet", "build_espnet", "class_scores", "convolve", "norm", "normed_activation", "prelu"]
+
+
+def convolve(
+    tensors: FrozenTensors, x: Annotated[Tensor, "B F H W"], name: str, *, stride: int = 1, dilation: int = 1
+) -> Annotated[Tensor, "B G h w"]:
+    """Zero-padded so that stride 1 keeps the size; with a bias where the file has one."""
+    weight = tensors[f"{name}.weight"]
+    bias = tensors.get(f"{name}.bias")
+    padding = weight.shape[-1] // 2 * dilation
+    return F.conv2d(x, weight, bias, stride, padding, dilation, x.shape[1] // weight.shape[1])
+
+
+def norm(tensors: FrozenTensors, x: Annotated[Tensor, "B F H W"], name: str) -> Annotated[Tensor, "B F H W"]:
+    """Batch normalisation by the statistics of training."""
+    mean, variance, weight, bias = (tensors[f"{name}.{part}"] for part in ("running_mean", "running_var", "weight", "bias"))
+    return F.batch_norm(x, mean, variance, weight, bias)
+
+
+def prelu(tensors: FrozenTensors, x: Annotated[Tensor, "B F H W"], name: str) -> Annotated[Tensor, "B F H W"]:
+    """A slope of its own for the negative part of every channel."""
+    return F.prelu(x, tensors[f"{name}.weight"])
+
+
+def normed_activation(
+    tensors: FrozenTensors, x: Annotated[Tensor, "B F H W"], name: str, parts: tuple[str, str] = ("bn", "act")
+) -> Annotated[Tensor, "B F H W"]:
+    """Normalisation, then activation; the decoder numbers them where the base network names them."""
+    return prelu(tensors, norm(tensors, x, f"{name}.{parts[0]}"), f"{name}.{parts[1]}")
+
+
+SCALES = (2.0, 1.5, 1.0, 0.5, 0.1)
+SMALLEST = 5
+"""Cells along an axis that a pyramid's coarse copies keep at least."""
+
+
+def class_scores(tensors: FrozenTensors, levels: Sequence[Tensor]) -> Tensor:
+    """From the maps [B F h w] of the four levels, finest first, to [B K h w] at the size of the first."""
+    x = _pyramid_pool(tensors, levels[-1], "bu_dec_l1")
+    x = normed_activation(tensors, x, "bu_dec_l1.br.br", ("0", "1"))
+    for step, level in zip((2, 3, 4), reversed(levels[:-1]), strict=True):
+        x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True) + _merged(tensors, level, step)
+        x = _pyramid_pool(tensors, normed_activation(tensors, x, f"bu_br_l{step}", ("0", "1")), f"bu_dec_l{step}")
+        if step < len(levels):
+            x = normed_activation(tensors, x, f"bu_dec_l{step}.br.br", ("0", "1"))
+    return x
+
+
+def _merged(tensors: FrozenTensors, level: Tensor, step: int) -> Tensor:
+    """A level of the base network, its channels weighed by what the whole image holds."""
+    name = f"merge_enc_dec_l{step}"
+    shares = torch.sigmoid(convolve(tensors, level.mean(dim=(2, 3), keepdim=True), f"{name}.wt_layer.1"))
+    return shares * _convolved(tensors, level, f"{name}.expansion_layer.cbr")
+
+
+def _pyramid_pool(tensors: FrozenTensors, x: Tensor, name: str) -> Tensor:
+    """One depthwise convolution at each of several sizes, merged channel by channel."""
+    x = _convolved(tensors, x, f"{name}.projection_layer.cbr")
+    size = (x.shape[2], x.shape[3])
+    found = []
+    for index, scale in enumerate(SCALES):
+        scaled = (max(SMALLEST, math.ceil(size[0] * scale)), max(SMALLEST, math.ceil(size[1] * scale)))
+        stage = f"{name}.stages.{index}"
+        if scale > 1:
+            larger = F.interpolate(x, scaled, mode="bilinear", align_corners=True)
+            found.append(F.adaptive_avg_pool2d(convolve(tensors, larger, stage), size))
+        elif scale < 1:
+            smaller = convolve(tensors, F.adaptive_avg_pool2d(x, scaled), stage)
+            found.append(F.interpolate(smaller, size, mode="bilinear", align_corners=True))
+        else:
+            found.append(convolve(tensors, x, stage))
+    joined = normed_activation(tensors, torch.cat(found, dim=1), f"{name}.merge_layer.0.br", ("0", "1"))
+    # Channel by channel, all sizes of it together: what the grouped convolution after it takes.
+    batch, channels = joined.shape[:2]
+    joined = joined.view(batch, len(SCALES), channels // len(SCALES), *size).transpose(1, 2).flatten(1, 2)
+    return convolve(tensors, _convolved(tensors, joined, f"{name}.merge_layer.2.cbr"), f"{name}.merge_layer.3")
+
+
+def _convolved(tensors: FrozenTensors, x: Tensor, name: str) -> Tensor:
+    return normed_activation(tensors, convolve(tensors, x, f"{name}.0"), name, ("1", "2"))
+
 
 FLAG = "--semantic.encoder.weights"
 SOURCE = WeightSource(

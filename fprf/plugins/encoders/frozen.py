@@ -1,12 +1,30 @@
-"""What every frozen encoder shares: padding that any size survives, and tensors that no optimiser sees."""
+"""What frozen encoders share: padding that any size survives, tensors that no optimiser sees, pictures to measure them on."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
 from typing import Annotated
 
+import numpy as np
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-__all__ = ["FrozenTensors", "finest", "freeze", "reflect_pad", "replicate_to_multiple", "resize_to_multiple"]
+from ...errors import WeightsError
+from ...interfaces import Encoder
+from ..weights import tensors_hash
+
+__all__ = [
+    "FrozenTensors",
+    "NetworkEncoder",
+    "finest",
+    "fitting",
+    "freeze",
+    "reflect_pad",
+    "replicate_to_multiple",
+    "resize_to_multiple",
+    "street",
+]
 
 
 class FrozenTensors(nn.Module):
@@ -70,3 +88,57 @@ def resize_to_multiple(image: Annotated[Tensor, "B 3 H W"], multiple: int) -> Te
     if (height, width) == tuple(image.shape[-2:]):
         return image
     return F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
+
+
+class NetworkEncoder(Encoder):
+    """A network of one feature per `stride` pixels. `name` says everything that changes the output but the tensors."""
+
+    def __init__(self, name: str, network: nn.Module, *, stride: int) -> None:
+        super().__init__()
+        self._identity, self._stride = f"{name}:{tensors_hash(network.state_dict())}", stride
+        self.network = network
+        freeze(self)
+        self._channels = int(self(torch.zeros(1, 3, stride, stride)).shape[1])
+
+    @property
+    def identity(self) -> str:
+        """Name and a hash of every tensor that is used."""
+        return self._identity
+
+    @property
+    def channels(self) -> int:
+        """Channels of the features."""
+        return self._channels
+
+    @torch.no_grad()
+    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
+        """Features, one per `stride` pixels, at least one along each axis."""
+        features: Tensor = self.network(resize_to_multiple(image, self._stride))
+        return features
+
+
+@contextmanager
+def fitting(source: str, what: str, flag: str) -> Iterator[None]:
+    """Building and trying a network on a file's tensors: what is missing or misshapen there is a WeightsError."""
+    try:
+        yield
+    except (KeyError, RuntimeError) as error:
+        reason = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error).strip().splitlines()[0]
+        raise WeightsError(
+            f"{source}: does not hold {what} ({reason}); choose a layer that it holds, or name another file with {flag} FILE"
+        ) from error
+
+
+WIDTH, HEIGHT = 160, 128
+
+
+@cache
+def street() -> Annotated[Tensor, "B 3 H W"]:
+    """Sky, plants, walls and a road, from day to night; made once, in half a second."""
+    from ...town.layout import build_town
+    from ...town.palettes import PALETTES
+    from ...town.render import render, walk
+
+    town, views = build_town(0), walk(seed=0, views=len(PALETTES), width=WIDTH, height=HEIGHT)
+    pictures = [render(town, view, look).rgb for view, look in zip(views, PALETTES.values(), strict=True)]
+    return torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2).float() / 255

@@ -3,6 +3,8 @@
 Where a feature looks depends on the parity that a network was trained with: on even sizes its filters have learned to
 make up for the half pixel that a stride-2 convolution is off; on odd ones (DeepLab's 513) cells are centred on every
 s-th pixel, so the image is shifted by half a cell and the first and last cells are dropped. Measured by mirroring.
+
+DeepLabv3 (Chen et al.) on MobileNetV2, trained on PASCAL VOC: any layer of its backbone, or the scores of its classes.
 """
 
 import math
@@ -10,15 +12,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...errors import WeightsError
-from .frozen import FrozenTensors
-from .network import NetworkEncoder, fitting
-from .weight_sources import IMAGENET_MEAN, IMAGENET_STD, find_weights, read_tensors, stated_triple, torchvision_file
+from ..weights import IMAGENET_MEAN, IMAGENET_STD, WeightSource, find_weights, read_tensors, stated_triple, torchvision_file
+from .frozen import FrozenTensors, NetworkEncoder, fitting
 
-__all__ = ["CLASSIFIER", "DEEPLAB", "Layout", "MobileNetV2", "build_mobilenet", "fold", "stride_at"]
+__all__ = [
+    "CLASSIFIER",
+    "DEEPLAB",
+    "DEEPLAB_SOURCE",
+    "SOURCE",
+    "Layout",
+    "MobileNetV2",
+    "build_deeplab",
+    "build_mobilenet",
+    "fold",
+    "stride_at",
+]
+
 
 TENSORFLOW_EPS, TORCHVISION_EPS = 1e-3, 1e-5
 FLAG = "--semantic.encoder.weights"
@@ -151,3 +165,48 @@ def _eps(metadata: Mapping[str, str], path: Path) -> float:
         return float(text)
     except ValueError as error:
         raise WeightsError(f"{path}: metadata 'bn_eps' is {text!r}, not a number such as 0.001") from error
+
+
+DEEPLAB_SOURCE = WeightSource(
+    "DeepLabv3",
+    "deeplabv3_mobilenetv2_pascal.safetensors",
+    "backbone.N.* named as torchvision's mobilenet_v2 features.N, head.*; docs/encoders.md",
+    FLAG,
+)
+_DEEPLAB_LAST = 17
+_DEEPLAB_MEAN = (0.5, 0.5, 0.5)
+
+
+class _Scores(nn.Module):
+    """Backbone and head without dilated branches: the mean over the image beside every cell, then the classes' scores."""
+
+    def __init__(self, backbone: MobileNetV2, head: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.backbone, self.head = backbone, FrozenTensors(head)
+
+    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B K h w"]:
+        """One score a class, before the softmax."""
+        x = self.backbone(image)
+        whole = F.relu(self._convolve(x.mean(dim=(2, 3), keepdim=True), "image_pooling")).expand(-1, -1, *x.shape[2:])
+        near = F.relu(self._convolve(x, "aspp0"))
+        joined = F.relu(self._convolve(torch.cat([whole, near], dim=1), "concat_projection"))
+        return self._convolve(joined, "logits")
+
+    def _convolve(self, x: Tensor, name: str) -> Tensor:
+        return F.conv2d(x, self.head[f"{name}.weight"], self.head[f"{name}.bias"])
+
+
+def build_deeplab(layer: str, *, weights: Path | None) -> NetworkEncoder:
+    """`backbone.N` or `logits`. Raises WeightsError where the file is absent or does not hold the layer."""
+    path = find_weights(DEEPLAB_SOURCE, weights)
+    tensors, metadata = read_tensors(path, DEEPLAB_SOURCE)
+    mean, std = (
+        stated_triple(metadata, key, default, path) for key, default in (("mean", _DEEPLAB_MEAN), ("std", _DEEPLAB_MEAN))
+    )
+    last = _DEEPLAB_LAST if layer == "logits" else int(layer.rpartition(".")[2])
+    with fitting(str(path), f"DeepLabv3 {layer}", FLAG):
+        folded = fold(tensors, "backbone.", TENSORFLOW_EPS)
+        backbone = MobileNetV2(folded, layout=DEEPLAB, last=last, same=True, mean=mean, std=std)
+        head = {name.removeprefix("head."): value for name, value in tensors.items() if name.startswith("head.")}
+        network = _Scores(backbone, head) if layer == "logits" else backbone
+        return NetworkEncoder(f"deeplab:{layer}", network, stride=stride_at(DEEPLAB, last))

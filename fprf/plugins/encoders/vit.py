@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ...errors import WeightsError
 from ...interfaces import Encoder
-from ..weightfiles import tensors_hash
+from ..weights import tensors_hash
 from .frozen import freeze
 
 __all__ = ["VitEncoder", "build_vit"]

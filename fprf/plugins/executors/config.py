@@ -36,7 +36,7 @@ class SerialConfig(ExecutorConfig):
 
     def build(self) -> Executor:
         """The executor."""
-        from .serial import SerialExecutor
+        from .executors import SerialExecutor
 
         return SerialExecutor()
 
@@ -75,6 +75,6 @@ class RayConfig(ExecutorConfig):
 
     def build(self) -> Executor:
         """The executor."""
-        from .ray import RayExecutor
+        from .executors import RayExecutor
 
         return RayExecutor(self)

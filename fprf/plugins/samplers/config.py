@@ -42,7 +42,7 @@ class UniformConfig(SamplerConfig):
 
     def build(self, *, seed: int) -> Sampler:
         """The sampler; it has no parameters."""
-        from .uniform import UniformSampler
+        from .samplers import UniformSampler
 
         return UniformSampler(self)
 
@@ -93,7 +93,7 @@ class ProposalConfig(SamplerConfig):
 
     def build(self, *, seed: int) -> Sampler:
         """The sampler, its planes drawn from the seed."""
-        from .proposal import ProposalSampler
+        from .samplers import ProposalSampler
 
         return ProposalSampler(self, seed=seed)
 

@@ -1,17 +1,49 @@
-"""Global AdaIN (paper, single reference): sigma_s (F - mu_c) / sigma_c + mu_s."""
+"""Local AdaIN (paper, Eq. 5 and 6): each point mixes the style codes that its semantics resemble.
+
+M_w = R^S M and Sigma_w = R^S Sigma over the codes' means and deviations, then Sigma_w (F - mu_c) / sigma_c + M_w with the
+statistics of the whole scene. With dot products, not centred, at the absolute temperature 1, R^S is the paper's softmax(R).
+
+Global AdaIN (paper, single reference) is sigma_s (F - mu_c) / sigma_c + mu_s; the identity changes nothing.
+"""
 
 from typing import Annotated
 
+import torch
 from torch import Tensor
 
 from ...interfaces import Stylizer
+from ...ops import mixture
 from ...ops.precision import full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
-from ...style.scene import SceneStyle
+from ...style.matching import Similarity, compared, point_shares, score_spread, share_mean
+from ...style.scene import SceneStyle, check_fit
 from ...style.statistics import deviation, double
 from ...types import Want
 
-__all__ = ["AdainStylizer"]
+__all__ = ["AdainStylizer", "IdentityStylizer", "LocalAdainStylizer"]
+
+
+class IdentityStylizer(Stylizer):
+    """Content goes through bit for bit."""
+
+    odds: Tensor
+
+    def __init__(self, dictionary: StyleDictionary) -> None:
+        super().__init__()
+        self.register_buffer("odds", code_odds(dictionary).float())
+
+    @property
+    def needs(self) -> Want:
+        """Content alone."""
+        return Want.CONTENT
+
+    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
+        """The content itself."""
+        return content
+
+    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
+        """Every point alike: the codes' shares of the references."""
+        return self.odds.expand(len(semantic), -1)
 
 
 class AdainStylizer(Stylizer):
@@ -46,3 +78,82 @@ class AdainStylizer(Stylizer):
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """Every point alike: the codes' shares of the references."""
         return self.odds.expand(len(semantic), -1)
+
+
+class LocalAdainStylizer(Stylizer):
+    """AdaIN towards a per-point mixture. With one code, or without semantics, the mixture is the same everywhere."""
+
+    content_mean: Annotated[Tensor, "C"]
+    centre: Annotated[Tensor, "D"] | None
+    """What directions are taken from; None for dot products."""
+    origin: Annotated[Tensor, "D"] | None
+    """The encoder's zero, for dot products of features as it gives them."""
+    keys: Annotated[Tensor, "T D"]
+    prior: Annotated[Tensor, "T"]
+    odds: Annotated[Tensor, "T"]
+    style_mean: Annotated[Tensor, "T C"]
+    gain: Annotated[Tensor, "T C"]
+
+    def __init__(
+        self,
+        dictionary: StyleDictionary,
+        scene: SceneStyle,
+        *,
+        temperature: float,
+        relative: bool,
+        similarity: Similarity,
+        centred: bool,
+    ) -> None:
+        super().__init__()
+        check_fit(dictionary, scene)
+        self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
+        centre, theirs = scene.semantic_mean, share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
+        regions, origin = scene.keys, None
+        if not centred:
+            origin = torch.zeros_like(centre) if dictionary.origin is None else dictionary.origin
+            if similarity == "cosine":
+                centre, theirs = origin, origin
+            else:
+                regions = regions - origin
+        queries, keys = compared(regions, dictionary.keys, similarity, queries_centre=centre, keys_centre=theirs)
+        # The only region of an undivided scene lies at its mean, where it says nothing about scores.
+        spread = score_spread(queries if len(queries) > 1 else keys, keys) if relative else 1.0
+        self.temperature = temperature * spread
+        mean, covariance = double(dictionary.mean), double(dictionary.covariance)
+        if not self.matched:
+            mean, covariance = (part[None] for part in whole_style(dictionary))
+        scene_sigma = deviation(double(scene.mean), double(scene.covariance).diagonal())
+        gain = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)) / scene_sigma
+        self.register_buffer("content_mean", scene.mean.float())
+        self.register_buffer("centre", centre.float() if similarity == "cosine" else None)
+        self.register_buffer("origin", None if origin is None or similarity == "cosine" else origin.float())
+        self.register_buffer("keys", keys.float())
+        self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
+        self.register_buffer("odds", code_odds(dictionary).to(keys.device).float())
+        self.register_buffer("style_mean", mean.to(keys.device).float())
+        self.register_buffer("gain", gain.to(keys.device).float())
+
+    @property
+    def needs(self) -> Want:
+        """Semantics only where there is something to choose."""
+        return Want.CONTENT | Want.SEMANTIC if self.matched else Want.CONTENT
+
+    def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
+        """AdaIN towards each point's own mixture; the mean is subtracted first."""
+        with full_precision(content):
+            features = content.to(self.gain)
+            if self.matched:
+                assert semantic is not None, "Want.SEMANTIC was asked for"
+                return mixture.scaled(features, self.match(semantic), self.gain, self.style_mean, centre=self.content_mean).to(
+                    content
+                )
+            return ((features - self.content_mean) * self.gain + self.style_mean).to(content)
+
+    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
+        """R^S: softmax of the scores."""
+        if not self.matched:
+            return self.odds.expand(len(semantic), -1)
+        query = semantic.to(self.keys)
+        if self.origin is not None:
+            query = query - self.origin
+        return point_shares(query, self.keys, self.temperature, centre=self.centre, prior=self.prior)

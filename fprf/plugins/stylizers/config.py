@@ -66,7 +66,7 @@ class IdentityConfig(StylizerConfig):
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The stylizer that changes nothing."""
-        from .identity import IdentityStylizer
+        from .adain import IdentityStylizer
 
         return IdentityStylizer(dictionary)
 
@@ -102,7 +102,7 @@ class LocalAdainConfig(StylizerConfig):
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """Local AdaIN towards these references."""
-        from .local import LocalAdainStylizer
+        from .adain import LocalAdainStylizer
 
         return LocalAdainStylizer(
             dictionary,
@@ -155,7 +155,7 @@ class _RegionConfig(StylizerConfig):
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The two-sided stylizer towards these references, with this kind of maps."""
-        from ...style.alignment import Matching
+        from ...style.matching import Matching
         from .region import TwoSidedStylizer, plan_regions
 
         matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred, self.centred)

@@ -17,11 +17,10 @@ from torch import Tensor, nn
 from ...interfaces import Stylizer
 from ...ops import mixture
 from ...ops.precision import full_precision
-from ...style.alignment import Keys, Matching, match_keys
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
+from ...style.matching import Keys, Matching, match_keys
 from ...style.scene import SceneStyle, check_fit, membership, own_style, region_units
-from ...style.statistics import deviation, double
-from ...style.transport import monge
+from ...style.statistics import deviation, double, monge
 from ...types import Want
 
 __all__ = ["ChannelMaps", "MatrixMaps", "RegionMaps", "RegionPlan", "TwoSidedStylizer", "plan_regions", "region_table"]

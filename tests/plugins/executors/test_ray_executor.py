@@ -13,7 +13,7 @@ import pytest
 from fprf.cli.cluster import run as cluster
 from fprf.errors import ConfigError, DataError, PluginError
 from fprf.plugins.executors.config import RayConfig
-from fprf.plugins.executors.ray import resources
+from fprf.plugins.executors.executors import resources
 from fprf.testing import check_config, check_executor
 
 

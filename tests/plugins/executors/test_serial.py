@@ -3,7 +3,7 @@
 import pytest
 
 from fprf.plugins.executors.config import SerialConfig
-from fprf.plugins.executors.serial import SerialExecutor
+from fprf.plugins.executors.executors import SerialExecutor
 from fprf.testing import check_executor
 
 

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from fprf.errors import ConfigError
 from fprf.interfaces import Sampler
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
-from fprf.plugins.samplers.proposal import ProposalSampler
-from fprf.plugins.samplers.uniform import even_edges
+from fprf.plugins.samplers.samplers import ProposalSampler, even_edges
 from fprf.rendering.space import Space
 from fprf.rendering.stepfun import interlevel
 from fprf.testing import check_sampler

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from fprf.cli import main as cli
 from fprf.datamanagers.basis import Basis, fit_basis
 from fprf.interfaces import Stylizer
+from fprf.plugins.stylizers.adain import LocalAdainStylizer
 from fprf.plugins.stylizers.config import LocalAdainConfig
-from fprf.plugins.stylizers.local import LocalAdainStylizer
 from fprf.style.dictionary import Reference, build_dictionary, load_dictionary
 from fprf.style.look import Restyle
 from fprf.style.scene import SceneStyle, scene_style

@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 from fprf.errors import DataError
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig
 from fprf.plugins.stylizers.region import region_table
-from fprf.style.alignment import Matching
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
-from fprf.style.matching import Similarity, score_spread, share_mean, unit
+from fprf.style.matching import Matching, Similarity, score_spread, share_mean, unit
 from fprf.style.scene import SceneStyle, membership, own_style, region_units, scene_style
-from fprf.style.statistics import deviation
-from fprf.style.transport import monge
+from fprf.style.statistics import deviation, monge
 from fprf.types import Want
 
 BOTH = (RegionAdainConfig, RegionOtConfig)

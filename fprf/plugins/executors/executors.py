@@ -14,10 +14,19 @@ from ...errors import PluginError
 from ...interfaces import Executor
 from .config import RayConfig
 
-__all__ = ["RayExecutor", "resources"]
+__all__ = ["RayExecutor", "SerialExecutor", "resources"]
+
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
+
+
+class SerialExecutor(Executor):
+    """The default: no dependency, no processes."""
+
+    def map(self, function: Callable[[Task], Result], tasks: Sequence[Task]) -> list[Result]:
+        """Results in the order of the tasks; the first error stops the rest."""
+        return [function(task) for task in tasks]
 
 
 def resources(config: RayConfig) -> dict[str, float]:

@@ -1,0 +1,308 @@
+"""Fields of a scene of blocks: points go to the members that they belong to, density and features are blended, then decoded.
+
+Densities blend by the weights of the router: sigma = sum_i w_i sigma_i. Features blend by what each member emits there,
+f = sum_i w_i sigma_i f_i / sum_i w_i sigma_i: a block that finds a place empty has no say about its colour. Shares are formed
+in log space, since densities span thirty orders of magnitude.
+
+A block starts as the surroundings it is trained in: what they have learnt of its place is not learnt again.
+
+Planes are laid anew over the block's chart, each node with the value that the old planes have there; networks are copied. The
+finer nodes then hold the coarse scene, which training sharpens. Parts that consist of anything else start from their seed.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Annotated
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ..fields.planes import Planes
+from ..interfaces import ContentField, Sampler, SemanticField
+from ..ops.triplane import AXES, split
+from ..rendering.space import Space
+from ..types import FieldSample, Rays, Sampled
+from .routing import Chart, Group, Router
+
+__all__ = ["BlockedField", "BlockedSampler", "BlockedSemantic", "Held", "Member", "Members", "emission", "inherit", "relay"]
+
+
+class Member(nn.Module):
+    """Fields and sampler of one block, and where they apply. Points are those of the scene's space."""
+
+    def __init__(self, chart: Chart, sampler: Sampler, field: ContentField, semantic: SemanticField | None) -> None:
+        super().__init__()
+        self.chart = chart
+        self.sampler = sampler
+        self.field = field
+        self.semantic = semantic
+
+    def proposal(self, level: int, points: Annotated[Tensor, "n 3"]) -> Annotated[Tensor, "n"]:
+        """Density of a level of the sampler's own fields."""
+        found: Tensor = self.sampler.fields[level](self.chart.locate(points))
+        return found
+
+
+class Members(ABC):
+    """Members by number: in memory, or fetched when they are asked for."""
+
+    @abstractmethod
+    def member(self, number: int) -> Member:
+        """One of them."""
+
+    @property
+    @abstractmethod
+    def held(self) -> Sequence[Member]:
+        """Those that live as long as the model, whose parameters are its own."""
+
+
+class Held(Members):
+    """All of them in memory."""
+
+    def __init__(self, members: Sequence[Member]) -> None:
+        self._members = tuple(members)
+
+    def member(self, number: int) -> Member:
+        """The member."""
+        return self._members[number]
+
+    @property
+    def held(self) -> Sequence[Member]:
+        """All."""
+        return self._members
+
+
+_SHARED = -1.0
+"""Instead of a member's number in the latent of a point that several members share."""
+
+
+def emission(density: Annotated[Tensor, "n m"], weight: Annotated[Tensor, "n m"]) -> Annotated[Tensor, "n m"]:
+    """Share of each member in what is emitted at a point; rows sum to 1, also where no member has any density."""
+    tiny = torch.finfo(density.dtype).tiny
+    return torch.softmax(density.clamp_min(tiny).log() + weight.log(), -1)
+
+
+class BlockedField(ContentField):
+    """Density and content. A latent is the member's number, the point, and the member's own latent.
+
+    Points that several members share are looked up again for their content: only those that are kept, and few lie in margins.
+    """
+
+    def __init__(self, members: Members, router: Router) -> None:
+        super().__init__()
+        self.members, self.router = members, router
+        self.held = nn.ModuleList(members.held)
+
+    def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
+        """Blended density; points are those of the scene's space."""
+        groups = self.router(points)
+        found = [self._group(points, group) for group in groups]
+        index = torch.cat([group.at for group in groups])
+        density, latent = (torch.cat(parts) for parts in zip(*found, strict=True))
+        if len(groups) == 1:
+            return FieldSample(density, latent)
+        back = torch.empty_like(index)
+        back[index] = torch.arange(len(index), device=index.device)
+        return FieldSample(density.index_select(0, back), latent.index_select(0, back))
+
+    def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
+        """Blended content features."""
+        owner, points = latent[:, 0].detach(), latent[:, 1:4].detach()
+        whole = self.router.whole(points)
+        if whole is not None and whole.weight is None:
+            return self.members.member(whole.members[0]).field.content(latent[:, 4:], view)
+        if whole is not None:
+            return self._shared(points, view, whole)
+        found, places = [], []
+        for number in torch.unique(owner).tolist():
+            index = (owner == number).nonzero()[:, 0]
+            if number != _SHARED:
+                found.append(self.members.member(int(number)).field.content(latent[index, 4:], view[index]))
+                places.append(index)
+                continue
+            for group in self.router(points[index]):
+                place = index[group.at]
+                found.append(self._shared(points[place], view[place], group))
+                places.append(place)
+        if len(found) == 1:
+            return found[0]
+        if not found:
+            return self.members.held[0].field.content(latent[:, 4:], view)
+        order = torch.cat(places)
+        back = torch.empty_like(order)
+        back[order] = torch.arange(len(order), device=order.device)
+        return torch.cat(found).index_select(0, back)
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Those of the members that are held, added up: each is regularised as if alone."""
+        return _added([member.field.penalties() for member in self.members.held])
+
+    def _group(self, points: Tensor, group: Group) -> tuple[Tensor, Tensor]:
+        here = points[group.at]
+        samples = [self.members.member(m).field.density(self.members.member(m).chart.locate(here)) for m in group.members]
+        if group.weight is None:
+            density, number = samples[0].density, here.new_full((len(here), 1), float(group.members[0]))
+        else:
+            density = (torch.stack([s.density for s in samples], -1) * group.weight).sum(-1)
+            number = here.new_full((len(here), 1), _SHARED)
+        return density, torch.cat([number, here, samples[0].latent], -1)
+
+    def _shared(self, points: Tensor, view: Tensor, group: Group) -> Tensor:
+        densities, contents = [], []
+        for number in group.members:
+            member = self.members.member(number)
+            sample = member.field.density(member.chart.locate(points))
+            densities.append(sample.density)
+            contents.append(member.field.content(sample.latent, view))
+        return _mixed(contents, densities, group)
+
+
+class BlockedSemantic(SemanticField):
+    """Semantics, blended as content is."""
+
+    def __init__(self, members: Members, router: Router) -> None:
+        super().__init__()
+        self.members, self.router = members, router
+
+    def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
+        """Blended features at points of the scene's space."""
+        groups = self.router(points)
+        found = []
+        for group in groups:
+            here = points[group.at]
+            features, densities = [], []
+            for number in group.members:
+                member = self.members.member(number)
+                assert member.semantic is not None
+                at = member.chart.locate(here)
+                features.append(member.semantic(at))
+                if group.weight is not None:
+                    densities.append(member.field.density(at).density)
+            found.append(_mixed(features, densities, group))
+        if len(found) == 1:
+            return found[0]
+        index = torch.cat([group.at for group in groups])
+        back = torch.empty_like(index)
+        back[index] = torch.arange(len(index), device=index.device)
+        return torch.cat(found).index_select(0, back)
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Those of the members that are held, added up."""
+        return _added([member.semantic.penalties() for member in self.members.held if member.semantic is not None])
+
+
+def _mixed(features: list[Tensor], densities: list[Tensor], group: Group) -> Tensor:
+    if group.weight is None:
+        return features[0]
+    share = emission(torch.stack(densities, -1), group.weight)
+    return (torch.stack(features, 1) * share[..., None]).sum(1)
+
+
+def _added(terms: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    names = {name for each in terms for name in each}
+    return {name: torch.stack([each[name] for each in terms if name in each]).sum() for name in sorted(names)}
+
+
+class _Routed(nn.Module):
+    """One density field of the sampler over all blocks."""
+
+    def __init__(self, members: Members, router: Router, level: int) -> None:
+        super().__init__()
+        self.members, self.router, self.level = members, router, level
+
+    def forward(self, points: Tensor) -> Tensor:
+        groups = self.router(points)
+        found = []
+        for group in groups:
+            here = points[group.at]
+            values = [self.members.member(number).proposal(self.level, here) for number in group.members]
+            found.append(values[0] if group.weight is None else (torch.stack(values, -1) * group.weight).sum(-1))
+        if len(found) == 1:
+            return found[0]
+        index = torch.cat([group.at for group in groups])
+        back = torch.empty_like(index)
+        back[index] = torch.arange(len(index), device=index.device)
+        return torch.cat(found).index_select(0, back)
+
+
+class BlockedSampler(Sampler):
+    """Samples as `inner` does, which the blocks' own fields tell where to look."""
+
+    def __init__(self, inner: Sampler, members: Members, router: Router) -> None:
+        super().__init__()
+        self.members, self.router = members, router
+        self.inner = inner
+        for level in range(len(inner.fields)):
+            inner.fields[level] = _Routed(members, router, level)
+
+    def forward(
+        self,
+        rays: Rays,
+        *,
+        space: Space,
+        step: int | None,
+        generator: torch.Generator | None,
+    ) -> Sampled:
+        """The inner sampler's edges; an open space leaves points as they are."""
+        found: Sampled = self.inner(rays, space=space, step=step, generator=generator)
+        return found
+
+    def penalties(self) -> dict[str, Tensor]:
+        """Those of the samplers of the members that are held, added up."""
+        terms = [member.sampler.penalties() for member in self.members.held]
+        names = {name for each in terms for name in each}
+        return {name: torch.stack([each[name] for each in terms if name in each]).sum() for name in sorted(names)}
+
+
+def inherit(member: Member, around: Member) -> None:
+    """Let a member of the same config start as `around` is where it lies."""
+    pairs: list[tuple[nn.Module | None, nn.Module | None]] = [
+        (member.sampler, around.sampler),
+        (member.field, around.field),
+        (member.semantic, around.semantic),
+    ]
+    for own, other in pairs:
+        if own is None or other is None or not _understood(own):
+            continue
+        own.load_state_dict(other.state_dict())
+        for mine, theirs in zip(own.modules(), other.modules(), strict=True):
+            if isinstance(mine, Planes) and isinstance(theirs, Planes):
+                with torch.no_grad():
+                    mine.table.copy_(relay(theirs, member.chart, around.chart))
+
+
+def relay(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F"]:
+    """The table of planes over `chart` that say what `planes` say over `old`: exact at the nodes where axes agree.
+
+    Of a turned chart each axis takes the plane of the old axis that it follows most.
+    """
+    follows = [int(row.abs().argmax()) for row in chart.turn @ old.turn.T]
+    if len(set(follows)) < len(follows):
+        follows = [0, 1, 2]
+    parts = []
+    for grids in split(planes.table.detach(), planes.resolutions):
+        nodes = torch.linspace(-1, 1, grids.shape[1], dtype=torch.float64)
+        for a, b in AXES:
+            cube = torch.zeros(len(nodes), len(nodes), 3, dtype=torch.float64)
+            cube[..., a], cube[..., b] = nodes[None, :], nodes[:, None]
+            at = old.locate(_leave(chart, cube.view(-1, 3))).view(cube.shape)
+            first, second = sorted((follows[a], follows[b]))
+            grid = grids[AXES.index((first, second))]
+            where = torch.stack([at[..., first], at[..., second]], -1)[None].to(grid)
+            found = F.grid_sample(grid.permute(2, 0, 1)[None], where, align_corners=True, padding_mode="border")
+            parts.append(found[0].permute(1, 2, 0).reshape(-1, grid.shape[2]))
+    return torch.cat(parts)
+
+
+def _leave(chart: Chart, cube: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+    """From the cube of a block's chart to the space."""
+    middle, half = (chart.low + chart.high) / 2, (chart.high - chart.low) / 2
+    return (cube * half + middle) @ chart.turn
+
+
+def _understood(part: nn.Module) -> bool:
+    """Whether all that a part has learnt lies in planes, linear maps and offsets."""
+    place = {id(p) for module in part.modules() if isinstance(module, Planes) for p in module.parameters()}
+    maps = {id(p) for module in part.modules() if isinstance(module, nn.Linear) for p in module.parameters()}
+    return bool(place) and all(id(p) in place | maps or p.ndim == 1 for p in part.parameters())
