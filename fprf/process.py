@@ -1,7 +1,5 @@
 """What the command line asks of the process that it runs in, before anything heavy is imported.
 
-Packages that are damaged are passed over by whoever looks for plug-ins.
-
 Threads that wait for others give way soon. By default OpenMP's spin for milliseconds, and where another program uses the
 cores they spin instead of those that they wait for: with 20 busy programs on two cores a training step took 2304 ms,
 and 236 ms with this; alone on the cores it costs a twentieth.
@@ -14,9 +12,8 @@ import ctypes
 import os
 import sys
 from collections.abc import MutableMapping
-from importlib.metadata import Distribution, EntryPoints
 
-__all__ = ["TRIM", "entry_points_of", "keep_memory", "settle", "spare_others", "wait_briefly"]
+__all__ = ["TRIM", "configure_process", "keep_memory", "wait_briefly"]
 
 SPINS = "1000"
 """Rounds that a waiting thread spins for GNU's OpenMP: some 20 microseconds."""
@@ -27,36 +24,14 @@ TRIM = 2**29
 LARGEST = 2**27
 """Pieces up to this size come from memory that was freed before."""
 OLDER = 2**25
-_READ = Distribution.entry_points.fget  # type: ignore[attr-defined]
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 
-def settle() -> None:
-    """All of it, unless the user decided otherwise."""
+def configure_process() -> None:
+    """Configure waiting threads, memory and OpenCV's log, unless the user decided otherwise."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "FATAL")  # else damaged images are told twice: by it, and by us in one line
     wait_briefly(os.environ)
     keep_memory()
-    spare_others()
-
-
-def spare_others() -> None:
-    """One package with damaged metadata must not end the others: torch, numba and tyro's type checker each look through the
-    entry points of all packages, and would not be imported. For them such a package has none. `fprf plugins` names it.
-    """
-
-    def spared(self: Distribution) -> EntryPoints:
-        try:
-            return entry_points_of(self)
-        except Exception:  # whatever a damaged file makes the reader raise
-            return EntryPoints()
-
-    Distribution.entry_points = property(spared)  # type: ignore[assignment,method-assign]
-
-
-def entry_points_of(distribution: Distribution) -> EntryPoints:
-    """A package's entry points, or whatever reading them raises, `spare_others` or not."""
-    found: EntryPoints = _READ(distribution)
-    return found
 
 
 def wait_briefly(environment: MutableMapping[str, str]) -> None:

@@ -18,7 +18,7 @@ from .. import __version__
 from ..errors import FprfError, UsageError
 from ..memory import out_of_memory, shortage
 from ..plugins.registry import installed, make, nearest
-from ..process import settle
+from ..process import configure_process
 
 __all__ = ["VERBS", "Verb", "main", "packaged", "run_verb"]
 
@@ -93,7 +93,7 @@ def _dispatch(args: list[str]) -> int:
     if args[0] == "--version":
         print(f"fprf {__version__}")
         return 0
-    settle()
+    configure_process()
     try:
         return run_verb(args[0], args[1:])
     except SystemExit as end:  # --help ends this way

@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 from ..errors import PluginError
-from ..process import entry_points_of
 
 __all__ = [
     "Entry",
@@ -167,7 +166,7 @@ def _scan() -> _Scan:
         try:
             package = _package(distribution)
             ours = f"[{_PREFIX}" in (distribution.read_text("entry_points.txt") or "")
-            points = list(entry_points_of(distribution)) if ours else []
+            points = list(distribution.entry_points) if ours else []
         except Exception as error:  # whatever a damaged file makes the reader raise
             bad.extend(_complaint(distribution, error))
             continue

@@ -53,13 +53,12 @@ BROKEN = {
 
 
 def install(packages: Packages) -> None:
-    """Each in a package of its own; two of one name; one with damaged metadata besides."""
+    """Each in a package of its own; two of one name."""
     for name, source in BROKEN.items():
         module = f"broken_{name.replace('-', '_')}"
         packages.install(f"acme-{name}", {"fprf.encoders": {name: f"{module}:C"}}, code={module: source})
     for k in (1, 2):
         packages.install(f"acme-clash-{k}", {"fprf.encoders": {"clash": f"broken_unbuilt:C{k}"}})
-    packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
 
 
 def run(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
@@ -71,6 +70,7 @@ def run(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
 def test_help_and_the_list_with_all_of_them_installed(tmp_path: Path) -> None:
     with packages_in(tmp_path) as packages:
         install(packages)
+        packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
     shown = run(tmp_path, "--help")
     assert shown.returncode == 0 and "usage: fprf VERB" in shown.stdout and not shown.stderr
     listed = run(tmp_path, "plugins")
