@@ -71,7 +71,7 @@ class SceneDecoder(Decoder):
         colour: Tensor = self(styled)
         return colour
 
-    def unaided(self, content: Annotated[Tensor, "N C"]) -> None:
+    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> None:
         """None: there is nothing besides."""
 
 

@@ -148,7 +148,7 @@ class Decoder(nn.Module, ABC):
         """
 
     @abstractmethod
-    def unaided(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"] | None:
+    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"] | None:
         """`forward` without the scene's own parameters; None where there are none.
 
         Training asks for these colours as well: they are what a new style starts from.

@@ -118,7 +118,7 @@ class Rendered(NamedTuple):
     sampled: Sampled | None = None
     counts: Mapping[str, int] = {}
     """How many samples were placed, kept, decoded: what was skipped can be read off."""
-    unaided: Annotated[Tensor, "R 3"] | None = None
+    frozen_rgb: Annotated[Tensor, "R 3"] | None = None
     """In training: the colour without the decoder's parameters that are the scene's own, if it has any."""
 
 

@@ -185,7 +185,7 @@ class Bright(Decoder):
     def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
         return self(styled)
 
-    def unaided(self, content: Tensor) -> None:
+    def frozen_colour(self, content: Tensor) -> None:
         return None
 
 

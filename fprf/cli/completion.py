@@ -1,7 +1,7 @@
 """`fprf completion bash|zsh|fish`: a script by which a shell completes verbs, their words, flags and files.
 
-tyro completes one parser; this command has one for each verb and, of `train`, for each method. So every verb is asked for
-its flags once, when the script is made, and pressing the key starts no program.
+tyro (shtab) and argcomplete complete one parser; here each verb has its own and, of `train`, each method. So every verb is
+asked for its flags once, when the script is made, and pressing the key starts no program, which would take 0.1 s and more.
 """
 
 import contextlib
@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from ..errors import FprfError, UsageError
+from ..export.config import KINDS
 from ..plugins.registry import installed
 from .parsing import LIST_FLAGS
 
@@ -26,7 +27,7 @@ Make it again after installing a plug-in."""
 _WORDS = {
     "pretrain": ("content", "semantic", "decoder"),
     "bench": ("speed", "profile", "memory", "restyle", "peer"),
-    "export": ("ply", "splat", "glb", "cameras", "lut"),
+    "export": tuple(KINDS),
     "completion": ("bash", "zsh", "fish"),
 }
 """Words of verbs that have a few."""
@@ -55,12 +56,13 @@ def run(args: list[str]) -> int:
 
 def offers() -> dict[str, Offer]:
     """Every verb with its words and flags; a verb that cannot say goes without flags."""
+    from .bench import NAMES
     from .main import VERBS, packaged
 
-    found = {}
+    known, found = _WORDS | {"bench": tuple(NAMES)}, {}
     summaries = {verb: about.summary for verb, about in VERBS.items()}
     for verb, summary in (summaries | {verb: f"of {package}" for verb, package in packaged().items()}).items():
-        words = tuple(installed("fprf.methods")) if verb == "train" else _WORDS.get(verb, ())
+        words = tuple(installed("fprf.methods")) if verb == "train" else known.get(verb, ())
         asked: Sequence[str | None] = words if verb in _FIRST or verb == "train" else (None,)
         flags = {flag for word in asked for flag in _flags(verb, word)}
         found[verb] = Offer(summary, words, tuple(sorted({*flags, "--help"})))

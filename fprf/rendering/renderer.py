@@ -173,7 +173,7 @@ def render_rays(
     """
     marched = march(rays, parts, budget=budget, step=step, generator=generator)
     kept, count = marched.kept, len(rays.near)
-    rgb = content = semantic = unaided = None
+    rgb = content = semantic = frozen_rgb = None
     if want & (Want.COLOUR | Want.CONTENT):
         features = parts.field.content(kept.latent, kept.view)
         if kept.gradient_scale is not None:
@@ -182,14 +182,16 @@ def render_rays(
             still = kept if content_moves_density else kept._replace(weight=kept.weight.detach())
             content = composite(still, features, count)
         if Want.COLOUR in want:
-            behind = 0.0 if background is None else marched.transmittance[:, None] * background
-            rgb = composite(kept, _colour(features, kept, parts, restyle), count) + behind
-            if step is not None and (alone := parts.decoder.unaided(features)) is not None:
-                unaided = composite(kept, alone, count) + behind
+            backdrop = 0.0 if background is None else marched.transmittance[:, None] * background
+            rgb = composite(kept, _colour(features, kept, parts, restyle), count) + backdrop
+            if step is not None and (alone := parts.decoder.frozen_colour(features)) is not None:
+                frozen_rgb = composite(kept, alone, count) + backdrop
     if Want.SEMANTIC in want and parts.semantic is not None:
         semantic = _semantics(marched, _fixed(rays), parts, count if semantic_rays is None else semantic_rays, semantic_samples)
     counts = {"rays": count, "samples": marched.weights.numel(), "kept": len(kept.ray)}
-    return Rendered(marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts, unaided)
+    return Rendered(
+        marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts, frozen_rgb
+    )
 
 
 def _colour(features: Annotated[Tensor, "M C"], kept: Kept, parts: Parts, restyle: Restyle | None) -> Annotated[Tensor, "M 3"]:

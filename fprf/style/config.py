@@ -23,12 +23,12 @@ __all__ = [
     "NO_MASK",
     "PRESETS",
     "Pixel",
+    "RegionValue",
     "StyleConfig",
-    "Wish",
     "find_reference",
     "labels",
+    "parse_region_value",
     "parse_strength",
-    "parse_wish",
     "pixel_of",
     "preset_flags",
     "with_preset",
@@ -38,7 +38,7 @@ __all__ = [
 _PIXEL = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
 
 
-class Wish(NamedTuple):
+class RegionValue(NamedTuple):
     """What is wanted of a region."""
 
     region: str
@@ -52,17 +52,17 @@ class Pixel(NamedTuple):
     y: float
 
 
-def parse_wish(field: str, text: str) -> Wish:
+def parse_region_value(field: str, text: str) -> RegionValue:
     """`REGION=VALUE`, at the last equals sign. Raises ConfigError naming the field."""
     region, equals, value = text.rpartition("=")
     if not (equals and region and value):
         raise ConfigError(f"{field}: {text!r} is not REGION=VALUE; write for example 3=autumn.jpg or IMG_0012:120,80=0")
-    return Wish(region, value)
+    return RegionValue(region, value)
 
 
 def parse_strength(field: str, text: str) -> tuple[str, float]:
     """`REGION=STRENGTH` with a strength in [0, 1]. Raises ConfigError."""
-    region, value = parse_wish(field, text)
+    region, value = parse_region_value(field, text)
     try:
         strength = float(value)
     except ValueError:
@@ -110,7 +110,7 @@ NO_MASK = Path("none")
 
 @dataclass(frozen=True, kw_only=True)
 class StyleConfig:
-    """How photographs become the style of a scene. REGION and REFERENCE are explained in `style.wishes`."""
+    """How photographs become the style of a scene. REGION and REFERENCE are explained above."""
 
     references: tuple[Path, ...] = ()
     """Photographs whose style the scene takes, or folders of them."""
@@ -153,7 +153,7 @@ class StyleConfig:
             between("keep_below", self.keep_below, -1.0, 1.0)
         for name in ("pin", "forbid"):
             for text in getattr(self, name):
-                parse_wish(name, text)
+                parse_region_value(name, text)
         for text in self.region_strength:
             parse_strength("region_strength", text)
         for name in ("weights", "masks"):

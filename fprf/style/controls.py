@@ -66,7 +66,7 @@ def allowed_references(
     pin: Mapping[int, Set[int]] | None = None,
     forbid: Sequence[tuple[int, int]] = (),
 ) -> Annotated[Tensor, "regions references"]:
-    """Which references each region may take codes from, bool: all, but for the user's wishes.
+    """Which references each region may take codes from, bool: all, but for what the user excludes.
 
     `pin` maps a region to the only references that it may take from; `forbid` holds (region, reference) pairs that may not
     meet. Raises UsageError for numbers out of range or a region that is left with nothing.

@@ -27,7 +27,7 @@ def regional(
     """The stylizer that heeds which references each region may take from; that of all of them where nothing is excluded."""
     if bool(allowed.all()):
         return config.build(dictionary=dictionary, scene=scene)
-    if config.heeds_regions:
+    if config.handles_allowed_references:
         return config.build(dictionary=dictionary._replace(allowed=allowed), scene=scene)
     rows = [tuple(row) for row in allowed.tolist()]
     choices = sorted(set(rows))

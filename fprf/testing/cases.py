@@ -98,7 +98,7 @@ class _Sigmoid(Decoder):
     def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
         return styled[:, :3].sigmoid()
 
-    def unaided(self, content: Tensor) -> None:
+    def frozen_colour(self, content: Tensor) -> None:
         return None
 
 

@@ -127,10 +127,12 @@ def check_decoder(config: DecoderConfig, *, encoder: str, channels: int) -> None
     same(decoder.restyled(content, content, 0.0), colour, 0.0, f"{name}.restyled: must be forward at strength 0")
     pointwise(lambda points: decoder.restyled(points, points + 1, 0.6), content, f"{name}.restyled")
     own = [parameter for parameter in decoder.parameters() if parameter.requires_grad]
-    alone = decoder.unaided(content)
-    require((alone is None) == (not own), f"{name}.unaided: colours where it has parameters to train, None where it is frozen")
+    alone = decoder.frozen_colour(content)
+    require(
+        (alone is None) == (not own), f"{name}.frozen_colour: colours where it has parameters to train, None where it is frozen"
+    )
     if alone is not None:
-        tensor(alone, (18, 3), f"{name}.unaided")
+        tensor(alone, (18, 3), f"{name}.frozen_colour")
         moved = torch.autograd.grad(alone.sum() + colour.sum(), own, allow_unused=True)
         require(all(each is not None for each in moved), f"{name}: no gradient reaches a parameter that wants one")
     decoder.double()
@@ -163,11 +165,14 @@ def check_stylizer(config: StylizerConfig) -> None:
         whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(11), 1e-4)
         require(whole, f"{name}.match: rows must be shares that sum to 1")
         _stylizer_follows(stylizer.double(), content.double(), semantic.double(), name)
-    if config.heeds_regions:
+    if config.handles_allowed_references:
         both = cases.dictionary(4, 8, 4)._replace(reference=torch.tensor([0, 0, 1, 1]), names=("one", "other"))
         pinned = both._replace(allowed=torch.tensor([[True, False]] * 3))
         match = config.build(dictionary=pinned, scene=cases.scene(3, 8, 4)).match(cases.normal(11, 4))
-        require(not bool(match[:, 2:].any()), f"{name}: heeds_regions is true, but codes that are not allowed are taken")
+        require(
+            not bool(match[:, 2:].any()),
+            f"{name}: handles_allowed_references is true, but codes that are not allowed are taken",
+        )
 
 
 def check_sampler(config: SamplerConfig) -> None:

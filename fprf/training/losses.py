@@ -82,9 +82,9 @@ def terms(
     result: dict[str, Tensor] = {}
     if rendered.rgb is not None and config.rgb > 0:
         result["rgb"] = F.mse_loss(rendered.rgb, batch.rgb)
-        if rendered.unaided is not None:
+        if rendered.frozen_rgb is not None:
             # Else the scene's own part of a decoder would do the frozen part's work, and a new style would have nothing.
-            result["unaided"] = F.mse_loss(rendered.unaided, batch.rgb)
+            result["unaided"] = F.mse_loss(rendered.frozen_rgb, batch.rgb)
     if config.content > 0 and rendered.content is not None and batch.content is not None:
         result["content"] = F.mse_loss(rendered.content, batch.content) / facts.content_scale**2
     if config.semantic > 0 and rendered.semantic is not None and batch.semantic is not None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UsageError
-from ..style.config import StyleConfig, find_reference, labels, parse_strength, parse_wish
+from ..style.config import StyleConfig, find_reference, labels, parse_region_value, parse_strength
 from ..style.controls import allowed_references
 from ..style.dictionary import StyleDictionary
 from ..style.files import StyleFile
@@ -103,7 +103,7 @@ class _Book:
 
     def pairs(self, field: str, texts: Sequence[str]) -> list[tuple[Found, int]]:
         """Regions and references of REGION=REFERENCE; a mask may mean several regions."""
-        wishes = [parse_wish(field, text) for text in texts]
+        wishes = [parse_region_value(field, text) for text in texts]
         return [(found, find_reference(w.value, self.references)) for w in wishes for found in self.find(w.region)]
 
     def label(self, reference: int) -> str:

@@ -63,5 +63,5 @@ def toned(rendered: Rendered, tones: Tones | None, view: Annotated[Tensor, "R"])
     if tones is None or rendered.rgb is None:
         return rendered
     factor = tones(view)
-    unaided = None if rendered.unaided is None else rendered.unaided * factor
-    return rendered._replace(rgb=rendered.rgb * factor, unaided=unaided)
+    frozen_rgb = None if rendered.frozen_rgb is None else rendered.frozen_rgb * factor
+    return rendered._replace(rgb=rendered.rgb * factor, frozen_rgb=frozen_rgb)

@@ -86,7 +86,7 @@ def test_a_decoder_of_the_scene_starts_grey_and_learns() -> None:
     decoder = SceneDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels, seed=3)
     again = SceneDecoderConfig().build(encoder=encoder.identity, channels=encoder.channels, seed=3)
     content = torch.randn(50, encoder.channels)
-    assert torch.equal(decoder(content), torch.full((50, 3), 0.5)) and decoder.unaided(content) is None
+    assert torch.equal(decoder(content), torch.full((50, 3), 0.5)) and decoder.frozen_colour(content) is None
     assert all(torch.equal(a, b) for a, b in zip(decoder.parameters(), again.parameters(), strict=True))
     target = content[:, :3].sigmoid()
     optimizer = torch.optim.Adam(decoder.parameters(), lr=1e-2)

@@ -260,14 +260,14 @@ def test_training_sees_both_colours_and_rendering_one(background: torch.Tensor |
         return render_rays(rays, parts, want=Want.COLOUR, budget=0.0, background=background, step=step)
 
     both, shown = render(parts, 0), render(parts, None)
-    assert shown.unaided is None
-    assert both.rgb is not None and both.unaided is not None
+    assert shown.frozen_rgb is None
+    assert both.rgb is not None and both.frozen_rgb is not None
     decoder = parts.decoder
     assert isinstance(decoder, ResidualDecoder)
     alone = render(parts._replace(decoder=decoder.frozen), 0)
-    assert alone.rgb is not None and alone.unaided is None
-    assert torch.equal(both.unaided, alone.rgb)
-    assert float((both.rgb - both.unaided).abs().max()) > 0.02
+    assert alone.rgb is not None and alone.frozen_rgb is None
+    assert torch.equal(both.frozen_rgb, alone.rgb)
+    assert float((both.rgb - both.frozen_rgb).abs().max()) > 0.02
 
 
 def rendered_of(rgb: float, unaided: float | None) -> Rendered:
@@ -280,7 +280,7 @@ def rendered_of(rgb: float, unaided: float | None) -> Rendered:
         rgb=colour(rgb),
         weights=torch.ones(1, 1),
         sampled=Sampled(edges, edges),
-        unaided=None if unaided is None else colour(unaided),
+        frozen_rgb=None if unaided is None else colour(unaided),
     )
 
 

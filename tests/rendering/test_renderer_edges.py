@@ -41,7 +41,7 @@ class Plain(Decoder):
     def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
         return self(styled)
 
-    def unaided(self, content: Tensor) -> None:
+    def frozen_colour(self, content: Tensor) -> None:
         return None
 
 
@@ -153,7 +153,7 @@ def test_content_is_not_asked_for_where_nobody_wants_it(want: Want) -> None:
 class Aided(toys.Squash):
     """A decoder with a part that helps it: alone it answers half."""
 
-    def unaided(self, content: Tensor) -> Tensor:  # type: ignore[override]
+    def frozen_colour(self, content: Tensor) -> Tensor:  # type: ignore[override]
         return self(content) / 2
 
 
@@ -162,6 +162,6 @@ def test_training_also_renders_what_the_decoder_says_alone() -> None:
     behind = torch.tensor([0.2, 0.4, 0.6])
     found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, background=behind)
     transmittance = 1 - found.opacity[:, None]
-    assert found.rgb is not None and found.unaided is not None
-    assert torch.allclose(found.unaided - transmittance * behind, (found.rgb - transmittance * behind) / 2, atol=1e-5)
-    assert render_rays(rays, parts, want=Want.COLOUR, budget=0.0).unaided is None
+    assert found.rgb is not None and found.frozen_rgb is not None
+    assert torch.allclose(found.frozen_rgb - transmittance * behind, (found.rgb - transmittance * behind) / 2, atol=1e-5)
+    assert render_rays(rays, parts, want=Want.COLOUR, budget=0.0).frozen_rgb is None

@@ -32,7 +32,7 @@ class Straight(Decoder):
     def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
         return self.forward(styled)
 
-    def unaided(self, content: Tensor) -> None:
+    def frozen_colour(self, content: Tensor) -> None:
         return None
 
 

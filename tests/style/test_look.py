@@ -28,7 +28,7 @@ class Sigmoid(Decoder):
         self.strength = strength
         return self.forward(styled)
 
-    def unaided(self, content: Tensor) -> None:
+    def frozen_colour(self, content: Tensor) -> None:
         return None
 
 

@@ -19,7 +19,7 @@ from fprf.types import Batch, Rendered
 
 def rendered(rgb: torch.Tensor, unaided: torch.Tensor | None = None) -> Rendered:
     nothing = torch.zeros(len(rgb))
-    return Rendered(nothing, nothing, rgb, unaided=unaided)
+    return Rendered(nothing, nothing, rgb, frozen_rgb=unaided)
 
 
 @settings(deadline=None)
@@ -61,7 +61,7 @@ def test_only_colours_are_touched() -> None:
     assert toned(plain, None, view) is plain
     out = toned(plain, tones, view)
     torch.testing.assert_close(out.rgb, rgb * tones(view))
-    torch.testing.assert_close(out.unaided, rgb / 2 * tones(view))
+    torch.testing.assert_close(out.frozen_rgb, rgb / 2 * tones(view))
     assert out.depth is plain.depth and out.content is None
 
 

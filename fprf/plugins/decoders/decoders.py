@@ -57,7 +57,7 @@ class MlpDecoder(Decoder):
         colour: Tensor = self(styled)
         return colour
 
-    def unaided(self, content: Annotated[Tensor, "N C"]) -> None:
+    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> None:
         """None: it has no parameters of a scene."""
 
 
@@ -157,7 +157,7 @@ class ResidualDecoder(Decoder):
         share = residual_share(logit - self.frozen.logit(hidden), strength, self._fade)
         return torch.sigmoid(logit + share * self.head(hidden))
 
-    def unaided(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
+    def frozen_colour(self, content: Annotated[Tensor, "N C"]) -> Annotated[Tensor, "N 3"]:
         """sigmoid(D)."""
         colour: Tensor = self.frozen(content)
         return colour

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ...interfaces import Stylizer
     from ...style.dictionary import StyleDictionary
     from ...style.scene import SceneStyle
-    from .region import RegionMaps, RegionPlan
 
 __all__ = [
     "AdainConfig",
@@ -37,8 +36,8 @@ class StylizerConfig(PluginConfig):
 
     group: ClassVar[str] = "fprf.stylizers"
 
-    heeds_regions: ClassVar[bool] = False
-    """Its stylizers heed `StyleDictionary.allowed` themselves. For others every choice of references gets one of its own."""
+    handles_allowed_references: ClassVar[bool] = False
+    """Its stylizers apply `StyleDictionary.allowed` themselves. For others every choice of references gets one of its own."""
 
     features: float = 1.0
     """How much of the change of features counts, in [0, 1]."""
@@ -118,7 +117,9 @@ class LocalAdainConfig(StylizerConfig):
 class _RegionConfig(StylizerConfig):
     """What all two-sided stylizers have: points belong to scene regions, regions match style codes."""
 
-    heeds_regions: ClassVar[bool] = True
+    handles_allowed_references: ClassVar[bool] = True
+    transport: ClassVar[bool] = False
+    """Whether each region's map is the optimal transport of all channels, else AdaIN, channel by channel."""
 
     temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
@@ -156,17 +157,12 @@ class _RegionConfig(StylizerConfig):
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         """The two-sided stylizer towards these references, with this kind of maps."""
         from ...style.matching import Matching
-        from .region import TwoSidedStylizer, plan_regions
+        from .region import ChannelMaps, MatrixMaps, TwoSidedStylizer, plan_regions
 
         matching = Matching(self.temperature, self.similarity, self.whitening, self.recentred, self.centred)
         plan = plan_regions(dictionary, scene, matching, self.smoothing(scene, dictionary.allowed))
-        return TwoSidedStylizer(plan, scene, self._maps(plan, scene))
-
-    def _maps(self, plan: RegionPlan, scene: SceneStyle) -> RegionMaps:
-        """AdaIN's."""
-        from .region import ChannelMaps
-
-        return ChannelMaps(plan, scene, self.gain)
+        maps = MatrixMaps if self.transport else ChannelMaps
+        return TwoSidedStylizer(plan, scene, maps(plan, scene, self.gain))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,11 +174,7 @@ class RegionAdainConfig(_RegionConfig):
 class RegionOtConfig(_RegionConfig):
     """Two-sided optimal transport: regions match style codes, all channels move together."""
 
-    def _maps(self, plan: RegionPlan, scene: SceneStyle) -> RegionMaps:
-        """Matrices."""
-        from .region import MatrixMaps
-
-        return MatrixMaps(plan, scene, self.gain)
+    transport: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True)

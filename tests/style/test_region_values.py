@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import ConfigError, UsageError
-from fprf.style.config import Pixel, Wish, find_reference, labels, parse_strength, parse_wish, pixel_of
+from fprf.style.config import Pixel, RegionValue, find_reference, labels, parse_region_value, parse_strength, pixel_of
 
 PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
 
@@ -11,19 +11,19 @@ PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/ni
 @pytest.mark.parametrize(
     ("text", "wish"),
     [
-        ("3=autumn.jpg", Wish("3", "autumn.jpg")),
-        ("IMG_0012:120,80=0", Wish("IMG_0012:120,80", "0")),
-        ("a=b:mask.png=x.jpg", Wish("a=b:mask.png", "x.jpg")),
+        ("3=autumn.jpg", RegionValue("3", "autumn.jpg")),
+        ("IMG_0012:120,80=0", RegionValue("IMG_0012:120,80", "0")),
+        ("a=b:mask.png=x.jpg", RegionValue("a=b:mask.png", "x.jpg")),
     ],
 )
-def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: Wish) -> None:
-    assert parse_wish("pin", text) == wish
+def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: RegionValue) -> None:
+    assert parse_region_value("pin", text) == wish
 
 
 @pytest.mark.parametrize("text", ["3", "=a.jpg", "3=", "="])
 def test_half_a_wish_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r"^pin: .* is not REGION=VALUE; write for example 3=autumn\.jpg"):
-        parse_wish("pin", text)
+        parse_region_value("pin", text)
 
 
 def test_strengths_are_numbers_in_a_range() -> None:
