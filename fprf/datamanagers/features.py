@@ -42,22 +42,7 @@ from .config import GuidedConfig
 if TYPE_CHECKING:
     from ..ops.guided_kernels import ViewTable
 
-__all__ = [
-    "GREY",
-    "LANES",
-    "Entry",
-    "FeatureStore",
-    "Progress",
-    "digest",
-    "extract",
-    "keep_within",
-    "pack",
-    "read_entry",
-    "read_tensors",
-    "remove_stale",
-    "write_entry",
-    "write_tensors",
-]
+__all__ = ["FeatureStore", "Progress", "extract"]
 
 
 GREY = 0.5

@@ -29,7 +29,6 @@ __all__ = [
     "IMAGE_SUFFIXES",
     "MAX_PIXELS",
     "Image",
-    "ImageHeader",
     "header_of",
     "load_image",
     "load_images",

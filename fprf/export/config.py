@@ -17,19 +17,7 @@ if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..rendering.renderer import Restyle
 
-__all__ = [
-    "KINDS",
-    "ExportConfig",
-    "Look",
-    "Named",
-    "Plan",
-    "look_file",
-    "make_looks",
-    "named_styles",
-    "plan",
-    "style_name",
-    "styles_of",
-]
+__all__ = ["KINDS", "ExportConfig", "Look", "Plan", "look_file", "make_looks", "named_styles", "plan", "styles_of"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,6 @@ __all__ = [
     "cosine_map",
     "default_reach",
     "depth_gaps",
-    "ray_quantile",
     "render_depth_maps",
     "spread_views",
     "surface_points",

@@ -31,7 +31,7 @@ from ..training.style_pass import lattice
 from ..types import Rays
 from .colours import shade
 
-__all__ = ["RAYS", "ColourPairs", "apply_lattice", "colour_pairs", "fit_lattice", "fit_quality", "identity", "write_cube"]
+__all__ = ["colour_pairs", "fit_quality", "write_cube"]
 
 
 SMOOTH = 1e-3

@@ -25,18 +25,7 @@ from ..splats.files.ply import ply_file
 from .depth_maps import DepthMaps, cosine_map, depth_gaps
 from .point_cloud import SPAN, Cloud, cells, keys, origin_comment, vertex_table
 
-__all__ = [
-    "Mesh",
-    "SignedDistance",
-    "build_mesh",
-    "components",
-    "integrate",
-    "lattice_near",
-    "surface_nets",
-    "vertex_normals",
-    "write_mesh_glb",
-    "write_mesh_ply",
-]
+__all__ = ["build_mesh", "write_mesh_glb", "write_mesh_ply"]
 
 
 _TRUNCATION = 3.0

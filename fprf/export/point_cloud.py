@@ -21,20 +21,15 @@ from ..splats.files.ply import ply_file
 from .depth_maps import DepthMaps, Surface, depth_gaps, surface_points
 
 __all__ = [
-    "LEVELS",
     "SPAN",
     "Cloud",
     "cells",
     "concatenate",
-    "finest_only",
     "fuse",
     "keys",
     "origin_comment",
     "origin_of",
-    "overlapping_views",
-    "pooled",
     "sky_dome",
-    "spacing",
     "vertex_table",
     "write_points",
 ]

@@ -18,7 +18,7 @@ from ..splats.files.ply import ply_bytes
 from ..splats.gaussians import HARMONIC, Gaussians
 from .point_cloud import Cloud
 
-__all__ = ["Splats", "rotation_to_normal", "surface_discs", "write_gaussians", "write_splat"]
+__all__ = ["surface_discs", "write_gaussians", "write_splat"]
 
 _WIDTH = 0.55
 """Standard deviation along the surface, in spacings."""

@@ -8,7 +8,7 @@ import torch
 from ..rendering.cameras import Cameras
 from ..rendering.lens import FISHEYE, OPENCV
 
-__all__ = ["Json", "transforms"]
+__all__ = ["transforms"]
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float"
 

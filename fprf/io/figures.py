@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple, TypeAlias
 
-__all__ = ["Figure", "Metrics", "figures", "number"]
+__all__ = ["Metrics", "figures", "number"]
 
 Metrics: TypeAlias = "Mapping[str, float | int | str | Metrics | None]"
 

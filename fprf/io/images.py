@@ -20,18 +20,7 @@ from torch import Tensor
 from ..errors import DataError, NumericsError
 from .atomic import write_bytes
 
-__all__ = [
-    "Format",
-    "Picture",
-    "checked",
-    "data_uri",
-    "encode",
-    "shrink",
-    "srgb_to_linear",
-    "to_uint8",
-    "write_exr",
-    "write_image",
-]
+__all__ = ["Picture", "checked", "data_uri", "encode", "shrink", "srgb_to_linear", "to_uint8", "write_exr", "write_image"]
 
 _Float = TypeVar("_Float", bound=np.floating)
 Picture: TypeAlias = NDArray[np.uint8]

@@ -15,7 +15,7 @@ from .figures import number
 if TYPE_CHECKING:
     from ..training.events import History
 
-__all__ = ["Series", "axis_ticks", "bar_chart", "line_chart", "sparkline", "write_report", "write_scalars"]
+__all__ = ["Series", "bar_chart", "line_chart", "sparkline", "write_report", "write_scalars"]
 
 
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 560, 260, 58, 12, 12, 34

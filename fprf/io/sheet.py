@@ -13,7 +13,7 @@ from ..errors import DataError
 from .images import Picture, checked
 from .maps import palette
 
-__all__ = ["Tile", "contact_sheet", "highlight", "seam_positions", "side_by_side", "wipe"]
+__all__ = ["Tile", "contact_sheet", "highlight", "side_by_side", "wipe"]
 
 
 _SIDE = 240

@@ -29,21 +29,7 @@ from .config import SfmConfig
 from .scene_folder import SceneFolder, State, step_key
 from .worker import NO_MODEL, NO_PYCOLMAP
 
-__all__ = [
-    "MatchTables",
-    "Pair",
-    "build_vocabulary",
-    "count_rows",
-    "descriptors",
-    "exhaustive_pairs",
-    "find_features",
-    "find_matches",
-    "find_poses",
-    "sequential_pairs",
-    "similar_pairs",
-    "union_of_pairs",
-    "vlad_vectors",
-]
+__all__ = ["MatchTables", "find_features", "find_matches", "find_poses"]
 
 
 _MAX_IMAGES = 2147483647

@@ -24,21 +24,7 @@ from ..io.atomic import atomic_path, write_bytes
 from .config import SfmConfig
 from .scene_folder import SceneFolder, State, step_key
 
-__all__ = [
-    "VIDEO_SUFFIXES",
-    "Choice",
-    "Lens",
-    "choose_frames",
-    "frame_name",
-    "frame_scores",
-    "gather_images",
-    "heic_exif_block",
-    "lens_of",
-    "natural_order",
-    "read_lens",
-    "save_frames",
-    "sharpness",
-]
+__all__ = ["gather_images"]
 
 
 _SIDE = 960

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json
 
-__all__ = ["Drop", "Matches", "SceneFolder", "State", "dropped_images", "report", "step_key", "summary_rows"]
+__all__ = ["SceneFolder", "State", "report", "step_key", "summary_rows"]
 
 
 _FORMAT = 1

@@ -33,19 +33,7 @@ from .config import BlockNerfConfig
 from .town import cache_folder
 from .views import View, assemble_scene, index_tensor, rigid_pose
 
-__all__ = [
-    "BlockNerfParser",
-    "Example",
-    "Feature",
-    "RayCamera",
-    "crc32c",
-    "fit_camera",
-    "is_record",
-    "masked",
-    "read_examples",
-    "read_records",
-    "record_files",
-]
+__all__ = ["BlockNerfParser", "crc32c", "is_record", "masked", "read_examples"]
 
 
 _POLYNOMIAL = 0x82F63B78

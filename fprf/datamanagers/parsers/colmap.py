@@ -27,19 +27,7 @@ from .config import ColmapConfig
 from .files import path_inside, read_bytes, read_npz
 from .views import View, assemble_scene, rigid_pose
 
-__all__ = [
-    "MODELS",
-    "Cloud",
-    "ColmapCamera",
-    "ColmapImage",
-    "ColmapModel",
-    "ColmapParser",
-    "cloud_of_images",
-    "cloud_of_model",
-    "model_folder",
-    "read_cloud",
-    "read_model",
-]
+__all__ = ["ColmapParser", "cloud_of_model", "model_folder", "read_cloud", "read_model"]
 
 
 MODELS = (

@@ -21,17 +21,7 @@ from ..images import read_header
 from ..scene import Scene
 from .files import name_of
 
-__all__ = [
-    "MASKS",
-    "SKY_MASKS",
-    "View",
-    "assemble_scene",
-    "check_images_exist",
-    "every_eighth",
-    "find_masks",
-    "index_tensor",
-    "rigid_pose",
-]
+__all__ = ["View", "assemble_scene", "check_images_exist", "index_tensor", "rigid_pose"]
 
 
 MASKS, SKY_MASKS = "masks", "sky_masks"
