@@ -12,6 +12,7 @@ from torch import Tensor
 from fprf.checks import at_least
 from fprf.cli.bench import bench_run
 from fprf.config import RenderConfig
+from fprf.datamanagers.bounds import find_space
 from fprf.datamanagers.scene import Scene
 from fprf.errors import FprfError
 from fprf.evaluation.config import BenchConfig
@@ -19,7 +20,6 @@ from fprf.evaluation.report import Outcome, machine, table
 from fprf.evaluation.subject import attempt, exact, find, settings, test_view, view_rays
 from fprf.io.atomic import write_text
 from fprf.plugins.stylizers.config import RegionOtConfig
-from fprf.rendering.bounds import find_space
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.renderer import render_rays
 from fprf.style.look import Restyle

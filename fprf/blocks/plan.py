@@ -19,11 +19,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..datamanagers.bounds import FAR, NEAR, ROUNDING, axes
 from ..datamanagers.scene import TILES, Scene, Sightings, find_sightings, tile_of
 from ..errors import ConfigError, DataError
 from ..fields.layouts import LayoutConfig
 from ..io.images import Picture
-from ..rendering.bounds import FAR, NEAR, ROUNDING, axes
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.space import Space
 from ..types import Boxes, Site

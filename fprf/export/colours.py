@@ -16,7 +16,8 @@ from ..memory import chunk_size
 from ..plugins.samplers.config import UniformConfig
 from ..plugins.samplers.samplers import UniformSampler
 from ..rendering.cameras import Cameras, project
-from ..rendering.renderer import March, Parts, Restyle, composite, march
+from ..rendering.renderer import March, Parts, composite, march
+from ..style.look import Restyle
 from ..training.model import Facts, Model, background_of
 from ..training.views import on_host
 from ..types import Rays, Want

@@ -15,7 +15,7 @@ from ..style.files import StyleFile, check_photographs, read_style, with_folders
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
-    from ..rendering.renderer import Restyle
+    from ..style.look import Restyle
 
 __all__ = ["KINDS", "ExportConfig", "Look", "Plan", "look_file", "make_looks", "named_styles", "plan", "styles_of"]
 

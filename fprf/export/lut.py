@@ -23,7 +23,8 @@ from ..config import RenderConfig
 from ..io.atomic import write_text
 from ..memory import chunk_size
 from ..rendering.cameras import Cameras, rays_through
-from ..rendering.renderer import Restyle, composite
+from ..rendering.renderer import composite
+from ..style.look import Restyle
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 from ..training.model import Model

@@ -10,7 +10,7 @@ In training on an accelerator every sample is kept and what is left out has weig
 number of samples in each step. Geometry stays in full precision under autocast: a density is an exponential.
 """
 
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -19,12 +19,14 @@ from torch import Tensor
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
 from ..ops import march as compiled
 from ..ops.precision import full_precision
-from ..style.look import Restyle
 from ..types import Rays, Rendered, Sampled, View, Want
 from .space import Space
 from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_weights
 
-__all__ = ["Kept", "Parts", "Restyle", "enlarged", "march", "render_rays"]
+if TYPE_CHECKING:
+    from ..style.look import Restyle
+
+__all__ = ["Kept", "Parts", "enlarged", "march", "render_rays"]
 
 
 _NEAR_CAMERA = 4.0
@@ -158,7 +160,7 @@ def render_rays(
     want: Want,
     budget: float,
     background: Annotated[Tensor, "3"] | None = None,
-    restyle: Restyle | None = None,
+    restyle: "Restyle | None" = None,
     step: int | None = None,
     generator: torch.Generator | None = None,
     semantic_rays: int | None = None,
@@ -194,7 +196,9 @@ def render_rays(
     )
 
 
-def _colour(features: Annotated[Tensor, "M C"], kept: Kept, parts: Parts, restyle: Restyle | None) -> Annotated[Tensor, "M 3"]:
+def _colour(
+    features: Annotated[Tensor, "M C"], kept: Kept, parts: Parts, restyle: "Restyle | None"
+) -> Annotated[Tensor, "M 3"]:
     if restyle is None or restyle.idle:
         plain: Tensor = parts.decoder(features)
         return plain

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from ..config import StatisticsConfig
+from ..datamanagers.bounds import find_space
 from ..datamanagers.images import load_images
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..plugins.encoders.config import BundledSemanticConfig
-from ..rendering.bounds import find_space
 from ..rendering.cameras import project
 from ..training import checkpoint
 from ..training.interrupts import held_back

@@ -16,7 +16,8 @@ from ..config import RenderConfig
 from ..interfaces import Decoder
 from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras
-from ..rendering.renderer import Kept, Restyle, composite, march
+from ..rendering.renderer import Kept, composite, march
+from ..style.look import Restyle
 from ..types import Rays, View, Want
 from .model import Facts, Model, background_of
 from .views import on_host, view_rays

@@ -12,12 +12,12 @@ from torch import Tensor
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.batches import WHITE
+from ..datamanagers.bounds import find_space
 from ..datamanagers.features import FeatureStore
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, exposures_differ, find_sightings, with_exposure
 from ..errors import PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
-from ..rendering.bounds import find_space
 from ..rendering.space import Space
 from .budget import find_downscale
 from .decoder import build_decoder

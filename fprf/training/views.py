@@ -10,7 +10,8 @@ from ..config import RenderConfig
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, grid_rays, rays_through
-from ..rendering.renderer import Restyle, composite, enlarged, march, render_rays
+from ..rendering.renderer import composite, enlarged, march, render_rays
+from ..style.look import Restyle
 from ..types import Rays, Rendered, View, Want
 from .model import Facts, Model, background_of
 

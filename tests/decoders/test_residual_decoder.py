@@ -17,7 +17,8 @@ from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
 from fprf.plugins.decoders.decoders import MlpDecoder, ResidualDecoder, residual_share
 from fprf.plugins.encoders.config import BundledContentConfig
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
-from fprf.rendering.renderer import Parts, Restyle, render_rays
+from fprf.rendering.renderer import Parts, render_rays
+from fprf.style.look import Restyle
 from fprf.style.scene import own_style
 from fprf.testing import check_decoder
 from fprf.training.loading import Trained, load_run

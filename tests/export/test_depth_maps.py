@@ -19,8 +19,8 @@ from fprf.export.depth_maps import (
     surface_points,
 )
 from fprf.rendering.cameras import pixel_grid, rays_through
-from fprf.rendering.renderer import Restyle
 from fprf.rendering.space import Space
+from fprf.style.look import Restyle
 from fprf.training.views import render_view
 
 angle = st.floats(-1.0, 1.0)

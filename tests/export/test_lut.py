@@ -11,7 +11,7 @@ from tiny_world import World
 
 from fprf.export.lut import ColourPairs, apply_lattice, colour_pairs, fit_lattice, fit_quality, identity, write_cube
 from fprf.plugins.stylizers.config import RegionOtConfig
-from fprf.rendering.renderer import Restyle
+from fprf.style.look import Restyle
 from fprf.training.loading import load_style
 from fprf.training.restyle import restyle
 from fprf.training.views import render_view

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from toy_parts import Never, Ones, Shift, Squash, Uniform, parts_of, rays_of, space_of
 
 from fprf.plugins.samplers.config import UniformConfig
-from fprf.rendering.renderer import Parts, Restyle, render_rays
+from fprf.rendering.renderer import Parts, render_rays
 from fprf.rendering.space import Kind
+from fprf.style.look import Restyle
 from fprf.types import Rays, Rendered, Want
 
 pytestmark = pytest.mark.usefixtures("form")

@@ -13,7 +13,7 @@ from fprf.plugins.stylizers.config import (
     RegionOtConfig,
     StylizerConfig,
 )
-from fprf.rendering.renderer import Restyle
+from fprf.style.look import Restyle
 from fprf.style.scene import own_style
 from fprf.training.loading import load_style
 from fprf.training.matches import match_map

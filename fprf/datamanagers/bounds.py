@@ -11,10 +11,10 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from ..datamanagers.scene import Scene
 from ..errors import DataError
-from .cameras import Cameras, rays_through
-from .space import Kind, Space
+from ..rendering.cameras import Cameras, rays_through
+from ..rendering.space import Kind, Space
+from .scene import Scene
 
 __all__ = ["FAR", "NEAR", "ROUNDING", "axes", "find_kind", "find_space", "focus"]
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from fprf.datamanagers import bounds
+from fprf.datamanagers.bounds import find_kind, find_space, focus
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
-from fprf.rendering import bounds
-from fprf.rendering.bounds import find_kind, find_space, focus
 from fprf.rendering.cameras import Cameras, rays_through
 from fprf.rendering.space import Space
 

@@ -1,0 +1,52 @@
+"""Packages import each other in one direction: every module-level import leads to a layer before, so that there is no cycle."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import fprf
+
+ROOT = Path(fprf.__file__).parent
+ORDER = (
+    *("version", "errors", "types", "memory", "checks", "process", "io", "interfaces", "configs"),
+    *("ops", "town", "rendering", "datamanagers", "style", "fields", "plugins", "blocks", "testing"),
+    *("training", "splats", "pretraining", "reconstruction", "evaluation", "export"),
+    *("viewer", "api", "cli", "__main__"),
+)
+"""Layers from the lowest to the highest. Imports within functions, such as those of `build`, may lead anywhere."""
+MECHANISM = ("config.py", "methods.py", "layouts.py")
+"""Files of any package that belong to the configs, as do the modules of `plugins` itself: none of them imports torch."""
+HELD = {("viewer", "cli")}
+"""Imports that lead upwards and are to be moved."""
+
+
+def layer(parts: tuple[str, ...]) -> str:
+    """The layer of a module by its path below `fprf`."""
+    if parts in ((), ("__init__",)):
+        return "version"
+    plugins = parts[0] == "plugins" and len(parts) <= 2 and parts[-1] != "weights"
+    return "configs" if plugins or (f"{parts[-1]}.py" in MECHANISM and parts[0] not in ("blocks", "export")) else parts[0]
+
+
+def imported(file: Path) -> Iterator[tuple[str, ...]]:
+    """Paths below `fprf` of the modules that a module imports when it is loaded."""
+    here = file.relative_to(ROOT).parts[:-1]
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = (*here[: len(here) - node.level + 1], *(node.module.split(".") if node.module else ()))
+            for alias in node.names:
+                whole = (*base, alias.name)
+                module = (ROOT.joinpath(*whole).with_suffix(".py").is_file() or ROOT.joinpath(*whole).is_dir()) and alias.name
+                yield whole if module else base
+
+
+def test_imports_lead_to_lower_layers() -> None:
+    breaches = set()
+    for file in ROOT.rglob("*.py"):
+        own = layer(file.relative_to(ROOT).with_suffix("").parts)
+        for other in map(layer, imported(file)):
+            if own != other and "__init__" not in (own, other) and (own, other) not in HELD:
+                assert own in ORDER and other in ORDER, f"{own} or {other} has no place in ORDER"
+                if ORDER.index(other) > ORDER.index(own):
+                    breaches.add(f"{file.relative_to(ROOT)}: {own} imports {other}")
+    assert not breaches
