@@ -23,7 +23,7 @@ def fprf() -> TrainConfig:
 
 
 def fprf_lite() -> TrainConfig:
-    """Bundled encoders, no download, made for a CPU: `fprf demo` trains it."""
+    """Bundled encoders, no download, made for a CPU."""
     return TrainConfig(
         steps=12_000,
         datamanager=RayBatchesConfig(rays=2048, semantic_share=0.25),

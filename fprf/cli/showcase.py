@@ -82,6 +82,7 @@ def write_page(
     scene: "Scene",
     *,
     title: str,
+    lead: str = "",
     facts: Mapping[str, str | int | float],
     views: Sequence[int],
     originals: "Sequence[View]",
@@ -89,8 +90,9 @@ def write_page(
     references: Mapping[str, Path],
     metrics: Mapping[str, Any],
     film: Path | None = None,
+    credits: Sequence[str] = (),
 ) -> None:
-    """Write the page. `references` are all photographs by the names that the page gives them."""
+    """Write the page: `lead` opens it, `credits` end it. `references` are all photographs by the names that it gives them."""
     from ..datamanagers.images import load_image
     from ..io.gallery import Reference, Style, write_gallery
     from ..io.images import to_uint8
@@ -102,6 +104,7 @@ def write_page(
     write_gallery(
         path,
         title=title,
+        lead=lead,
         scene=facts,
         view_names=[scene.names[view] for view in views],
         originals=[to_uint8(view.rgb) for view in originals],
@@ -120,6 +123,7 @@ def write_page(
         depth=[depth_image(view.depth, view.opacity, limits) for view in originals],
         metrics=metrics,
         video=film,
+        credits=credits,
     )
 
 

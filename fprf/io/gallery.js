@@ -1,5 +1,10 @@
 (() => {
   "use strict";
+  const flight = document.querySelector("video.flight");
+  if (flight && !matchMedia("(prefers-reduced-motion: reduce)").matches) {
+    const seen = ([entry]) => (entry.isIntersecting ? flight.play().catch(() => {}) : flight.pause());
+    new IntersectionObserver(seen, { threshold: 0.3 }).observe(flight);
+  }
   const wipe = document.querySelector(".wipe");
   if (!wipe) return;
   const slider = wipe.querySelector("input");

@@ -80,9 +80,16 @@ _LEAST, _MOST = 760, 2.6
 
 
 def _compare(
-    view_names: Sequence[str], originals: Sequence[Picture], styles: Sequence[Style], known: Mapping[str, Reference]
+    view_names: Sequence[str],
+    originals: Sequence[Picture],
+    styles: Sequence[Style],
+    known: Mapping[str, Reference],
+    film: str = "",
 ) -> str:
-    """The stage with its choices: what lies left and right of the wipe, and of which view; nothing without styles."""
+    """The stage with its choices: what lies left and right of the wipe, and of which view; nothing without styles.
+
+    A film stands beside the wipe.
+    """
     if not styles:
         return ""
     first = originals[0]
@@ -92,11 +99,12 @@ def _compare(
         f"{_stack(style, known)}<span>{escape(style.name)}</span></button>"
         for index, style in enumerate(styles)
     )
-    film = "\n".join(
+    strip = "\n".join(
         f'<button type="button" data-view="{index}" aria-pressed="{str(index == 0).lower()}" title="{escape(name)}">'
         f"{_img(picture, _VIEW_SIDE, f'View {name}, original', eager=True)}</button>"
         for index, (name, picture) in enumerate(zip(view_names, originals, strict=True))
     )
+    beside = film and f'\n<figure class="beside" style="--ratio:{_ratio(first)}">{film}</figure>'
     return f"""<section class="compare" id="compare" aria-label="Compare">
 <div class="stage">
 <figure class="wipe" style="--at:50%;--ratio:{_ratio(first)};--most:{most:.0f}px">
@@ -105,7 +113,7 @@ def _compare(
 <span class="tag one">Original</span><span class="tag two">{escape(styles[0].name)}</span>
 <input type="range" min="0" max="100" step="any" value="50" aria-label="How much of the original is shown">
 <span class="seam"></span>
-</figure>
+</figure>{beside}
 </div>
 <div class="choose">
 <div class="against"><label for="left">Left side</label>
@@ -118,7 +126,7 @@ def _compare(
 </div></div>
 <div><h2 id="pick-view">View</h2>
 <div class="film" role="group" aria-labelledby="pick-view">
-{film}
+{strip}
 </div></div>
 </div>
 </section>"""
@@ -228,6 +236,7 @@ def write_gallery(
     path: Path,
     *,
     title: str,
+    lead: str = "",
     scene: Mapping[str, str | int | float],
     view_names: Sequence[str],
     originals: Sequence[Picture],
@@ -236,32 +245,39 @@ def write_gallery(
     depth: Sequence[Picture] = (),
     metrics: "Metrics | None" = None,
     video: Path | None = None,
+    credits: Sequence[str] = (),
 ) -> None:
     """Write the page to `path` (.html), whole or not at all.
 
     `scene` holds a few facts by their labels ("Photographs": 34). `originals` are the unstylised renders. A film is
-    embedded where it is H.264 of at most 8 MiB, else linked beside the page. Every name is shown as text, whatever it
-    holds. Raises DataError where numbers of views differ or a style names an unknown reference.
+    embedded where it is H.264 or WebP of at most 8 MiB, else linked beside the page. Where views are higher than wide it
+    stands beside the comparison. Every name, `lead` and every line of `credits` are shown as text, whatever they hold.
+    Raises DataError where numbers of views differ or a style names an unknown reference.
     """
     _fitting(view_names, originals, references, styles)
     known = {reference.name: reference for reference in references}
+    film = "" if video is None else _film(video, path)
+    upright = originals[0].shape[0] > originals[0].shape[1]
+    beside = film if upright and styles else ""
     parts = [
-        ("", _opening(title, scene)),
-        ("Compare", _compare(view_names, originals, styles, known)),
+        ("", _opening(title, lead, scene)),
+        ("Compare", _compare(view_names, originals, styles, known, beside)),
+        ("Flight", _flight(film) if film and not beside else ""),
         ("Overview", _overview(view_names, originals, styles)),
         ("Styles", _styles_section(view_names, styles, known)),
         ("Geometry", _geometry(view_names, depth)),
-        ("Flight", "" if video is None else _flight(video, path)),
         ("Figures", _figures(metrics or {})),
     ]
     present = [(name, part) for name, part in parts if part]
     here = files(__package__)
     page = Template((here / "gallery.html").read_text("utf-8")).substitute(
         title=escape(title),
+        shape="upright" if upright else "",
         css=(here / "gallery.css").read_text("utf-8"),
         script=(here / "gallery.js").read_text("utf-8"),
         nav="\n".join(f'<a href="#{name.lower()}">{name}</a>' for name, _ in present if name),
         body="\n".join(part for _, part in present),
+        credits="\n".join(f"<p>{escape(line)}</p>" for line in credits),
     )
     write_text(path, page)
 
@@ -282,10 +298,11 @@ def _fitting(
             raise DataError(f"gallery: style {style.name} has {len(style.shares)} shares of {len(style.references)} references")
 
 
-def _opening(title: str, scene: Mapping[str, str | int | float]) -> str:
+def _opening(title: str, lead: str, scene: Mapping[str, str | int | float]) -> str:
     facts = "\n".join(f"<div><dt>{escape(name)}</dt><dd>{escape(number(fact))}</dd></div>" for name, fact in scene.items())
     listed = f'\n<dl class="facts">\n{facts}\n</dl>' if facts else ""
-    return f'<section class="opening">\n<h1>{escape(title)}</h1>{listed}\n</section>'
+    told = f'\n<p class="lead">{escape(lead)}</p>' if lead else ""
+    return f'<section class="opening">\n<h1>{escape(title)}</h1>{told}{listed}\n</section>'
 
 
 def _geometry(view_names: Sequence[str], depth: Sequence[Picture]) -> str:
@@ -298,20 +315,26 @@ def _geometry(view_names: Sequence[str], depth: Sequence[Picture]) -> str:
 </section>"""
 
 
-def _flight(video: Path, page: Path) -> str:
+def _film(video: Path, page: Path) -> str:
     with video.open("rb") as film:
         data = film.read(_EMBEDDED_VIDEO + 1)
+    small = len(data) <= _EMBEDDED_VIDEO
     beside = quote(Path(os.path.relpath(video, page.parent)).as_posix())
     # The codec's box lies at the front of what we write; other codecs do not play in browsers.
-    if b"avc1" not in data:
+    animated, plays = video.suffix.lower() == ".webp", b"avc1" in data
+    media = "image/webp" if animated else "video/mp4"
+    source = f"data:{media};base64,{base64.b64encode(data).decode('ascii')}" if small else escape(beside)
+    if animated and small:
+        return f'<img class="flight" src="{source}" alt="Flight through the scene" decoding="async">'
+    if not plays:
         link = f'<a href="{escape(beside)}">{escape(video.name)}</a>'
-        shown = f'<p class="lead">This film needs a player outside of the browser: {link}</p>'
-    else:
-        small = len(data) <= _EMBEDDED_VIDEO
-        source = f"data:video/mp4;base64,{base64.b64encode(data).decode('ascii')}" if small else escape(beside)
-        kind = 'controls loop muted playsinline preload="metadata" aria-label="Flight through the scene"'
-        shown = f'<video src="{source}" {kind}></video>'
-    return f'<section id="flight">\n<h2>Flight</h2>\n<div class="film-box">{shown}</div>\n</section>'
+        return f'<p class="lead">This film needs a player outside of the browser: {link}</p>'
+    kind = 'controls loop muted playsinline preload="metadata" aria-label="Flight through the scene"'
+    return f'<video class="flight" src="{source}" {kind}></video>'
+
+
+def _flight(film: str) -> str:
+    return f'<section id="flight">\n<h2>Flight</h2>\n<div class="film-box">{film}</div>\n</section>'
 
 
 def _figures(metrics: "Metrics") -> str:

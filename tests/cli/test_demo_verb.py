@@ -1,44 +1,65 @@
 import json
-import shutil
+import re
 from dataclasses import replace
+from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import pytest
-from tiny_world import World
+import torch
 
 import fprf.methods
 from fprf.cli import main as cli
-from fprf.datamanagers.parsers.config import TownConfig
+from fprf.cli.demo import fading
+from fprf.datamanagers.parsers.config import parse_scene
+from fprf.splats.files import read_capture
+from fprf.style.look import Restyle
+
+GARDEN = Path(str(files("fprf") / "garden"))
 
 
-@pytest.fixture
-def _small(world: World, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The demo's own code on a smaller town and a smaller model."""
-    monkeypatch.setattr(fprf.methods, "fprf_lite", lambda: replace(world.config, output=None, steps=10))
-    made = TownConfig.__init__
-    monkeypatch.setattr(made, "__kwdefaults__", made.__kwdefaults__ | {"views": 10, "width": 32, "height": 24})
-    monkeypatch.setattr("fprf.cli.demo.LOOKS", {"autumn": (3, 9), "night": (2, 4)})
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.mark.usefixtures("_small")
-def test_the_demo_from_nothing_to_a_gallery(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = ["demo", "--output", "out", "--minutes", "5", "--frames", "4"]
+def test_the_demo_from_nothing_to_a_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = replace(fprf.methods.fprf_splats(), steps=10, initial=800, cap=900)
+    monkeypatch.setattr(fprf.methods, "fprf_splats", lambda: small)
     out = tmp_path / "out"
-    (out / "references").mkdir(parents=True)
-    shutil.copy(world.references[1], out / "references" / "night.png")
-    assert cli.main(args) == 0, "and pictures that lie there already are not painted again"
-    assert {p.name for p in out.iterdir()} >= {"run", "references", "film.mp4", "metrics.json", "gallery.html"}
+    args = ["demo", "--output", str(out), "--minutes", "5", "--frames", "10", "--downscale", "8"]
+    assert cli.main(args) == 0
+    styles = ["all-together.ply", "autumn.ply", "night.ply", "sunset.ply", "winter.ply"]
+    assert {p.name for p in out.iterdir()} >= {"run", "film.mp4", "metrics.json", "garden.html", *styles}
+    plain, *others = [read_capture(out / name).gaussians for name in ("night.ply", "autumn.ply", "winter.ply")]
+    assert all(torch.equal(plain.means, each.means) and not torch.equal(plain.harmonics, each.harmonics) for each in others)
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics.keys() >= {
-        "method", "scene", "psnr", "ssim", "dictionary_seconds", "restyled_seconds_per_view", "total_seconds", "per_view",
-    }  # fmt: skip
-    assert (metrics["scene"], metrics["views"], metrics["train_steps"]) == ("town", 2, 10)
-    assert sorted(p.name for p in (out / "references").iterdir()) == ["autumn.png", "night.png"]
-    assert (out / "references" / "night.png").read_bytes() == world.references[1].read_bytes()
-    page = (out / "gallery.html").read_text()
-    assert "autumn + night" in page and "http://" not in page.replace("http://www.w3.org", "")
-    assert "open out/gallery.html" in capsys.readouterr().out
+    assert (metrics["method"], metrics["scene"], metrics["views"], metrics["train_steps"]) == ("fprf-splats", "garden", 4, 10)
+    assert metrics["total_seconds"] > metrics["new_style_seconds"] > 0
+    page = (out / "garden.html").read_text()
+    assert "CC BY 4.0" in page and not re.findall(r"""(?:src|href)=["'](?!data:|#)""", page), "it loads nothing"
+    assert f"open {out / 'garden.html'}" in capsys.readouterr().out
+
+
+def test_held_out_views_of_the_garden_are_surrounded_by_others() -> None:
+    scene = parse_scene(GARDEN, 1, None)
+    assert len(scene.train) == 21 and scene.points is not None
+    train, test = ([int(view) for view in views] for views in (scene.train, scene.test))
+    assert len(test) == 4 and all({view - 1, view + 1} <= {*train} for view in test)
+
+
+def test_photographs_that_ship_are_credited_and_small() -> None:
+    credits = (GARDEN / "README.md").read_text()
+    references = sorted((GARDEN / "references").iterdir())
+    assert references and all(path.stem in credits for path in references)
+    assert all(max(cv2.imread(str(path)).shape) <= 640 for path in references)
+    assert sum(path.stat().st_size for path in GARDEN.rglob("*") if path.is_file()) < 3e6
+
+
+def test_the_film_fades_from_look_to_look() -> None:
+    looks = [Restyle(None, strength) for strength in (0.0, 0.5, 1.0)]  # type: ignore[arg-type]  # nothing is rendered
+    strengths = [sum(part.share * part.strength for part in fading(looks, 30)(frame).parts) for frame in range(30)]
+    assert strengths == sorted(strengths) and strengths[0] == 0 and strengths[-1] == 1
+    assert max(b - a for a, b in pairwise(strengths)) < 0.11
+    assert strengths.count(0.5) >= 5
 
 
 @pytest.mark.parametrize(("args", "told"), [(["--minutes", "0"], "--minutes: 0.0 must be above 0"),

@@ -4,18 +4,14 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from pretend_cuda import pretend_cuda
 from tiny_world import World
 
-import fprf.methods
 from fprf.cli import main as cli
-from fprf.datamanagers.parsers.config import TownConfig
 from fprf.ops import backend
 from fprf.plugins.weights import read_weights
 
@@ -136,18 +132,3 @@ def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatc
         ran(["eval", str(tmp_path / device), "--fit-poses", "--images", "false"], device)
         found.append(content(tmp_path / device / "metrics.json"))
     assert found[0] == found[1]
-
-
-@pytest.mark.slow
-def test_the_demo(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fprf.methods, "fprf_lite", lambda: replace(world.config, output=None, steps=2))
-    made = TownConfig.__init__
-    monkeypatch.setattr(made, "__kwdefaults__", made.__kwdefaults__ | {"views": 10, "width": 32, "height": 24})
-    monkeypatch.setattr("fprf.cli.demo.LOOKS", {"night": (2, 4)})
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "out" / "references").mkdir(parents=True)
-    shutil.copy(world.references[1], tmp_path / "out" / "references" / "night.png")
-    ran(["demo", "--output", "out", "--minutes", "5", "--frames", "2"], DEVICE)
-    assert {p.name for p in (tmp_path / "out").iterdir()} >= {"run", "film.mp4", "metrics.json", "gallery.html"}
-    assert json.loads((tmp_path / "out" / "run" / "config.json").read_text())["config"]["device"] == DEVICE
-    assert torch.isfinite(torch.tensor(json.loads((tmp_path / "out" / "metrics.json").read_text())["psnr"]))

@@ -166,6 +166,18 @@ def test_a_film_that_browsers_cannot_play_is_offered_as_a_file(tmp_path: Path) -
     assert not page.all("video") and page.all("a", href="flight.mp4")
 
 
+def test_an_animated_picture_plays_without_h264_and_stands_beside_upright_views(tmp_path: Path) -> None:
+    flight = tmp_path / "flight.webp"
+    write_video(flight, (np.full((32, 24, 3), index * 20, np.uint8) for index in range(6)), 12)
+    page = page_of(tmp_path / "wide.html", video=flight, credits=["By A <a@b>", EVIL])
+    (shown,) = page.all("img", **{"class": "flight"})
+    assert base64.b64decode(shown["src"].removeprefix("data:image/webp;base64,")) == flight.read_bytes()
+    assert page.all("section", id="flight") and {"By A <a@b>", EVIL} <= {*page.text}
+    upright = [picture(index, 40, 30) for index in range(3)]
+    page = page_of(tmp_path / "upright.html", video=flight, originals=upright, styles=[Style("dusk", upright)])
+    assert page.all("figure", **{"class": "beside"}) and not page.all("section", id="flight")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
