@@ -2,7 +2,7 @@
 
     python -m benchmarks viewer_tour RUN --references autumn.png winter.png night.png [--output docs/images]
 
-RUN is a trained run, by preference one of `town`; `fprf demo` leaves photographs that suit it in demo/references. Writes
+RUN is a trained run, by preference one of `town`. Writes
 viewer-tour.mp4 and viewer-style.png, viewer-wipe.png, viewer-region.png, viewer-matches.png, viewer-flight.png. Needs the
 extras `viewer` and `video`, playwright and a Chromium. The film shows one picture of the page after the other: its clock is
 not that of the machine; benchmarks/viewer_speed.py measures times.

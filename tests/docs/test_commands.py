@@ -23,6 +23,7 @@ from fprf.cli.main import VERBS
 from fprf.io.atomic import write_json
 from fprf.io.video import write_video
 from fprf.splats.files import write_gaussians
+from fprf.testing import check_encoder
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -55,7 +56,7 @@ FEWER = {"render": ["--frames", "2"], "export": ["--tolerance", "0.3", "--agree"
 FEWER["restyle"] = ["--views", "3", "--size", "64", "48", "--regions", "3"]
 """The tiny model renders few frames, and has barely begun to agree with itself."""
 SCENES = ("my_scene", "SCENE", "DIR", "FOLDER", "scenes/yard", "fox")
-RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite", "runs/yard-fprf-lite")
+RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite", "runs/my_scene-fprf-splats", "runs/yard-fprf-lite")
 PHOTOGRAPHS = ("autumn.jpg", "night.jpg", "dusk.jpg", "snow.jpg", "a.jpg", "A.jpg", "photos/one.jpg", "my_photos/one.jpg")
 CAPTURES = ("capture.ply", "plant.splat", "my_scan.spz")
 WEIGHTS = ("vgg19.safetensors", "F")
@@ -202,6 +203,17 @@ def test_scripts_are_there(command: Command) -> None:
     assert (ROOT / command.words[1]).is_file()
 
 
+def python_of(page: str) -> dict[str, Any]:
+    """What the one Python block of a page defines."""
+    [block] = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
+    defined: dict[str, Any] = {"__name__": "page"}
+    exec(compile(block, page, "exec"), defined)
+    return defined
+
+
 def test_the_python_of_the_plug_in_page_runs() -> None:
-    [block] = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "plugins.md").read_text(), re.DOTALL | re.MULTILINE)
-    exec(compile(block, "docs/plugins.md", "exec"), {})
+    assert python_of("docs/plugins.md")
+
+
+def test_the_plug_in_of_the_readme_keeps_its_contract() -> None:
+    check_encoder(python_of("README.md")["ContrastConfig"]())
