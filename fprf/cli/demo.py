@@ -93,7 +93,8 @@ def run(args: list[str]) -> int:
                 antialiased=True,
             )
         looks = [styles[0].styled.restyle.faded, *(style.styled.restyle for style in styles[: len(references)])]
-        tour = camera_path(opened.known, RenderVerbConfig(frames=config.frames, split="train"))[0]
+        # From one held-out view to the next, where other views surround the camera.
+        tour = camera_path(opened.known, RenderVerbConfig(frames=config.frames, split="test"))[0]
         frames = list(frames_of(scene, tour, fading(looks, len(tour)), display))
     film = config.output / "film.mp4"
     if write_video(film, frames, fps=12) == "mp4v":  # browsers do not play that
