@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ..training.model import Model
     from ..training.trainer import Report
     from .server import Access, ViewerServer
-    from .session import Session, Viewed
+    from .session import Session
     from .state import TrainingProgress
 
 __all__ = ["LiveViewer", "TrainingFollower", "ViewAddress", "main"]
@@ -279,7 +279,7 @@ class TrainingFollower:
         from safetensors.torch import load_file
 
         from .restyler import load_unfinished, measure_encoders, set_parameters
-        from .session import view_of_run
+        from .session import Viewed, view_of_run
         from .state import TrainingProgress
 
         tensors = load_file(path)
