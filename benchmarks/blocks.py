@@ -17,8 +17,7 @@ from fprf.blocks.plan import boxes_to
 from fprf.io.atomic import write_json
 from fprf.rendering.renderer import render_rays
 from fprf.style.look import Restyle
-from fprf.training.blocks import SURROUNDINGS, folder_of
-from fprf.training.lay_out import load_boxes
+from fprf.training.blocks import SURROUNDINGS, folder_of, load_boxes
 from fprf.training.loading import Trained, load_run
 from fprf.training.views import render_view
 from fprf.types import Boxes, Want

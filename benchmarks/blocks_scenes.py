@@ -19,7 +19,8 @@ from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import train_scene
 from fprf.fields.layouts import SingleConfig
 from fprf.process import keep_memory
-from fprf.training.lay_out import lay_out, load_boxes, plan_scene
+from fprf.training.block_plan import lay_out, plan_scene
+from fprf.training.blocks import load_boxes
 from fprf.training.loading import load_run
 
 from .common import add_entry, arguments, split_flags

@@ -24,9 +24,9 @@ from fprf.io.images import shrink, write_image
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.config import PRESETS, StyleConfig, with_preset
 from fprf.style.files import StyleFile
-from fprf.training.cached_view import cache_view
 from fprf.training.loading import load_run
 from fprf.training.restyle import apply_style
+from fprf.training.views import cache_view
 
 from .common import RESULTS, arguments, report
 from .pictures import sheet

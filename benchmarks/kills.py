@@ -32,14 +32,14 @@ from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.town.write import write_town
-from fprf.training import lay_out, prepare, style_pass, trainer
+from fprf.training import block_plan, prepare, style_pass, trainer
 from fprf.training.checkpoint import load
 from fprf.training.checkpoint import steps as saved
 
 from .common import arguments, report
 
 KILLED = -9
-PARTS = (lay_out, prepare, style_pass, trainer)
+PARTS = (block_plan, prepare, style_pass, trainer)
 """What a training imports when it begins: here already, so that children start at once."""
 SPAN = 0.7
 """Seconds after a process's first save within which it is killed."""

@@ -37,7 +37,8 @@ from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.town.write import write_town
 from fprf.training import trainer
-from fprf.training.lay_out import lay_out, load_boxes, plan_scene
+from fprf.training.block_plan import lay_out, plan_scene
+from fprf.training.blocks import load_boxes
 from fprf.training.loading import Trained, load_run
 from fprf.training.restyle import apply_style
 from fprf.training.views import render_view

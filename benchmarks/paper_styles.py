@@ -46,9 +46,9 @@ from fprf.style.look import Restyle
 from fprf.style.references import Encoders
 from fprf.style.scene import scene_style
 from fprf.style.statistics import covariance, group_moments, moments
-from fprf.training.cached_view import CachedView, cache_view
 from fprf.training.loading import Trained
 from fprf.training.restyle import apply_style
+from fprf.training.views import CachedView, cache_view
 
 from .style_runs import PLAIN, Exhibit, judge_exhibit
 

@@ -28,8 +28,8 @@ from fprf.datamanagers.parsers.config import parse_scene
 from fprf.evaluation.evaluate import align, judge
 from fprf.process import keep_memory
 from fprf.rendering.cameras import Cameras
+from fprf.training.camera_optimizers import rotated
 from fprf.training.loading import load_run
-from fprf.training.poses import rotated
 from fprf.training.prepare import with_downscale
 
 from .common import add_entry, arguments, split_flags

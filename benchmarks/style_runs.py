@@ -28,9 +28,9 @@ from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.town.write import read_truth
-from fprf.training.cached_view import cache_view
 from fprf.training.loading import Trained, load_run
 from fprf.training.restyle import apply_style
+from fprf.training.views import cache_view
 
 from .pictures import SETS, town_reference
 

@@ -187,9 +187,9 @@ class TrainedScene:
     def save_style(self, path: PathLike) -> None:
         """Write the style as a style.json. Raises UsageError without one, or for a mix made by `towards`."""
         styled = self._style("save_style")
-        if len(styled.restyle.parts) > 1 and styled.orders.saved.style.between is None:
+        if len(styled.restyle.parts) > 1 and styled.controls.saved.style.between is None:
             raise UsageError("save_style: a mix has no file of its own; save both styles, and give one `between` and `at`")
-        write_style(Path(path), styled.orders.saved)
+        write_style(Path(path), styled.controls.saved)
 
     def render(self, camera: Cameras | int | str) -> Shot:
         """One view: of a camera, or of a captured one by number or name. Raises UsageError for several cameras."""

@@ -286,7 +286,7 @@ class TrainConfig(RunConfig):
 
     def verbs(self) -> "Verbs":
         """How a run of fields is trained, judged, filmed and exported."""
-        from .cli.fields import FieldVerbs
+        from .cli.verbs import FieldVerbs
 
         return FieldVerbs(self)
 

@@ -58,7 +58,7 @@ def test_views_go_by_number_and_name(scene: TrainedScene) -> None:
 def test_a_preset_is_what_it_sets(scene: TrainedScene, world: World) -> None:
     styled = scene.stylize(world.references[:1], luminance=1.0, preset="gentle").styled
     assert styled is not None
-    assert styled.orders.saved.style == with_preset(StyleConfig(references=tuple(world.references[:1])), "gentle")
+    assert styled.controls.saved.style == with_preset(StyleConfig(references=tuple(world.references[:1])), "gentle")
 
 
 def test_scenes_never_change(scene: TrainedScene, world: World) -> None:

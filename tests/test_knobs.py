@@ -24,9 +24,9 @@ from fprf.io.images import write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import from_json, to_json
 from fprf.training import checkpoint
+from fprf.training.loop import progress
 from fprf.training.model import build_model
 from fprf.training.prepare import device_of, prepare
-from fprf.training.schedule import progress
 from fprf.training.style_pass import measure_style
 from fprf.training.trainer import Loop, optimizer_of
 from fprf.training.views import render_view

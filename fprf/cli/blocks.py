@@ -4,14 +4,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .event_log import EventLog
-from .progress import Display
+from .progress import Display, EventLog
 
 if TYPE_CHECKING:
     from ..blocks.plan import Plan
     from ..config import TrainConfig
     from ..datamanagers.scene import Scene
-    from ..training.block_task import BlockTask
+    from ..training.blocks import BlockTask
     from ..training.model import Model
     from ..training.run import Run
     from ..training.trainer import Report
@@ -38,9 +37,8 @@ def train_blocks(
     With a `view` all is trained here, where it can be looked at, whatever the executor.
     """
     from ..style.scene import to_tensors
-    from ..training.block_task import BlockTask
-    from ..training.blocks import SURROUNDINGS
-    from ..training.lay_out import lay_out, write_down
+    from ..training.block_plan import lay_out, write_down
+    from ..training.blocks import SURROUNDINGS, BlockTask
     from ..training.loading import load_run
     from ..training.prepare import device_of
     from ..training.style_pass import measure_style
@@ -80,8 +78,7 @@ def block_minutes(config: "TrainConfig", blocks: int, spent: float) -> tuple[flo
 
 def run_block(task: "BlockTask", view: "LiveViewer | None" = None) -> None:
     """Train one block, here or on a worker, and show how it goes."""
-    from ..training.block_task import train_block
-    from ..training.blocks import SURROUNDINGS, folder_of
+    from ..training.blocks import SURROUNDINGS, folder_of, train_block
     from ..training.run import Run
 
     name = "surroundings" if task.block == SURROUNDINGS else f"block {task.block:02d}"
@@ -111,8 +108,7 @@ def show_plan(config: "TrainConfig", method: str, output: Path) -> None:
     from ..blocks.plan import top_view
     from ..io.atomic import write_json
     from ..io.images import write_image
-    from ..training.estimate import estimates
-    from ..training.lay_out import plan_scene
+    from ..training.block_plan import estimates, plan_scene
 
     scene, plan = plan_scene(config)
     rows = estimates(config, scene, plan)

@@ -251,7 +251,7 @@ def run_folder(folder: Path) -> Iterator[Finding]:
 
 def _trouble(folder: Path) -> Iterator[Finding]:
     """What training noted on the way: skipped steps, damaged checkpoints."""
-    from ..training.events import read_history
+    from ..training.run import read_history
 
     if not (folder / "events.jsonl").is_file():
         return

@@ -68,7 +68,7 @@ def keyed_looks(scene: "Scene", keys: Sequence[Key]) -> "Callable[[int], Restyle
             check_photographs(key.style, file)
             styled = apply_style(scene, file, encoders, (key.style.resolve(),))
             looks[key.style] = styled.restyle
-            for note in styled.orders.notes:
+            for note in styled.controls.notes:
                 print(f"{key.style}: {note}")
     frames = [key.frame for key in keys]
 

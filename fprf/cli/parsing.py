@@ -1,12 +1,15 @@
 """Arguments to a config: slots first, then every field as a flag, by tyro."""
 
+import ast
 import contextlib
 import dataclasses
+import inspect
 import io
 import json
 import os
 import shutil
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -15,22 +18,18 @@ from ..errors import ConfigError, PluginError, UsageError
 from ..plugins import registry
 from ..plugins.codec import Missing, load_config, method_config
 from ..plugins.slots import Slot, hints_of, resolve, slots
-from .describe import describe
 from .flags import Flag, explain, flags_of, spell
 
 if TYPE_CHECKING:
     from ..config import RunConfig, TrainConfig
 
-__all__ = ["DESCRIBE", "LIST_FLAGS", "load_field_method", "load_method", "methods", "parse"]
+__all__ = ["DESCRIBE", "LIST_FLAGS", "describe", "load_field_method", "load_method", "meanings", "methods", "parse"]
 
 C = TypeVar("C")
-
 LIST_FLAGS = "--list-flags"
 """Asks any verb for its flags, one a line: for shells that complete them."""
-
 DESCRIBE = "--describe"
 """Asks any verb for all of its flags with their meanings, as JSON."""
-
 _COLUMNS = 100
 
 
@@ -186,3 +185,53 @@ def _width(columns: int) -> Iterator[None]:
             del os.environ["COLUMNS"]
         else:
             os.environ["COLUMNS"] = before
+
+
+def describe(config: Any, *, prog: str, description: str, positional: Sequence[str]) -> str:
+    """The JSON text of a config that flags change."""
+    rows = []
+    for text, flag in flags_of(config).items():
+        owner = config
+        *way, name = flag.path.split(".")
+        for part in way:
+            owner = getattr(owner, part)
+        given = name if flag.path in positional else text
+        row = {"flag": given, "takes": flag.takes, "default": _written(getattr(owner, name)), "of": ".".join(way)}
+        rows.append(row | {"meaning": meanings(type(owner)).get(name, ""), "positional": flag.path in positional})
+    chosen = []
+    for slot in slots(config):
+        default = "none" if slot.value is None else registry.name_of(slot.kind.group, type(slot.value))
+        about = (slot.kind.__doc__ or "").strip().partition("\n")[0]
+        names = list(registry.installed(slot.kind.group))
+        chosen.append({"flag": f"--{slot.path.replace('_', '-')}", "one of": names, "default": default, "meaning": about})
+    return json.dumps({"prog": prog, "description": description, "flags": rows, "slots": chosen}, indent=1)
+
+
+def meanings(kind: type) -> dict[str, str]:
+    """The docstring below each field of a dataclass, those of its bases included; of a class without source, none."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(base):
+            continue
+        try:
+            body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
+        except (OSError, TypeError, SyntaxError):
+            continue
+        assert isinstance(body, ast.ClassDef)
+        for field, text in zip(body.body, body.body[1:], strict=False):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
+                said = text.value.value if isinstance(text.value, ast.Constant) else None
+                if isinstance(said, str):
+                    found[field.target.id] = " ".join(said.split())
+    return found
+
+
+def _written(value: Any) -> str:
+    """A default as it would be typed."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (tuple, list)):
+        return " ".join(map(_written, value))
+    return "" if isinstance(value, Path) and value == Path() else str(value)

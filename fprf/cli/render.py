@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..rendering.cameras import Cameras
     from ..style.files import StyleFile
     from ..style.look import Restyle
-    from ..training.footage import Take
+    from ..training.film import Take
     from ..training.loading import LoadedRun
     from ..training.run import Known
 
@@ -133,7 +133,7 @@ def _render(
     """Render the frames that are missing, each written as soon as it is done."""
     from ..io.images import write_exr, write_image
     from ..io.sheet import side_by_side, wipe
-    from ..training.footage import limits_of, panels, planes
+    from ..training.film import limits_of, panels, planes
 
     eyes = config.eyes if config.lens == "stereo" else None
     limits = limits_of(scene, cameras) if "depth" in config.show and todo else None
@@ -180,7 +180,7 @@ def _key(opened: "LoadedRun[Scene]", config: RenderVerbConfig, cameras: "Cameras
 def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list[Take]":
     """The looks of a film, at least one. Raises UsageError for a match map without a style to match."""
     from ..export.config import named_styles
-    from ..training.footage import Take
+    from ..training.film import Take
 
     takes = []
     if config.keyframes is not None:
@@ -201,11 +201,11 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
 
 
 def _styled_take(scene: "Scene", name: str, file: "StyleFile") -> "Take":
-    from ..training.footage import Take
+    from ..training.film import Take
     from ..training.restyle import apply_style
 
     styled = apply_style(scene, file)
-    for note in styled.orders.notes:
+    for note in styled.controls.notes:
         print(note)
     restyled = scene.restyled(styled.restyle)
     return Take(name, lambda frame: restyled, styled)

@@ -13,7 +13,7 @@ from ..errors import CheckpointError
 from .parsing import parse
 
 if TYPE_CHECKING:
-    from ..training.events import History
+    from ..training.run import History
 
 __all__ = ["ReportConfig", "run"]
 
@@ -41,7 +41,7 @@ def run(args: list[str]) -> int:
     if not config.run.is_dir():
         raise CheckpointError(f"{config.run}: no such folder; give a run folder, as `fprf train` makes it")
     from ..io.report import bar_chart, write_report
-    from ..training.events import read_history
+    from ..training.run import read_history
 
     histories = read_history(config.run)
     parts = _parts(config.run, histories)

@@ -100,15 +100,15 @@ def run(args: list[str]) -> int:
                     harmonics = torch.where(finite[:, None, None], harmonics, capture.gaussians.harmonics)
                 output = _named(config.output, name)
                 write_capture(output, capture, harmonics)
-                write_style(_beside(output, "style.json"), styled.orders.saved)
+                write_style(_beside(output, "style.json"), styled.controls.saved)
             made.append((name, styled, shown, time.perf_counter() - start))
         display.count(len(named), len(named), "restyling")
-    for note in dict.fromkeys(note for _, styled, _, _ in made for note in styled.orders.notes):
+    for note in dict.fromkeys(note for _, styled, _, _ in made for note in styled.controls.notes):
         print(note)
     if config.explain:
         folder = (config.output or config.sheet or config.page or Path("x")).parent
         for name, styled, _, _ in made:
-            print_explained(folder / name if name else folder, styled.orders.regions, styled)
+            print_explained(folder / name if name else folder, styled.controls.regions, styled)
         if not made:
             print_explained(folder, Regions(scene, *scene.measured(), file.regions, file.semantic_encoder), None)
     if config.sheet is not None or config.page is not None:

@@ -103,10 +103,8 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
     compiling = compile_beside((config.degree + 1) ** 2)  # while torch is imported and images are read
     from ..io.atomic import remove_unfinished
     from ..splats.training import facts_of, prepare, scene_of, train, with_downscale
-    from ..training import originals
-    from ..training.lock import held
-    from ..training.run import Run
-    from .event_log import EventLog
+    from ..training.run import Run, check_images, held, image_hashes, save_image_hashes
+    from .progress import EventLog
     from .train import check_same, default_output
 
     start = time.perf_counter()
@@ -121,13 +119,13 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
         check_same(folder, config)
         remove_unfinished(output)
         scene = scene_of(config)
-        marks = originals.fingerprints(scene)
+        marks = image_hashes(scene)
         if folder.exists and not others:
-            originals.refuse_others(output, scene, marks)
+            check_images(output, scene, marks)
         prepared = prepare(config, scene)
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
-        originals.keep(output, marks)
+        save_image_hashes(output, marks)
         folder.save_known(scene, config.data, facts_of(config, scene))
         display.say(f"{_described(scene)}, {prepared.learner.count} Gaussians at {prepared.origin}")
         log = EventLog(folder)

@@ -89,14 +89,14 @@ def run(args: list[str]) -> int:
         "codes": len(styled.codes.reference),
         "dead_channels": dead_channels(own.mean, own.covariance.diagonal()).nonzero().flatten().tolist(),
     }
-    for note in styled.orders.notes:
+    for note in styled.controls.notes:
         print(note)
     if config.explain:
-        print_explained(output, styled.orders.regions, styled)
+        print_explained(output, styled.controls.regions, styled)
     if config.match_only or not config.explain:
         made |= _make(scene, output, styled, views, config)
     save_dictionary(output / "dictionary.safetensors", styled.dictionary)
-    write_style(output / "style.json", styled.orders.saved, made)
+    write_style(output / "style.json", styled.controls.saved, made)
     return 0
 
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from ..errors import UsageError
 from .blocks import train_blocks
-from .event_log import EventLog
 from .live_view import VIEW, finish_view, open_view, take_view
 from .parsing import LIST_FLAGS, load_method, methods, parse
+from .progress import EventLog
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -87,12 +87,11 @@ def train_scene(
     """
     from ..io.atomic import remove_unfinished
     from ..style.scene import to_tensors
-    from ..training import originals, prepare, style_pass, trainer
-    from ..training.budget import Forecast
-    from ..training.lay_out import plan_scene
-    from ..training.lock import held
+    from ..training import prepare, style_pass, trainer
+    from ..training.block_plan import plan_scene
     from ..training.model import build_model
-    from ..training.run import Run
+    from ..training.prepare import Forecast
+    from ..training.run import Run, check_images, held, image_hashes, save_image_hashes
     from .progress import Display
 
     start = time.perf_counter()
@@ -112,15 +111,15 @@ def train_scene(
         marks: dict[str, str] = {}
 
         def look(scene: "Scene") -> None:
-            marks.update(originals.fingerprints(scene))
+            marks.update(image_hashes(scene))
             if folder.exists and not others:
-                originals.refuse_others(output, scene, marks)
+                check_images(output, scene, marks)
 
         if config.blocks.cuts:
             scene, plan = plan_scene(config)
             if plan.cut:
                 look(scene)
-                originals.keep(output, marks)
+                save_image_hashes(output, marks)
                 train_blocks(config, method, folder, scene, plan, display, start, view)
                 _say_outcome(folder, config, scene, display, time.perf_counter() - start)
                 finish_view(view, display)
@@ -128,7 +127,7 @@ def train_scene(
         prepared = prepare.prepare(config, _told_features(config, display), look, folder.saved_facts())
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
-        originals.keep(output, marks)
+        save_image_hashes(output, marks)
         folder.save_known(prepared.scene, config.data, prepared.facts)
         if prepared.basis is not None:
             folder.save_tensors("basis", prepared.basis.tensors())
@@ -178,7 +177,7 @@ def _described(prepared: "Prepared") -> str:
 
 def _check_needs(config: "TrainConfig", method: str, display: "Display") -> None:
     """Raise UsageError where something is missing that nothing downloads, after showing all that is missing."""
-    from ..training.needs import decoder_needs, plugin_needs, scene_needs
+    from ..training.prepare import decoder_needs, plugin_needs, scene_needs
 
     needs = plugin_needs(config)
     if config.data is not None and all(need.downloaded for need in needs):
@@ -237,7 +236,7 @@ def _told_features(config: "TrainConfig", display: "Display") -> "Callable[[int,
 
 def _say_outcome(folder: "Run", config: "TrainConfig", scene: "Scene", display: "Display", seconds: float) -> None:
     """Say the quality that training reached and the next command."""
-    from ..training.budget import outcome
+    from ..training.prepare import outcome
 
     quoted = shlex.quote(str(folder.root))
     found = outcome(folder.root, config, scene)
@@ -257,7 +256,7 @@ def check_same(folder: "Run", config: "RunConfig") -> None:
         return
     from ..config import RESUMABLE
     from ..plugins.typed_json import leaves
-    from ..training.lay_out import FREE
+    from ..training.blocks import FREE
 
     old, _ = folder.load_config()
     cut = [getattr(each, "blocks", None) for each in (old, config)]

@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from ..config import TrainConfig
     from ..export.config import ExportConfig
     from ..plugins.config import Need
     from ..style.files import StyleFile
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
-__all__ = ["Verbs", "verbs_of"]
+__all__ = ["FieldVerbs", "Verbs", "verbs_of"]
 
 
 class Verbs(ABC):
@@ -49,3 +50,44 @@ def verbs_of(run: Path) -> Verbs:
     from ..training.run import Run
 
     return Run(run).load_config()[0].verbs()
+
+
+class FieldVerbs(Verbs):
+    """Verbs on runs of fields; each calls its own module."""
+
+    def __init__(self, config: "TrainConfig") -> None:
+        self.config = config
+
+    def plan(self, method: str) -> None:
+        """Show the blocks and what they will cost."""
+        from .blocks import show_plan
+        from .train import default_output
+
+        show_plan(self.config, method, self.config.output or default_output(self.config, method))
+
+    def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
+        """Train a model."""
+        from .train import train_scene
+
+        return train_scene(self.config, method, quiet=quiet, view=view, others=others)
+
+    def needs(self) -> "list[Need]":
+        """List packages and weights that plug-ins and the decoder lack."""
+        from ..training.prepare import decoder_needs, plugin_needs
+
+        found = plugin_needs(self.config)
+        if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in found):
+            found = [*found, *decoder_needs(self.config)]
+        return found
+
+    def evaluate(self, config: "EvalConfig") -> dict[str, object]:
+        """Judge a model."""
+        from .eval import evaluate_fields
+
+        return evaluate_fields(config)
+
+    def export(self, config: "ExportConfig", file: "StyleFile") -> None:
+        """Fuse rendered depths, colour them, write the files."""
+        from .export import export_fields
+
+        export_fields(config, file)

@@ -18,9 +18,9 @@ from ..datamanagers.scene import Scene
 from ..memory import peak
 from ..rendering.cameras import Cameras, PixelRays
 from ..rendering.renderer import render_rays
+from ..training.camera_optimizers import moved, moving, rotated
 from ..training.loading import Trained
 from ..training.model import background_of
-from ..training.poses import moved, moving, rotated
 from ..training.prepare import reach_of
 from ..training.run import Known
 from ..training.views import render_view

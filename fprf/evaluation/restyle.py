@@ -25,9 +25,9 @@ from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.references import Encoders, encode_photograph
-from ..training.cached_view import CachedView
 from ..training.loading import Trained, load_run
 from ..training.restyle import dress
+from ..training.views import CachedView
 from ..types import Want
 from .config import RestyleConfig
 from .consistency import steadiness

@@ -12,11 +12,10 @@ from ..interfaces import Stylizer
 from ..plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from ..rendering.cameras import Cameras
 from ..style.look import Restyle
-from ..training.cached_view import cache_view
 from ..training.model import Facts, Model
 from ..training.prepare import Prepared
 from ..training.restyle import restyle
-from ..training.views import render_view
+from ..training.views import cache_view, render_view
 from .config import SpeedConfig
 from .naive import plain_planes, triplane_rows, without_skipping
 from .report import Outcome, Row, document, ratio, rows_table, spread

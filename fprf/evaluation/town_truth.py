@@ -33,9 +33,9 @@ from ..town.palettes import palette
 from ..town.render import View, geometry, render, walk
 from ..town.surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
 from ..town.write import TownSettings, is_town
-from ..training.cached_view import CachedView, cache_view
 from ..training.loading import Trained
 from ..training.prepare import scene_of
+from ..training.views import CachedView, cache_view
 from .metrics import delta_e, image_metrics, mean_metrics
 from .single_image import encoded
 

@@ -13,7 +13,7 @@ from .atomic import write_text
 from .figures import number
 
 if TYPE_CHECKING:
-    from ..training.events import History
+    from ..training.run import History
 
 __all__ = ["Series", "bar_chart", "line_chart", "sparkline", "write_report", "write_scalars"]
 

@@ -20,12 +20,11 @@ from ..errors import CheckpointError, NumericsError, UsageError
 from ..plugins.encoders.config import BundledSemanticConfig
 from ..rendering.cameras import project
 from ..training import checkpoint
-from ..training.interrupts import held_back
 from ..training.loading import LoadedRun
+from ..training.loop import held_back, progress
 from ..training.model import Facts
 from ..training.quality import PRESETS, QualityConfig
 from ..training.run import Known, Run
-from ..training.schedule import progress
 from ..training.trainer import REPORT_SECONDS, Report
 from .config import GaussiansConfig
 from .gaussians import Gaussians

@@ -14,7 +14,12 @@ four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
 """
 
 import copy
+import hashlib
 import json
+import shutil
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -22,35 +27,52 @@ import torch
 from torch import Tensor, nn
 
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, inherit
+from ..blocks.plan import boxes_from, pixel_mask
 from ..blocks.routing import Chart, Everywhere, Inset, Router, chart_of, surroundings_of
-from ..config import TrainConfig
-from ..errors import CheckpointError
-from ..interfaces import Decoder
+from ..config import RESUMABLE, TrainConfig
+from ..datamanagers.basis import Basis
+from ..datamanagers.scene import Scene
+from ..errors import CheckpointError, ConfigError
+from ..interfaces import DataManager, Decoder
 from ..io.atomic import write_json
+from ..plugins.codec import to_json
 from ..rendering.renderer import Parts
 from ..types import Boxes
 from . import tensorfiles
-from .decoder import build_decoder
-from .first_use import check_parts
-from .model import Facts, Model, poses_of, tones_of
-from .poses import Poses
-from .tones import Tones
+from .camera_optimizers import Poses, Tones
+from .checkpoint import reached
+from .model import Facts, Model, build_decoder, poses_of, tones_of
+from .plugin_checks import check_parts
+from .prepare import Prepared, build_encoders, cache_folder, scene_of
+from .run import Run, held
+from .trainer import Report, train
 
 __all__ = [
+    "FREE",
+    "RAYS",
     "SURROUNDINGS",
+    "BlockTask",
     "Built",
     "Finished",
+    "asked_of",
     "assemble",
+    "built_block",
     "folder_of",
     "inset",
+    "load_boxes",
     "load_finished",
     "member_of",
     "read_done",
     "restore",
     "save_finished",
     "surroundings",
+    "train_block",
 ]
 
+FREE = (*RESUMABLE, "blocks", "executor", "statistics", "render")
+"""Fields of a config that do not decide what a block of given bounds and rays learns."""
+RAYS = "rays.safetensors"
+"""In a block's folder: the views and tiles that it learns from."""
 SURROUNDINGS = -1
 """The number of what no block holds."""
 _FORMAT = 1
@@ -185,3 +207,163 @@ def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
     if wrong:
         raise CheckpointError(f"block: {kind} {wrong[0]} does not fit the config; it was changed since the block was trained")
     module.load_state_dict(own, assign=True)
+
+
+def load_boxes(root: Path) -> Boxes:
+    """How a run is cut. Raises CheckpointError."""
+    path = root / "blocks.json"
+    try:
+        document: dict[str, Any] = json.loads(path.read_text())
+        if document["format"] != 1:
+            raise ValueError(f"format {document['format']!r}, this fprf reads 1")
+        return boxes_from(document["boxes"])
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise CheckpointError(f"{path}: cannot be read ({e}); train the scene again") from e
+
+
+def asked_of(
+    config: TrainConfig, facts: Facts, scene: Scene, boxes: Boxes, block: int, rays: dict[str, Tensor]
+) -> dict[str, Any]:
+    """What a block is trained as; while it stays the same, what was trained stays good. `rays` is its rays.safetensors.
+
+    A block is decided by its bounds and rays, its images, and the config but for what may change, not by its surroundings:
+    they are only its frame.
+    """
+    tree = to_json(config)
+    assert isinstance(tree, dict)
+    knobs = {name: value for name, value in tree.items() if name not in FREE}
+    views = rays["views"].tolist()
+    # What the surroundings span follows from all blocks together, not from how they are cut.
+    chart = surroundings_of(boxes) if block == SURROUNDINGS else chart_of(boxes, block)
+    parts = {
+        "config": knobs,
+        "bounds": [t.tolist() for t in (chart.low, chart.high, chart.turn)],
+        "space": [facts.space.centre, facts.space.rotation, facts.space.scale, facts.space.near, facts.space.far],
+        "views": views,
+        "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
+        "facts": [facts.channels, facts.dim, facts.content_encoder, facts.semantic_encoder, facts.background, facts.exposure],
+    }
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode() + rays["seen"].numpy().tobytes())
+    for view in views:
+        digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
+    return {"task": digest.hexdigest()[:32], "steps": config.steps, "minutes": config.minutes}
+
+
+WARM_UP = 20
+"""Most steps of warm-up of a block: what it inherits is no random start, only Adam's averages are new."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockTask:
+    """What a worker is told; the rest lies in the run folder. Small, so that it can be sent to other machines."""
+
+    root: str
+    """Run folder."""
+    data: str
+    """Scene folder."""
+    block: int
+    """Number of the block, or SURROUNDINGS."""
+    minutes: float | None
+    """Its part of the time limit."""
+    quiet: bool = False
+    """Show nothing."""
+
+
+def train_block(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None] = lambda model: None) -> bool:
+    """Train a block to its end, from its newest checkpoint; False where it was finished already. `begun` is given its model.
+
+    A folder that was trained as something else (other bounds, rays, images or knobs) is started anew. Raises ConfigError
+    where the images are not those of the run, DataError where another process trains the block at this moment.
+    """
+    with held(folder_of(Path(task.root), task.block)):
+        return _train_held(task, report, begun)
+
+
+def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None]) -> bool:
+    root = Path(task.root)
+    run = Run(root)
+    config = run.load_config()[0].fields_only(root)
+    facts, boxes = run.load_known().facts, load_boxes(root)
+    folder = folder_of(root, task.block)
+    scene = scene_of(replace(config, data=Path(task.data)))
+    own = _scene_of(scene, folder)
+    asked = asked_of(config, facts, scene, boxes, task.block, tensorfiles.read(folder / RAYS))
+    done = read_done(folder)
+    if done is not None and done["asked"] == asked:
+        return False
+    config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
+    _begin(folder, asked["task"])
+    manager = _manager(run, config, facts, own, folder)
+    built = built_block(root, config, facts, boxes, task.block, own.train)
+    block_run = Run(folder)
+    prepared, lead = Prepared(own, manager, facts, None), 0
+    if task.block != SURROUNDINGS:
+        lead = load_finished(folder_of(root, SURROUNDINGS), verify=False).step
+        config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
+    begun(built.model)
+    train(config, prepared, block_run, report, model=built.model, lead=lead)
+    step, seconds = reached(block_run.checkpoints)
+    save_finished(folder, built, asked=asked, step=step, seconds=seconds)
+    return True
+
+
+def _begin(folder: Path, task: str) -> None:
+    """Clear what was trained as something else; what belongs to this task stays, so that it is gone on with."""
+    mark = folder / "task.json"
+    known = json.loads(mark.read_text()).get("task") if mark.is_file() else None
+    (folder / "done.json").unlink(missing_ok=True)
+    if known == task:
+        return
+    mark.unlink(missing_ok=True)
+    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+    for name in ("block.safetensors", "events.jsonl"):
+        (folder / name).unlink(missing_ok=True)
+    write_json(mark, {"task": task})
+
+
+def _scene_of(scene: Scene, folder: Path) -> Scene:
+    """The scene with the training views that a block learns from."""
+    views = tensorfiles.read(folder / RAYS)["views"]
+    if len(views) and int(views.max()) >= len(scene.paths):
+        raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
+    return replace(scene, train=views)
+
+
+def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: Path) -> DataManager:
+    """The block's own batches: its views, its pixels, the whole scene's basis; features are in the cache."""
+    rays = tensorfiles.read(folder / RAYS)
+    slots = {view: slot for slot, view in enumerate(rays["views"].tolist())}
+
+    def seen(view: int) -> Tensor:
+        width, height = scene.cameras.size[view].tolist()
+        return pixel_mask(rays["seen"][slots[view]].bool(), (width, height))
+
+    content, semantic = build_encoders(config)
+    return config.datamanager.build(
+        scene=scene,
+        content=content,
+        semantic=semantic if facts.dim else None,
+        dim=config.semantic.dim,
+        cache=cache_folder() / "features",
+        seed=config.seed,
+        basis=Basis.from_tensors(run.load_tensors("basis")) if facts.dim else None,
+        seen=seen,
+        background=facts.background,
+    )
+
+
+def built_block(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, block: int, views: Tensor) -> Built:
+    """The model of a block, inside of its finished surroundings."""
+    around = surroundings(config, facts, boxes)
+    if block == SURROUNDINGS:
+        return around
+    finished = load_finished(folder_of(root, SURROUNDINGS)).tensors
+    own = {name: tensor.clone() for name, tensor in finished.items()}  # training writes to them, the file stays
+    restore(around.member, "member", own)
+    restore(around.model.decoder, "decoder", own)
+    if around.model.tones is not None:
+        restore(around.model.tones, "tones", own)
+    if around.model.poses is not None:
+        restore(around.model.poses, "poses", own)
+    around.member.requires_grad_(True)
+    return inset(config, facts, boxes, block, around, views)

@@ -121,7 +121,7 @@ def _middle(share: Annotated[Tensor, "H W"], size: tuple[int, int]) -> tuple[int
 
 
 def _matched(region: Region, styled: Styled, attention: Annotated[Tensor, "T"]) -> Region:
-    reference, score, orders = styled.dictionary.reference, styled.orders.score[region.number], styled.orders
+    reference, score, controls = styled.dictionary.reference, styled.controls.score[region.number], styled.controls
     rows = [
         Taken(name, float(attention[reference == i].sum()), float(score[reference == i].max()))
         for i, name in enumerate(styled.dictionary.names)
@@ -129,6 +129,6 @@ def _matched(region: Region, styled: Styled, attention: Annotated[Tensor, "T"]) 
     return region._replace(
         taken=tuple(sorted(rows, key=lambda row: (-row.share, -row.score))),
         entropy=float(torch.special.entr(attention).sum()) / math.log(2),
-        strength=float(orders.strength[region.number]),
-        restricted=not bool(orders.allowed[region.number].all()),
+        strength=float(controls.strength[region.number]),
+        restricted=not bool(controls.allowed[region.number].all()),
     )

@@ -1,6 +1,8 @@
-"""A trained run, ready to render."""
+"""A trained run, ready to render; blocks of a large scene are fetched as they are met."""
 
-from collections.abc import Callable
+import copy
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Generic, NamedTuple, TypeVar
@@ -8,7 +10,8 @@ from typing import Annotated, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from ..blocks.routing import Blend
+from ..blocks.fields import Member, Members
+from ..blocks.routing import Blend, chart_of
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
 from ..errors import CheckpointError, WeightsError
@@ -20,23 +23,71 @@ from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.references import Encoders
 from ..style.scene import SceneStyle, from_tensors
-from ..types import View
+from ..types import Boxes, View
 from . import checkpoint
-from .blocks import SURROUNDINGS, assemble, folder_of, load_finished, read_done, restore, surroundings
-from .lay_out import load_boxes
+from .blocks import SURROUNDINGS, assemble, folder_of, load_boxes, load_finished, read_done, restore, surroundings
 from .model import Model, build_model
 from .prepare import device_of
 from .quality import QualityConfig, at_quality
 from .run import Known, Run
-from .shelf import Shelf
 from .views import paint_pixels, render_view
 
-__all__ = ["LoadedRun", "Trained", "encoders_of", "load_run", "load_style", "open_fields", "open_run"]
+__all__ = ["LoadedRun", "Shelf", "Trained", "encoders_of", "load_run", "load_style", "open_fields", "open_run"]
+
+
+class Shelf(Members):
+    """Blocks of a run, the last used first; the surroundings always at hand."""
+
+    def __init__(
+        self,
+        root: Path,
+        boxes: Boxes,
+        around: Member,
+        *,
+        device: torch.device,
+        limit: int | None,
+        told: Callable[[int], None] = lambda block: None,
+    ) -> None:
+        self._root, self._boxes, self._around = root, boxes, around
+        self._device, self._told = device, told
+        self._here: OrderedDict[int, Member] = OrderedDict()
+        self._verified: set[int] = set()
+        size = sum(t.numel() * t.element_size() for t in around.state_dict().values())
+        self._room = None if limit is None else max(1, limit // size - 1)
+
+    @property
+    def held(self) -> Sequence[Member]:
+        """The surroundings."""
+        return (self._around,)
+
+    @property
+    def here(self) -> tuple[int, ...]:
+        """Blocks in memory, the least recently used first."""
+        return tuple(self._here)
+
+    def member(self, number: int) -> Member:
+        """A block by its number; the surroundings come after the last one. Raises CheckpointError for a missing block."""
+        if number == len(self._boxes.low):
+            return self._around
+        if number in self._here:
+            self._here.move_to_end(number)
+            return self._here[number]
+        while self._room is not None and len(self._here) >= self._room:
+            self._here.popitem(last=False)
+        self._here[number] = found = self._fetch(number)
+        return found
+
+    def _fetch(self, number: int) -> Member:
+        self._told(number)
+        member = copy.deepcopy(self._around)
+        member.chart = chart_of(self._boxes, number)
+        finished = load_finished(folder_of(self._root, number), verify=number not in self._verified)
+        restore(member, "member", finished.tensors)
+        self._verified.add(number)
+        return member.requires_grad_(False).to(self._device).eval()
 
 
 _MIB = 1 << 20
-
-
 S = TypeVar("S", bound=Scene, covariant=True)
 
 

@@ -16,8 +16,8 @@ from ..interfaces import LossTerm
 from ..plugins.registry import nearest
 from ..rendering.stepfun import distortion, interlevel, midpoints
 from ..types import Batch, Rendered, Want
-from .first_use import check_term
 from .model import Facts, Model
+from .plugin_checks import check_term
 
 __all__ = ["FADE", "NEARBY", "SHELL", "check_penalties", "emptiness", "ending", "extra_term", "terms", "total", "wanted"]
 

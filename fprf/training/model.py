@@ -8,14 +8,27 @@ import torch
 from torch import Tensor, nn
 
 from ..config import TrainConfig
+from ..errors import WeightsError
+from ..interfaces import Decoder
+from ..plugins.decoders.remedy import pretrain_line
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
-from .decoder import build_decoder
-from .first_use import check_parts
-from .poses import Poses
-from .tones import Tones
+from .camera_optimizers import Poses, Tones
+from .plugin_checks import check_parts
 
-__all__ = ["Facts", "Model", "background_of", "build_model", "poses_of", "tones_of"]
+__all__ = ["Facts", "Model", "background_of", "build_decoder", "build_model", "poses_of", "tones_of"]
+
+
+def build_decoder(config: TrainConfig, *, encoder: str, channels: int) -> Decoder:
+    """The decoder of the content encoder, by the encoder's identity.
+
+    Raises WeightsError where there is none or it belongs to another encoder, with the line that makes the right one.
+    """
+    try:
+        return config.content.decoder.build(encoder=encoder, channels=channels, seed=config.seed + 3)
+    except WeightsError as error:
+        line = pretrain_line(config.content.encoder)
+        raise WeightsError(f"{error}; `{line}` makes its decoder, --content.decoder.weights FILE names it") from error
 
 
 @dataclass(frozen=True, kw_only=True)

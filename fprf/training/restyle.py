@@ -1,6 +1,7 @@
-"""References to a style on a scene: the feed-forward step, a second or less a photograph."""
+"""References to a style on a scene: the feed-forward step, a second or less a photograph, and what holds for single regions."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -10,26 +11,19 @@ from torch import Tensor
 from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
-from ..style.config import NO_MASK, StyleConfig, labels
+from ..style.config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value, parse_strength
+from ..style.controls import allowed_references
 from ..style.dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
 from ..style.files import StyleFile, check_photographs, read_style
 from ..style.look import Restyle
-from ..style.matching import unit
+from ..style.matching import scores, unit
 from ..style.references import Encoders, encode_photograph
 from ..style.regional import RegionWeight, regional
 from ..style.scene import SceneStyle
-from .first_use import check_stylizer
-from .orders import Orders, take_orders
-from .regions import Regions
+from .plugin_checks import check_stylizer
+from .regions import Found, Regions, find_regions, key_of
 
-__all__ = [
-    "Codes",
-    "Styled",
-    "apply_style",
-    "dress",
-    "mixed",
-    "restyle",
-]
+__all__ = ["Codes", "RegionControls", "Styled", "apply_style", "dress", "mixed", "region_controls", "region_scores", "restyle"]
 
 
 class Codes(NamedTuple):
@@ -48,7 +42,7 @@ class Styled(NamedTuple):
     dictionary: StyleDictionary
     scene: SceneStyle
     codes: Codes
-    orders: Orders
+    controls: "RegionControls"
 
 
 @torch.inference_mode()
@@ -83,24 +77,24 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
     if basis is not None:
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
     regions = Regions(here, scene, basis, file.regions, file.semantic_encoder)
-    orders = take_orders(regions, dictionary, style)
+    controls = region_controls(regions, dictionary, style)
     chosen = style.stylizer
-    stylizer = regional(dictionary, scene, orders.allowed, chosen)
-    partly = bool((orders.strength != 1).any())
+    stylizer = regional(dictionary, scene, controls.allowed, chosen)
+    partly = bool((controls.strength != 1).any())
     check_stylizer(chosen, stylizer, dictionary, scene)
     device = here.device
     stylizer = stylizer.to(device)
-    colours = here.colour_maps(stylizer, dictionary, scene, chosen, orders.allowed)
+    colours = here.colour_maps(stylizer, dictionary, scene, chosen, controls.allowed)
     mine = Restyle(
         stylizer,
         style.strength,
-        RegionWeight(scene, orders.strength[:, None]).to(device) if partly else None,
+        RegionWeight(scene, controls.strength[:, None]).to(device) if partly else None,
         chosen.features,
         None if colours is None else colours.to(device),
         style.luminance,
     )
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
-    return Styled(mine, dictionary, scene, codes, orders)
+    return Styled(mine, dictionary, scene, codes, controls)
 
 
 def restyle(
@@ -142,9 +136,114 @@ def _dictionary(style: StyleConfig, encoders: Encoders) -> StyleDictionary:
 def mixed(a: Styled, b: Styled, at: float) -> Styled:
     """Style `a` on the way to `b`, which lies at 1.
 
-    The dictionary and the orders stay those of `a`; codes and notes are those of both.
+    The dictionary and the controls stay those of `a`; codes and notes are those of both.
     """
     reference = torch.cat([a.codes.reference, b.codes.reference + len(a.codes.names)])
     codes = Codes(reference, a.codes.names + b.codes.names, torch.cat([a.codes.units, b.codes.units]))
-    orders = a.orders._replace(notes=a.orders.notes + b.orders.notes)
-    return a._replace(restyle=a.restyle.mixed(b.restyle, at), codes=codes, orders=orders)
+    controls = a.controls._replace(notes=a.controls.notes + b.controls.notes)
+    return a._replace(restyle=a.restyle.mixed(b.restyle, at), codes=codes, controls=controls)
+
+
+class RegionControls(NamedTuple):
+    """What holds for each of K regions."""
+
+    allowed: Annotated[Tensor, "K references"]
+    """Which references it may take from, bool, in the order of the dictionary."""
+    strength: Annotated[Tensor, "K"]
+    """How strongly it is restyled; 0 = kept."""
+    score: Annotated[Tensor, "K T"]
+    """Cosine of the region with each style code, both from the scene's mean; 0 without semantics."""
+    saved: StyleFile
+    """The style with every wish in terms that hold on other scenes."""
+    regions: Regions
+    notes: tuple[str, ...]
+    """A line for each thing that the user may not expect."""
+
+
+def region_scores(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor, "K T"]:
+    """Cosines between regions and style codes, in [-1, 1]: whether the references show such a thing at all.
+
+    Both are seen from the scene's mean. Matching, which only has to choose, centres each side on its own: there a rose's
+    petals are as far from its leaves as the sky from the road, and something would always fit.
+    """
+    return scores(unit(scene.keys, scene.semantic_mean), unit(dictionary.keys, scene.semantic_mean))
+
+
+def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleConfig) -> RegionControls:
+    """Find every region and reference that the style names. Raises UsageError for those that are not there, or contradict."""
+    book = _Book(regions, dictionary, style.references)
+    pins, bans = book.pairs("pin", style.pin), book.pairs("forbid", style.forbid)
+    kept = [found for text in style.keep for found in book.find(text)]
+    parsed = [parse_strength("region_strength", text) for text in style.region_strength]
+    strengths = [(found, value) for text, value in parsed for found in book.find(text)]
+    pinned: dict[int, set[int]] = {}
+    for found, i in pins:
+        pinned.setdefault(found.number, set()).add(book.order[i])
+    allowed = allowed_references(
+        len(regions.scene.share), len(dictionary.names), pin=pinned, forbid=[(f.number, book.order[i]) for f, i in bans]
+    )
+    for found in kept:
+        if found.number in pinned or found.number in {f.number for f, _ in strengths}:
+            raise UsageError(f"region {found.name}: is to be kept, and to be pinned or restyled in part; leave out one of both")
+    strength, score = torch.ones(len(allowed)), region_scores(regions.scene, dictionary)
+    for found, value in strengths:
+        strength[found.number] = value
+    strength[[found.number for found in kept]] = 0.0
+    if style.keep_below is not None:
+        best = score.masked_fill(~allowed[:, dictionary.reference], -torch.inf).amax(1)
+        poor = (best < style.keep_below).nonzero().flatten().tolist()
+        strength[[k for k in poor if k not in pinned]] = 0.0
+    saved = replace(
+        style,
+        pin=tuple(f"{book.name(f)}={book.label(i)}" for f, i in pins),
+        forbid=tuple(f"{book.name(f)}={book.label(i)}" for f, i in bans),
+        keep=tuple(book.name(f) for f in kept),
+        region_strength=tuple(f"{book.name(f)}={value:g}" for f, value in strengths),
+    )
+    file = StyleFile(saved, book.keys, regions.views.semantic_encoder)
+    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)))
+
+
+class _Book:
+    """Looks up names, and remembers which keys and notes belong to them."""
+
+    def __init__(self, regions: Regions, dictionary: StyleDictionary, references: Sequence[Path]) -> None:
+        self.regions, self.references = regions, references
+        self.names = labels(references)
+        self.order = [dictionary.names.index(name) for name in self.names]
+        # All regions, not only those that are wished about: on another scene each must find its like among all of them.
+        every = {f"region{k}": key_of(regions, k) for k in range(len(regions.scene.share)) if regions.basis is not None}
+        self.keys = dict(regions.keys) if regions.keys else every
+        self.notes: list[str] = []
+
+    def find(self, text: str) -> list[Found]:
+        found = find_regions(self.regions, text)
+        if not found:
+            self.notes.append(f"region {text!r} of the style: no region here is most like it, so it is left out")
+        for each in found:
+            if each.name in self.regions.keys:
+                self.notes.append(f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})")
+        return found
+
+    def pairs(self, field: str, texts: Sequence[str]) -> list[tuple[Found, int]]:
+        """Regions and references of REGION=REFERENCE; a mask may mean several regions."""
+        wishes = [parse_region_value(field, text) for text in texts]
+        return [(found, find_reference(w.value, self.references)) for w in wishes for found in self.find(w.region)]
+
+    def label(self, reference: int) -> str:
+        """A reference as a style file names it, wherever its photographs are moved to."""
+        name = self.references[reference].name
+        return name if self.names[reference] == name else str(reference)
+
+    def name(self, found: Found) -> str:
+        """What the region is called in a style file, which holds its key under that name."""
+        if found.name in self.regions.keys or not self.keys:
+            return found.name
+        key, name = key_of(self.regions, found.number), f"region{found.number}"
+        known = [other for other, its in self.keys.items() if its == key]
+        if known:
+            return known[0]
+        while name in self.keys:
+            name += "'"
+        self.keys[name] = key
+        return name

@@ -13,20 +13,26 @@ It can be moved and shared: it holds no absolute path that matters and needs nei
 """
 
 import dataclasses
+import errno
+import hashlib
 import json
+import math
 import os
-from collections.abc import Sequence
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..config import RunConfig
 from ..datamanagers.scene import Scene
-from ..errors import CheckpointError
-from ..io.atomic import write_json
+from ..errors import CheckpointError, DataError, UsageError
+from ..io.atomic import unwritable, write_json
 from ..plugins.codec import load_config, save_config
 from ..rendering.cameras import Cameras
 from ..rendering.coverage import well_covered
@@ -34,7 +40,20 @@ from ..rendering.space import Space
 from . import tensorfiles
 from .model import Facts
 
-__all__ = ["Known", "Run", "view_names"]
+__all__ = [
+    "CHANGED_IMAGES",
+    "IMAGES",
+    "LOCK",
+    "History",
+    "Known",
+    "Run",
+    "check_images",
+    "held",
+    "image_hashes",
+    "read_history",
+    "save_image_hashes",
+    "view_names",
+]
 
 FORMAT = 1
 _SHOWN = 8
@@ -164,3 +183,184 @@ def view_names(paths: Sequence[Path]) -> list[str]:
 
 def _tupled(value: Any) -> Any:
     return tuple(_tupled(v) for v in value) if isinstance(value, list) else value
+
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+LOCK = ".lock"
+_BUSY = (errno.EAGAIN, errno.EACCES)
+_NOTE = 200
+"""Bytes of the holder's note that are repeated to others."""
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold a folder for the length of the block; it is made if need be, and removed again if it stays empty.
+
+    Raises DataError where another process holds it, naming that, and where nothing can be written: before any work is done.
+    """
+    handle = _open(folder)
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # while it is held: who opened it before finds out in `_open`
+            (folder / LOCK).unlink()
+        os.close(handle)
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _open(folder: Path) -> int:
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except FileExistsError as error:
+            raise DataError(f"{folder}: is a file, not a folder; choose another --output") from error
+        except OSError as error:
+            raise unwritable(folder, error) from error
+        try:
+            _take(folder, handle)
+            if os.fstat(handle).st_ino == os.stat(folder / LOCK).st_ino:
+                return handle
+        except FileNotFoundError:  # removed by its holder, who ended in between
+            pass
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _take(folder: Path, handle: int) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in _BUSY:
+            return
+        note = os.pread(handle, _NOTE, 0).decode(errors="replace").strip()
+        who = note if note.isprintable() and note else "another process"
+        raise DataError(f"{folder}: {who} is training here; wait for it, end it, or choose another --output") from error
+    try:
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+    except OSError as error:
+        raise unwritable(folder, error) from error
+
+
+IMAGES = "images.json"
+CHANGED_IMAGES = "--changed-images"
+"""Of `fprf train`: go on nevertheless."""
+_IMAGES_FORMAT = 1
+_NAMED = 3
+
+
+def image_hashes(scene: Scene) -> dict[str, str]:
+    """SHA-256 of each image's file, by the view's name. Raises DataError where one cannot be read."""
+
+    def of(path: Path) -> str:
+        try:
+            with path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+
+    with ThreadPoolExecutor() as pool:
+        return dict(zip(view_names(scene.paths), pool.map(of, scene.paths), strict=True))
+
+
+def save_image_hashes(root: Path, found: Mapping[str, str]) -> None:
+    """Write images.json."""
+    write_json(root / IMAGES, {"format": _IMAGES_FORMAT, "images": dict(found)})
+
+
+def check_images(root: Path, scene: Scene, found: Mapping[str, str]) -> None:
+    """Raise UsageError where images differ from those that the run in a folder was begun with; no run, or one of before
+    there was a list, has none.
+    """
+    path = root / IMAGES
+    if not path.exists():
+        return
+    try:
+        document = json.loads(path.read_text())
+        before = {str(name): str(mark) for name, mark in document["images"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CheckpointError(f"{path}: cannot be read ({error!r}); remove it, and the images are taken as they are") from error
+    files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
+    changed = [f"{files[name]} is another" for name in found if name in before and before[name] != found[name]]
+    changed += [f"{files[name]} is new" for name in found if name not in before]
+    changed += [f"{name} is gone" for name in before if name not in found]
+    if changed:
+        more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+        raise UsageError(
+            f"{root}: its images have changed since it was begun: {', '.join(changed[:_NAMED])}{more}; put them back, "
+            f"choose another --output, or go on with these by {CHANGED_IMAGES}"
+        )
+
+
+class History(NamedTuple):
+    """One training: of the run, or of one of its blocks."""
+
+    name: str
+    """Empty for the run itself."""
+    step: list[int]
+    seconds: list[float]
+    """Training time at each step, over all resumes."""
+    values: dict[str, list[float | None]]
+    """psnr, rays_per_second, kept and each loss by its name, at each step; None where a line does not say."""
+    parts: dict[str, float]
+    """Seconds of each part of training by its name, all resumes together."""
+    notes: list[str]
+    """What went wrong: skipped steps, damaged checkpoints, returns to an earlier one."""
+
+
+def read_history(run: Path) -> list[History]:
+    """The histories of a run and of its blocks, in the order of their names; those without any line are left out.
+
+    Where a run was resumed from an earlier step, the later steps of the first try are dropped. Raises CheckpointError
+    where there is no line at all.
+    """
+    files = [run / "events.jsonl", *sorted((run / "blocks").glob("*/events.jsonl"))]
+    found = [_history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()]
+    found = [history for history in found if history.step or history.parts]
+    if not found:
+        raise CheckpointError(f"{run}: no events.jsonl with a line of training; `fprf train` writes it as it goes")
+    return found
+
+
+def _history(name: str, file: Path) -> History:
+    lines: list[dict[str, Any]] = []
+    parts: dict[str, float] = {}
+    notes: list[str] = []
+    for event in _events(file):
+        if "part" in event and _number(event.get("seconds")) is not None:
+            parts[str(event["part"])] = parts.get(str(event["part"]), 0.0) + float(event["seconds"])
+        elif isinstance(event.get("step"), int) and _number(event.get("seconds")) is not None:
+            while lines and lines[-1]["step"] >= event["step"]:
+                lines.pop()
+            lines.append(event)
+        else:
+            notes.append(", ".join(f"{key.replace('_', ' ')}: {value}" for key, value in event.items()))
+    flat = [{**event, **(event["losses"] if isinstance(event.get("losses"), dict) else {})} for event in lines]
+    known = dict.fromkeys(key for event in flat for key in event if key not in ("step", "seconds", "losses"))
+    values = {key: [_number(event.get(key)) for event in flat] for key in known}
+    return History(name, [e["step"] for e in lines], [float(e["seconds"]) for e in lines], values, parts, notes)
+
+
+def _events(file: Path) -> Iterator[dict[str, Any]]:
+    for line in file.read_text("utf-8", errors="replace").splitlines():
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(event, dict):
+            yield event
+
+
+def _number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)

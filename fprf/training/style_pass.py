@@ -17,8 +17,8 @@ from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import composite, march
 from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.statistics import Moments, merge, moments
+from .camera_optimizers import refined
 from .model import Model
-from .poses import refined
 
 __all__ = ["POINTS", "lattice", "measure_style", "neighbours"]
 

@@ -23,15 +23,23 @@ from ..rendering.cameras import PixelRays
 from ..rendering.renderer import render_rays
 from ..types import Batch, Rays
 from . import checkpoint
-from .guards import CLEAR_EVERY, PATIENCE, StepStatistics, clear_denormals, unfit_gradients, unfit_step, unfit_terms
-from .interrupts import held_back
+from .camera_optimizers import moving, toned
+from .loop import (
+    CLEAR_EVERY,
+    PATIENCE,
+    StepStatistics,
+    clear_denormals,
+    held_back,
+    progress,
+    rate,
+    unfit_gradients,
+    unfit_step,
+    unfit_terms,
+)
 from .losses import check_penalties, extra_term, terms, total, wanted
 from .model import Facts, Model, background_of, build_model
-from .poses import moving
 from .prepare import Prepared, device_of
 from .run import Run
-from .schedule import progress, rate
-from .tones import toned
 
 __all__ = ["Loop", "Report", "optimizer_of", "train"]
 

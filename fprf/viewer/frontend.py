@@ -21,7 +21,7 @@ from ..errors import FprfError
 from ..io.images import to_uint8
 from ..rendering.cameras import pixel_grid
 from ..splats.scene import SplatScene
-from ..training.lay_out import load_boxes
+from ..training.blocks import load_boxes
 from .cameras import CameraState, Segments, box_edges, camera_frustums, checked_camera, path_segments
 from .film import film_cameras
 from .gaussian_renderer import Colours, page_gaussians

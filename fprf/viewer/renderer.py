@@ -25,9 +25,9 @@ from ..rendering.cameras import Cameras
 from ..style.look import Restyle
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
-from ..training.cached_view import Part, view_parts
 from ..training.loading import Trained
 from ..training.restyle import Styled
+from ..training.views import Part, view_parts
 from .cameras import CameraState, PageTransform, picture_size
 from .restyler import Restyler
 from .state import ViewSettings

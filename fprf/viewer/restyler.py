@@ -27,9 +27,7 @@ from ..style.matching import unit
 from ..style.references import Encoders, encode_photograph
 from ..style.scene import SceneStyle
 from ..training import tensorfiles
-from ..training.block_task import built_block
-from ..training.blocks import folder_of
-from ..training.lay_out import RAYS, load_boxes
+from ..training.blocks import RAYS, built_block, folder_of, load_boxes
 from ..training.loading import Trained, encoders_of
 from ..training.model import build_model
 from ..training.prepare import device_of

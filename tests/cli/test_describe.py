@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from fprf.cli import main as cli
-from fprf.cli.describe import describe, meanings
 from fprf.cli.main import VERBS
+from fprf.cli.parsing import describe, meanings
 from fprf.export.config import ExportConfig
 from fprf.style.config import StyleConfig
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fprf.cli import event_log
-from fprf.cli.event_log import EventLog
+from fprf.cli import progress
+from fprf.cli.progress import EventLog
 from fprf.training.run import Run
 from fprf.training.trainer import Report
 
@@ -30,7 +30,7 @@ def lines(folder: Path) -> list[dict[str, object]]:
 
 def test_lines_come_every_few_seconds_and_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
-    monkeypatch.setattr(event_log.time, "perf_counter", lambda: now)
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now)
     log = EventLog(Run(tmp_path))
     for step, seconds, share in ((1, 0.0, 0.1), (2, 1.0, 0.2), (3, 6.0, 0.5), (4, 6.5, 0.9), (5, 7.0, 1.0)):
         now = 100.0 + seconds

@@ -18,7 +18,7 @@ from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, Enc
 from fprf.plugins.typed_json import Missing
 from fprf.plugins.weights import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig
-from fprf.training.decoder import build_decoder
+from fprf.training.model import build_decoder
 from fprf.training.prepare import prepare
 
 ENCODERS = [

@@ -9,7 +9,7 @@ from tiny_world import World
 
 from fprf.evaluation.evaluate import AlignmentConfig, align, align_view
 from fprf.io.images import to_uint8, write_image
-from fprf.training.poses import rotated
+from fprf.training.camera_optimizers import rotated
 from fprf.training.views import render_view
 
 

@@ -13,10 +13,9 @@ from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary
 from fprf.style.files import StyleFile
 from fprf.style.references import Encoders
-from fprf.training.cached_view import CachedView, cache_view
 from fprf.training.loading import Trained
 from fprf.training.restyle import apply_style
-from fprf.training.views import render_view
+from fprf.training.views import CachedView, cache_view, render_view
 
 
 class Stand:

@@ -21,8 +21,8 @@ from fprf.plugins.decoders.config import DecoderConfig
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.style.scene import own_style
 from fprf.testing import cases
-from fprf.training.first_use import check_parts, check_stylizer
 from fprf.training.model import build_model
+from fprf.training.plugin_checks import check_parts, check_stylizer
 from fprf.types import FieldSample, Want
 
 CONFIG = '''

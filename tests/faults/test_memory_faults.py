@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from fprf import memory
 from fprf.cli import main as cli
-from fprf.training import cached_view, style_pass, views
+from fprf.training import style_pass, views
 from fprf.training.loading import load_run
 
 def limit(room):
@@ -41,7 +41,7 @@ def counted(function):
     return call
 
 tried = []
-for module in (views, cached_view, style_pass):
+for module in (views, style_pass):
     module.in_parts = counted(memory.in_parts)
 """
 
@@ -54,7 +54,7 @@ small = replace(config, chunk=3000)
 
 def all_ways(config):
     view = views.render_view(model, facts, cameras, 0, config)
-    cached = cached_view.cache_view(model, facts, cameras, 0, config)
+    cached = views.cache_view(model, facts, cameras, 0, config)
     return view.rgb, view.depth, view.opacity, cached.restyled().rgb, cached.depth
 
 wanted = all_ways(small)

@@ -19,9 +19,8 @@ from fprf.cli import main as cli
 from fprf.cli.train import train_scene
 from fprf.errors import CheckpointError, DataError
 from fprf.training import checkpoint
-from fprf.training.lock import held
 from fprf.training.model import Model, build_model
-from fprf.training.run import Run
+from fprf.training.run import Run, held
 
 Trainer = tuple[Model, torch.optim.Optimizer]
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fprf.errors import UsageError
 from fprf.io.report import Series, axis_ticks, bar_chart, line_chart, sparkline, write_scalars
-from fprf.training.events import History
+from fprf.training.run import History
 
 EVIL = """<script>"'&"""
 

@@ -19,7 +19,7 @@ from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.weights import read_weights
 from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.pretraining.loop import report_path, samples_folder
-from fprf.training.decoder import build_decoder
+from fprf.training.model import build_decoder
 
 ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
 QUICK = ["--pixels", "60", "--batch", "64", "--size", "24", "--pairs", "1"]

@@ -15,7 +15,7 @@ from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
 from fprf.town.write import write_town
-from fprf.training.budget import outcome
+from fprf.training.prepare import outcome
 from fprf.training.run import Run
 
 

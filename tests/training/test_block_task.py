@@ -19,8 +19,7 @@ from fprf.cli.train import train_scene
 from fprf.errors import CheckpointError, ConfigError, DataError
 from fprf.fields.layouts import AdaptiveConfig, StreetConfig
 from fprf.training import trainer
-from fprf.training.block_task import BlockTask, train_block
-from fprf.training.blocks import SURROUNDINGS
+from fprf.training.blocks import SURROUNDINGS, BlockTask, train_block
 from fprf.training.loading import load_run
 from fprf.training.trainer import Report
 from fprf.types import Rendered

@@ -16,13 +16,13 @@ from fprf.training.blocks import (
     SURROUNDINGS,
     folder_of,
     inset,
+    load_boxes,
     load_finished,
     read_done,
     restore,
     save_finished,
     surroundings,
 )
-from fprf.training.lay_out import load_boxes
 from fprf.training.run import Run
 from fprf.types import Boxes, FieldSample
 

@@ -11,8 +11,7 @@ from tiny_world import World
 
 from fprf.errors import UsageError
 from fprf.methods import fprf, fprf_lite
-from fprf.training.budget import Forecast, Outcome, find_downscale, outcome
-from fprf.training.prepare import scene_of, with_downscale
+from fprf.training.prepare import Forecast, Outcome, find_downscale, outcome, scene_of, with_downscale
 from fprf.training.trainer import Report
 
 

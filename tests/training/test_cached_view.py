@@ -16,9 +16,8 @@ from fprf.plugins.stylizers.config import (
     StylizerConfig,
 )
 from fprf.rendering.cameras import pixel_grid
-from fprf.training.cached_view import cache_view, view_parts
 from fprf.training.restyle import restyle
-from fprf.training.views import render_view
+from fprf.training.views import cache_view, render_view, view_parts
 
 STYLIZERS = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
 

@@ -8,9 +8,8 @@ from block_world import BlockWorld, small
 
 from fprf.fields.config import PlanesConfig
 from fprf.fields.layouts import SingleConfig, StreetConfig
-from fprf.training import estimate
-from fprf.training.estimate import Estimate, estimates
-from fprf.training.lay_out import plan_scene
+from fprf.training import block_plan
+from fprf.training.block_plan import Estimate, estimates, plan_scene
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +60,7 @@ def test_time_follows_the_steps_until_the_limit(block_world: BlockWorld) -> None
 def test_many_pixels_take_disk_and_no_memory(
     block_world: BlockWorld, rows: list[Estimate], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(estimate, "HELD", 0)
+    monkeypatch.setattr(block_plan, "HELD", 0)
     mapped = estimates(block_world.config, *plan_scene(block_world.config))
     pixels = 3 * 10 * 32 * 24 / 2**20
     assert rows[0].memory_mib - mapped[0].memory_mib == pytest.approx(pixels)

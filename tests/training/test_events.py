@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from fprf.errors import CheckpointError
-from fprf.training.events import read_history
+from fprf.training.run import read_history
 
 
 def write(folder: Path, *events: dict[str, Any] | str) -> Path:

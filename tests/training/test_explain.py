@@ -47,13 +47,13 @@ def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, st
     trained = world.load()
     style = StyleConfig(references=world.references, clusters=3, keep=("1",), forbid=("0=0",))
     styled = apply_style(trained, StyleFile(replace(style, stylizer=stylizer)))  # type: ignore[arg-type]
-    found = explain(styled.orders.regions, styled)
+    found = explain(styled.controls.regions, styled)
     match = styled.restyle.stylizer.match(styled.scene.keys)
     for each in found:
         for taken in each.taken:
             own = styled.dictionary.reference == styled.dictionary.names.index(taken.name)
             assert taken.share == pytest.approx(float(match[each.number, own].sum()), abs=1e-5)
-            assert taken.score == pytest.approx(float(styled.orders.score[each.number, own].max()))
+            assert taken.score == pytest.approx(float(styled.controls.score[each.number, own].max()))
         assert [t.share for t in each.taken] == sorted((t.share for t in each.taken), reverse=True)
         bits = -(match[each.number] * match[each.number].clamp_min(1e-30).log2()).sum()
         assert each.entropy == pytest.approx(float(bits), abs=1e-4)

@@ -12,7 +12,7 @@ from torch import nn
 from fprf.config import TrainConfig
 from fprf.errors import NumericsError
 from fprf.training import checkpoint
-from fprf.training.guards import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, unfit_gradients, unfit_terms
+from fprf.training.loop import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, unfit_gradients, unfit_terms
 from fprf.training.model import build_model
 from fprf.training.run import Run
 from fprf.training.trainer import train

@@ -9,7 +9,7 @@ import torch
 from tiny_world import World, parameters, trained_for
 
 from fprf.training import checkpoint
-from fprf.training.interrupts import held_back
+from fprf.training.loop import held_back
 from fprf.training.run import Run
 from fprf.types import Batch
 

@@ -13,8 +13,8 @@ from fprf.blocks.plan import boxes_from, boxes_to
 from fprf.errors import CheckpointError
 from fprf.fields.layouts import GridConfig
 from fprf.training import tensorfiles
-from fprf.training.blocks import SURROUNDINGS
-from fprf.training.lay_out import FREE, asked_of, load_boxes, plan_scene
+from fprf.training.block_plan import plan_scene
+from fprf.training.blocks import FREE, SURROUNDINGS, asked_of, load_boxes
 from fprf.training.run import Run
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import DataError
-from fprf.training.lock import NAME, held
+from fprf.training.run import LOCK, held
 
-HOLDER = "import sys, time; from pathlib import Path; from fprf.training.lock import held\n"
+HOLDER = "import sys, time; from pathlib import Path; from fprf.training.run import held\n"
 HOLDER += "with held(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
 
 
@@ -31,17 +31,17 @@ def test_a_second_process_is_told_who_is_there_until_that_is_killed(tmp_path: Pa
     finally:
         process.send_signal(signal.SIGKILL)
         process.communicate()
-    assert (folder / NAME).exists()
+    assert (folder / LOCK).exists()
     with held(folder):
-        assert str(os.getpid()) in (folder / NAME).read_text()
-    assert not (folder / NAME).exists()
+        assert str(os.getpid()) in (folder / LOCK).read_text()
+    assert not (folder / LOCK).exists()
 
 
 def test_the_same_process_cannot_hold_it_twice(tmp_path: Path) -> None:
     with held(tmp_path):
         with pytest.raises(DataError, match=f"process {os.getpid()}"), held(tmp_path):
             pass
-        assert (tmp_path / NAME).exists(), "the refused one leaves the holder's file"
+        assert (tmp_path / LOCK).exists(), "the refused one leaves the holder's file"
     with held(tmp_path):
         pass
 
@@ -65,7 +65,7 @@ def test_a_file_in_its_place_is_named(tmp_path: Path) -> None:
 
 def test_a_note_of_nonsense_is_not_repeated(tmp_path: Path) -> None:
     with held(tmp_path):
-        (tmp_path / NAME).write_bytes(b"\x1b[31m\n\xff" * 9)
+        (tmp_path / LOCK).write_bytes(b"\x1b[31m\n\xff" * 9)
         with pytest.raises(DataError, match="another process is training here"), held(tmp_path):
             pass
 

@@ -14,9 +14,9 @@ from torch import Tensor
 from fprf.cli.train import train_scene
 from fprf.rendering.cameras import rays_through
 from fprf.rendering.renderer import render_rays
+from fprf.training.camera_optimizers import Poses, moving, refined, rotated
 from fprf.training.loading import load_run
 from fprf.training.model import poses_of
-from fprf.training.poses import Poses, moving, refined, rotated
 from fprf.training.prepare import reach_of
 from fprf.types import Want
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fprf.training.block_plan import renumber, trained_tasks
 from fprf.training.blocks import folder_of
-from fprf.training.renumber import renumber, trained_tasks
 
 tasks = st.lists(st.sampled_from("abcdefgh"), unique=True, max_size=6)
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.config import OptimizerConfig, TrainConfig
-from fprf.training.schedule import progress, rate
+from fprf.training.loop import progress, rate
 
 
 def config(steps: int, minutes: float | None = None) -> TrainConfig:

@@ -10,11 +10,9 @@ from block_world import BlockWorld
 
 from fprf.blocks.routing import chart_of
 from fprf.errors import CheckpointError
-from fprf.training.blocks import SURROUNDINGS, folder_of, load_finished, restore, surroundings
-from fprf.training.lay_out import load_boxes
-from fprf.training.loading import load_run
+from fprf.training.blocks import SURROUNDINGS, folder_of, load_boxes, load_finished, restore, surroundings
+from fprf.training.loading import Shelf, load_run
 from fprf.training.run import Run
-from fprf.training.shelf import Shelf
 from fprf.training.views import render_view
 
 _MIB = 1 << 20

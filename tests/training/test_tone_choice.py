@@ -8,12 +8,11 @@ import torch
 from tiny_world import World
 
 from fprf.errors import UsageError
-from fprf.training.cached_view import cache_view
+from fprf.training.camera_optimizers import Tones
 from fprf.training.loading import Trained
 from fprf.training.model import Model
 from fprf.training.quality import QualityConfig, at_quality
-from fprf.training.tones import Tones
-from fprf.training.views import render_view
+from fprf.training.views import cache_view, render_view
 
 
 def lit(world: World) -> Trained:

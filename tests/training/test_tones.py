@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from tiny_world import World, trained_for
 
 from fprf.cli.train import train_scene
+from fprf.training.camera_optimizers import Tones, relative, toned
 from fprf.training.loading import load_run
-from fprf.training.tones import Tones, relative, toned
 from fprf.training.views import render_view
 from fprf.types import Batch, Rendered
 

@@ -26,8 +26,7 @@ from fprf.methods import fprf
 from fprf.plugins.decoders.config import ResidualDecoderConfig
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.training import checkpoint, trainer
-from fprf.training.block_task import BlockTask, train_block
-from fprf.training.blocks import SURROUNDINGS
+from fprf.training.blocks import SURROUNDINGS, BlockTask, train_block
 from fprf.training.loading import load_run
 from fprf.training.model import Model, build_model
 from fprf.training.prepare import device_of, prepare

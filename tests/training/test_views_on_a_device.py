@@ -27,13 +27,11 @@ from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary, build_dictionary
 from fprf.style.files import StyleFile
 from fprf.style.references import Encoders, encode_photograph
-from fprf.training.cached_view import cache_view
+from fprf.training.camera_optimizers import Poses, Tones
 from fprf.training.loading import Trained, load_run
 from fprf.training.matches import match_map
-from fprf.training.poses import Poses
 from fprf.training.restyle import dress
-from fprf.training.tones import Tones
-from fprf.training.views import render_view
+from fprf.training.views import cache_view, render_view
 
 STYLIZERS = (
     AdainConfig(colours=0.5),

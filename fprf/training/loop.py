@@ -1,36 +1,91 @@
-"""What keeps one bad batch from spoiling a run: steps that are not finite change nothing, and denormals are cleared.
+"""What a training loop heeds: its schedule, interrupts, and numbers that are not finite."""
 
-One gradient that is not finite destroys a parameter and its moments for ever, so it is looked for before the optimiser sees
-it; so is one whose square overflows, which would stay in Adam's second moment as infinity. One norm over everything tells
-both: it takes a twentieth of the time of a look at each number.
-
-Moments of what is no longer seen decay into denormal numbers and, rounded, stay there; Adam takes 15 times as long over them.
-They are cleared by step number, not by the processor's own mode: that is set a thread, so that results would depend on which
-thread computed what.
-
-On CUDA the host does not check before the optimiser steps, since it would wait. `unfit_step` stays on the device, fused Adam
-reads it there and skips the step, and `StepStatistics` counts; the host reads the counts with the reports.
-"""
-
-from collections.abc import Iterable, Mapping
+import math
+import signal
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from types import FrameType
 
 import torch
 from torch import Tensor, nn
+
+from ..config import OptimizerConfig, RunConfig
 
 __all__ = [
     "CLEAR_EVERY",
     "PATIENCE",
     "SMOOTHING",
     "StepStatistics",
+    "Stop",
     "clear_denormals",
+    "held_back",
+    "progress",
+    "rate",
     "unfit_gradients",
     "unfit_step",
     "unfit_terms",
 ]
 
+
+def progress(config: RunConfig, step: int, seconds: float) -> float:
+    """Share of the way, 0 to 1: by steps or by minutes, whichever is further."""
+    share = step / config.steps if config.steps else 1.0
+    if config.minutes is not None:
+        share = max(share, seconds / (60 * config.minutes))
+    return min(1.0, share)
+
+
+def rate(config: OptimizerConfig, step: int, share: float) -> float:
+    """Linear warm-up, then a cosine from `rate` to `final * rate`, and 1 / sqrt(step) from `hold` on."""
+    late = 1.0 if config.hold is None else math.sqrt(config.hold / max(config.hold, step))
+    warm = min(1.0, (step + 1) / max(1, config.warm_up))
+    cosine = 0.5 * (1 + math.cos(math.pi * share))
+    return config.rate * warm * late * (config.final + (1 - config.final) * cosine)
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stop:
+    """What was asked for since."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        """Once: end when the step is done."""
+        self.hurried = False
+        """Twice: ended within a step, so that what is in memory is of no use."""
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take note of a signal; the second raises KeyboardInterrupt wherever the program is."""
+        self.hurried = self.asked
+        self.asked = True
+        if self.hurried:
+            raise KeyboardInterrupt
+
+    def obey(self) -> None:
+        """Raise KeyboardInterrupt if it was asked for."""
+        if self.asked:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def held_back() -> Iterator[Stop]:
+    """Hold signals back inside the block, and as before after it. Other threads than the first cannot, and don't."""
+    stop = Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.signal(number, stop) for number in _SIGNALS}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 SMOOTHING = 0.95
 """Decay of running means."""
-
 PATIENCE = 3
 """Steps in a row that are not finite after which a run goes back to its last checkpoint: it will not recover by itself."""
 CLEAR_EVERY = 100

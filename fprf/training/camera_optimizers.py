@@ -16,10 +16,11 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
+from ..datamanagers.scene import GAMMA
 from ..rendering.cameras import Cameras
-from ..types import Rays
+from ..types import Rays, Rendered
 
-__all__ = ["Poses", "moved", "moving", "refined", "rotated"]
+__all__ = ["Poses", "Tones", "moved", "moving", "refined", "relative", "rotated", "toned"]
 
 _TINY = 1e-24
 """Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
@@ -122,3 +123,51 @@ def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
     # One view alone can be put anywhere; views in one place cannot be told to scale.
     found: Tensor = basis[:, size > 1e-9 * size[0]]
     return found
+
+
+class Tones(nn.Module):
+    """Factors of V views."""
+
+    exposure: Tensor
+    learned: Tensor
+
+    def __init__(self, exposure: Annotated[Tensor, "V"], held: tuple[int, ...]) -> None:
+        """`exposure` is `relative`; `held` are views that are not learnt from."""
+        super().__init__()
+        views = len(exposure)
+        self.gain = nn.Parameter(torch.zeros(views, 3))
+        self.exponent = nn.Parameter(torch.tensor(GAMMA))
+        learned = torch.ones(views, 1)
+        learned[list(held)] = 0
+        self.register_buffer("exposure", exposure.float(), persistent=False)
+        self.register_buffer("learned", learned, persistent=False)
+
+    def forward(self, view: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R 3"]:
+        """Factors of views; of one that is not learnt from, what its exposure alone says."""
+        centre = (self.gain * self.learned).sum(0) / self.learned.sum().clamp_min(1)
+        free = (self.gain - centre) * self.learned
+        at = view.to(self.gain.device)
+        return torch.exp(free.index_select(0, at) + self.exponent * self.exposure.index_select(0, at)[:, None])
+
+    def mixed(self, views: tuple[int, ...], weights: tuple[float, ...]) -> Annotated[Tensor, "3"]:
+        """Factors between those of some views, weighted; weights sum to 1. Means are taken of logarithms."""
+        factor = self(torch.tensor(views)).log()
+        between: Tensor = (factor * torch.tensor(weights).to(factor)[:, None]).sum(0)
+        return between.exp()
+
+
+def relative(exposure: Annotated[Tensor, "V"] | None, views: int) -> tuple[float, ...]:
+    """Logarithm of each view's exposure over their geometric mean; zeros where nothing is known."""
+    if exposure is None:
+        return (0.0,) * views
+    log = exposure.double().log()
+    return tuple((log - log.mean()).tolist())
+
+
+def toned(rendered: Rendered, tones: Tones | None, view: Annotated[Tensor, "R"]) -> Rendered:
+    """The render as the cameras of its rays took it."""
+    if tones is None or rendered.rgb is None:
+        return rendered
+    factor = tones(view)
+    frozen_rgb = None if rendered.frozen_rgb is None else rendered.frozen_rgb * factor
+    return rendered._replace(rgb=rendered.rgb * factor, frozen_rgb=frozen_rgb)
