@@ -178,7 +178,10 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         "train fprf-splats --degree 4",
     ],
 )
-def test_what_gaussians_do_not_know_is_refused_in_one_line(run: Path, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_gaussians_do_not_know_is_refused_in_one_line(
+    run: Path, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     assert main([str(run) if word == "RUN" else word for word in line.split()]) == 2
     told = capsys.readouterr().err.strip().splitlines()
     assert len([text for text in told if text.startswith("error: ")]) == 1
