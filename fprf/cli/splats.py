@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
     from ..export.config import ExportConfig
     from ..plugins.config import Need
+    from ..splats.cell_training import CellTask
     from ..splats.config import GaussiansConfig
     from ..style.files import StyleFile
+    from ..training.run import Run
     from ..training.trainer import Report
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
@@ -122,11 +124,16 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
         marks = image_hashes(scene)
         if folder.exists and not others:
             check_images(output, scene, marks)
-        prepared = prepare(config, scene)
+        prepared = prepare(config, scene) if config.cells == 1 else None
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
         save_image_hashes(output, marks)
         folder.save_known(scene, config.data, facts_of(config, scene))
+        if prepared is None:
+            for process in compiling:
+                process.wait()
+            _train_cells(config, folder, scene, display, start)
+            return output
         display.say(f"{_described(scene)}, {prepared.learner.count} Gaussians at {prepared.origin}")
         log = EventLog(folder)
         spent = time.perf_counter() - start
@@ -149,3 +156,40 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
 def _described(scene: "Scene") -> str:
     width, height = (int(v) for v in scene.cameras.size[0])
     return f"{scene.name}: {len(scene.train)} + {len(scene.test)} views of {width}x{height}"
+
+
+def _train_cells(config: "GaussiansConfig", folder: "Run", scene: "Scene", display: Display, start: float) -> None:
+    """Train all cells, those with the most points first, and write their union."""
+    from ..splats.cell_training import CellTask, unite, write_cells
+
+    assert config.data is not None
+    cells = write_cells(folder.root, scene, config.cells)
+    pixels = sum(width * height for cell in cells for _, _, width, height in cell.windows.values())
+    whole = int(scene.cameras.size[scene.train].prod(1).sum())
+    display.say(f"{_described(scene)}, {len(cells)} cells, whose windows are {pixels / whole:.2f} times the photographs")
+    minutes = None
+    if config.minutes is not None:
+        minutes = max(config.minutes - (time.perf_counter() - start) / 60, 0.05 * config.minutes) / len(cells)
+    root, data = str(folder.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
+    order = sorted(range(len(cells)), key=lambda cell: -len(cells[cell].points))
+    tasks = [CellTask(root=root, data=data, cell=cell, minutes=minutes, quiet=display.quiet) for cell in order]
+    config.executor.on("cpu").build().map(run_cell, tasks)
+    count = unite(folder, cells)
+    display.say(f"done after {time.perf_counter() - start:.0f} s, {count} Gaussians: fprf eval {folder.root}")
+
+
+def run_cell(task: "CellTask") -> None:
+    """Train one cell, here or on a worker, and show how it goes."""
+    from ..splats.cell_training import folder_of, train_cell
+    from ..training.run import Run
+    from .progress import EventLog
+
+    log = EventLog(Run(folder_of(Path(task.root), task.cell)))
+    with Display(quiet=task.quiet) as display:
+
+        def report(event: "Report") -> None:
+            display.training(event, f"cell {task.cell:02d}")
+            log(event)
+
+        if not train_cell(task, report):
+            display.say(f"cell {task.cell:02d} is finished already")

@@ -266,8 +266,8 @@ def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     return mask.astype(np.bool_)
 
 
-def load_images(scene: "Scene", background: Sequence[float] | None = None) -> list[Image]:
-    """Every view of a scene at its camera's size, in the scene's order; sizes may differ.
+def load_images(scene: "Scene", background: Sequence[float] | None = None, views: Sequence[int] | None = None) -> list[Image]:
+    """Views of a scene (all, in the scene's order, where none are named) at their cameras' sizes, which may differ.
 
     Raises DataError as `load_image` does, and where a file's shape has changed since the scene was parsed.
     """
@@ -285,7 +285,7 @@ def load_images(scene: "Scene", background: Sequence[float] | None = None) -> li
         return load_image(path, (width, height), background)
 
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(load, range(len(sizes))))
+        return list(pool.map(load, range(len(sizes)) if views is None else views))
 
 
 def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Path]:

@@ -8,6 +8,7 @@ from ..checks import at_least, between, positive
 from ..config import RunConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
+from ..plugins.executors.config import ExecutorConfig, SerialConfig
 
 if TYPE_CHECKING:
     from ..cli.verbs import Verbs
@@ -44,6 +45,11 @@ class GaussiansConfig(RunConfig):
     """Steps between moves of transparent Gaussians to where views err."""
     rate: float = 1.0
     """Factor of all learning rates."""
+    cells: int = 1
+    """Parts of space that are trained apart, each for `steps` steps, with a part of the time and of the Gaussians; 1 = none.
+    More need points of a reconstruction."""
+    executor: ExecutorConfig = SerialConfig()
+    """Where cells are trained: one after the other, or several at a time."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind everything, also where images have transparency."""
 
@@ -51,6 +57,7 @@ class GaussiansConfig(RunConfig):
         super().__post_init__()
         at_least("initial", self.initial, 1)
         at_least("cap", self.cap, 1)
+        at_least("cells", self.cells, 1)
         if self.degree not in range(4):
             raise ConfigError(f"degree: {self.degree}; 0, 1, 2 or 3 are possible")
         for name in ("ssim", "coarse"):

@@ -1,6 +1,7 @@
 """Where Gaussians begin: at the reconstruction's points, else at points matched between posed views, else anywhere in view."""
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, NamedTuple
 
 import cv2
@@ -31,7 +32,7 @@ class Points(NamedTuple):
     colour: Annotated[NDArray[np.float32], "P 3"]
 
 
-def initial_points(scene: Scene, images: list[Image], count: int, rng: np.random.Generator) -> tuple[Points, str]:
+def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> tuple[Points, str]:
     """At most `count` points, and where they are from; images as they lie, at the size of the cameras."""
     if scene.points is not None and len(scene.points) >= _ENOUGH:
         position = scene.points.double().numpy()
@@ -78,7 +79,7 @@ def spatial_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[n
     return np.argsort(code, kind="stable")
 
 
-def _coloured(scene: Scene, images: list[Image], position: Doubles) -> Points:
+def _coloured(scene: Scene, images: Mapping[int, Image], position: Doubles) -> Points:
     """Points with the mean colour of the training views that have them in the picture."""
     total, count = np.zeros((len(position), 3)), np.zeros(len(position))
     points = torch.from_numpy(position)
@@ -93,7 +94,7 @@ def _coloured(scene: Scene, images: list[Image], position: Doubles) -> Points:
     return Points(position, colour.astype(np.float32))
 
 
-def _matched(scene: Scene, images: list[Image]) -> Points:
+def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
     """Points triangulated from SIFT matches between neighbouring training views."""
     views = scene.train.tolist()
     detector = cv2.SIFT.create(nfeatures=_FEATURES, contrastThreshold=0.01)
@@ -159,7 +160,7 @@ def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres:
     return np.where((good & (cosine < math.cos(_ANGLE)))[:, None], position, np.nan)
 
 
-def _scattered(scene: Scene, images: list[Image], count: int, rng: np.random.Generator) -> Points:
+def _scattered(scene: Scene, images: Mapping[int, Image], count: int, rng: np.random.Generator) -> Points:
     """Points on random rays, their distances spread evenly over the logarithm: from a third to 30 times the cameras' spread."""
     views = rng.choice(scene.train.numpy(), count)
     centre = scene.cameras.pose[:, :, 3].numpy()

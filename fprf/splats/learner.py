@@ -80,10 +80,10 @@ class Learner:
         # Half the size until `coarse`, a quarter until a third of that, and so on.
         reduced = sum(share < self.config.coarse / 3**k for k in range(len(self.levels) - 1))
         level = self.levels[reduced]
-        views = list(level.photographs)
+        views = list(level)
         epoch, turn = divmod(step, len(views))
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
-        target = level.photographs[view]
+        target = level[view]
         found = learn(
             self.blocks, (self.first, self.second), self.count, self.bands, self.splats, target,
             background=self.config.background, ssim=self.config.ssim, rates=self._rates(share), step=step,
@@ -92,7 +92,7 @@ class Learner:
             return None
         if (step + 1) % self.config.relocate_every == 0 and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, level, share)
-        height, width = level.height, level.width
+        height, width = target.height, target.width
         tall, wide = -(-height // LANES) * LANES, -(-width // LANES) * LANES
         apart = (found.image - target.planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
         squared = float(np.square(apart).mean())
@@ -115,10 +115,10 @@ class Learner:
         longest axis.
         """
         draw = np.random.default_rng((self.config.seed, step, 1))
-        views = draw.permutation(list(level.photographs))[:_JUDGES]
+        views = draw.permutation(list(level))[:_JUDGES]
         chance = np.zeros(self.count)
         for view in views:
-            target, background = level.photographs[view], self.config.background
+            target, background = level[view], self.config.background
             chance += errors(self.blocks, self.count, self.bands, self.splats, target, background)
         parts = [_rows(each, self.rows) for each in (self.blocks, self.first, self.second)]
         rows, first, second = parts

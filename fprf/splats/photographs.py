@@ -1,6 +1,7 @@
 """Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
 
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -8,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datamanagers.images import Image, load_mask
+from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene
 from ..errors import DataError
-from ..ops.photometric import blurred, slack
+from ..ops.photometric import WINDOW, blurred, slack
 from ..ops.rasterise import Pinhole, camera_array
 from ..ops.rasterise_training import Target
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
@@ -24,12 +25,8 @@ _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
 
 
-class Level(NamedTuple):
-    """Training views of one size, by view."""
-
-    width: int
-    height: int
-    photographs: dict[int, Target]
+Level = dict[int, Target]
+"""Training views at one scale, by view; their sizes may differ."""
 
 
 def pinhole(cameras: Cameras, view: int, near: float) -> Pinhole:
@@ -86,26 +83,22 @@ def distorted(image: Annotated[Tensor, "h w C"], place: Annotated[Tensor, "H W 2
     return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy())))
 
 
-def make_levels(
-    scene: Scene, images: list[Image], background: tuple[float, float, float], near: float, *, masks: bool
-) -> list[Level]:
+def make_levels(scene: Scene, images: Mapping[int, Image], masks: Mapping[int, NDArray[np.bool_]], near: float) -> list[Level]:
     """The training views at their own size, at half of it and so on, until the longer side has less than 240 pixels.
 
-    Views of a level are brought to the size of the largest one by padding.
+    A view counts where its mask, if it has one, is true.
     """
     views = scene.train.tolist()
     cameras = {view: cover(scene.cameras, view, near)[0] for view in views}
-    width, height = max(each.width for each in cameras.values()), max(each.height for each in cameras.values())
-    levels = [
-        Level(max(1, width >> k), max(1, height >> k), {}) for k in range(max(2, (max(width, height) // 120).bit_length()))
-    ]
+    longest = max(max(each.width, each.height) for each in cameras.values())
+    shortest = min(min(each.width, each.height) for each in cameras.values())
+    count = max(2, min((longest // 120).bit_length(), (shortest // WINDOW).bit_length()))  # SSIM needs its window
+    levels: list[Level] = [{} for _ in range(count)]
     for view in views:
         camera = cameras[view]
         image, valid = undistorted(scene.cameras, view, images[view], camera)
-        mask = scene.masks[view] if masks and scene.masks else None
-        if mask is not None:
-            kept = load_mask(mask, (images[view].shape[1], images[view].shape[0]))
-            white = np.repeat(kept[..., None], 3, 2).astype(np.uint8) * 255
+        if view in masks:
+            white = np.repeat(masks[view][..., None], 3, 2).astype(np.uint8) * 255
             seen = undistorted(scene.cameras, view, white, camera)[0][..., 0] > 254
             valid = seen if valid is None else valid & seen
         colours: Floats = np.divide(image, 255, dtype=np.float32)
@@ -117,24 +110,17 @@ def make_levels(
             used = valid
             if valid is not None and k:
                 used = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-            level.photographs[view] = _photograph(small, reduced, used, level.width, level.height)
+            level[view] = _target(small, reduced, used)
     return levels
 
 
-def _photograph(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, width: int, height: int) -> Target:
-    """Pad a view to the size of its level; what is added does not count."""
-    if (camera.width, camera.height) != (width, height):
-        seen = np.zeros((height, width), np.bool_)
-        seen[: camera.height, : camera.width] = True if valid is None else valid
-        whole = np.zeros((height, width, 3), np.float32)
-        whole[: camera.height, : camera.width] = colours
-        colours, valid = whole, seen
+def _target(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None) -> Target:
+    width, height = camera.width, camera.height
     planes = _planes(colours)
     used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2).astype(np.float32))
     if used is not None:
         used = used[: _area(width, height) * 3 + 64]
-    array = camera_array(camera._replace(width=width, height=height), True)
-    return Target(width, height, array, planes, blurred(planes, width, height), used)
+    return Target(width, height, camera_array(camera, True), planes, blurred(planes, width, height), used)
 
 
 def _area(width: int, height: int) -> int:

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..config import StatisticsConfig
 from ..datamanagers.bounds import find_space
-from ..datamanagers.images import load_images
+from ..datamanagers.images import load_images, load_mask
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, NumericsError, UsageError
@@ -26,6 +27,7 @@ from ..training.model import Facts
 from ..training.quality import PRESETS, QualityConfig
 from ..training.run import Known, Run
 from ..training.trainer import REPORT_SECONDS, Report
+from .cells import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points
@@ -36,9 +38,11 @@ from .scene import Semantics, SplatScene, find_semantics, load_semantics, semant
 __all__ = [
     "Prepared",
     "facts_of",
+    "gaussians_of",
     "open_gaussians",
     "prepare",
     "scene_of",
+    "state_of",
     "train",
     "with_downscale",
 ]
@@ -81,13 +85,24 @@ def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
     return replace(config, downscale=max(1, math.ceil(math.sqrt(pixels / _PIXELS))))
 
 
-def prepare(config: GaussiansConfig, scene: Scene) -> Prepared:
-    """Load photographs and find the first points."""
-    images = load_images(scene, config.background)
+def prepare(config: GaussiansConfig, scene: Scene, cell: Cell | None = None) -> Prepared:
+    """Load photographs and find the first points, of the whole scene or of what a cell learns from."""
+    views = scene.train.tolist() if cell is None else list(cell.windows)
+    images = dict(zip(views, load_images(scene, config.background, views), strict=True))
+    masks = {}
+    for view in views:
+        path = scene.masks[view] if config.masks and scene.masks else None
+        if path is not None:
+            masks[view] = load_mask(path, (images[view].shape[1], images[view].shape[0]))
+    if cell is not None:
+        scene = cell.scene(scene)
+        images = {view: cell.cut(view, image) for view, image in images.items()}
+        masks = {view: cell.cut(view, mask) for view, mask in masks.items()}
+        config = replace(config, initial=cell.share_of(config.initial), cap=cell.share_of(config.cap))
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
     near = _near(scene, points)
-    levels = make_levels(scene, images, config.background, near, masks=config.masks)
+    levels = make_levels(scene, images, masks, near)
     centre = scene.cameras.pose[scene.train][:, :, 3]
     reach = 1.1 * float((centre - centre.mean(0)).norm(dim=1).max())
     learner = Learner(config, levels, reach or 1.0, max(config.cap, len(points.position)))
@@ -122,14 +137,13 @@ def train(config: GaussiansConfig, prepared: Prepared, run: Run, report: Callabl
         run.log({"damaged": line})
     step, clock = 0, spent
     if saved is not None:
-        learner.restore(_gaussians(saved), saved.optimizer)
+        learner.restore(gaussians_of(saved), saved.optimizer)
         step, clock = saved.step, saved.seconds
     meter = _Meter(clock)
     last_saved = last_report = time.perf_counter()
 
     def save() -> None:
-        state = {name: getattr(found, name) for found in (learner.gaussians(),) for name in _PARTS}
-        state["near"] = torch.tensor(prepared.near, dtype=torch.float64)
+        state = state_of(learner.gaussians(), prepared.near)
         checkpoint.write(run.checkpoints, state, learner.moments(), step=step, seconds=clock)
 
     with held_back() as stop:
@@ -195,7 +209,13 @@ class _Meter:
 _PARTS = ("means", "quaternions", "log_scales", "logits", "harmonics")
 
 
-def _gaussians(saved: checkpoint.Saved) -> Gaussians:
+def state_of(gaussians: Gaussians, near: float) -> dict[str, Tensor]:
+    """The tensors of a checkpoint; nothing nearer to a camera than `near` is drawn."""
+    return {name: getattr(gaussians, name) for name in _PARTS} | {"near": torch.tensor(near, dtype=torch.float64)}
+
+
+def gaussians_of(saved: checkpoint.Saved) -> Gaussians:
+    """The Gaussians of a checkpoint. Raises CheckpointError where it holds none."""
     try:
         return Gaussians(*(saved.model[name] for name in _PARTS))
     except KeyError as error:
@@ -214,7 +234,7 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
     saved, _ = checkpoint.load_latest(run.checkpoints)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
-    known, gaussians = run.load_known(), _gaussians(saved)
+    known, gaussians = run.load_known(), gaussians_of(saved)
     near = float(saved.model.get("near", torch.tensor(0.01)))
     preset = PRESETS[quality.quality].resolution if quality.quality is not None else 1.0
     scene = SplatScene(

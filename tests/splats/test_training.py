@@ -102,7 +102,7 @@ def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tm
 def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: Scene) -> None:
     learner = prepare(config, scene).learner
     before = learner.gaussians()
-    for photograph in learner.levels[1].photographs.values():
+    for photograph in learner.levels[1].values():
         photograph.planes[:] = np.nan
     assert learner.step(0, 0.0) is None and equal(learner.gaussians(), before)
 
@@ -218,7 +218,7 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
 
 def test_points_begin_where_there_are_none(scene: Scene) -> None:
     bare = replace(scene, points=None, seen=None)
-    found, origin = initial.initial_points(bare, load_images(bare), 500, np.random.default_rng(0))
+    found, origin = initial.initial_points(bare, dict(enumerate(load_images(bare))), 500, np.random.default_rng(0))
     assert origin == "random points" and len(found.position) == 500 and np.isfinite(found.position).all()
     assert found.colour.min() >= 0 and found.colour.max() <= 1
 

@@ -1,0 +1,145 @@
+"""Large scenes in cells: boxes that are trained apart and whose union is the scene.
+
+The space is bisected along the principal axes of the reconstruction's points, so that the points of each cell were seen about
+equally often; cells at the outside are unbounded. A cell learns from the windows of photographs that show its points and a
+border around it. Gaussians outside of the cell explain what else the windows show, and are dropped in the end. A cell's cost
+follows from its windows alone, and it can be trained on any machine, in any order (compare VastGaussian, Lin et al. 2024).
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..datamanagers.scene import Scene, find_sightings
+from ..errors import ConfigError
+from .gaussians import Gaussians
+
+__all__ = ["Cell", "cut"]
+
+Number = TypeVar("Number", bound=np.generic)
+Window = tuple[int, int, int, int]
+"""Left, top, width, height in pixels."""
+_BORDER = 0.1
+"""Of the cell's width to each side, from which it learns as well."""
+_SEEN = 8
+"""Points of a cell that a view shows, at least, where the cell learns from it."""
+_LEAST, _ROOM = 64, 16
+"""Least width and height of a window; pixels around the points in it."""
+_OUTLIERS = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """A box of space, half open, in the frame of the cut, and what it is learnt from."""
+
+    frame: Annotated[Tensor, "3 3"]
+    """Rows are axes, float64: coordinates are `frame @ point`."""
+    low: Annotated[Tensor, "3"]
+    high: Annotated[Tensor, "3"]
+    windows: dict[int, Window]
+    """What it learns from, by view."""
+    points: Annotated[Tensor, "P 3"]
+    """Points of the reconstruction that the windows show."""
+    share: float
+    """Of all Gaussians, those that are trained here: the cell's own, and those around it."""
+
+    def holds(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """True for points inside."""
+        local = points.double() @ self.frame.T
+        return ((local >= self.low) & (local < self.high)).all(1)
+
+    def own(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians whose centres lie inside."""
+        return gaussians.select(self.holds(gaussians.means))
+
+    def scene(self, scene: Scene) -> Scene:
+        """The scene that the cell sees: its windows are the training views."""
+        views = torch.tensor(list(self.windows), dtype=torch.int64)
+        window = torch.tensor(list(self.windows.values()), dtype=torch.int64)
+        centre, size = scene.cameras.centre.clone(), scene.cameras.size.clone()
+        centre[views] -= window[:, :2]
+        size[views] = window[:, 2:]
+        cameras = replace(scene.cameras, centre=centre, size=size)
+        return replace(scene, cameras=cameras, train=views, points=self.points, seen=None)
+
+    def cut(self, view: int, image: NDArray[Number]) -> NDArray[Number]:
+        """The window of an image [H W ...] of a view."""
+        left, top, width, height = self.windows[view]
+        return image[top : top + height, left : left + width]
+
+    def share_of(self, count: int) -> int:
+        """The cell's part of a number of Gaussians."""
+        return max(1, round(self.share * count))
+
+
+def cut(scene: Scene, count: int) -> list[Cell]:
+    """`count` cells, each with about as many sightings of points. Raises ConfigError where the points do not allow that."""
+    sightings = find_sightings(scene)
+    if sightings is None or len(sightings.view) < _SEEN * count:
+        raise ConfigError(
+            f"cells: {scene.name} has too few points of a reconstruction for {count} cells; train it in one piece"
+        )
+    centred = sightings.point - sightings.point.mean(0)
+    frame = torch.linalg.eigh(centred.T @ centred).eigenvectors.T.flip(0).contiguous()
+    local = sightings.point @ frame.T
+    cells = []
+    for low, high in _bisected(local, torch.full((3,), -math.inf).double(), torch.full((3,), math.inf).double(), count):
+        inside = ((local >= low) & (local < high)).all(1)
+        own = local[inside]
+        first, last = _extent(own)
+        span = last - first
+        near = ((local >= low - _BORDER * span) & (local < high + _BORDER * span)).all(1)
+        windows: dict[int, Window] = {}
+        shown = torch.zeros(len(local), dtype=torch.bool)
+        for view in torch.unique(sightings.view[near]).tolist():
+            of_view = sightings.view == view
+            pixel = sightings.pixel[of_view & near]
+            if len(pixel) < _SEEN:
+                continue
+            width, height = scene.cameras.size[view].tolist()
+            first, last = _extent(pixel)
+            left, wide = _interval(float(first[0]), float(last[0]), width)
+            top, tall = _interval(float(first[1]), float(last[1]), height)
+            windows[view] = (left, top, wide, tall)
+            x, y = sightings.pixel.unbind(1)
+            shown |= of_view & (x >= left) & (x < left + wide) & (y >= top) & (y < top + tall)
+        if not windows:
+            raise ConfigError(f"cells: no view shows {_SEEN} points of one of {count} cells; take fewer")
+        points = torch.unique(sightings.point[shown], dim=0)
+        others = len(points) / max(1, len(torch.unique(sightings.point[inside], dim=0)))
+        share = others * float(inside.double().mean())
+        cells.append(Cell(frame=frame, low=low, high=high, windows=windows, points=points, share=share))
+    return cells
+
+
+def _bisected(
+    local: Annotated[Tensor, "O 3"], low: Annotated[Tensor, "3"], high: Annotated[Tensor, "3"], count: int
+) -> list[tuple[Tensor, Tensor]]:
+    """Boxes with equal numbers of rows in each, cut across the longest side of what is in them."""
+    if count == 1:
+        return [(low, high)]
+    inside = local[((local >= low) & (local < high)).all(1)]
+    first, last = _extent(inside)
+    axis = int((last - first).argmax())
+    at = float(np.quantile(inside[:, axis].numpy(), (count // 2) / count))
+    middle_high, middle_low = high.clone(), low.clone()
+    middle_high[axis] = middle_low[axis] = at
+    return _bisected(local, low, middle_high, count // 2) + _bisected(local, middle_low, high, count - count // 2)
+
+
+def _extent(values: Annotated[Tensor, "N K"]) -> tuple[Annotated[Tensor, "K"], Annotated[Tensor, "K"]]:
+    """Quantiles between which nearly all rows lie."""
+    low, high = np.quantile(values.numpy(), (_OUTLIERS, 1 - _OUTLIERS), axis=0)
+    return torch.from_numpy(low), torch.from_numpy(high)
+
+
+def _interval(first: float, last: float, size: int) -> tuple[int, int]:
+    """Start and length of a part of [0, size) around [first, last], at least `_LEAST` long where there is room."""
+    start = max(0, math.floor(first) - _ROOM)
+    length = min(max(math.ceil(last) + _ROOM - start, _LEAST), size)
+    return min(start, size - length), length

@@ -1,0 +1,95 @@
+"""Scenes in cells: the cut covers space once, cells can be lost and trained again, and their union is the scene."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from fprf.cli.main import main
+from fprf.datamanagers.parsers.config import parse_scene
+from fprf.datamanagers.scene import Scene, find_sightings
+from fprf.errors import ConfigError
+from fprf.splats.cells import Cell, cut
+from fprf.splats.files import read_capture
+from fprf.town.write import write_town
+
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cells") / "town"
+    write_town(folder, seed=0, palette="day", views=10, width=96, height=72)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(town: Path) -> Scene:
+    return parse_scene(town, 1, None)
+
+
+@pytest.fixture(scope="module")
+def cells(scene: Scene) -> list[Cell]:
+    return cut(scene, COUNT)
+
+
+def test_every_point_is_in_one_cell(cells: list[Cell]) -> None:
+    draw = torch.Generator().manual_seed(0)
+    points = 1e3 * torch.randn(1000, 3, generator=draw, dtype=torch.float64) ** 3
+    assert torch.stack([cell.holds(points) for cell in cells]).sum(0).eq(1).all()
+
+
+def test_cells_have_equally_many_sightings(scene: Scene, cells: list[Cell]) -> None:
+    sightings = find_sightings(scene)
+    assert sightings is not None
+    shares = [float(cell.holds(sightings.point).double().mean()) for cell in cells]
+    assert max(abs(share - 1 / COUNT) for share in shares) < 0.02
+
+
+def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: list[Cell]) -> None:
+    sightings = find_sightings(scene)
+    assert sightings is not None
+    for cell in cells:
+        assert not {*cell.windows} - {*scene.train.tolist()}
+        own = cell.scene(scene)
+        found = find_sightings(replace(own, points=cell.points, seen=None))
+        assert found is not None and {*found.view.tolist()} == {*cell.windows}
+        mine = cell.holds(sightings.point)
+        inside = torch.zeros_like(mine)
+        for view, (left, top, width, height) in cell.windows.items():
+            x, y = sightings.pixel.unbind(1)
+            inside |= (sightings.view == view) & (x >= left) & (x < left + width) & (y >= top) & (y < top + height)
+        assert inside[mine].double().mean() > 0.9  # outliers and views with few points are left out
+
+
+def test_too_few_points_are_refused(scene: Scene) -> None:
+    with pytest.raises(ConfigError, match="cells"):
+        cut(replace(scene, points=None, seen=None), 2)
+
+
+def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Scene, cells: list[Cell], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = ["train", "fprf-splats", "--data", str(town), "--downscale", "1", "--steps", "25", "--cells", str(COUNT)]
+    command += ["--initial", "300", "--cap", "600", "--output", str(run)]
+    assert main(command) == 0
+
+    def exported(name: str) -> bytes:
+        assert main(["export", str(run), "ply", "--output", str(tmp_path / name)]) == 0
+        return (tmp_path / name).read_bytes()
+
+    first = exported("a.ply")
+    stamps = {path: path.stat().st_mtime_ns for path in run.glob("cells/*/done.json")}
+    assert len(stamps) == COUNT
+    shutil.rmtree(run / "cells" / "01")
+    assert main(command) == 0
+    assert exported("b.ply") == first
+    assert [path.parent.name for path, stamp in stamps.items() if path.stat().st_mtime_ns != stamp] == ["01"]
+    gaussians = read_capture(tmp_path / "a.ply").gaussians
+    assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cells]).sum(0).eq(1).all()
+    document = json.loads((run / "cells.json").read_text())
+    assert math.isclose(sum(len(cell.windows) for cell in cells), sum(len(each["windows"]) for each in document["cells"]))
+    assert main(["eval", str(run), "--split", "test"]) == 0
