@@ -32,11 +32,6 @@ def test_methods_are_functions_of_nothing_and_differ() -> None:
     assert [load_method(name)[0] for name in ("fprf", "fprf-lite")] == made
 
 
-def test_each_method_says_what_it_is_for() -> None:
-    for method in (fprf, fprf_lite):
-        assert (method.__doc__ or "").strip().endswith(("samples.", "rays.", "it."))
-
-
 @pytest.mark.parametrize(
     "make",
     [

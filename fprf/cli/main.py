@@ -36,7 +36,7 @@ class Verb(NamedTuple):
 
 
 VERBS = {
-    "demo": Verb("[--output DIR]", "a garden from photographs to a page in several styles; no network, no data"),
+    "demo": Verb("[--output DIR]", "a garden, trained and restyled, as a page; no network, no data"),
     "process": Verb("IMAGES|VIDEO --output SCENE", "find poses for images or a video that have none"),
     "train": Verb("METHOD|CONFIG.json --data DIR", "train a scene, or go on where a run stopped"),
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),

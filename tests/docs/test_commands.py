@@ -200,7 +200,11 @@ def test_what_is_installed_and_marked_exists(command: Command) -> None:
 
 @pytest.mark.parametrize("command", [command for command in EVERY if command.words[0] == "python"], ids=str)
 def test_scripts_are_there(command: Command) -> None:
-    assert (ROOT / command.words[1]).is_file()
+    if command.words[1] == "-m":
+        package, name = command.words[2:4]
+        assert (ROOT / package / "__main__.py").is_file() and (ROOT / package / f"{name}.py").is_file()
+    else:
+        assert (ROOT / command.words[1]).is_file()
 
 
 def python_of(page: str) -> dict[str, Any]:

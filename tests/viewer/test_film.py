@@ -21,9 +21,15 @@ from fprf.training.loading import load_run
 from fprf.viewer import film
 from fprf.viewer.cameras import CameraState, page_transform
 from fprf.viewer.film import FilmPlan, film_cameras, film_frames, new_folder, queued_frames, write_film_files
+from fprf.viewer.renderer import ProgressiveRenderer
 from fprf.viewer.restyler import Restyler
 from fprf.viewer.session import Session
 from fprf.viewer.state import Key, Look, State, set_rule
+
+
+def drawn_by(restyler: Restyler) -> ProgressiveRenderer:
+    """A renderer that shows nothing to anybody."""
+    return ProgressiveRenderer(restyler.scene, restyler, page_transform(restyler.scene.known.cameras), lambda *shown: None)
 
 
 def plan_of(restyler: Restyler, looks: list[Look], seconds: float = 0.1, fps: float = 30.0) -> FilmPlan:
@@ -43,7 +49,7 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(world: World, tmp_path
     write_film_files(folder, page_transform(restyler.scene.known.cameras), plan, restyler.scene.known.facts.semantic_encoder)
     out: Queue[Picture | None] = Queue()
     told: list[tuple[int, int]] = []
-    for _ in film_frames(folder, restyler.scene, out, lambda done, total: told.append((done, total))):
+    for _ in film_frames(folder, restyler.scene, drawn_by(restyler), out, lambda done, total: told.append((done, total))):
         pass
     frames = list(queued_frames(out))
     assert len(frames) == 7 and told == [(i + 1, 7) for i in range(7)]
@@ -101,7 +107,8 @@ def test_folders_are_numbered(tmp_path: Path) -> None:
 def test_a_film_that_fails_ends_its_frames(world: World, tmp_path: Path) -> None:
     out: Queue[Picture | None] = Queue()
     with pytest.raises(Exception, match="no such camera path"):
-        list(film_frames(tmp_path, world.load(), out, lambda done, total: None))
+        restyler = Restyler(world.load())
+        list(film_frames(tmp_path, restyler.scene, drawn_by(restyler), out, lambda done, total: None))
     assert out.get_nowait() is None
 
 

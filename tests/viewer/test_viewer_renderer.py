@@ -128,8 +128,6 @@ def test_work_that_is_dropped_keeps_nothing_half(watched: Watched) -> None:
 def test_a_fast_machine_begins_sharp(watched: Watched) -> None:
     watched.renderer._speed.seconds = 1e-9
     assert len(watched.look(watched.glance())) == 1
-    watched.renderer.reload(watched.trained)
-    assert watched.renderer._bytes() == 0
 
 
 def painted(restyler: Restyler, shown: ViewSettings, chunk: int = 100) -> Layers:
