@@ -25,7 +25,7 @@ LEAD = (
     "Trained on a CPU from 25 photographs. Each look is then taken from one picture, without training, and is the same "
     "from every viewpoint."
 )
-LOOKS = ("autumn", "sunset", "winter", "night")
+LOOKS = ("winter", "night", "sunset", "autumn")
 """References, in the order in which they are shown."""
 CREDITS = (
     "Photographs of the garden: The SfM Tool Authors (sfmtool/sfmtool, test-data), Apache-2.0; reduced and re-encoded.",
