@@ -175,7 +175,7 @@ def _kernels(interpreted: bool) -> dict:
     usable = triplane_triton.usable
     return {
         "usable": lambda points, table: isinstance(points, Pretended) and usable(points, table),
-        **{name: inside(getattr(triplane_triton, name)) for name in ("forward", "density", "backward")},
+        **{name: inside(getattr(triplane_triton, name)) for name in ("forward", "backward")},
     }
 
 

@@ -339,7 +339,7 @@ def counting(name, function):
         return function(points, table, *args, **kwargs)
     return call
 
-for name in ("forward", "density", "backward"):
+for name in ("forward", "backward"):
     setattr(triplane_triton, name, counting(name, getattr(triplane_triton, name)))
 run, trainer.REPORT_SECONDS = Run(Path(sys.argv[1])), 1e9
 config, _ = run.load_config()
@@ -353,7 +353,7 @@ with pretend_cuda(triton=True) as seen:
         return result
     trainer.Loop.step = counted
     trainer.train(config, prepared, run, lambda event: None)
-print(*(taken[name] for name in ("density", "forward", "backward", "waits")))
+print(*(taken[name] for name in ("forward", "backward", "waits")))
 """
 
 
@@ -373,8 +373,8 @@ def test_kernels_of_the_device_are_taken(world: World, tmp_path: Path) -> None:
     command = [sys.executable, "-c", TRITON, str(run.root)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    # Of each step: proposals and content have a density, semantics a lookup; the proposals learn in the first one.
-    assert done.stdout.split() == ["4", "2", "5", "0"]
+    # Of each step: proposals, content and semantics look up their planes; the proposals learn in the first one.
+    assert done.stdout.split() == ["6", "5", "0"]
     other, _ = on_device(config, tmp_path / "plain")
     start, _ = on_device(replace(config, steps=0), tmp_path / "start")
     # Adam makes a whole step of a gradient that is rounding alone: one parameter in some thousands.
