@@ -58,7 +58,7 @@ class Members(ABC):
 
 
 class Held(Members):
-    """All of them in memory."""
+    """Members that are all in memory."""
 
     def __init__(self, members: Sequence[Member]) -> None:
         self._members = tuple(members)
@@ -69,7 +69,7 @@ class Held(Members):
 
     @property
     def held(self) -> Sequence[Member]:
-        """All."""
+        """Every member."""
         return self._members
 
 
@@ -302,7 +302,7 @@ def _leave(chart: Chart, cube: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N
 
 
 def _understood(part: nn.Module) -> bool:
-    """Whether all that a part has learnt lies in planes, linear maps and offsets."""
+    """True if a part consists of planes, linear maps and offsets alone."""
     place = {id(p) for module in part.modules() if isinstance(module, Planes) for p in module.parameters()}
     maps = {id(p) for module in part.modules() if isinstance(module, nn.Linear) for p in module.parameters()}
     return bool(place) and all(id(p) in place | maps or p.ndim == 1 for p in part.parameters())

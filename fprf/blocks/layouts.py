@@ -160,7 +160,7 @@ def _load(node: _Node, place: Tensor, weight: Tensor) -> float:
 
 
 def _median(values: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
-    """Where half of the weight lies below."""
+    """Weighted median."""
     order = values.argsort()
     total = weight[order].cumsum(0)
     at = int(torch.searchsorted(total, total[-1] / 2))

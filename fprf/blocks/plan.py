@@ -120,7 +120,7 @@ class Tiles(NamedTuple):
     origin: Annotated[Tensor, "M 3"]
     direction: Annotated[Tensor, "M TILES TILES 3"]
     reach: Annotated[Tensor, "M TILES TILES"]
-    """Where the rays end at the latest, space units; inf where nothing is known."""
+    """Upper bounds of the lengths of rays, space units; inf where nothing is known."""
     pixels: Annotated[Tensor, "M TILES TILES"]
     """int64 pixels of each tile; 0 outside of the image."""
 
@@ -148,12 +148,12 @@ def tile_rays(scene: Scene, space: Space, views: Annotated[Tensor, "M"], sightin
 
 
 def _centres(low: Tensor, high: Tensor) -> Tensor:
-    """How many pixel centres (+0.5) lie in [low, high): what `tile_of` puts into a tile."""
+    """Count pixel centres (+0.5) in [low, high), as `tile_of` puts them into tiles."""
     return ((high - 0.5).ceil() - (low - 0.5).ceil()).clamp_min(0).long()
 
 
 def visible(tiles: Tiles, boxes: Boxes) -> Annotated[Tensor, "M Z TILES TILES"]:
-    """Whether the rays of a tile meet each block, margins included, before they end."""
+    """True where the rays of a tile meet a block, margins included, before they end."""
     return torch.stack([meets(tiles, boxes, block) for block in range(len(boxes.low))], 1)
 
 

@@ -81,7 +81,7 @@ def shares(points: Annotated[Tensor, "N 3"], boxes: Boxes) -> Annotated[Tensor, 
 
 @dataclass(frozen=True)
 class Chart:
-    """Where low becomes -1 and high becomes 1 (or, contracted, -1/2 and 1/2), in turned axes."""
+    """Turned axes in which low becomes -1 and high becomes 1 (or, contracted, -1/2 and 1/2)."""
 
     low: Annotated[Tensor, "3"]
     high: Annotated[Tensor, "3"]
