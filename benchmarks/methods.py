@@ -1,6 +1,6 @@
 """Fields and Gaussians on the same captures: equal wall seconds, size and threads, judged on the same held-out views.
 
-    python -m benchmarks methods SCENE[:VIEWS] ... --output FILE.json [--minutes 2] [--side 320] [--only fprf-lite|fprf-splats ...]
+    python -m benchmarks methods SCENE[:VIEWS] ... --output FILE.json [--minutes 2] [--side 320] [--only METHOD ...]
 
 `SCENE:9` trains on nine of its training views (see `first_use`). Images are reduced by whole numbers until the longer side has
 at most `--side` pixels. Seconds count training with its features, not the imports; the fields distil semantics as well, the
