@@ -51,7 +51,7 @@ def compared(data: Path, place: Path, args: Any) -> dict[str, Any]:
     rows: dict[str, Any] = {"training_views": len(scene.train), "held_out_views": len(scene.test), "size": size}
     for method in args.only:
         run = place / method
-        wanted = ("--downscale", str(downscale), "--steps", "100000", "--minutes", str(args.minutes), "--device", "cpu")
+        wanted = ("--downscale", str(downscale), "--steps", "100000", "--minutes", str(args.minutes))
         _, processor, memory = command("train", method, "--data", str(data), "--output", str(run), *wanted)
         command("eval", str(run))
         figures = json.loads((run / "metrics.json").read_text())

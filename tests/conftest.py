@@ -32,6 +32,10 @@ def _one_kernel_thread() -> None:
 
     torch and numba share OpenMP: numba's first call gives torch, too, as many threads as there are cores.
     """
+    _use_one_thread()
+
+
+def _use_one_thread() -> None:
     numba.set_num_threads(1)
     torch.set_num_threads(1)
 
@@ -40,6 +44,7 @@ def _one_kernel_thread() -> None:
 def _world(tmp_path_factory: pytest.TempPathFactory) -> Iterator["World"]:
     from tiny_world import make_world  # imports the engine, which few tests need
 
+    _use_one_thread()  # fixtures of a session come before those of a test, and sums depend on the threads
     folder = tmp_path_factory.mktemp("world")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))

@@ -218,7 +218,7 @@ def scene_folder(data: Path) -> Iterator[Finding]:
         yield Finding("images", f"{len(absent)} are absent, the first is {absent[0]}", "restore them, or remove their poses")
     points = 0 if scene.points is None else len(scene.points)
     yield Finding("points", f"{points} of the reconstruction" if points else "none; bounds come from the cameras")
-    yield Finding("next", f"fprf train fprf-lite --data {shlex.quote(str(data))}")
+    yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
 
 
 def run_folder(folder: Path) -> Iterator[Finding]:

@@ -38,7 +38,7 @@ class Verb(NamedTuple):
 VERBS = {
     "demo": Verb("[--output DIR]", "a garden, trained and restyled, as a page; no network, no data"),
     "process": Verb("IMAGES|VIDEO --output SCENE", "find poses for images or a video that have none"),
-    "train": Verb("METHOD|CONFIG.json --data DIR", "train a scene, or go on where a run stopped"),
+    "train": Verb("[METHOD|CONFIG.json] --data DIR", "train a scene, or go on where a run stopped"),
     "eval": Verb("RUN", "measure a run: quality, speed, consistency"),
     "stylize": Verb("RUN --references A.jpg ...", "restyle captured views with photographs"),
     "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),

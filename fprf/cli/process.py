@@ -1,7 +1,7 @@
 """`fprf process IMAGES|VIDEO --output SCENE`: poses for images that have none, by COLMAP's Python package."""
 
 import shlex
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,14 @@ from rich.table import Table
 
 from .. import __version__
 from ..errors import UsageError
-from ..plugins.codec import method_config
 from ..reconstruction.config import SfmConfig
 from .parsing import parse
 from .progress import Display
 
 __all__ = ["ProcessConfig", "run"]
 
-METHOD, MINUTES = "fprf-lite", 8
-"""Method and minutes of the printed training command; with poses less than twelve minutes in all on two cores."""
+MINUTES = 3
+"""Minutes of the printed training command."""
 
 _DESCRIPTION = """Find poses for a folder of images or for a video, and make a scene folder that `fprf train` reads.
 
@@ -89,14 +88,15 @@ def _print(content: dict[str, Any], root: Path) -> None:
 def _check(root: Path) -> None:
     """Read the scene as training will, and print the commands that come next. Raises DataError where it cannot be read."""
     from ..datamanagers.parsers.config import parse_scene
-    from ..training.prepare import with_downscale
-    from .train import default_output
+    from ..splats.config import GaussiansConfig
+    from ..splats.training import with_downscale
+    from .train import DEFAULT_METHOD, default_output
 
-    config = replace(method_config(METHOD).fields_only(root), data=root, minutes=MINUTES)
+    config = GaussiansConfig(data=root, minutes=MINUTES)
     delivered = parse_scene(root, 1, None)
     size = with_downscale(config).downscale or 1
     width, height = delivered.cameras.scaled(size).size[0].tolist()
-    run = default_output(config, METHOD)
+    run = default_output(config, DEFAULT_METHOD)
     print(f"{len(delivered.train)} + {len(delivered.test)} views, trained at {width}x{height}")
-    print(f"fprf train {METHOD} --data {shlex.quote(str(root))} --minutes {MINUTES}")
+    print(f"fprf train --data {shlex.quote(str(root))} --minutes {MINUTES}")
     print(f"fprf stylize {shlex.quote(str(run))} --references PHOTO.jpg")

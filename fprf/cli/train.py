@@ -1,4 +1,4 @@
-"""`fprf train METHOD|CONFIG.json`: train a scene, or go on where a run stopped."""
+"""`fprf train [METHOD|CONFIG.json]`: train a scene, or go on where a run stopped."""
 
 import shlex
 import time
@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from ..viewer.live import LiveViewer
     from .progress import Display
 
-__all__ = ["check_same", "default_output", "run", "train_scene"]
+__all__ = ["DEFAULT_METHOD", "check_same", "default_output", "run", "train_scene"]
 
+DEFAULT_METHOD = "fprf-splats"
+"""Where none is named: the best quality for the time on every capture that was measured (docs/photographs.md)."""
 PLAN = "--plan"
 CHANGED = "--changed-images"
 _TIMED_VIEWS = 2
@@ -42,7 +44,7 @@ def run(args: list[str]) -> int:
         print(_usage())
         return 0 if args else 2
     if args[0].startswith("-"):
-        raise UsageError(f"fprf train {args[0]}: the method comes first, for example `fprf train fprf-lite {args[0]} ...`")
+        args = [DEFAULT_METHOD, *args]
     config, method = load_method(args[0])
     source = Path(args[0])
     if source.suffix == ".json" and config.output is None:
@@ -274,7 +276,8 @@ def check_same(folder: "Run", config: "RunConfig") -> None:
 
 
 def _usage() -> str:
-    lines = ["usage: fprf train METHOD|CONFIG.json [--data DIR] [any field]", "", "methods:"]
+    lines = ["usage: fprf train [METHOD|CONFIG.json] --data DIR [any field]", ""]
+    lines += [f"methods ({DEFAULT_METHOD} where none is named):"]
     listed = list(methods())
     width = max(len(name) for name, _ in listed)
     lines += [f"  {name:<{width}}  {about}" for name, about in listed]

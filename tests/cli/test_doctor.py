@@ -123,7 +123,7 @@ def test_scene_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((24, 32, 3), np.uint8))
     found = _by_name(scene_folder(tmp_path))
     assert found["format"].found == "transforms" and found["views"].found == "3 of 32 x 24 pixels, pinhole lens"
-    assert found["next"].found == f"fprf train fprf-lite --data {tmp_path}"
+    assert found["next"].found == f"fprf train --data {tmp_path}"
     assert run(["--target", str(tmp_path)]) == 0
     assert "32 x 24" in capsys.readouterr().out
 

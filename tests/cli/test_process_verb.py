@@ -14,7 +14,7 @@ import pytest
 
 from fprf.cli import main as cli
 from fprf.cli.parsing import load_method, parse
-from fprf.cli.train import default_output
+from fprf.cli.train import DEFAULT_METHOD, default_output
 from fprf.datamanagers.parsers.config import parse_scene
 
 FAKE = Path(__file__).parents[1] / "reconstruction" / "fake"
@@ -62,9 +62,10 @@ def test_images_become_a_scene(photos: Path, capsys: pytest.CaptureFixture[str])
     out = capsys.readouterr().out
     assert "5 of 5 images have a pose; 50 points, 0.50 pixels off; exhaustive matching" in out
     train, stylize = (shlex.split(line)[1:] for line in out.splitlines()[-2:])
-    assert train == ["train", "fprf-lite", "--data", str(photos.parent / "scene"), "--minutes", "8"]
-    config = parse(load_method("fprf-lite")[0], train[2:], prog="fprf train fprf-lite", description="")
-    assert stylize[:2] == ["stylize", str(default_output(config, "fprf-lite"))] and stylize[2:] == ["--references", "PHOTO.jpg"]
+    assert train == ["train", "--data", str(photos.parent / "scene"), "--minutes", "3"]
+    config = parse(load_method(DEFAULT_METHOD)[0], train[1:], prog="fprf train", description="")
+    assert stylize[:2] == ["stylize", str(default_output(config, DEFAULT_METHOD))]
+    assert stylize[2:] == ["--references", "PHOTO.jpg"]
     assert report(photos)["images"] == {"given": 5, "used": 5, "posed": 5}
 
 

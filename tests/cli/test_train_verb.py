@@ -73,7 +73,7 @@ def test_another_config_in_an_existing_run_is_refused_before_any_work(
     ("args", "told"),
     [
         (["fprf-litee"], "did you mean 'fprf-lite'"),
-        (["--data", "x"], "the method comes first"),
+        (["--sampler", "uniform"], "--sampler: no such flag; `fprf train fprf-splats --help`"),
         (["fprf-lite", "--stepz", "3"], "--stepz: no such flag; did you mean --steps?"),
         (["fprf-lite", "--steps", "many"], "--steps many: it takes a whole number"),
         (["fprf-lite", "--steps", "-1"], "--steps: -1 must be at least 0"),
@@ -108,7 +108,7 @@ def test_mistakes_in_the_data(capsys: pytest.CaptureFixture[str], tmp_path: Path
 def test_usage_lists_the_methods(capsys: pytest.CaptureFixture[str]) -> None:
     assert (cli.main(["train"]), cli.main(["train", "--help"])) == (2, 0)
     text = capsys.readouterr().out
-    assert text.count("usage: fprf train METHOD|CONFIG.json") == 2 and "fprf-lite" in text
+    assert text.count("usage: fprf train [METHOD|CONFIG.json]") == 2 and "fprf-lite" in text
 
 
 def test_an_interrupt_is_130_and_the_run_goes_on(
