@@ -6,7 +6,8 @@
 The first compares kernels and the plain torch form on a cloud in front of a camera of 500 x 375 pixels; most Gaussians are a
 pixel or two wide, as in a trained scene. Seconds are the least of several calls: of wall time, and of processor time, which
 counts all threads. The plain form runs once. The second trains the scenes of SCENES that lie in a folder and judges whole
-held-out photographs by `fprf eval`; processor seconds and memory are those of the command, its imports included.
+held-out photographs by `fprf eval`; processor seconds and memory are those of the command, its imports included. Each scene is
+an entry of the file with its own commit; the others stay.
 """
 
 import json
@@ -27,7 +28,7 @@ from torch import Tensor
 from fprf.ops import backend
 from fprf.ops.rasterise import Pinhole, Rasterised, lift, rasterise
 
-from .common import arguments, report
+from .common import add_entry, arguments, report
 
 WIDTH, HEIGHT, BANDS, CHANNELS = 500, 375, 4, 32
 SCENES = {
@@ -140,7 +141,6 @@ def trained(name: str, folder: Path, flags: str) -> dict[str, Any]:
         command("eval", str(run))
         found = json.loads((run / "metrics.json").read_text())
     return {
-        "name": name,
         "scene": folder.name,
         "command": f"fprf train fprf-splats --data {folder.name} --steps 100000 {flags}",
         "wall_seconds": wall,
@@ -159,17 +159,16 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--only", nargs="+", choices=SCENES, default=[*SCENES])
     parser.add_argument("--output", type=Path)
     args = parser.parse_args(argv)
-    found: dict[str, Any] = {}
     if args.scenes is None:
         torch.set_num_threads(args.threads)
         numba.set_num_threads(args.threads)
-        found = {"threads": args.threads, **measure(args.count, args.times)}
-    else:
-        found = {"load_average": os.getloadavg()[0], "rows": []}
-    for name in args.only if args.scenes is not None else ():
-        found["rows"].append(trained(name, args.scenes / SCENES[name][0], SCENES[name][1]))
-        if args.output is not None:  # what is measured is kept
+        found: dict[str, Any] = {"threads": args.threads, **measure(args.count, args.times)}
+        print(json.dumps(found, indent=1))
+        if args.output is not None:
             report(args.output, found)
-    print(json.dumps(found, indent=1))
-    if args.output is not None:
-        report(args.output, found)
+        return
+    for name in args.only:
+        row = trained(name, args.scenes / SCENES[name][0], SCENES[name][1]) | {"load_average": os.getloadavg()[0]}
+        print(name, json.dumps(row), flush=True)
+        if args.output is not None:
+            add_entry(args.output, name, row)
