@@ -1,16 +1,16 @@
-"""A folder as a phone gives it (the town's views as JPEG, no poses) to a restyled scene, by the README's own lines.
+"""A folder as a phone gives it (the town's views as JPEG, no poses) to a restyled scene, by `process` and the lines it prints.
 
-    python -m benchmarks phone WORK [--output benchmarks/results/phone.json] [--picture FILE.jpg] [--minutes 8]
+    python -m benchmarks phone WORK [--output benchmarks/results/phone.json] [--picture FILE.jpg]
 
 WORK holds everything that is made; lines that have run are not repeated. Needs the extra `sfm`.
 """
 
 import json
-import re
 import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ sys.path.insert(0, str(ROOT / "tests" / "reconstruction"))  # the tests' own mea
 
 from alignment import misses
 
-VERBS = ("process", "train", "eval", "stylize")
+PROCESS = ("process", "my_photos", "--output", "my_scene")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,22 +46,27 @@ class PhoneConfig:
     """Photographs."""
     quality: int = 92
     """Of the JPEG files."""
-    verbs: tuple[str, ...] = VERBS
-    """Lines of the README that are run now."""
-    minutes: float | None = None
-    """Training, instead of the README's."""
     output: Path | None = None
     """JSON file for the figures."""
     picture: Path | None = None
     """A sheet: captured, rendered, in two styles."""
 
 
-def lines_of(readme: str) -> dict[str, list[str]]:
-    """The words of the README's tour, without comments, for each verb that is needed here."""
-    tour = re.search(r"## Five-minute tour\s+```sh\n(.*?)```", readme, re.S)
-    assert tour is not None, "the README has a tour"
-    words = [shlex.split(line, comments=True) for line in tour[1].splitlines()]
-    return {each[1]: each[1:] for each in words if each[:1] == ["fprf"] and each[1] in VERBS}
+def execute(words: Sequence[str], work: Path, done: dict[str, Any]) -> None:
+    """Run a line of fprf in the folder, unless it has been run; note its seconds and what it printed."""
+    if words[0] in done:
+        return
+    start = time.monotonic()
+    print("fprf", *words, flush=True)
+    ended = subprocess.run([sys.executable, "-m", "fprf", *words], cwd=work, check=False, stdout=subprocess.PIPE, text=True)
+    if ended.returncode:
+        raise UsageError(f"`fprf {' '.join(words)}` failed in {work}; see above")
+    done[words[0]] = {
+        "line": shlex.join(["fprf", *words]),
+        "seconds": round(time.monotonic() - start, 1),
+        "printed": ended.stdout.splitlines()[-2:],
+    }
+    write_json(work / "lines.json", done)
 
 
 def photographs(config: PhoneConfig) -> None:
@@ -100,26 +105,19 @@ def main(argv: list[str]) -> None:
     done: dict[str, Any] = json.loads(log.read_text()) if log.is_file() else {}
     if not (work / "night.jpg").is_file():
         photographs(config)
-    for verb, words in lines_of((ROOT / "README.md").read_text()).items():
-        if verb in done or verb not in config.verbs:
-            continue
-        if verb == "train" and config.minutes is not None:
-            words += ["--minutes", str(config.minutes)]
-        start = time.monotonic()
-        print("fprf", *words, flush=True)
-        if subprocess.run([sys.executable, "-m", "fprf", *words], cwd=work, check=False).returncode:
-            raise UsageError(f"`fprf {' '.join(words)}` failed in {work}; see above")
-        done[verb] = {"line": shlex.join(["fprf", *words]), "seconds": round(time.monotonic() - start, 1)}
-        write_json(log, done)
+    execute(PROCESS, work, done)
+    train, stylize = (shlex.split(line)[1:] for line in done["process"]["printed"])
+    execute(train, work, done)
+    execute(["eval", stylize[1]], work, done)
+    execute([*stylize[:-1], "autumn.jpg", "night.jpg"], work, done)
     figures: dict[str, Any] = {"poses": poses(work), "lines": done}
-    run = next((work / "runs").glob("*/metrics.json"), work / "none").parent
-    if "eval" in done:
-        metrics = json.loads((run / "metrics.json").read_text())
-        figures |= {key: metrics[key] for key in ("psnr", "ssim", "train_seconds", "train_steps")}
+    run = work / stylize[1]
+    metrics = json.loads((run / "metrics.json").read_text())
+    figures |= {key: metrics[key] for key in ("psnr", "ssim", "train_seconds", "train_steps")}
     print(json.dumps(figures, indent=1))
     if config.output is not None:
         report(config.output, figures)
-    if config.picture is not None and "stylize" in done:
+    if config.picture is not None:
         write_image(config.picture, sheet([row(work, run, name) for name in held_out(run)]))
 
 
