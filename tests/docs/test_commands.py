@@ -56,7 +56,7 @@ FEWER = {"render": ["--frames", "2"], "export": ["--tolerance", "0.3", "--agree"
 FEWER["restyle"] = ["--views", "3", "--size", "64", "48", "--regions", "3"]
 """The tiny model renders few frames, and has barely begun to agree with itself."""
 SCENES = ("my_scene", "SCENE", "DIR", "FOLDER", "scenes/yard", "fox")
-RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite", "runs/my_scene-fprf-splats", "runs/yard-fprf-lite")
+RUNS = ("RUN", "OTHER_RUN", "runs/my_scene-fprf-lite", "runs/my_scene-fprf-splats", "runs/yard-fprf-splats")
 PHOTOGRAPHS = ("autumn.jpg", "night.jpg", "dusk.jpg", "snow.jpg", "a.jpg", "A.jpg", "photos/one.jpg", "my_photos/one.jpg")
 CAPTURES = ("capture.ply", "plant.splat", "my_scan.spz")
 WEIGHTS = ("vgg19.safetensors", "F")
