@@ -120,7 +120,7 @@ def _tyro(config: C, args: list[str], *, prog: str, description: str, positional
 
 
 def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
-    """The config with some fields marked as positional and required, in a subclass that checks nothing yet."""
+    """The config with some fields marked as positional, in a subclass that checks nothing yet; None can be left out."""
     import tyro
 
     if not names:
@@ -128,7 +128,8 @@ def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
     hints = hints_of(type(config))
     marked = []
     for name in names:
-        arg = tyro.conf.arg(metavar=name.upper(), help_behavior_hint="(required)")
+        hint = None if getattr(config, name) is None else "(required)"
+        arg = tyro.conf.arg(metavar=name.upper(), help_behavior_hint=hint)
         marked.append((name, Annotated[hints[name], tyro.conf.Positional, arg]))
     kind = dataclasses.make_dataclass(
         type(config).__name__,
@@ -139,7 +140,7 @@ def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
         kw_only=True,
     )
     values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return kind(**values | dict.fromkeys(names, tyro.MISSING))
+    return kind(**values | {name: tyro.MISSING for name in names if values[name] is not None})
 
 
 def _slot_flags(found: list[Slot]) -> Any:

@@ -1,10 +1,11 @@
-"""`fprf view RUN` or `fprf view CAPTURE.ply`: the scene in the browser; drop a photograph on it and it is restyled."""
+"""`fprf view [RUN|CAPTURE.ply]`: a scene in the browser, or the page that makes one; a photograph dropped on it restyles it."""
 
+import contextlib
 import importlib.util
 import os
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,9 @@ from .parsing import parse
 from .style_flags import say
 
 if TYPE_CHECKING:
+    from ..viewer.server import ViewerServer
     from ..viewer.session import Viewed
+    from ..viewer.start_page import StartPage
 
 __all__ = ["ViewConfig", "run"]
 
@@ -27,8 +30,11 @@ _EXIT_TIMEOUT = 15.0
 class ViewConfig(QualityConfig):
     """Which run to show, and to whom."""
 
-    run: Path = Path()
-    """Run folder, or a capture of 3D Gaussians: .ply .compressed.ply .splat .spz .sog, or a SOG folder."""
+    run: Path | None = None
+    """Run folder, or a capture of 3D Gaussians: .ply .compressed.ply .splat .spz .sog, or a SOG folder; none = a start page in
+    the browser, which takes photographs, a video, a capture or a run."""
+    output: Path = Path("my_scenes")
+    """Folder of what the start page makes, with a folder for each scene."""
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
     """Direction that points up in a capture's own axes."""
     inside: bool | None = None
@@ -57,18 +63,26 @@ class ViewConfig(QualityConfig):
 
 def run(args: list[str]) -> int:
     """Serve until interrupted."""
-    config = parse(ViewConfig(), args, prog="fprf view", description="Look at a run in the browser.", positional=("run",))
+    description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
+    config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
     if importlib.util.find_spec("viser") is None:
         raise UsageError("fprf view: needs viser; install it with pip install 'fprf[viewer]'")
     from ..viewer.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
-    with ViewerServer(access, config.port) as server:
-        if not (_is_capture(config.run) or (config.run / "config.json").is_file()):
-            raise CheckpointError(f"{config.run}: no config.json here, so it is no run folder; `fprf train` makes one")
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(ViewerServer(access, config.port))
+        from ..viewer.scene_files import is_capture
+
+        path = config.run
+        if path is not None and not (is_capture(path) or (path / "config.json").is_file()):
+            raise CheckpointError(f"{path}: no config.json here, so it is no run folder; `fprf train` makes one")
         references = _photographs(config.references)
         print(server.address, flush=True)
-        server.open(lambda: _load(config), references, config.pixels)
+        if path is None:
+            stack.callback(_start(server, config, references).close)
+        else:
+            server.open(lambda: _load(config, path), references, config.pixels)
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
@@ -89,19 +103,28 @@ def _photographs(references: Sequence[Path]) -> Sequence[Path]:
     return photographs(references, say)
 
 
-def _is_capture(path: Path) -> bool:
-    return (
-        path.suffix.lower() in (".ply", ".splat", ".spz", ".sog") or path.name == "meta.json" or (path / "meta.json").is_file()
-    )
+def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path]) -> "StartPage":
+    from ..viewer.start_page import StartPage
+
+    def show(path: Path, name: str) -> None:
+        server.open(lambda: replace(_load(config, path), name=name), references, config.pixels)
+
+    def leave() -> None:
+        server.show_start(page.routes)
+
+    page = StartPage(config.output, show, leave)
+    leave()
+    return page
 
 
-def _load(config: ViewConfig) -> "Viewed":
+def _load(config: ViewConfig, path: Path) -> "Viewed":
+    from ..viewer.scene_files import is_capture
     from ..viewer.session import Viewed, view_of_run
 
-    if not _is_capture(config.run):
+    if not is_capture(path):
         from ..training.loading import open_run
 
-        run = open_run(config.run, config.device, config)
+        run = open_run(path, config.device, config)
         return view_of_run(run.scene, run.run, run.known)
     from ..plugins.encoders.config import BundledSemanticConfig
     from ..plugins.stylizers.config import RegionToneConfig
@@ -109,8 +132,6 @@ def _load(config: ViewConfig) -> "Viewed":
     from ..splats.look_config import LookConfig
     from .restyle import seen_capture
 
-    scene = seen_capture(
-        read_capture(config.run), BundledSemanticConfig().build(), LookConfig(up=config.up, inside=config.inside)
-    )
-    name = config.run.resolve().name.partition(".")[0]
+    scene = seen_capture(read_capture(path), BundledSemanticConfig().build(), LookConfig(up=config.up, inside=config.inside))
+    name = path.resolve().name.partition(".")[0]
     return Viewed(scene, name, 0, stylizer=RegionToneConfig(centred=False))

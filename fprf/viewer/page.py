@@ -5,7 +5,6 @@ is something newer than N, or after some seconds.
 """
 
 import asyncio
-import json
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ from typing import Any
 from ..errors import UsageError
 from ..io.images import encode
 from ..io.maps import palette
-from .server import Handler, Request, Response
+from .server import Handler, Request, Response, json_body, json_response
 from .session import Session
 from .state import (
     Photograph,
@@ -36,7 +35,6 @@ __all__ = ["Page", "described"]
 _WAIT = 20.0
 """Seconds until a request for changes is answered without any."""
 _MESSAGES = 20
-_MAX_REQUEST = 4096
 _IMAGE = {"cache-control": "private, max-age=3600"}
 _EDITS: Mapping[str, Callable[[State], State]] = {
     "choose": lambda state: state,
@@ -48,10 +46,10 @@ _ACTIONS: Mapping[str, RegionAction | None] = {"pin": "pin", "forbid": "forbid",
 
 
 class Page:
-    """Handlers of one session. `index` is what `/` shows."""
+    """Handlers of one session. `index` is what `/` shows; with `start` there is a start page to go back to."""
 
-    def __init__(self, session: Session, index: bytes) -> None:
-        self._session, self._first = session, index
+    def __init__(self, session: Session, index: bytes, *, start: bool = False) -> None:
+        self._session, self._first, self._start = session, index, start
         self._version = 0
         self._messages: deque[tuple[int, str]] = deque(maxlen=_MESSAGES)
         self._lock = threading.Lock()
@@ -114,7 +112,7 @@ class Page:
                     self._waiting.discard(entry)
         with self._lock:
             version, said = self._version, [text for at, text in self._messages if at > after >= 0]
-        return _json({"version": version, "said": said, **described(self._session.state)})
+        return json_response({"version": version, "said": said, "start": self._start, **described(self._session.state)})
 
     async def _thumbnail(self, request: Request) -> Response:
         photograph = _photograph(self._session.state, request.query)
@@ -136,7 +134,7 @@ class Page:
         return Response(404, "text/plain; charset=utf-8", b"no picture of this key\n")
 
     async def _edit_key(self, request: Request) -> Response:
-        asked = _object(request)
+        asked = json_body(request)
         at, edit = _integer(str(asked.get("key"))), _EDITS.get(str(asked.get("action")))
         if edit is None:
             raise UsageError(f"keys: the action is none of {', '.join(_EDITS)}")
@@ -145,10 +143,10 @@ class Page:
     async def _upload(self, request: Request) -> Response:
         name = request.query.get("name", "photograph")
         photograph = await asyncio.to_thread(self._session.upload, request.body, name)
-        return _json({"card": photograph.number, "name": photograph.name})
+        return json_response({"card": photograph.number, "name": photograph.name})
 
     async def _edit_shelf(self, request: Request) -> Response:
-        asked = _object(request)
+        asked = json_body(request)
         number, action = {"card": str(asked.get("card"))}, asked.get("action")
 
         def change(state: State) -> State:
@@ -165,11 +163,11 @@ class Page:
         return self._update(change)
 
     async def _edit_region(self, request: Request) -> Response:
-        asked = _object(request)
+        asked = json_body(request)
         text = str(asked.get("verb"))
         if text == "close":
             self._session.select_region(None)
-            return _json({})
+            return json_response({})
         if text not in _ACTIONS:
             raise UsageError(f"region: the verb is none of {', '.join(_ACTIONS)}, close")
         action = _ACTIONS[text]
@@ -186,7 +184,7 @@ class Page:
         return self._update(change)
 
     async def _move_wipe(self, request: Request) -> Response:
-        at = _number(_object(request), "at", 1.0)
+        at = _number(json_body(request), "at", 1.0)
         return self._update(lambda state: replace(state, wipe=at) if state.wipe is not None else state)
 
     def _update(self, change: Callable[[State], State]) -> Response:
@@ -203,7 +201,7 @@ class Page:
         self._session.update(guarded)
         if faults:
             raise faults[0]
-        return _json({})
+        return json_response({})
 
 
 def described(state: State) -> dict[str, Any]:
@@ -259,19 +257,3 @@ def _number(asked: Mapping[str, Any], name: str, most: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
         raise UsageError(f"{name}: must be a number from 0 to {most:g}")
     return float(value)
-
-
-def _object(request: Request) -> dict[str, Any]:
-    if len(request.body) > _MAX_REQUEST:
-        raise UsageError("request: too long")
-    try:
-        asked = json.loads(request.body)
-    except (ValueError, RecursionError):
-        raise UsageError("request: not JSON") from None
-    if not isinstance(asked, dict):
-        raise UsageError("request: not an object")
-    return asked
-
-
-def _json(value: dict[str, Any]) -> Response:
-    return Response(200, "application/json", json.dumps(value).encode())

@@ -10,6 +10,7 @@ import contextlib
 import hmac
 import importlib
 import ipaddress
+import json
 import logging
 import secrets
 import socket
@@ -29,7 +30,19 @@ if TYPE_CHECKING:
     from .restyler import OpenEncoders
     from .session import Session, Viewed
 
-__all__ = ["COOKIE", "Access", "HttpServer", "Request", "Response", "ViewerServer", "make_access"]
+__all__ = [
+    "COOKIE",
+    "Access",
+    "Handler",
+    "HttpServer",
+    "Request",
+    "Response",
+    "Routes",
+    "ViewerServer",
+    "json_body",
+    "json_response",
+    "make_access",
+]
 
 COOKIE = "fprf-token"
 _MIN_TOKEN = 16
@@ -44,6 +57,8 @@ _UPLOADS = 4
 _MAX_BODY = 20 << 20
 _MAX_MESSAGE = 1 << 20
 """Bytes of a WebSocket message; the page sends a few hundred."""
+_MAX_JSON = 4096
+"""Bytes of a request that is JSON."""
 _PIECE = 1 << 16
 _HEADERS = {
     "x-content-type-options": "nosniff",
@@ -182,6 +197,10 @@ class HttpServer:
         self._thread = threading.Thread(target=self._server.run, args=([listener],), name="fprf-http", daemon=True)
         self._thread.start()
 
+    def serve(self, routes: Routes) -> None:
+        """Change the routes and relay no WebSockets."""
+        self._routes, self._viser = routes, None
+
     def relay_to(self, routes: Routes, address: tuple[str, int], check: Callable[[bytes], None]) -> None:
         """Change the routes and relay WebSockets to viser; a message for which `check` raises ends its connection."""
         self._routes, self._viser = routes, (f"ws://{address[0]}:{address[1]}", check)
@@ -272,15 +291,16 @@ class ViewerServer:
             threading.Thread(target=_import_viser, daemon=True).start()
         self.visited = threading.Event()
         self._session: Session | None = None
+        self._start: Routes | None = None
         self._http = HttpServer(access, port, {("GET", "/"): self._loading_page})
-        self._closers: list[Callable[[], None]] = [self._http.close]
+        self._closers: list[Callable[[], None]] = []
 
     def __enter__(self) -> "ViewerServer":
         return self
 
     def __exit__(self, *_: object) -> None:
-        for close in reversed(self._closers):
-            close()
+        self._close_session()
+        self._http.close()
 
     @property
     def address(self) -> str:
@@ -290,6 +310,12 @@ class ViewerServer:
         host = f"[{host}]" if ":" in host else host
         token = "" if access.token is None else f"?token={quote(access.token)}"
         return f"http://{host}:{self._http.port}/{token}"
+
+    def show_start(self, routes: Routes) -> None:
+        """Show the start page in the place of a scene; its routes stay when one is opened, but for `/`."""
+        self._start = routes
+        self._close_session()
+        self._http.serve(routes)
 
     def notify(self, text: str) -> None:
         """Show a line on all pages."""
@@ -303,11 +329,13 @@ class ViewerServer:
         pixels: int,
         open_encoders: "OpenEncoders | None" = None,
     ) -> "Session":
-        """Load the scene and let clients in; `open_encoders` opens the encoders of a scene that is still trained.
+        """Load the scene and let clients in, in the place of one that was open; `open_encoders` opens the encoders of a scene
+        that is still trained.
 
         Raises what `load` raises, and DataError for an unreadable photograph.
         """
         viewed = load()
+        self._close_session()
         from .frontend import ViserFrontend, page_of
         from .message_validation import check_message
         from .page import Page
@@ -318,16 +346,21 @@ class ViewerServer:
         session = Session(viewed, state, open_encoders)
         session.__enter__()
         self._closers.append(session.close)
-        page = Page(session, page_of(viewed.name))
+        page = Page(session, page_of(viewed.name), start=self._start is not None)
         frontend = ViserFrontend(session, page)
         self._closers.append(frontend.close)
-        self._http.relay_to(page.routes, frontend.address, check_message)
+        self._http.relay_to({**(self._start or {}), **page.routes}, frontend.address, check_message)
         for path in references:
             session.upload(path.read_bytes(), path.name)
         if open_encoders is None:
             session.warm_up()
         self._session = session
         return session
+
+    def _close_session(self) -> None:
+        for close in reversed(self._closers):
+            close()
+        self._closers, self._session = [], None
 
     async def _loading_page(self, request: Request) -> Response:
         self.visited.set()
@@ -387,6 +420,24 @@ async def _send(send: _Send, response: Response, kind: str) -> None:
         last = start + _PIECE >= len(response.body)
         piece = {"type": f"{kind}.body", "body": response.body[start : start + _PIECE], "more_body": not last}
         await asyncio.wait_for(send(piece), _TIMEOUT)
+
+
+def json_response(value: object) -> Response:
+    """A value as JSON."""
+    return Response(200, "application/json", json.dumps(value).encode())
+
+
+def json_body(request: Request) -> dict[str, Any]:
+    """The object that a request holds. Raises UsageError where it holds none."""
+    if len(request.body) > _MAX_JSON:
+        raise UsageError("request: too long")
+    try:
+        asked = json.loads(request.body)
+    except (ValueError, RecursionError):
+        raise UsageError("request: not JSON") from None
+    if not isinstance(asked, dict):
+        raise UsageError("request: not an object")
+    return asked
 
 
 def _text(status: int, text: str) -> Response:

@@ -1,0 +1,347 @@
+"""The page of `fprf view` without a run: photographs, a video or a capture come in, and become a scene that the viewer shows.
+
+Poses and training are `fprf process` and `fprf train` in processes of their own; the page shows the lines that they print. A
+scene has one folder: its `files`, the `scene` with their poses, and the run folder `run`.
+"""
+
+import asyncio
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+from ..checks import between
+from ..errors import DataError, FprfError, UsageError
+from .scene_files import SceneFiles, Source, find_source
+from .server import Handler, Request, Response, json_body, json_response
+
+__all__ = ["Progress", "StartPage"]
+
+METHOD = "fprf-splats"
+_FILES, _SCENE, _RUN = "files", "scene", "run"
+_LINES = 40
+"""Lines of a process that are kept."""
+_RECENT = 12
+_EXIT_TIMEOUT = 10.0
+"""Seconds that a process has to save and end."""
+_PICTURE = 480
+"""Longest side of the picture of training, in pixels."""
+_SAVES = 40
+"""Times that training saves, and so shows another picture, at most every six seconds."""
+
+Stage: TypeAlias = Literal["idle", "poses", "training", "opening", "open"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a scene is made."""
+
+    name: str = ""
+    stage: Stage = "idle"
+    what: str = ""
+    """What is done now, in words."""
+    share: float | None = None
+    """Of `what`, in [0, 1]; None = not known."""
+    detail: str = ""
+    lines: tuple[str, ...] = ()
+    """What the processes said, the last lines of it."""
+    error: str | None = None
+    folder: str = ""
+    """Where everything lies."""
+
+
+class _Left(Exception):
+    """The user wants nothing more of a scene."""
+
+
+class StartPage:
+    """`output` holds a folder a scene; `show` opens the viewer on a run folder or a capture, `leave` closes it."""
+
+    def __init__(self, output: Path, show: Callable[[Path, str], None], leave: Callable[[], None]) -> None:
+        self._output, self._show, self._leave = output.resolve(), show, leave
+        self._uploads: dict[str, SceneFiles] = {}
+        self._progress = Progress()
+        self._lock, self._drawing = threading.Lock(), threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._stopped = ""
+        """What was asked for when it was stopped: `show` or `leave`."""
+        self._thread: threading.Thread | None = None
+        self._picture: tuple[int, bytes] = (-1, b"")
+
+    @property
+    def routes(self) -> dict[tuple[str, str], Handler]:
+        """Handlers by method and path; those but `/` serve the viewer's page as well."""
+        return {
+            ("GET", "/"): _asset("start.html", "text/html; charset=utf-8"),
+            ("GET", "/fprf/start.js"): _asset("start.js", "text/javascript; charset=utf-8"),
+            ("GET", "/fprf/start.css"): _asset("start.css", "text/css; charset=utf-8"),
+            ("GET", "/fprf/start"): self._state,
+            ("GET", "/fprf/start/picture"): self._draw,
+            ("POST", "/fprf/start/new"): self._new,
+            ("POST", "/fprf/start/piece"): self._piece,
+            ("POST", "/fprf/start/make"): self._make_uploaded,
+            ("POST", "/fprf/start/open"): self._make_path,
+            ("POST", "/fprf/start/stop"): self._stop,
+            ("POST", "/fprf/start/leave"): self._close_scene,
+        }
+
+    def close(self) -> None:
+        """End what is being made, as an interrupt at the terminal would."""
+        self._interrupt("leave")
+        if self._thread is not None:
+            self._thread.join(_EXIT_TIMEOUT)
+
+    async def _state(self, request: Request) -> Response:
+        progress = self._progress
+        idle = progress.stage == "idle"
+        return json_response(
+            {
+                **asdict(progress),
+                "picture": -1 if progress.stage != "training" else _newest(self._output / progress.name / _RUN),
+                "output": str(self._output),
+                "recent": await asyncio.to_thread(self._recent) if idle else [],
+            }
+        )
+
+    async def _draw(self, request: Request) -> Response:
+        picture = await asyncio.to_thread(self._drawn, self._output / self._progress.name / _RUN)
+        if not picture:
+            return Response(404, "text/plain; charset=utf-8", b"no picture yet\n")
+        return Response(200, "image/jpeg", picture)
+
+    async def _new(self, request: Request) -> Response:
+        """Begin a scene under a name like the one that is asked for."""
+        name = self._unused(str(json_body(request).get("name", "")))
+        self._uploads[name] = SceneFiles(self._output / name / _FILES)
+        return json_response({"scene": name})
+
+    async def _piece(self, request: Request) -> Response:
+        query = request.query
+        upload = self._upload(query.get("scene"))
+        at, size = (_count(query.get(key, "")) for key in ("at", "size"))
+        await asyncio.to_thread(upload.add, query.get("name", ""), at, size, request.body)
+        return json_response({})
+
+    async def _make_uploaded(self, request: Request) -> Response:
+        asked = json_body(request)
+        name = str(asked.get("scene"))
+        folder = self._upload(name).folder
+        if not folder.is_dir():
+            raise UsageError("none of these files can become a scene; give photographs, a video or a capture")
+        self._begin(await asyncio.to_thread(find_source, folder), name, _minutes(asked))
+        return json_response({})
+
+    async def _make_path(self, request: Request) -> Response:
+        """Open, or make a scene of, a file or folder of this machine."""
+        asked = json_body(request)
+        text = str(asked.get("path", "")).strip().strip("\"'")
+        if not text:
+            raise UsageError("name a run folder, a capture, a video or a folder of photographs")
+        path = Path(text).expanduser()
+        source = await asyncio.to_thread(find_source, path)
+        ours = path.name == _FILES and path.resolve().parent.parent == self._output
+        self._begin(source, path.resolve().parent.name if ours else self._unused(path.stem), _minutes(asked))
+        return json_response({})
+
+    async def _stop(self, request: Request) -> Response:
+        """Stop what is being made, to show what there is, or to leave it; a failure is put away."""
+        self._interrupt("show" if json_body(request).get("then") == "show" else "leave")
+        if self._thread is None or not self._thread.is_alive():
+            self._progress = Progress()
+        return json_response({})
+
+    async def _close_scene(self, request: Request) -> Response:
+        if self._progress.stage in ("idle", "open"):
+            await asyncio.to_thread(self._leave)
+            self._progress = Progress()
+        return json_response({})
+
+    def _begin(self, source: Source, name: str, minutes: float) -> None:
+        with self._lock:
+            if self._thread is not None and self._thread.is_alive():
+                raise UsageError(f"{self._progress.name} is being made; stop it first")
+            self._stopped, self._picture = "", (-1, b"")
+            folder = self._output / name if source.kind != "run" else source.path
+            self._progress = Progress(name=name, stage="opening", folder=str(folder))
+            self._thread = threading.Thread(target=self._make, args=(source, name, minutes), name="fprf-make", daemon=True)
+            self._thread.start()
+
+    def _make(self, source: Source, name: str, minutes: float) -> None:
+        """Find poses, train, and open the viewer, as far as the source needs it."""
+        root, path = self._output / name, source.path
+        try:
+            if source.kind in ("photographs", "video"):
+                self._set(stage="poses", what="looking at the photographs")
+                self._call(["process", str(path), "--output", str(root / _SCENE)])
+                path = root / _SCENE
+            if source.kind in ("photographs", "video", "scene"):
+                self._set(stage="training", what="reading photographs", share=None, detail="")
+                often = f"{max(0.1, minutes / _SAVES):g}"
+                place = ["--data", str(path), "--output", str(root / _RUN)]
+                self._call(["train", METHOD, *place, "--minutes", f"{minutes:g}", "--checkpoint-minutes", often])
+                path = root / _RUN
+            self._set(stage="opening", what="opening the scene", share=None, detail="")
+            self._show(path, name if source.kind != "run" else path.resolve().name)
+            self._set(stage="open")
+        except _Left:
+            self._progress = Progress()
+        except FprfError as error:
+            self._set(error=str(error))
+        except Exception as error:  # whatever it is, the page goes on and the files are there
+            self._set(error=f"this should not have happened: {type(error).__name__}: {error}")
+
+    def _call(self, args: Sequence[str]) -> None:
+        """Run a verb to its end. Raises DataError with what it says when it fails, `_Left` when it is to be left."""
+        if self._stopped:
+            raise _Left
+        command = [sys.executable, "-m", "fprf", *args]
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace"
+        ) as process:
+            self._process = process
+            assert process.stdout is not None
+            last = ""
+            for line in process.stdout:
+                if line.strip():
+                    last = line.strip()
+                    self._follow(last)
+        self._process = None
+        if self._stopped == "leave" or (self._stopped and _newest(self._output / self._progress.name / _RUN) < 0):
+            raise _Left
+        if process.returncode and not self._stopped:
+            raise DataError(last.removeprefix("error: ") or f"fprf {args[0]} has ended with {process.returncode}")
+
+    def _follow(self, line: str) -> None:
+        """Take a line that a process printed: progress as JSON, or a message."""
+        try:
+            event = json.loads(line)
+        except ValueError:
+            event = None
+        if not isinstance(event, dict) or "event" not in event:
+            self._set(lines=(*self._progress.lines, line)[-_LINES:])
+            return
+        what = str(event["event"])
+        if "step" in event:
+            clock = f"{event['seconds_left'] // 60}:{event['seconds_left'] % 60:02d} left"
+            self._set(what=what, share=event["share"], detail=f"step {event['step']} · {event['psnr']:.1f} dB · {clock}")
+        elif "total" in event:
+            share = event["done"] / max(1, event["total"])
+            self._set(what=what, share=share, detail=f"{event['done']} of {event['total']}")
+        else:
+            self._set(lines=(*self._progress.lines, what)[-_LINES:])
+
+    def _interrupt(self, then: str) -> None:
+        """Let the process that runs save and end; one that does not is killed."""
+        self._stopped = then
+        process = self._process
+        if process is not None:
+            with contextlib.suppress(OSError):
+                process.send_signal(signal.SIGINT)
+            threading.Thread(target=_end, args=(process,), daemon=True).start()
+
+    def _set(self, **changes: Any) -> None:
+        self._progress = replace(self._progress, **changes)
+
+    def _upload(self, name: str | None) -> SceneFiles:
+        found = self._uploads.get(name or "")
+        if found is None:
+            raise UsageError("no such scene; begin again by dropping the files")
+        return found
+
+    def _unused(self, asked: str) -> str:
+        """A folder's name like the one asked for, that no other scene has."""
+        last = asked.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
+        plain = "".join(c if c.isalnum() or c in "-_" else "-" for c in last)[:40].strip("-") or "scene"
+        names = (plain if number == 1 else f"{plain}-{number}" for number in range(1, 10_000))
+        return next(name for name in names if name not in self._uploads and not (self._output / name).exists())
+
+    def _recent(self) -> list[dict[str, str]]:
+        """Scenes and runs on this machine, the newest first."""
+        found = [*_scenes(self._output), *((path, path.name) for path in _runs(Path("runs"))), (Path("demo/run"), "demo")]
+        dated = [(path.stat().st_mtime, path, name) for path, name in found if path.is_dir()]
+        return [
+            {
+                "path": str(path.resolve()),
+                "name": name,
+                "kind": "files" if path.name == _FILES else "run",
+                "when": time.strftime("%d %b %H:%M", time.localtime(date)),
+            }
+            for date, path, name in sorted(dated, reverse=True)[:_RECENT]
+        ]
+
+    def _drawn(self, run: Path) -> bytes:
+        """A view of the newest checkpoint as a JPEG; empty where there is none."""
+        with self._drawing:
+            step = _newest(run)
+            if step > self._picture[0]:
+                with contextlib.suppress(FprfError, OSError):  # while it is saved or replaced the one before is good
+                    self._picture = (step, _render(run))
+            return self._picture[1]
+
+
+def _render(run: Path) -> bytes:
+    from ..io.images import encode, to_uint8
+    from ..training.loading import open_run
+    from ..training.quality import QualityConfig
+
+    opened = open_run(run, "cpu", QualityConfig())
+    views = opened.known.test or opened.known.train
+    view = views[len(views) // 2]
+    small = min(1.0, _PICTURE / int(opened.known.cameras.size[view].amax()))
+    return encode(to_uint8(opened.scene.render(opened.known.cameras, view, resolution=small).rgb), "jpg")
+
+
+def _asset(name: str, content_type: str) -> Handler:
+    async def asset(request: Request) -> Response:
+        return Response(200, content_type, (files(__package__) / name).read_bytes())
+
+    return asset
+
+
+def _newest(run: Path) -> int:
+    """Step of the newest whole checkpoint; -1 where there is none."""
+    steps = (path.parent.name.removeprefix("step-") for path in run.glob("checkpoints/step-*/manifest.json"))
+    return max((int(step) for step in steps if step.isdigit()), default=-1)
+
+
+def _runs(folder: Path) -> Iterator[Path]:
+    for config in folder.glob("*/config.json"):
+        if _newest(config.parent) >= 0:
+            yield config.parent
+
+
+def _scenes(output: Path) -> Iterator[tuple[Path, str]]:
+    """What the folder of each scene is opened by: its run, or its files where there is none yet."""
+    for folder in output.glob("*/"):
+        opened = folder / _RUN if _newest(folder / _RUN) >= 0 else folder / _FILES
+        if opened.is_dir():
+            yield opened, folder.name
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    try:
+        process.wait(_EXIT_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def _minutes(asked: dict[str, Any]) -> float:
+    minutes = asked.get("minutes", 2)
+    if isinstance(minutes, bool) or not isinstance(minutes, int | float):
+        raise UsageError("minutes: no number")
+    between("minutes", float(minutes), 0.05, 600.0)
+    return float(minutes)
+
+
+def _count(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) <= 12):
+        raise UsageError(f"{text[:20]!r}: no number of bytes")
+    return int(text)
