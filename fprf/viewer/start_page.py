@@ -200,7 +200,7 @@ class StartPage:
 
     def _call(self, args: Sequence[str]) -> None:
         """Run a verb to its end. Raises DataError with what it says when it fails, `_Left` when it is to be left."""
-        if self._stopped:
+        if self._stopped == "leave":
             raise _Left
         command = [sys.executable, "-m", "fprf", *args]
         with subprocess.Popen(
