@@ -9,7 +9,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -17,12 +16,11 @@ from block_world import BlockWorld, block_flags, digests, done_of, small, steps_
 
 from fprf.cli.train import train_scene
 from fprf.errors import CheckpointError, ConfigError, DataError
-from fprf.fields.layouts import AdaptiveConfig, StreetConfig
+from fprf.fields.layouts import AdaptiveConfig
 from fprf.training import trainer
 from fprf.training.blocks import SURROUNDINGS, BlockTask, train_block
 from fprf.training.loading import load_run
 from fprf.training.trainer import Report
-from fprf.types import Rendered
 
 NAMES = ("surroundings", "00", "01", "02")
 
@@ -57,16 +55,6 @@ def test_a_finished_block_is_left_alone(block_world: BlockWorld, tmp_path: Path)
     # Its part of a time limit is another in every call; that is no reason to train on.
     assert not train_block(replace(task(block_world, root, 1), minutes=7.5), lambda event: None)
     assert stamps(root, "01") == before
-
-
-def test_the_same_task_gives_the_same_bits(block_world: BlockWorld, tmp_path: Path) -> None:
-    root = copy_of(block_world, tmp_path)
-    shutil.rmtree(root / "blocks/02/checkpoints")
-    for name in ("done.json", "task.json", "block.safetensors"):
-        (root / "blocks/02" / name).unlink()
-    assert train_block(task(block_world, root, 2), lambda event: None)
-    assert same(root, block_world.root, "02")
-    assert done_of(root, "02")["tensors"] == done_of(block_world.root, "02")["tensors"]
 
 
 @pytest.mark.parametrize("block", [SURROUNDINGS, 0])
@@ -111,25 +99,6 @@ def test_two_workers_on_a_block_the_second_is_told_and_changes_nothing(block_wor
     assert met and same(root, block_world.root, "01")
     assert not train_block(task(block_world, root, 1), lambda event: None)
     assert not (root / "blocks/01/.lock").exists()
-
-
-def test_a_block_s_sampler_goes_on_where_its_surroundings_stopped(
-    block_world: BlockWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root, asked = copy_of(block_world, tmp_path), []
-    whole = trainer.render_rays
-
-    def watched(*args: Any, **named: Any) -> Rendered:
-        asked.append(named["step"])
-        return whole(*args, **named)
-
-    monkeypatch.setattr(trainer, "render_rays", watched)
-    for name in ("surroundings", "01"):
-        shutil.rmtree(root / "blocks" / name / "checkpoints")
-        (root / "blocks" / name / "done.json").unlink()
-    assert train_block(task(block_world, root, SURROUNDINGS), lambda event: None)
-    assert train_block(task(block_world, root, 1), lambda event: None)
-    assert asked == [*range(6), *range(6, 12)]
 
 
 def test_another_task_in_the_folder_starts_anew(block_world: BlockWorld, tmp_path: Path) -> None:
@@ -240,16 +209,3 @@ def test_a_killed_block_is_resumed_to_the_same_bits(block_world: BlockWorld, tmp
     for name in NAMES:
         assert done_of(root, name)["step"] == steps
         assert same(root, calm, name), name
-
-
-def test_blocks_of_a_street_are_largest_first(block_world: BlockWorld, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from fprf.cli import blocks as verb
-
-    order: list[int] = []
-    inner = verb.run_block
-    monkeypatch.setattr(verb, "run_block", lambda each: (order.append(each.block), inner(each))[1])
-    train_scene(
-        replace(small(block_world.config.data, tmp_path / "run"), blocks=StreetConfig(segments=2)), "fprf-lite", quiet=True
-    )
-    rays = json.loads((tmp_path / "run/blocks.json").read_text())["rays"]
-    assert order[0] == SURROUNDINGS and [rays[b] for b in order[1:]] == sorted(rays, reverse=True)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.ops import backend
 from fprf.plugins.stylizers.config import (
     AdainConfig,
     IdentityConfig,
@@ -56,14 +55,6 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
     per_sample = 4 * (1 + 48 + trained.known.facts.dim) + 8
     kept = sum(len(part.kept.ray) for part in cached.parts)
     assert kept * per_sample <= cached.bytes <= kept * per_sample + 16 * 32 * 24 + 8
-
-
-def test_plain_forms_agree(world: World) -> None:
-    trained = world.load()
-    known, render = trained.known, trained.config.render
-    with backend.plain():
-        plain = cache_view(trained.model, known.facts, known.cameras, 2, render).restyled()
-    assert torch.allclose(plain.rgb, cache_view(trained.model, known.facts, known.cameras, 2, render).restyled().rgb, atol=1e-4)
 
 
 def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_maps(world: World) -> None:

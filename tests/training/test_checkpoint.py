@@ -78,11 +78,6 @@ def test_tidying_removes_what_was_cut_short_and_nothing_else(root: Path) -> None
     checkpoint.tidy(root / "absent")
 
 
-def test_none_is_no_mistake(tmp_path: Path) -> None:
-    assert checkpoint.load_latest(tmp_path / "absent") == (None, [])
-    assert checkpoint.steps(tmp_path) == []
-
-
 def test_what_was_cut_short_does_not_count(root: Path) -> None:
     """A kill between the tensors and the manifest leaves files without one."""
     cut = root / "step-0000020"

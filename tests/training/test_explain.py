@@ -15,19 +15,6 @@ from fprf.training.regions import Regions, find_regions, membership_view
 from fprf.training.restyle import apply_style
 
 
-def test_regions_are_listed_without_a_style(world: World) -> None:
-    trained = world.load()
-    regions = Regions(trained, *load_style(trained.run))
-    found = explain(regions)
-    assert [each.number for each in found] == list(range(len(regions.scene.share)))
-    assert sum(each.share for each in found) == pytest.approx(1, abs=1e-4)
-    for each in found:
-        assert each.view in trained.known.names and each.picture.shape == (24, 32, 3) and not each.taken
-        assert 0 <= each.pixel[0] < 32 and 0 <= each.pixel[1] < 24
-        assert region_row(each).keys() == {"region", "share", "view", "pixel"}
-        assert len(region_tile(each, ()).lines) == 2
-
-
 def test_the_place_of_a_region_is_in_the_view_that_shows_most_of_it(world: World) -> None:
     trained = world.load()
     regions = Regions(trained, *load_style(trained.run))
@@ -63,17 +50,3 @@ def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, st
     assert sum(region_tile(found[0], styled.dictionary.names).shares) == pytest.approx(1, abs=1e-4)
     row = region_row(found[0])
     assert {"references", "entropy_bits", "strength", "restricted"} < row.keys() and len(row["references"]) == 2
-
-
-def test_a_scene_without_semantics_is_one_region(world: World) -> None:
-    trained = world.load()
-    scene, _ = load_style(trained.run)
-    one = scene._replace(
-        keys=scene.keys[:1, :0],
-        region_mean=scene.region_mean[:1],
-        region_covariance=scene.region_covariance[:1],
-        share=torch.ones(1),
-        semantic_mean=scene.semantic_mean[:0],
-    )
-    (found,) = explain(Regions(trained, one, None))
-    assert found.share == 1.0 and found.picture.shape == (24, 32, 3)

@@ -33,12 +33,6 @@ def test_the_first_signal_lets_the_step_end(world: World, tmp_path: Path, number
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[1])
 
 
-def test_a_signal_in_the_last_step_is_obeyed_too(world: World, tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        trained_for(world, tmp_path / "run", replace(world.config, steps=3), change=signalled(2, signal.SIGINT))
-    assert checkpoint.steps(Run(tmp_path / "run").checkpoints) == [3]
-
-
 def test_the_second_one_ends_it_at_once_and_saves_nothing_doubtful(world: World, tmp_path: Path) -> None:
     config = replace(world.config, steps=9)
     with pytest.raises(KeyboardInterrupt):

@@ -11,7 +11,6 @@ from block_world import BlockWorld, small
 
 from fprf.blocks.plan import boxes_from, boxes_to
 from fprf.errors import CheckpointError
-from fprf.fields.layouts import GridConfig
 from fprf.training import tensorfiles
 from fprf.training.block_plan import plan_scene
 from fprf.training.blocks import FREE, SURROUNDINGS, asked_of, load_boxes
@@ -72,11 +71,6 @@ def test_a_cut_that_cannot_be_read_is_named(tmp_path: Path, text: str) -> None:
         load_boxes(tmp_path)
 
 
-def test_cells_larger_than_the_scene_do_not_cut_it(block_world: BlockWorld) -> None:
-    _, plan = plan_scene(replace(block_world.config, blocks=GridConfig(size=1e4)))
-    assert not plan.cut and plan.rays.tolist() == [10 * 32 * 24]
-
-
 @pytest.mark.parametrize("block", [SURROUNDINGS, 1])
 def test_what_may_change_without_training_again(block_world: BlockWorld, block: int) -> None:
     was = asked(block_world, block)
@@ -96,31 +90,6 @@ def test_what_makes_it_another_task(block_world: BlockWorld, block: int) -> None
         asked(block_world, block, loss=replace(base.loss, rgb=2.0)),
     }
     assert len(digests) == 5
-
-
-def test_blocks_differ_from_each_other(block_world: BlockWorld) -> None:
-    assert len({asked(block_world, block) for block in (SURROUNDINGS, 0, 1, 2)}) == 4
-
-
-def test_the_surroundings_stay_when_the_same_region_is_cut_otherwise(block_world: BlockWorld) -> None:
-    """A grid's cells widen by their margin at the border, so other cells span another region; the digest tells."""
-    config = block_world.config
-    facts = Run(block_world.root).load_known().facts
-    rays = tensorfiles.read(block_world.root / "blocks/surroundings/rays.safetensors")
-    scene, plan = plan_scene(config)
-    low, high = plan.boxes.low, plan.boxes.high
-    first = asked_of(config, facts, scene, plan.boxes, SURROUNDINGS, rays)
-    # The same boxes with one cut in two: what all span stays.
-    middle = (low[0] + high[0]) / 2
-    axis = torch.tensor([1.0, 0.0, 0.0]).bool()
-    half_low, half_high = torch.where(axis, middle, low[0]), torch.where(axis, middle, high[0])
-    turn = torch.cat([plan.boxes.turn[:1], plan.boxes.turn])
-    finer = plan.boxes._replace(
-        low=torch.cat([low[:1], half_low[None], low[1:]]), high=torch.cat([half_high[None], high]), turn=turn
-    )
-    assert asked_of(config, facts, scene, finer, SURROUNDINGS, rays) == first
-    wider = plan.boxes._replace(high=high + 0.5)
-    assert asked_of(config, facts, scene, wider, SURROUNDINGS, rays)["task"] != first["task"]
 
 
 def test_small_configs_agree_with_their_flags(block_world: BlockWorld, tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from tiny_world import World
 from fprf.cli.parsing import load_method
 from fprf.cli.train import train_scene
 from fprf.config import IncompleteConfig
-from fprf.errors import CheckpointError, PluginError, UsageError
-from fprf.training.loading import load_run, load_style
+from fprf.errors import CheckpointError, UsageError
+from fprf.training.loading import load_run
 from fprf.training.views import render_view
 
 
@@ -45,46 +45,12 @@ def test_rendering_needs_no_encoder(moved: Path) -> None:
     assert bool(view.rgb.isfinite().all())
 
 
-def test_nothing_of_a_loaded_model_learns(world: World) -> None:
-    model = world.load().model
-    assert not model.training and not any(p.requires_grad for p in model.parameters()) and model.learned() == []
-
-
-def test_the_style_of_the_scene(world: World) -> None:
-    scene, basis = load_style(world.load().run)
-    facts = world.prepared.facts
-    assert scene.mean.shape == (facts.channels,) and scene.keys.shape[1] == facts.dim
-    assert basis is not None and basis.matrix.shape[1] == facts.dim
-
-
-def test_a_scene_without_semantics_has_no_basis(moved: Path) -> None:
-    run = load_run(moved).run
-    tensors = run.load_tensors("style")
-    one = {name: tensors[name][:1] for name in ("region_mean", "region_covariance")} | {"share": torch.ones(1)}
-    run.save_tensors(
-        "style", tensors | one | {"keys": torch.zeros(1, 0), "semantic_mean": torch.zeros(0), "contacts": torch.zeros(1, 1)}
-    )
-    scene, basis = load_style(run)
-    assert basis is None and scene.keys.shape == (1, 0)
-
-
 def test_a_damaged_newest_checkpoint_is_stepped_over_and_named(world: World, moved: Path) -> None:
     copy = moved / "checkpoints" / "step-0000020"
     shutil.copytree(moved / "checkpoints" / "step-0000015", copy)
     (copy / "model.safetensors").write_bytes(b"no")
     trained = load_run(moved)
     assert trained.step == 15 and len(trained.damaged) == 1 and "step-0000020" in trained.damaged[0]
-
-
-def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="so it is no run folder; `fprf train` makes one"):
-        load_run(tmp_path)
-    shutil.rmtree(moved / "checkpoints")
-    with pytest.raises(CheckpointError, match=r"no checkpoint yet; go on with `fprf train elsewhere/run/config\.json"):
-        load_run(moved)
-    (moved / "scene.json").unlink()
-    with pytest.raises(CheckpointError, match=r"scene\.json: cannot be read.*train the scene again"):
-        load_run(moved)
 
 
 def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp_path: Path) -> None:
@@ -104,11 +70,6 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
     assert torch.equal(a.rgb, b.rgb)
     there.run.save_config(there.config, there.method)
     assert (moved / "config.json").read_text() == saved
-
-
-def test_an_unknown_device_is_told(world: World) -> None:
-    with pytest.raises(PluginError, match="'tpu' is not available here"):
-        load_run(world.run, "tpu")
 
 
 def test_a_changed_config_does_not_fit_its_checkpoint(moved: Path) -> None:

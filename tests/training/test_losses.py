@@ -1,6 +1,5 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
 
 import pytest
 import torch
@@ -11,7 +10,6 @@ from fprf.errors import ConfigError, PluginError
 from fprf.interfaces import LossTerm
 from fprf.plugins.losses.config import LossTermConfig
 from fprf.rendering.renderer import Parts, render_rays
-from fprf.training import losses
 from fprf.training.losses import check_penalties, extra_term, terms, total, wanted
 from fprf.training.model import Model, build_model
 from fprf.training.trainer import Report
@@ -26,7 +24,6 @@ ZERO: dict[str, float] = {
     "interlevel": 0.0,
     "distortion": 0.0,
 }
-WANTS = {"rgb": Want.COLOUR, "content": Want.CONTENT, "semantic": Want.SEMANTIC}
 
 
 def only(**weights: float) -> LossConfig:
@@ -44,18 +41,6 @@ def rendered(world: World, model: Model, batch: Batch, config: LossConfig, *, co
         semantic_samples=2,
         content_moves_density=content_moves_density,
     )
-
-
-def forbidden(*args: Any, **named: Any) -> NoReturn:
-    raise AssertionError("computed for nothing")
-
-
-def test_wanted_follows_weights_and_targets(world: World) -> None:
-    batch = world.prepared.manager.batch(0)
-    assert wanted(LossConfig(), batch) == Want.DENSITY | Want.COLOUR | Want.CONTENT | Want.SEMANTIC
-    assert wanted(LossConfig(), batch._replace(content=None, semantic=None)) == Want.DENSITY | Want.COLOUR
-    for name, want in WANTS.items():
-        assert wanted(only(**{name: 1.0}), batch) == Want.DENSITY | want
 
 
 def test_each_term_is_what_it_says(world: World) -> None:
@@ -93,28 +78,6 @@ def test_feature_terms_do_not_depend_on_the_unit_of_the_features(world: World) -
         assert float(tenfold[name]) == pytest.approx(float(value), rel=1e-5)
 
 
-@pytest.mark.parametrize("name", list(ZERO))
-def test_a_term_of_weight_0_is_never_computed(world: World, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    model, batch = world.load().model, world.prepared.manager.batch(0)
-    config = replace(LossConfig(), **{name: 0.0})  # type: ignore[arg-type]
-    if name in ("variation", "proposal_variation"):
-        config = replace(config, variation=0.0, proposal_variation=0.0)
-        assert model.penalty_names, "looked up once, before training"
-        monkeypatch.setattr(model, "penalties", forbidden)
-    if name in ("interlevel", "distortion"):
-        monkeypatch.setattr(losses, name, forbidden)
-    if name == "rgb":
-        monkeypatch.setattr(model.decoder, "forward", forbidden)
-    if name == "semantic":
-        assert model.semantic is not None
-        monkeypatch.setattr(model.semantic, "forward", forbidden)
-    if name == "content":
-        assert Want.CONTENT not in wanted(config, batch)
-    found = terms(config, world.prepared.facts, rendered(world, model, batch, config), batch, model, step=0)
-    assert (name not in found and "variation" not in found) or name not in ("variation", "proposal_variation")
-    assert name not in found and len(found) >= len(ZERO) - 2
-
-
 def test_penalties_come_when_they_are_due_and_weigh_as_many_times_more(world: World) -> None:
     model, batch = world.load().model, world.prepared.manager.batch(0)
     config = replace(LossConfig(), penalty_every=4)
@@ -140,19 +103,6 @@ def test_a_penalty_of_any_name_counts(world: World, monkeypatch: pytest.MonkeyPa
     with pytest.raises(ConfigError, match=r"no part of this model has a penalty 'entrpy'; did you mean 'entropy'\?") as caught:
         check_penalties(LossConfig(penalties=(("entrpy", 1.0),)), model)
     assert "(penalties that can be named: entropy)" in str(caught.value)
-
-
-def test_a_penalty_that_is_called_like_a_term_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = world.load().model
-    monkeypatch.setattr(model.field, "penalties", lambda: {"content": torch.tensor(3.0)})
-    with pytest.raises(PluginError, match="is called 'content'"):
-        check_penalties(LossConfig(), model)
-
-
-def test_weights_of_penalties_are_checked() -> None:
-    for penalties in ((("a", -1.0),), (("a", 1.0), ("a", 2.0)), (("variation", 1.0),)):
-        with pytest.raises(ConfigError, match=r"loss\.penalties"):
-            LossConfig(penalties=penalties)
 
 
 class Weights(LossTerm):
@@ -213,18 +163,6 @@ def test_training_with_a_term_of_a_package_is_reproducible(world: World, tmp_pat
     assert names - others == {"extra"}
 
 
-def test_the_total_is_the_weighted_sum() -> None:
-    config = LossConfig(rgb=1.0, content=2.0, semantic=3.0, interlevel=4.0, distortion=5.0)
-    parts = {name: torch.tensor(10.0**i) for i, name in enumerate(("rgb", "content", "semantic", "interlevel", "distortion"))}
-    assert float(total(config, parts)) == pytest.approx(54321)
-
-
-def test_the_depth_of_points_fades() -> None:
-    config, parts = LossConfig(rgb=1.0, depth=10.0), {"rgb": torch.tensor(1.0), "depth": torch.tensor(1.0)}
-    found = [float(total(config, parts, share)) for share in (0.0, 0.5, 1.0)]
-    assert found == pytest.approx([11.0, 1.0 + 10.0 * losses.FADE**0.5, 1.0 + 10.0 * losses.FADE])
-
-
 @pytest.mark.parametrize("name", ["semantic", "content"])
 def test_features_never_move_density(world: World, name: str) -> None:
     """Paper: semantics are rendered with detached weights; a method may ask so for content too."""
@@ -257,8 +195,3 @@ def test_the_proposal_learns_from_the_interlevel_term_alone(world: World) -> Non
         total(config, parts).backward()  # type: ignore[no-untyped-call]
         grads = [p.grad for p in model.sampler.parameters()]
         assert any(g is not None and bool((g != 0).any()) for g in grads) == learns
-
-
-def test_nothing_to_learn_is_refused() -> None:
-    with pytest.raises(ConfigError, match="nothing would be learnt"):
-        LossConfig(rgb=0.0, content=0.0, semantic=0.0)

@@ -1,6 +1,5 @@
 """Match maps against the attention of single points, and their files."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from fprf.rendering.cameras import pixel_grid
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.training.loading import Trained
-from fprf.training.matches import MatchMap, clusters, match_map, match_pictures, summarize, write_pixels
+from fprf.training.matches import MatchMap, match_map, summarize, write_pixels
 from fprf.training.restyle import Codes, Styled, apply_style
 from fprf.training.views import paint_pixels, render_view
 
@@ -104,31 +103,6 @@ def test_summaries_count_what_is_there() -> None:
     assert summary["regions"] == [{"region": 0, "share": pytest.approx(1 / 3)}, {"region": 1, "share": pytest.approx(2 / 3)}]
 
 
-def test_an_empty_view_has_a_summary_too() -> None:
-    found, codes = made_up()
-    nothing = MatchMap(*(torch.zeros_like(t) for t in found))
-    summary = summarize(nothing, codes)
-    assert summary["kept_share"] == summary["score"] == summary["entropy_bits"] == 0 and summary["codes"] == []
-    assert all(picture.shape == (2, 2, 3) for picture in match_pictures(nothing, codes).values())
-
-
-def test_entropy_is_in_bits() -> None:
-    found, _ = made_up()
-    assert found.entropy.tolist() == [[0.0, pytest.approx(1.0)], [0.0, 0.0]]
-
-
-def test_pictures_tell_references_doubt_kept_and_empty_apart() -> None:
-    found, codes = made_up()
-    pictures = match_pictures(found, codes)
-    match = pictures["match"].astype(int)
-    colours = {tuple(pixel) for row in match for pixel in row}
-    assert len(colours) == 4
-    assert match[1, 0].min() > 200, "kept is pale"
-    assert pictures["score"][0, 0].astype(int).sum() > pictures["score"][0, 1].astype(int).sum(), "brighter is better"
-    most = math.log2(3)
-    assert found.entropy.max() <= most and not np.array_equal(pictures["entropy"][0, 0], pictures["entropy"][0, 1])
-
-
 def test_numbers_of_pixels(tmp_path: Path) -> None:
     found, codes = made_up()
     write_pixels(tmp_path / "m.npz", found, codes)
@@ -140,8 +114,3 @@ def test_numbers_of_pixels(tmp_path: Path) -> None:
     assert arrays["reference"].dtype == np.int16 and arrays["score"].dtype == np.float32
     assert np.allclose(arrays["entropy_bits"], found.entropy) and np.allclose(arrays["kept"], [[0, 0], [1, 0]])
     assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
-
-
-def test_clusters_are_numbered_within_their_reference() -> None:
-    codes = Codes(torch.tensor([0, 0, 1, 0, 1]), ("a", "b"), torch.zeros(5, 2))
-    assert clusters(codes).tolist() == [0, 1, 0, 2, 1]

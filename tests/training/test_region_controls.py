@@ -12,7 +12,7 @@ from fprf.errors import UsageError
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.training.regions import Regions
-from fprf.training.restyle import RegionControls, Styled, apply_style, region_controls, region_scores
+from fprf.training.restyle import RegionControls, Styled, apply_style, region_controls
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +38,6 @@ def controls_of(world: World, styled: Styled, file: StyleFile | None = None, **w
     return region_controls(regions, styled.dictionary, style)
 
 
-def test_without_wishes_everything_is_allowed(world: World, styled: Styled) -> None:
-    controls = controls_of(world, styled)
-    assert bool(controls.allowed.all()) and controls.allowed.shape == (len(styled.scene.share), 2)
-    assert bool((controls.strength == 1).all()) and not controls.notes
-    assert list(controls.saved.regions) == [f"region{k}" for k in range(len(styled.scene.share))], "all of them, as landmarks"
-    assert controls.saved.style == style_of(world.references)
-
-
 def test_references_are_meant_in_the_order_given_whatever_the_dictionarys(world: World, styled: Styled) -> None:
     for number, name in enumerate(("dusk.png", "snow.png")):
         place = styled.dictionary.names.index(name)
@@ -58,12 +50,6 @@ def test_forbidding_keeping_and_strengths(world: World, styled: Styled) -> None:
     controls = controls_of(world, styled, forbid=("0=snow.png",), keep=("1",), region_strength=("2=0.25", "0=0.5"))
     assert controls.allowed[0].tolist() == [name != "snow.png" for name in styled.dictionary.names]
     assert controls.strength[:3].tolist() == [0.5, 0.0, 0.25]
-
-
-def test_scores_are_cosines_from_the_scenes_mean(styled: Styled) -> None:
-    scene, d = styled.scene, styled.dictionary
-    here, there = (torch.nn.functional.normalize((x - scene.semantic_mean).double(), dim=1) for x in (scene.keys, d.keys))
-    torch.testing.assert_close(region_scores(scene, d).double(), here @ there.T, rtol=0.0, atol=1e-5)
 
 
 def test_poor_matches_are_kept_unless_pinned(world: World, styled: Styled) -> None:
@@ -100,10 +86,6 @@ def test_contradictions_and_unknown_names(world: World, styled: Styled, wishes: 
         controls_of(world, styled, **wishes)
 
 
-def test_several_pins_allow_any_of_them(world: World, styled: Styled) -> None:
-    assert bool(controls_of(world, styled, pin=("1=0", "1=1")).allowed.all())
-
-
 def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: Styled) -> None:
     controls = controls_of(
         world, styled, pin=("0=snow.png", "0002:15,20=1"), forbid=("1=0",), keep=("2",) if len(styled.scene.share) > 2 else ()
@@ -128,16 +110,6 @@ def test_a_new_wish_does_not_take_the_name_of_an_old_one(world: World, styled: S
     assert both.saved.regions[pin.partition("=")[0]] == first.regions["region0"] != both.saved.regions["region0"]
     again = controls_of(world, styled, both.saved, keep=both.saved.style.keep, pin=both.saved.style.pin)
     assert torch.equal(again.allowed, both.allowed) and torch.equal(again.strength, both.strength)
-
-
-def test_regions_that_a_scene_lacks_are_left_out_and_told(
-    world: World, styled: Styled, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fprf.training.regions.ALIKE", 1.5)
-    file = controls_of(world, styled, keep=("1",)).saved
-    controls = controls_of(world, styled, file, keep=("region1",))
-    assert bool((controls.strength == 1).all())
-    assert controls.notes == ("region 'region1' of the style: no region here is most like it, so it is left out",)
 
 
 def test_photographs_of_one_name_are_told_apart(world: World, tmp_path: Path) -> None:

@@ -20,12 +20,6 @@ def run(world: World, tmp_path: Path) -> Run:
     return Run(tmp_path / "run")
 
 
-def test_the_files_of_a_run(world: World) -> None:
-    found = {p.name for p in world.run.iterdir()}
-    kept = {"config.json", "scene.json", "images.json", "basis.safetensors", "style.safetensors", "events.jsonl", "checkpoints"}
-    assert found == kept
-
-
 def test_no_file_names_the_place_that_it_lies_in(world: World) -> None:
     for name in ("config.json", "scene.json", "events.jsonl"):
         assert str(world.run) not in (world.run / name).read_text()
@@ -48,12 +42,6 @@ def test_the_config_comes_back_without_its_folder(world: World) -> None:
     config, method = Run(world.run).load_config()
     assert method == "fprf-lite" and config.output is None
     assert config == type(config)(**{**vars(world.config), "output": None})
-
-
-def test_a_folder_that_is_no_run_says_so(tmp_path: Path) -> None:
-    assert not Run(tmp_path).exists
-    with pytest.raises(CheckpointError, match=r"no config\.json here, so it is no run folder"):
-        Run(tmp_path).load_config()
 
 
 def _without(key: str) -> Any:
@@ -120,13 +108,6 @@ def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> Non
     run.log({"step": 4})
     lines = (tmp_path / "events.jsonl").read_text().splitlines()
     assert [json.loads(lines[i])["step"] for i in (0, 2, 3)] == [1, 3, 4] and len(lines) == 4
-
-
-def test_names_are_stems_where_those_differ() -> None:
-    assert view_names([Path("a/0001.png"), Path("a/0002.jpg")]) == ["0001", "0002"]
-    assert view_names([Path("s/left/1.png"), Path("s/right/1.png")]) == ["left-1", "right-1"]
-    assert view_names([Path("s/1.png"), Path("s/1.jpg")]) == ["00000-1", "00001-1"]
-    assert view_names([]) == []
 
 
 @given(st.lists(st.lists(st.sampled_from(["a", "b", "ab"]), min_size=1, max_size=3), min_size=1, max_size=6))

@@ -46,11 +46,6 @@ def test_the_rate_warms_up_then_falls_to_its_end() -> None:
     assert rate(of, 500, 0.5) == pytest.approx(0.5 * 0.55)
 
 
-def test_from_hold_on_it_falls_with_the_steps() -> None:
-    of = OptimizerConfig(rate=0.5, final=0.1, warm_up=1, hold=100)
-    assert [rate(of, step, 0.0) for step in (0, 100, 400, 10_000)] == pytest.approx([0.5, 0.5, 0.25, 0.05])
-
-
 @given(st.integers(0, 10**6), st.floats(0, 1), st.floats(0, 1), st.integers(0, 1000))
 def test_the_rate_stays_within_its_bounds(step: int, share: float, final: float, warm_up: int) -> None:
     of = OptimizerConfig(rate=0.02, final=final, warm_up=warm_up)

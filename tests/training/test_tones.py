@@ -11,15 +11,10 @@ from hypothesis import strategies as st
 from tiny_world import World, trained_for
 
 from fprf.cli.train import train_scene
-from fprf.training.camera_optimizers import Tones, relative, toned
+from fprf.training.camera_optimizers import Tones, relative
 from fprf.training.loading import load_run
 from fprf.training.views import render_view
-from fprf.types import Batch, Rendered
-
-
-def rendered(rgb: torch.Tensor, unaided: torch.Tensor | None = None) -> Rendered:
-    nothing = torch.zeros(len(rgb))
-    return Rendered(nothing, nothing, rgb, frozen_rgb=unaided)
+from fprf.types import Batch
 
 
 @settings(deadline=None)
@@ -45,24 +40,6 @@ def test_known_exposures_speak_for_views_that_are_held_out() -> None:
     assert tones(torch.tensor([3]))[0].tolist() == pytest.approx([1.0] * 3)
     assert (tones(torch.tensor([2])) / tones(torch.tensor([0])))[0].tolist() == pytest.approx([4 ** (1 / 2.2)] * 3)
     assert relative(None, 3) == (0.0, 0.0, 0.0)
-
-
-def test_between_two_views() -> None:
-    tones = Tones(torch.tensor([-0.5, 0.5]), ())
-    a, b = tones(torch.tensor([0, 1]))
-    torch.testing.assert_close(tones.mixed((0, 1), (1.0, 0.0)), a)
-    torch.testing.assert_close(tones.mixed((0, 1), (0.5, 0.5)), (a * b).sqrt())
-
-
-def test_only_colours_are_touched() -> None:
-    tones = Tones(torch.tensor([-0.5, 0.5]), ())
-    rgb, view = torch.rand(6, 3), torch.tensor([0, 1, 0, 1, 1, 0])
-    plain = rendered(rgb, rgb / 2)
-    assert toned(plain, None, view) is plain
-    out = toned(plain, tones, view)
-    torch.testing.assert_close(out.rgb, rgb * tones(view))
-    torch.testing.assert_close(out.frozen_rgb, rgb / 2 * tones(view))
-    assert out.depth is plain.depth and out.content is None
 
 
 def test_views_that_were_taken_darker_are_found(world: World, tmp_path: Path) -> None:
@@ -107,8 +84,3 @@ def test_all_blocks_mean_the_same_by_a_view(block_world: BlockWorld, tmp_path: P
     view = (trained.model, trained.known.facts, trained.known.cameras, 1, config.render)
     plain, double = render_view(*view).rgb, render_view(*view, factor=torch.tensor([0.5, 1.0, 1.0])).rgb
     torch.testing.assert_close(double, plain * torch.tensor([0.5, 1.0, 1.0]))
-
-
-def test_without_tones_nothing_is_kept_of_them(block_world: BlockWorld) -> None:
-    assert load_run(block_world.root, "cpu").model.tones is None
-    assert not [name for name in tensors_of(block_world.root, "surroundings") if name.startswith("tones")]

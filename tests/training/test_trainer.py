@@ -84,11 +84,6 @@ def test_a_finished_run_stays_as_it_is(world: World, tmp_path: Path) -> None:
     assert {p: p.stat().st_mtime_ns for p in run.checkpoints.rglob("*")} == before and not reports
 
 
-def test_no_steps_leave_the_seeded_start(world: World, tmp_path: Path) -> None:
-    run = trained_for(world, tmp_path / "run", replace(world.config, steps=0))
-    assert checkpoint.steps(run.checkpoints) == [0]
-
-
 def test_minutes_end_a_run_too(world: World, tmp_path: Path) -> None:
     reports: list[Report] = []
     config = replace(world.config, steps=10**6, minutes=0.4 / 60)
