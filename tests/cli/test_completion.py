@@ -58,18 +58,3 @@ def test_the_scripts_are_whole(shell: str) -> None:
     if found is not None:
         ended = subprocess.run([found, "-n"], input=text, capture_output=True, text=True, timeout=60, check=False)
         assert ended.returncode == 0, ended.stderr
-
-
-def test_fish_says_what_verbs_are_for() -> None:
-    text = script("fish", FEW)
-    assert "-a view -d 'it\\'s a view'" in text and "'__fish_seen_subcommand_from train' -l data" in text
-
-
-def test_the_verb(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.cli.completion.offers", lambda: FEW)
-    assert cli.main(["completion", "bash"]) == 0
-    assert capsys.readouterr().out == script("bash", FEW)
-    assert cli.main(["completion", "--help"]) == 0 and "completions/fprf" in capsys.readouterr().out
-    for wrong in ([], ["tcsh"], ["bash", "zsh"]):
-        assert cli.main(["completion", *wrong]) == 2
-        assert "name one shell: bash, zsh, fish" in capsys.readouterr().err

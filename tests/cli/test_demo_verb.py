@@ -60,11 +60,3 @@ def test_the_film_fades_from_look_to_look() -> None:
     assert strengths == sorted(strengths) and strengths[0] == 0 and strengths[-1] == 1
     assert max(b - a for a, b in pairwise(strengths)) < 0.11
     assert strengths.count(0.5) >= 5
-
-
-@pytest.mark.parametrize(("args", "told"), [(["--minutes", "0"], "--minutes: 0.0 must be above 0"),
-                                            (["--frames", "1"], "--frames: 1 must be at least 2"),
-                                            (["--data", "x"], "--data: no such flag")])  # fmt: skip
-def test_mistakes(args: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["demo", *args]) == 2
-    assert told in capsys.readouterr().err

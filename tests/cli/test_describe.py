@@ -7,9 +7,7 @@ import pytest
 
 from fprf.cli import main as cli
 from fprf.cli.main import VERBS
-from fprf.cli.parsing import describe, meanings
-from fprf.export.config import ExportConfig
-from fprf.style.config import StyleConfig
+from fprf.cli.parsing import describe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,17 +37,6 @@ def test_a_config_in_words() -> None:
     assert run["meaning"] == "Where it lies, over two lines." and loud["meaning"] == ""
     assert [row["default"] for row in (run, size, loud, bare)] == ["", "none", "true", "1 2"]
     assert "none" in size["takes"]
-
-
-def test_meanings_are_inherited_and_made_of_source_alone() -> None:
-    assert meanings(ExportConfig)["strength"] == meanings(StyleConfig)["strength"] != ""
-    assert "side" in meanings(ExportConfig) and "side" not in meanings(StyleConfig)
-    assert meanings(int) == {}
-
-
-def test_slots_are_named_with_what_may_fill_them() -> None:
-    slots = {slot["flag"]: slot for slot in told(ExportConfig())["slots"]}
-    assert slots["--stylizer"]["default"] == "region-tone" and "local-adain" in slots["--stylizer"]["one of"]
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS.keys() - {"completion"}))

@@ -3,11 +3,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fake_packages import packages_in
 
-from fprf.cli import doctor
-from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder, scene_folder, speed
-from fprf.errors import ConfigError, DataError, UsageError
+from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder, scene_folder
+from fprf.errors import DataError, UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 
@@ -16,44 +14,6 @@ LAST = fprf_lite().steps
 
 def _by_name(findings: Iterator[Finding]) -> dict[str, Finding]:
     return {finding.what: finding for finding in findings}
-
-
-def test_the_machine_is_described() -> None:
-    found = _by_name(machine())
-    assert {
-        "fprf",
-        "torch",
-        "numpy",
-        "numba",
-        "processor",
-        "disk",
-        "encoders",
-        "decoders",
-        "cached",
-        "plug-ins",
-    } <= found.keys()
-    assert "threads" in found["processor"].found
-    assert not {"pytest", "ruff", "mypy"} & found.keys(), "what tests need is nobody's concern"
-    assert all(finding.found and "\n" not in finding.found for finding in found.values())
-
-
-def test_a_package_that_is_absent_is_a_problem_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = ["numpy>=1", "surely-absent>=2", 'absent-extra>=1; extra == "video"', 'pytest; extra == "test"']
-    monkeypatch.setattr(doctor, "requires", lambda name: asked)
-    found = _by_name(doctor._packages())
-    assert not found["numpy"].remedy
-    assert found["surely-absent"] == Finding("surely-absent", "not installed", "pip install 'surely-absent>=2'")
-    assert found["absent-extra"].optional and found["absent-extra"].remedy == 'pip install "fprf[video]"'
-    assert "pytest" not in found
-
-
-def test_a_broken_torch_is_a_finding() -> None:
-    def broken() -> Iterator[Finding]:
-        raise OSError("libtorch.so: cannot open")
-        yield
-
-    (finding,) = doctor._guarded("torch", broken)
-    assert "libtorch.so" in finding.found and finding.remedy.endswith("torch")
 
 
 @pytest.fixture
@@ -100,12 +60,6 @@ def test_a_missing_plugin_of_a_run_is_named(trained: Path) -> None:
     assert run([str(trained)]) == 0, "it renders without its encoder"
 
 
-def test_a_run_with_a_damaged_config_is_an_error(trained: Path) -> None:
-    (trained / "config.json").write_text("{")
-    with pytest.raises(ConfigError, match="is not JSON"):
-        run([str(trained)])
-
-
 def test_scene_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(DataError, match="no such folder"):
         run([str(tmp_path / "none")])
@@ -132,30 +86,6 @@ def _pose(i: int) -> list[list[float]]:
     return [[1, 0, 0, i * 0.5], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
 
 
-def test_damaged_metadata_of_a_stranger_is_a_problem(tmp_path: Path) -> None:
-    with packages_in(tmp_path) as packages:
-        packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
-        found = [finding for finding in machine() if finding.what == "plug-ins"]
-    assert found[-1].remedy == "reinstall or uninstall that package"
-
-
-def test_what_is_slow_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_cores", lambda: 8)
-    monkeypatch.setattr(doctor.os, "getloadavg", lambda: (3.0, 3.0, 3.0))
-    assert [f for f in speed({"OMP_NUM_THREADS": "8", "NUMBA_NUM_THREADS": "none"}) if f.what != "cuda"] == []
-    (threads,) = (finding for finding in speed({"OMP_NUM_THREADS": "2"}) if finding.what == "threads")
-    assert threads == Finding("threads", "OMP_NUM_THREADS=2, 8 cores are usable", "unset OMP_NUM_THREADS", True)
-    monkeypatch.setattr(doctor.os, "getloadavg", lambda: (24.0, 3.0, 3.0))
-    (load,) = (finding for finding in speed({}) if finding.what == "load")
-    assert load.found.startswith("24 programs want the 8 cores") and load.optional
-
-
-def test_a_full_disk_is_a_problem() -> None:
-    assert doctor._disk(50 << 30) == Finding("disk", "50.0 GiB free here")
-    full = doctor._disk(100 << 20)
-    assert full.remedy.startswith("fprf doctor --clean") and not full.optional
-
-
 def test_a_method_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -179,12 +109,3 @@ def test_the_feature_cache_is_told_and_cleaned(
     assert _by_name(machine())["features"].found.startswith("3 MiB of at most 2048")
     assert run(["--clean"]) == 0 and "3 MiB deleted" in capsys.readouterr().out
     assert not files.exists() and (tmp_path / "fprf" / "weights").is_dir()
-
-
-def test_what_training_noted_is_told(trained: Path) -> None:
-    assert "events" not in _by_name(run_folder(trained))
-    (trained / "events.jsonl").write_text('{"step": 1, "seconds": 1}\n{"damaged": "step-5"}\n{"step": 7, "skipped": "rgb"}\n')
-    finding = _by_name(run_folder(trained))["events"]
-    assert finding == Finding("events", "step: 7, skipped: rgb and 1 more", f"fprf report '{trained}'", True)
-    (trained / "events.jsonl").write_text("{")
-    assert "events" not in _by_name(run_folder(trained))

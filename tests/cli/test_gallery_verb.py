@@ -7,7 +7,6 @@ import pytest
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.gallery import _named
 
 
 @pytest.fixture
@@ -59,22 +58,13 @@ def test_style_files_and_a_flight(run: Path, world: World) -> None:
     assert (run / "gallery.mp4").stat().st_size > 100 and 'id="flight"' in page
 
 
-def test_photographs_of_one_name_are_told_apart() -> None:
-    a, b, c = Path("x/sky.jpg"), Path("y/sky.png"), Path("z/sky.png")
-    assert _named([a], [Path("y/sea.jpg"), a]) == {"sky": a, "sea": Path("y/sea.jpg")}
-    assert _named([a, b], [c]) == {"sky.jpg": a, "sky.png": b, "sky.png (3)": c}
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [
         ([], "name photographs with --references, or style files with --styles"),
         (["--references", "EMPTY"], "holds no images (.avif"),
-        (["--references", "absent.jpg"], "absent.jpg"),
         (["--references", "PHOTO", "--output", "page.pdf"], "--output page.pdf: the page is an .html file"),
         (["--references", "PHOTO", "--views", "0099"], "--views 0099: no such view in the run"),
-        (["--references", "PHOTO", "--most", "0"], "--most: 0 must be at least 1"),
-        (["--references", "PHOTO", "--strength", "2"], "--strength: 2.0 must lie in"),
     ],
 )
 def test_mistakes(run: Path, world: World, words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:

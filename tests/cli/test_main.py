@@ -1,4 +1,3 @@
-import importlib.util
 import os
 import subprocess
 import sys
@@ -8,7 +7,6 @@ from types import ModuleType
 
 import pytest
 
-from fprf import __version__
 from fprf.cli import main as cli
 from fprf.errors import DataError
 
@@ -39,21 +37,6 @@ def test_help_lists_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
 def test_no_verb_is_a_mistake_that_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 2
     assert "usage: fprf VERB" in capsys.readouterr().out
-
-
-def test_every_verb_has_a_module() -> None:
-    for name in cli.VERBS:
-        assert importlib.util.find_spec(f"fprf.cli.{name}") is not None, name
-
-
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"fprf {__version__}\n"
-
-
-def test_an_unknown_verb_suggests_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["trian"]) == 2
-    assert capsys.readouterr().err.startswith("error: fprf trian: no such verb; did you mean 'train'? (verbs: demo,")
 
 
 def test_arguments_and_exit_code_pass_through(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,6 @@ import pytest
 from fake_packages import Packages, packages_in
 
 from fprf.cli import main as cli
-from fprf.cli.completion import offers
 from fprf.cli.config import CommandConfig
 from fprf.cli.plugins import rows
 
@@ -69,13 +68,6 @@ def test_it_is_parsed_and_called_like_a_built_in_one(packages: Packages, capsys:
     shown = capsys.readouterr().out
     assert "usage: fprf count" in shown and "Count the files of a folder." in shown and "--step INT" in shown
     assert cli.main(["cuont"]) == 2 and "did you mean 'count'?" in capsys.readouterr().err
-
-
-def test_completion_knows_its_flags(packages: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.cli.main.VERBS", {"doctor": cli.VERBS["doctor"]})
-    offer = offers()["count"]
-    assert {"--step", "--folder", "--sampler", "--sampler.samples", "--help"} <= set(offer.flags)
-    assert offer.summary == "of acme-count 0.2"
 
 
 def test_a_broken_verb_harms_only_its_callers(packages: Packages, capsys: pytest.CaptureFixture[str]) -> None:

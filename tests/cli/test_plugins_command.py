@@ -4,8 +4,7 @@ from pathlib import Path
 import pytest
 from fake_packages import ENCODER, Packages, packages_in
 
-from fprf.cli.plugins import KINDS, METHODS, faults, rows, run
-from fprf.plugins import registry
+from fprf.cli.plugins import faults, run
 
 
 @pytest.fixture
@@ -21,11 +20,6 @@ def test_built_ins_are_listed_and_load(capsys: pytest.CaptureFixture[str], monke
     assert "vgg19" in text and "fprf.plugins.encoders.config:Vgg19Config" in text and "state" not in text
     assert run(["--check"]) == 0
     assert "broken" not in capsys.readouterr().out
-
-
-def test_every_group_that_is_installed_is_known() -> None:
-    assert set(registry.groups()) <= {METHODS, *KINDS}
-    assert {row.group for row in rows()} == set(registry.groups())
 
 
 @pytest.mark.parametrize(

@@ -122,16 +122,6 @@ def test_dropped_images_are_told_with_their_reasons(photos: Path, capsys: pytest
     assert "6 of 12 images have a pose" in out and "no other image" in out and "process.json" in out
 
 
-def test_cameras_are_shared_by_size_or_each(photos: Path) -> None:
-    add(photos, 5, (16, 24))
-    assert process(photos) == 0
-    assert len([line for line in calls(photos) if line.startswith("features")]) == 2
-    assert process(photos, "--cameras", "each", "--side", "800") == 0
-    assert [line for line in calls(photos) if line.startswith("features")] == [
-        f"features SIMPLE_RADIAL 800 {k}.png" for k in range(6)
-    ]
-
-
 def test_similar_matching_reads_the_features(photos: Path) -> None:
     for k in range(5, 30):
         add(photos, k)
@@ -144,15 +134,6 @@ def test_nothing_fits_together(photos: Path, capsys: pytest.CaptureFixture[str])
     assert process(photos, plan={"nothing": True}) == 2
     assert "no two images fit together; take more views" in capsys.readouterr().err
     assert report(photos)["images"]["posed"] == 0, "the report is written all the same"
-
-
-def test_without_pycolmap_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("fprf.cli.process.find_spec", lambda name: None)
-    assert cli.main(["process", str(tmp_path)]) == 2
-    told = "error: fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'\n"
-    assert capsys.readouterr().err == told
 
 
 def test_an_old_pycolmap_is_refused(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

@@ -45,24 +45,6 @@ def test_off_a_terminal_lines_come_every_few_seconds_and_at_the_end(
     assert found[1]["seconds_left"] == round(12.34 * 0.95 / 0.05)
 
 
-def test_counting(capsys: pytest.CaptureFixture[str]) -> None:
-    with Display() as display:
-        for done in range(4):
-            display.count(done, 3, "rendering")
-        display.features(0, 0, "features")
-    found = lines(capsys)
-    assert found[0] == {"event": "rendering", "done": 0, "total": 3} and found[-2]["done"] == 3
-    assert found[-1] == {"event": "features", "done": 0, "total": 0}
-
-
-def test_quiet_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
-    with Display(quiet=True) as display:
-        display.say("x")
-        display.count(1, 1, "y")
-        display.training(report(1, 1.0))
-    assert capsys.readouterr() == ("", "")
-
-
 def test_a_terminal_sees_a_bar_and_no_json(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
     made = Console(file=screen, force_terminal=True, width=120, highlight=False)
@@ -74,15 +56,3 @@ def test_a_terminal_sees_a_bar_and_no_json(monkeypatch: pytest.MonkeyPatch) -> N
         display.count(1, 2, "rendering")
     text = screen.getvalue()
     assert "a town [of] 3" in text and "step 7" in text and "20.12 dB" in text and "rendering" in text and "{" not in text
-
-
-def test_an_error_ends_the_bar() -> None:
-    display = Display(quiet=True)
-    with pytest.raises(KeyError), display:
-        raise KeyError
-    assert not display.progress.live.is_started
-
-
-@pytest.mark.parametrize(("seconds", "shown"), [(0, "0:00"), (59.6, "1:00"), (61, "1:01"), (3725, "62:05")])
-def test_the_clock(seconds: float, shown: str) -> None:
-    assert progress._clock(seconds) == shown

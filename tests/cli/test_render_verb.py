@@ -51,31 +51,6 @@ def test_a_gif_is_a_file_and_other_films_are_refused(run: Path, tmp_path: Path, 
     assert "films end in .mp4 .gif .webp .apng" in capsys.readouterr().err and not (tmp_path / "a.mov").exists()
 
 
-def test_frames_in_a_folder_and_depth(run: Path, tmp_path: Path) -> None:
-    common = ["render", str(run), "--path", "spiral", "--frames", "3"]
-    assert cli.main([*common, "--output", str(tmp_path / "plain")]) == 0
-    assert cli.main([*common, "--show", "depth", "--output", str(tmp_path / "depth")]) == 0
-    plain, depth = pictures(tmp_path / "plain"), pictures(tmp_path / "depth")
-    assert list(plain) == list(depth) == ["00000.png", "00001.png", "00002.png"]
-    assert not any(np.array_equal(plain[name], depth[name]) for name in plain)
-
-
-def test_a_film(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    film = tmp_path / "x.mp4"
-    assert cli.main(["render", str(run), "--path", "orbit", "--frames", "4", "--output", str(film)]) == 0
-    assert film.stat().st_size > 100 and capsys.readouterr().out.startswith(f"4 frames in {film} (")
-
-
-def test_restyled_frames_differ_and_strength_0_does_not(run: Path, world: World, tmp_path: Path) -> None:
-    common = ["render", str(run), "--path", "dataset", "--split", "test", "--output"]
-    style = ["--references", str(world.references[0])]
-    assert cli.main([*common, str(tmp_path / "plain")]) == 0
-    assert cli.main([*common, str(tmp_path / "full"), *style]) == 0
-    assert cli.main([*common, str(tmp_path / "none"), *style, "--strength", "0"]) == 0
-    plain, full, none = (pictures(tmp_path / name) for name in ("plain", "full", "none"))
-    assert all(np.array_equal(plain[name], none[name]) and not np.array_equal(plain[name], full[name]) for name in plain)
-
-
 def test_a_camera_path_file(run: Path, tmp_path: Path) -> None:
     pose = [1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 2.0, 0, 0, 0, 1.0]
     path = tmp_path / "path.json"
@@ -92,13 +67,9 @@ def test_a_camera_path_file(run: Path, tmp_path: Path) -> None:
     ("args", "told"),
     [
         (["--path", "spirale"], "--path spirale: neither a file nor one of spiral, orbit, interpolate, dataset"),
-        (["--frames", "0"], "--frames: 0 must be at least 1"),
-        (["--fps", "0"], "--fps: 0.0 must be at least 1"),
         (["--show", "match", "--path", "orbit"], "--show match: needs a style that holds throughout"),
         (["--show", "colour", "normals", "--lens", "stereo"], "--show: a stereo panorama shows colour and depth only"),
-        (["--eyes", "0"], "--eyes: 0.0 must be above 0"),
         (["--styles", "dusk", "--path", "orbit"], "--styles dusk: write NAME=PHOTO,PHOTO or NAME=STYLE.json"),
-        (["--references", "absent.png", "--path", "orbit"], "absent.png"),
     ],
 )
 def test_mistakes(run: Path, args: list[str], told: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

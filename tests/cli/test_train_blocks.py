@@ -8,7 +8,6 @@ from tiny_world import World, flags
 
 from fprf.cli.blocks import SHARE, block_minutes
 from fprf.cli.main import main
-from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 
 BLOCKS = ["--blocks", "street", "--blocks.segments", "2", "--steps", "4"]
@@ -24,11 +23,6 @@ def test_the_plan_runs_nothing(world: World, tmp_path: Path, capsys: pytest.Capt
     document = json.loads((tmp_path / "run/plan.json").read_text())
     assert [row["name"] for row in document["blocks"]] == ["surroundings", "00", "01", "together"]
     assert all(row["images"] and row["rays"] and row["memory_mib"] > 0 for row in document["blocks"])
-
-
-def test_a_plan_for_one_block(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--plan"]) == 0
-    assert capsys.readouterr().out.splitlines()[2].split()[0] == "whole"
 
 
 def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,19 +46,6 @@ def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.Ca
     assert (run / "blocks/00/done.json").read_bytes() == before
 
 
-def test_a_run_of_blocks_refuses_other_knobs(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = tmp_path / "run"
-    assert main(["train", "fprf-lite", *flags(world, run), *BLOCKS]) == 0
-    assert main(["train", "fprf-lite", *flags(world, run), *BLOCKS, "--seed", "3"]) == 2
-    assert "holds a run with seed" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("memory", ["0", "-5", "nan"])
-def test_limits_that_are_none_are_refused(world: World, capsys: pytest.CaptureFixture[str], memory: str) -> None:
-    assert main(["eval", str(world.run), "--max-memory", memory]) == 2
-    assert "--max-memory" in capsys.readouterr().err
-
-
 def test_time_is_shared_between_the_surroundings_and_the_blocks() -> None:
     config = TrainConfig(minutes=10.0)
     around, each = block_minutes(config, 4, 60.0)
@@ -74,14 +55,3 @@ def test_time_is_shared_between_the_surroundings_and_the_blocks() -> None:
     # Features that took longer than the limit leave a little all the same.
     late = block_minutes(config, 4, 1e4)
     assert late[0] == pytest.approx(0.5 * SHARE)
-
-
-def test_quiet_training_says_nothing(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from dataclasses import replace
-
-    from fprf.fields.layouts import StreetConfig
-
-    config = replace(world.config, output=tmp_path / "run", blocks=StreetConfig(segments=2), steps=2)
-    train_scene(config, "fprf-lite", quiet=True)
-    said = capsys.readouterr()
-    assert said.out == "" and said.err == ""

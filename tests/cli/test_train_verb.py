@@ -1,23 +1,18 @@
-import json
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import sleep
 
 import pytest
 from tiny_world import World, flags, parameters
 
 from fprf.cli import main as cli
-from fprf.cli.train import default_output, train_scene
-from fprf.config import TrainConfig
-from fprf.errors import DataError, UsageError
+from fprf.cli.train import train_scene
+from fprf.errors import UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins import registry
 from fprf.plugins.config import Need
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig
-from fprf.plugins.executors.config import SerialConfig
 from fprf.training import checkpoint
 from fprf.training.run import Run
 
@@ -37,17 +32,6 @@ def test_the_flags_make_the_config_and_the_run_is_the_same(world: World, tmp_pat
     assert run.load_config() == (replace(world.config, output=None), "fprf-lite")
     here, there = parameters(run, 15), parameters(Run(world.run), 15)
     assert here.keys() == there.keys() and all(here[name].equal(there[name]) for name in here)
-
-
-def test_progress_off_a_terminal_is_json_lines(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = [*flags(world, tmp_path / "run"), "--steps", "2"]
-    args = args[:4] + args[6:]
-    assert cli.main(["train", "fprf-lite", *args]) == 0
-    out, err = capsys.readouterr()
-    events = [json.loads(line) for line in err.splitlines()]
-    assert out == "" and events[0]["event"].startswith("fprf-lite on ")
-    last = [e for e in events if e["event"] == "training"][-1]
-    assert last["step"] == 2 and last["share"] == 1 and {"seconds", "psnr", "rays_per_second", "seconds_left"} <= last.keys()
 
 
 def test_a_config_json_goes_on_with_its_run_wherever_that_lies(world: World, tmp_path: Path) -> None:
@@ -74,12 +58,8 @@ def test_another_config_in_an_existing_run_is_refused_before_any_work(
     [
         (["fprf-litee"], "did you mean 'fprf-lite'"),
         (["--sampler", "uniform"], "--sampler: no such flag; `fprf train fprf-splats --help`"),
-        (["fprf-lite", "--stepz", "3"], "--stepz: no such flag; did you mean --steps?"),
-        (["fprf-lite", "--steps", "many"], "--steps many: it takes a whole number"),
         (["fprf-lite", "--steps", "-1"], "--steps: -1 must be at least 0"),
-        (["fprf-lite", "--seed", "-1"], "--seed: -1 must lie in [0, 2147483647]"),
         (["fprf-lite", "--loss.rgb", "0", "--loss.content", "0", "--loss.semantic", "0"], "nothing would be learnt"),
-        (["fprf-lite", "--content.encoder", "vgg99"], "no plug-in 'vgg99'"),
         (["absent/config.json"], "absent/config.json: cannot be read"),
         (["fprf-lite"], "no scene is named: give --data FOLDER, or --data town"),
     ],
@@ -90,25 +70,6 @@ def test_mistakes_on_the_command_line(
     monkeypatch.chdir(tmp_path)
     assert told in mistake(capsys, "train", *args)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_mistakes_in_the_data(capsys: pytest.CaptureFixture[str], tmp_path: Path, world: World) -> None:
-    absent, empty = tmp_path / "absent", tmp_path / "empty"
-    empty.mkdir()
-    output = ["--output", str(tmp_path / "run")]
-    assert f"{absent}: no such folder" in mistake(capsys, "train", "fprf-lite", "--data", str(absent), *output)
-    line = mistake(capsys, "train", "fprf-lite", "--data", str(empty), *output)
-    assert f"{empty}: no transforms.json" in line and "but nothing" in line
-    assert "a folder, not a method" in mistake(capsys, "train", str(world.run))
-    assert "'tpu' is not available here" in mistake(
-        capsys, "train", "fprf-lite", *[("tpu" if a == "cpu" else a) for a in flags(world, tmp_path / "run")]
-    )
-
-
-def test_usage_lists_the_methods(capsys: pytest.CaptureFixture[str]) -> None:
-    assert (cli.main(["train"]), cli.main(["train", "--help"])) == (2, 0)
-    text = capsys.readouterr().out
-    assert text.count("usage: fprf train [METHOD|CONFIG.json]") == 2 and "fprf-lite" in text
 
 
 def test_an_interrupt_is_130_and_the_run_goes_on(
@@ -129,24 +90,6 @@ def test_an_interrupt_is_130_and_the_run_goes_on(
     assert checkpoint.steps(tmp_path / "run" / "checkpoints") == [3]
     monkeypatch.undo()
     assert cli.main(["eval", str(tmp_path / "run")]) in (0, 2)
-
-
-def test_where_runs_go(tmp_path: Path) -> None:
-    config = replace(fprf_lite(), data=tmp_path / "fern")
-    assert default_output(config, "fprf-lite") == Path("runs/fern-fprf-lite")
-    assert default_output(replace(config, data=Path("/")), "m") == Path("runs/scene-m")
-
-
-def test_a_quiet_run_says_nothing(
-    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[str] = []
-    monkeypatch.setattr(SerialConfig, "on", lambda self, device: asked.append(device) or self)
-    assert train_scene(replace(world.config, output=tmp_path / "run", steps=1), "fprf-lite", quiet=True) == tmp_path / "run"
-    assert asked == ["cpu"], "executors are told where a scene is trained: Ray hides GPUs that nobody asks for"
-    assert capsys.readouterr() == ("", "")
-    with pytest.raises(UsageError, match="holds a run with seed"):
-        train_scene(replace(world.config, output=tmp_path / "run", seed=3), "fprf-lite", quiet=True)
 
 
 def test_everything_that_is_missing_is_listed_at_once(
@@ -182,21 +125,3 @@ def test_a_size_that_is_found_stays_with_the_run(world: World, tmp_path: Path, m
     run = Run(tmp_path / "run")
     assert run.load_config()[0].downscale == 2 and run.load_known().cameras.size[0].tolist() == [16, 12]
     assert checkpoint.steps(run.checkpoints) == [2, 3]
-
-
-def test_few_pixels_and_slow_features_are_told_before_the_training(
-    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def slow(config: TrainConfig, progress: Callable[[int, int, str], None], *rest: object) -> None:
-        progress(0, 100, "features of slow")
-        sleep(0.05)
-        progress(1, 100, "features of slow")
-        progress(2, 100, "features of slow")
-        raise DataError("no more")
-
-    monkeypatch.setattr("fprf.training.prepare.prepare", slow)
-    for minutes in (0.01, 10.0):
-        with pytest.raises(DataError, match="no more"):
-            train_scene(replace(world.config, output=tmp_path / "run", downscale=2, minutes=minutes), "fprf-lite")
-    told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-    assert len(told) == 3 and "16x12 pixels are few" in told[0] and "--downscale 4" in told[1] and "16x12" in told[2]

@@ -1,4 +1,3 @@
-import importlib.util
 import json
 from pathlib import Path
 
@@ -8,7 +7,7 @@ from tiny_world import World, flags, parameters
 
 from fprf.cli import main as cli
 from fprf.cli import train
-from fprf.cli.live_view import open_view, take_view
+from fprf.cli.live_view import take_view
 from fprf.errors import UsageError
 from fprf.training import trainer
 from fprf.training.run import Run
@@ -43,12 +42,6 @@ def test_what_is_no_place_is_refused(args: list[str]) -> None:
         take_view(args)
 
 
-def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"pip install 'fprf\[viewer\]'"):
-        open_view(ViewAddress())
-
-
 @pytest.mark.parametrize("script", [GREEDY, DEAF, DEAD])
 def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, capsys: pytest.CaptureFixture[str]
@@ -63,14 +56,6 @@ def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
     assert "live at http://here/" in capsys.readouterr().err
     if script is GREEDY:
         assert "snapshot" in log.read_text()
-
-
-def test_help_and_completion_know_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["train", "fprf-lite", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "--view [[HOST:]PORT]" in text and max(len(line) for line in text.splitlines()) <= 110
-    assert cli.main(["train", "fprf-lite", "--list-flags"]) == 0
-    assert {"--view", "--plan", "--steps"} <= set(capsys.readouterr().out.splitlines())
 
 
 def test_blocks_are_shown_one_after_the_other_and_trained_the_same(

@@ -4,8 +4,6 @@ from pathlib import Path
 import pytest
 
 from fprf.cli import main as cli
-from fprf.cli.view import ViewConfig
-from fprf.errors import ConfigError
 
 
 @pytest.fixture
@@ -43,9 +41,3 @@ def test_a_folder_that_is_no_run_is_told(tmp_path: Path, capsys: pytest.CaptureF
     assert cli.main(["view", str(tmp_path), "--port", "0"]) == 2
     out = capsys.readouterr()
     assert "no config.json" in out.err and out.out == "", "no address before there is something to see"
-
-
-def test_ranges() -> None:
-    assert ViewConfig(port=0).host == "127.0.0.1"
-    with pytest.raises(ConfigError):
-        ViewConfig(port=65536)
