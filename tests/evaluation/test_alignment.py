@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from tiny_world import World
 
@@ -52,19 +51,3 @@ def test_a_fit_is_a_function_of_its_input_and_looks_at_nothing_that_is_masked(wo
     first, second = (align_view(trained, cameras, view, image, 1.0, config, where) for image in (truth, spoilt))
     assert torch.equal(first, second) and float(first.abs().max()) > 0
     assert not torch.equal(first, align_view(trained, cameras, view, truth, 1.0, config))
-
-
-def test_masks_of_the_capture_are_read(world: World, tmp_path: Path) -> None:
-    trained = world.load()
-    view = trained.known.test[0]
-    width, height = trained.known.cameras.size[view].tolist()
-    half = np.zeros((height, width, 3), np.uint8)
-    half[:, : width // 2] = 255
-    write_image(tmp_path / "half.png", half)
-    masks = tuple(tmp_path / "half.png" if k == view else None for k in range(len(trained.known.names)))
-    config = AlignmentConfig(steps=2, rays=32)
-    told: list[int] = []
-    scene = world.prepared.scene
-    _, plain = align(trained, scene, [view], lambda done, total, what: told.append(done), config)
-    _, masked = align(trained, replace(scene, masks=masks), [view], config=config)
-    assert told == [0, 1] and not torch.equal(plain[view], masked[view])

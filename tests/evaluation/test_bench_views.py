@@ -5,8 +5,7 @@ import torch
 from tiny_world import World
 
 from fprf.evaluation.naive import plain_planes
-from fprf.evaluation.subject import count, difference, exact, plainly, small_view, view_rays
-from fprf.ops import dense
+from fprf.evaluation.subject import count, difference, exact, plainly, view_rays
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.rendering.renderer import march
 from fprf.training.restyle import restyle
@@ -33,19 +32,6 @@ def test_exact_is_double_and_every_way_comes_near_it(world: World) -> None:
     assert all(p.dtype == torch.float32 for p in model.parameters()), "the run's own model stays as it is"
 
 
-def test_plainly_runs_no_compiled_network(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    trained = world.load()
-    rays = view_rays(trained.model, trained.known.cameras, 1)
-
-    def refused(*args: object, **kwargs: object) -> None:
-        raise AssertionError("a kernel ran")
-
-    monkeypatch.setattr(dense, "_packed", refused)
-    plainly(trained.model, trained.known.facts, rays, trained.config.render)
-    with pytest.raises(AssertionError, match="a kernel ran"):
-        render_view(trained.model, trained.known.facts, trained.known.cameras, 1, trained.config.render)
-
-
 def test_counts_are_those_of_the_march(world: World) -> None:
     trained = world.load()
     rays = view_rays(trained.model, trained.known.cameras, 0)
@@ -55,26 +41,3 @@ def test_counts_are_those_of_the_march(world: World) -> None:
     assert (found.rays, found.samples, found.kept) == (768, 768 * 8, len(kept.ray))
     assert found.empty == 768 - len(set(kept.ray.tolist()))
     assert found.shares["kept_samples_per_ray"] == pytest.approx(len(kept.ray) / 768)
-
-
-def test_rays_that_see_nothing_are_counted(world: World) -> None:
-    trained = world.load()
-    with torch.no_grad():
-        trained.model.get_parameter("field.to_density.weight").fill_(-1e6)
-    found = count(trained.model.parts, view_rays(trained.model, trained.known.cameras, 0), 1 / 512)
-    assert found.kept == 0 and found.shares["empty_rays_share"] == 1
-
-
-def test_differences() -> None:
-    found = difference(torch.tensor([[0.0, 0.5]]), torch.tensor([[0.3, 0.1]]))
-    assert found == pytest.approx((0.4, (0.5 * (0.09 + 0.16)) ** 0.5))
-
-
-@pytest.mark.parametrize("rays", [64, 200, 768, 10**6])
-def test_a_view_is_made_no_larger_than_asked(world: World, rays: int) -> None:
-    cameras = world.load().known.cameras
-    one = small_view(cameras, 3, rays)
-    width, height = one.size[0].tolist()
-    assert len(one) == 1 and 0.6 * min(rays, 768) <= width * height <= rays
-    assert torch.equal(one.pose[0], cameras.pose[3])
-    assert one.focal[0, 0] / width == pytest.approx(float(cameras.focal[3, 0]) / 32)

@@ -4,32 +4,14 @@ from tiny_world import World
 
 from fprf.errors import DataError
 from fprf.evaluation.single_image import encoded
-from fprf.evaluation.town_truth import KINDS, Reference, code_classes, interior, match_rates, photograph, places, winners
+from fprf.evaluation.town_truth import Reference, code_classes, match_rates, photograph, places
 from fprf.style.dictionary import Reference as Samples
 from fprf.style.dictionary import build_dictionary
-from fprf.town.surface import CAR, CLASSES, FACADE, SKY, WINDOW
+from fprf.town.surface import CAR, SKY, WINDOW
 
 
 def reference(classes: torch.Tensor) -> Reference:
     return Reference("some", torch.zeros(*classes.shape, 3), classes)
-
-
-def test_every_class_has_a_kind() -> None:
-    assert set(KINDS) == set(range(len(CLASSES)))
-
-
-def test_rates_count_what_they_say() -> None:
-    truth = torch.full((12, 12), SKY)
-    truth[6:] = FACADE
-    shown = reference(torch.tensor([[SKY, FACADE, WINDOW]]))
-    assert tuple(match_rates([truth], [truth], [shown])) == (1, 1, 1, 1)
-    found = truth.clone()
-    found[6:] = WINDOW  # the right kind, another class
-    assert tuple(match_rates([found], [truth], [shown])) == (0.5, 0.5, 0.5, 1)
-    edge = truth.clone()
-    edge[5:7] = CAR  # wrong at the border alone
-    match, inside, border, kind = match_rates([edge], [truth], [shown])
-    assert match == pytest.approx(10 / 12) and inside == 1 and border == 0.5 and kind == pytest.approx(10 / 12)
 
 
 def test_classes_that_no_reference_shows_do_not_count() -> None:
@@ -38,17 +20,6 @@ def test_classes_that_no_reference_shows_do_not_count() -> None:
     assert match_rates([truth], [truth], [reference(torch.tensor([[WINDOW]]))]).match is None
     without = torch.full_like(truth, -1)  # codes of no class are wrong, of no kind too
     assert tuple(match_rates([without], [truth], [reference(truth)])) == (0, None, 0, 0)
-
-
-def test_interiors_keep_their_distance() -> None:
-    labels = torch.zeros(9, 9, dtype=torch.int64)
-    labels[:, 5:] = 1
-    assert interior(labels)[4].tolist() == [True] * 3 + [False] * 4 + [True] * 2
-
-
-def test_the_winner_is_the_largest_share() -> None:
-    share = torch.tensor([[0.2, 0.5, 0.3], [0.6, 0.1, 0.3]])
-    assert winners(share, torch.tensor([4, 5, 6])).tolist() == [5, 4]
 
 
 def test_codes_are_of_the_class_that_they_were_made_of(world: World) -> None:

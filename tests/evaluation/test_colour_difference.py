@@ -53,23 +53,10 @@ def test_the_published_pairs() -> None:
     assert (found - ROWS[:, 6]).abs().max() < 5e-5, "as many digits as were published"
 
 
-def test_the_published_pairs_the_other_way_round() -> None:
-    found = delta_e_2000(ROWS[:, 3:6], ROWS[:, :3])
-    # Hues exactly opposite have no shorter way round: pair 10 and 14 are on that edge and keep their value.
-    assert (found - ROWS[:, 6]).abs().max() < 5e-5
-
-
 def test_lab_is_that_of_another_library() -> None:
     image = torch.rand(1, 3, 40, 50, generator=torch.Generator().manual_seed(0))
     ours = srgb_to_lab(image[0].permute(1, 2, 0))
     assert torch.allclose(ours.float(), rgb_to_lab(image)[0].permute(1, 2, 0), atol=0.02)
-
-
-def test_known_colours() -> None:
-    found = srgb_to_lab(torch.tensor([[0.0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5], [1, 0, 0]]))
-    expected = torch.tensor([[0, 0, 0], [100, 0, 0], [53.389, 0, 0], [53.241, 80.092, 67.203]], dtype=torch.float64)
-    assert torch.allclose(found, expected, atol=5e-3)
-    assert float(delta_e(torch.zeros(3), torch.ones(3))) == pytest.approx(100, abs=1e-6)
 
 
 @settings(max_examples=60, deadline=None)
@@ -80,8 +67,3 @@ def test_it_is_a_difference(first: tuple[float, float, float], second: tuple[flo
     assert float(delta_e(a, a)) < 1e-6
     assert 0 <= there < 150
     assert there == pytest.approx(back, abs=1e-6)
-
-
-def test_shapes_are_kept() -> None:
-    image = torch.rand(4, 5, 3)
-    assert delta_e(image, image.flip(0)).shape == (4, 5)

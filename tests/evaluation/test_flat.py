@@ -44,16 +44,6 @@ def scene(content: Encoder) -> Flat:
     return flat_scene(encoded(image, content, GUIDED), encoded(image, semantic, GUIDED, basis), (40, 56), regions=3)
 
 
-def test_features_lie_at_pixels_and_in_the_basis(content: Encoder) -> None:
-    image, semantic = photo(0), RandomConfig(channels=8).build()
-    basis = cells_basis(image, semantic, 4)
-    assert encoded(image, content, GUIDED).shape == (40 * 56, content.channels)
-    projected = encoded(image, semantic, GUIDED, basis)
-    assert projected.shape == (40 * 56, 4)
-    # The filter and the projection are linear: their order plays no part.
-    assert torch.allclose(projected, basis.project(encoded(image, semantic, GUIDED)), atol=2e-3)
-
-
 @pytest.mark.parametrize("config", [AdainConfig(), *TWO_SIDED])
 def test_a_photographs_own_style_returns_it(scene: Flat, decoder: Decoder, config: StylizerConfig) -> None:
     stylizer = config.build(dictionary=own_style(scene.style), scene=scene.style)
@@ -89,19 +79,3 @@ def test_painted_regions_take_the_colours_of_their_like(content: Encoder, decode
         colour = found[:, here].mean((0, 1))
         near, far = ((colour - style[:, part].mean((0, 1))).norm() for part in (right, wrong))
         assert near < 0.25 * far
-
-
-def test_painted_regions_are_whole_at_any_size() -> None:
-    regions = torch.tensor([[0, 2], [1, 1]])
-    semantic = painted(regions, 3, (6, 4))
-    assert semantic.shape == (24, 3)
-    assert semantic.sum(1).eq(1).all()
-    assert semantic.reshape(6, 4, 3).argmax(-1)[0].tolist() == [0, 0, 2, 2]
-
-
-def test_large_photographs_are_sampled_for_their_statistics() -> None:
-    features = torch.rand(300_000, 2, generator=torch.Generator().manual_seed(0))
-    flat = flat_scene(features, None, (300, 1000))
-    assert torch.allclose(flat.style.mean, features.mean(0), atol=5e-3)
-    assert len(flat_reference("large", features, None).content) in range(20_000, 20_500)
-    assert len(flat_reference("small", features[:7], None).content) == 7

@@ -1,12 +1,9 @@
-from dataclasses import replace
-
 import pytest
 import torch
 from tiny_world import World
 
 from fprf.datamanagers.images import load_image
-from fprf.errors import DataError
-from fprf.evaluation.evaluate import judge, peak_memory
+from fprf.evaluation.evaluate import judge
 from fprf.evaluation.metrics import image_metrics
 from fprf.training.views import render_view
 
@@ -27,24 +24,3 @@ def test_metrics_are_those_of_the_renders(world: World) -> None:
     assert metrics["seconds_per_view"] == pytest.approx(metrics["render_seconds"] / 2)
     assert (metrics["train_steps"], metrics["train_seconds"]) == (15, trained.seconds) and metrics["lpips"] is None
     assert metrics["consistency"]["pairs"] == 1 and 0 < metrics["kept_samples_share"] <= 1
-
-
-def test_images_are_compared_on_the_scenes_background(world: World) -> None:
-    trained, scene = world.load(), world.prepared.scene
-    facts = replace(trained.known.facts, background=(1.0, 1.0, 1.0))
-    metrics, _ = judge(
-        replace(trained, known=replace(trained.known, facts=facts)), scene, trained.known.test[:1], lambda *of: None
-    )
-    assert metrics["views"] == 1 and metrics["consistency"]["rmse"] is None
-
-
-def test_no_views_is_told(world: World) -> None:
-    with pytest.raises(DataError, match="no views"):
-        judge(world.load(), world.prepared.scene, (), lambda *of: None)
-
-
-def test_peak_memory_is_in_mebibytes_and_only_rises() -> None:
-    before = peak_memory()
-    assert 50 < before < 1e6
-    held = torch.ones(64, 1 << 20)
-    assert peak_memory() >= before and held.sum() > 0

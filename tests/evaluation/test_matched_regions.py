@@ -37,18 +37,3 @@ def test_bands_of_another_light_find_their_like() -> None:
     assert there[0].equal(torch.tensor([sky, wall, grass]).repeat_interleave(4)[:, None].expand(12, 6))
     assert here[0][:, 0].tolist() == [sky] * 4 + [wall] * 2 + [grass] * 6
     assert here[1][:, 0].tolist() == [sky] * 2 + [wall] * 6 + [grass] * 4
-
-
-def test_a_style_of_one_colour_has_one_region() -> None:
-    grey = torch.full((8, 8, 3), 0.5)
-    here, there = matched_regions(Halved(), [bands((4, 4, 4), DAY)], [grey, grey], regions=5, seed=0)
-    assert len(there) == 2
-    assert {int(n) for each in (*here, *there) for n in each.unique()} == {0}
-
-
-def test_regions_are_the_same_for_the_same_seed() -> None:
-    draw = torch.Generator().manual_seed(0)
-    contents, styles = [torch.rand(16, 20, 3, generator=draw)], [torch.rand(12, 16, 3, generator=draw)]
-    first, again = (matched_regions(Halved(), contents, styles, regions=4, seed=3) for _ in range(2))
-    assert all(a.equal(b) for a, b in zip(first[0] + first[1], again[0] + again[1], strict=True))
-    assert int(first[1][0].max()) == 3

@@ -8,8 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.errors import DataError, UsageError
-from fprf.evaluation.town_truth import PARTS, places, set_stage, short_path, shows, town_folder, town_view, true_views
+from fprf.errors import DataError
+from fprf.evaluation.town_truth import PARTS, places, set_stage, short_path, shows, town_view
 from fprf.town.surface import FACADE, FOLIAGE, LAWN, ROAD, SKY
 
 FIXTURE = [HealthCheck.function_scoped_fixture]
@@ -29,18 +29,6 @@ def test_views_are_spread_over_what_was_held_out(world: World) -> None:
     stage = set_stage(every, views=2, frames=8, longest=16)
     assert torch.equal(stage.views.pose, trained.known.cameras.pose[[1, 5]])
     assert torch.equal(stage.path.pose[0], stage.views.pose[1]), "the path begins in the middle"
-
-
-def test_runs_that_held_nothing_out_are_judged_on_what_they_learnt(world: World) -> None:
-    trained = world.load()
-    none = replace(trained, known=replace(trained.known, test=()))
-    stage = set_stage(none, views=1, frames=0, longest=16)
-    assert torch.equal(stage.views.pose[0], trained.known.cameras.pose[trained.known.train[0]])
-
-
-def test_pictures_are_never_enlarged(world: World) -> None:
-    stage = set_stage(world.load(), views=1, frames=0, longest=4000)
-    assert stage.views.size.tolist() == [[32, 24]] and true_views(stage, "day")[0].shape == (24, 32, 3)
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=FIXTURE)
@@ -65,16 +53,6 @@ def test_cameras_that_a_town_does_not_have_are_refused(world: World, off: float,
     bent = replace(cameras, lens=torch.ones_like(cameras.lens))
     with pytest.raises(DataError, match="view 1"):
         town_view(bent, 1)
-
-
-def test_lights_that_do_not_exist(world: World) -> None:
-    stage = set_stage(world.load(), views=1, frames=0, longest=16)
-    with pytest.raises((DataError, UsageError), match="noon"):
-        true_views(stage, "noon")
-
-
-def test_a_towns_folder_is_where_its_images_are(world: World) -> None:
-    assert town_folder(world.load()) == world.town
 
 
 def test_places_are_the_same_for_the_same_seeds() -> None:

@@ -1,4 +1,3 @@
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -6,28 +5,16 @@ from pathlib import Path
 import torch
 from tiny_world import World
 
-from fprf.datamanagers.images import load_image
 from fprf.evaluation.config import SpeedConfig
 from fprf.evaluation.subject import (
-    LOOKS,
     attempt,
     batch_rays,
     colour_gradient,
     find,
     fresh_model,
     loop_of,
-    settings,
     stepper,
-    town_references,
 )
-from fprf.io.images import Picture
-
-
-def test_a_run_with_its_images(world: World, tmp_path: Path) -> None:
-    subject = find(world.run, SpeedConfig(references=world.references, device="cpu"), tmp_path)
-    prepared, missing = attempt(subject)
-    assert prepared is not None and missing == "" and subject.references == world.references
-    assert settings(SpeedConfig(), subject.trained, missing)["trained_steps"] == 15
 
 
 def test_a_run_without_images_can_be_measured_but_for_training(world: World, tmp_path: Path) -> None:
@@ -39,23 +26,6 @@ def test_a_run_without_images_can_be_measured_but_for_training(world: World, tmp
     assert prepared is None and f"{tmp_path / 'gone'}: no such folder" in missing
     prepared, missing = attempt(find(tmp_path / "run", replace(asked, data=world.town), tmp_path))
     assert prepared is not None and missing == ""
-
-
-def test_other_encoders_than_the_runs_are_refused(world: World, tmp_path: Path) -> None:
-    shutil.copytree(world.run, tmp_path / "run")
-    scene = tmp_path / "run" / "scene.json"
-    known = json.loads(scene.read_text())
-    known["facts"]["semantic_encoder"] = "another:1234"
-    scene.write_text(json.dumps(known))
-    _, missing = attempt(find(tmp_path / "run", SpeedConfig(references=world.references, device="cpu"), tmp_path))
-    assert missing.startswith("semantic encoder: the run was trained with another:1234")
-
-
-def test_references_of_our_own(tmp_path: Path) -> None:
-    paths = town_references(tmp_path / "made", width=24, height=16)
-    pictures: list[Picture] = [load_image(path) for path in paths]
-    assert [path.stem for path in paths] == list(LOOKS) and all(p.shape == (16, 24, 3) for p in pictures)
-    assert pictures[0].mean() > pictures[2].mean(), "night is darker than autumn"
 
 
 def test_steps_train_a_copy(world: World) -> None:

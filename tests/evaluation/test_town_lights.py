@@ -1,7 +1,6 @@
 import torch
 
 from fprf.evaluation.town_truth import PARTS, photograph, places, shows
-from fprf.town.surface import FACADE, ROAD, SKY
 
 SIZE = (48, 36)
 
@@ -23,12 +22,3 @@ def test_light_changes_no_class() -> None:
     assert torch.equal(day.classes, night.classes) and day.image.shape == (36, 48, 3)
     assert float(night.image.mean()) < float(day.image.mean())
     assert (day.name, night.name) == ("day-street", "night-street")
-
-
-def test_a_street_needs_road_and_sky() -> None:
-    labels = torch.full((4, 4), ROAD).numpy()
-    assert shows(labels, "street") == 0
-    labels[:2] = SKY
-    assert shows(labels, "street") == 1
-    labels[0] = FACADE
-    assert shows(labels, "facades") == 0.25

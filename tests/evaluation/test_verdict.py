@@ -5,12 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from benchmarks.paper import paper_page
-from benchmarks.paper_styles import PaperConfig
-from fprf.errors import ConfigError
-from fprf.evaluation.config import RestyleConfig
-from fprf.evaluation.peer import peer_page
-from fprf.evaluation.restyle import FLAT, GLOBAL, GOALS, PLAIN, lineup, restyle_page, transfers, verdict
+from fprf.evaluation.restyle import FLAT, GLOBAL, GOALS, PLAIN, lineup, transfers, verdict
 from fprf.evaluation.town_truth import Row
 from fprf.plugins.stylizers.config import RegionOtConfig, RegionToneConfig
 
@@ -85,40 +80,3 @@ def document() -> dict[str, Any]:
             for n, light in enumerate(("night", "noon"), 1)
         },
     }  # fmt: skip
-
-
-def test_the_page_says_what_was_met_and_what_was_not() -> None:
-    text = restyle_page(document(), picture="all.jpg")
-    assert "not known" in text and "**not met**" in text and "| met |" in text
-    assert "](all.jpg)" in text and "0123abcd" in text and "12x9" in text
-    assert "| a | 1.5 | 3.0 |" in text, "differences of a class are means over the palettes"
-    assert "![" not in restyle_page(document())
-
-
-def test_a_peers_page_names_the_missing_flag() -> None:
-    known = {"frames": 3, "size": [4, 3], "provenance": PROVENANCE}
-    nothing = {**known, "steadiness": None, "published": None, "truth": None, "style": None, "missing": {"truth": "--truth"}}
-    assert "- truth: not known without --truth" in peer_page(nothing) and "–" in peer_page(nothing)
-    one = {"rmse": 0.0123, "e_warp": 1.5e-4, "lpips": None, "pairs": 2}
-    some = {**nothing, "published": {"short": one, "long": {**one, "rmse": None}}, "missing": {}}
-    assert "| 0.0123 |" in peer_page(some) and "1.50e-04" in peer_page(some) and "without" not in peer_page(some)
-
-
-def test_a_papers_page_has_the_columns_that_it_needs() -> None:
-    settings = {
-        "data": "fox", "downscale": 2, "method": "m", "steps": 3, "trainings": [0, 1], "views": 4, "palettes": ["night"],
-    }  # fmt: skip
-    made = {"table": "reconstruction", "settings": settings, "provenance": PROVENANCE, "rows": {"frozen": {"psnr": 21.5}}}
-    text = paper_page(made)
-    assert "| frozen | 21.50 |" in text and "match" not in text and "*Styled*" not in text and "seeds 0, 1" in text
-    made["rows"] = {"frozen": {"styled_psnr": 17.0}}
-    assert "*Styled*: against the truth of the palettes night" in paper_page(made)
-
-
-def test_knobs_are_checked() -> None:
-    for wrong in ({"frames": 7}, {"seeds": (1, 2)}, {"blend": 1.1}, {"palettes": ()}, {"longest": 8}):
-        with pytest.raises(ConfigError):
-            RestyleConfig(**wrong)  # type: ignore[arg-type]
-    for wrong in ({"trainings": ()}, {"clusters": (0,)}, {"steps": 0}, {"downscale": 0}):
-        with pytest.raises(ConfigError):
-            PaperConfig(**wrong)  # type: ignore[arg-type]
