@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
-from fprf.datamanagers import features as module
 from fprf.datamanagers import features as store_files
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.features import FeatureStore, extract
-from fprf.errors import DataError, NumericsError, PluginError
 from fprf.interfaces import Encoder
 from fprf.ops import guided
 
@@ -42,12 +40,6 @@ def test_half_precision_keeps_eleven_bits_of_the_largest_coefficient(
     error = (entry.plain() - coefs).abs().amax((0, 1, 3))
     # b is kept at mid-grey: its own rounding and that of three halved slopes.
     assert (error <= 2.5 * store_files.TOP * 2.0**-11 * entry.scale + 2.0**-22 * abs(offset) * size).all()
-
-
-def test_constant_and_zero_features() -> None:
-    coefs = torch.zeros(2, 2, 3, 4)
-    coefs[..., 3] = torch.tensor([0.0, 5.0, -2.0])
-    assert torch.equal(store_files.pack(coefs, (2, 2)).plain(), coefs)
 
 
 def make(folder: Path) -> tuple[str, store_files.Entry]:
@@ -77,14 +69,6 @@ def test_a_flipped_bit_or_a_lost_end_makes_the_entry_absent(tmp_path: Path, shar
     assert store_files.read_entry(tmp_path, key) is None
     path.write_bytes(data)
     assert store_files.read_entry(tmp_path, key) is not None
-
-
-def test_a_file_under_another_name_is_not_believed(tmp_path: Path) -> None:
-    key, _ = make(tmp_path)
-    other = store_files.digest("other inputs")
-    (tmp_path / f"{key}.safetensors").rename(tmp_path / f"{other}.safetensors")
-    assert store_files.read_entry(tmp_path, key) is None
-    assert store_files.read_entry(tmp_path, other) is None
 
 
 def test_only_old_unfinished_files_are_removed(tmp_path: Path) -> None:
@@ -187,14 +171,6 @@ def test_the_store_answers_what_the_filter_says(tmp_path: Path, channels: int) -
     assert (found - expected).abs().max() <= 4e-3 * expected.std()
 
 
-def test_compiled_and_plain_answers_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store, where = build(tmp_path, Counting(11)), draw()
-    where[1][:4] = torch.tensor([[0.0, 0.0], [1e3, 1e3], [-5.0, 3.0], [3.0, -5.0]])
-    compiled = store.at(*where)
-    monkeypatch.setattr(module, "_COMPILED", False)
-    assert (store.at(*where) - compiled).abs().max() <= 1e-5 * compiled.abs().max()
-
-
 def test_coefficients_on_a_device_answer_as_those_of_the_host(tmp_path: Path) -> None:
     store, where = build(tmp_path, Counting(11)), draw()
     where[1][:4] = torch.tensor([[0.0, 0.0], [1e3, 1e3], [-5.0, 3.0], [3.0, -5.0]])
@@ -232,13 +208,6 @@ def test_mean_and_spread_are_those_of_the_targets(tmp_path: Path) -> None:
     assert store.mean == pytest.approx(float(every.mean()), abs=0.04 * store.std)
     assert store.std == pytest.approx(float(every.var(0).mean().sqrt()), rel=0.03)
     assert store.scale == store.std
-
-
-def test_features_that_never_change_have_scale_one(tmp_path: Path) -> None:
-    store = build(tmp_path, Counting(2, gain=0.0, offset=3.0))
-    assert store.std <= 1e-6 and store.scale == 1.0
-    assert (store.at(*draw(5)) - 3.0).abs().max() <= 1e-6
-    assert build(tmp_path, Counting(2, gain=0.0)).scale == 1.0
 
 
 def test_semantics_are_the_projected_features(tmp_path: Path) -> None:
@@ -299,29 +268,6 @@ def test_an_interrupted_extraction_goes_on(tmp_path: Path) -> None:
     encoder.calls, encoder.fail_after = 0, 99
     build(tmp_path, encoder)
     assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.glob("manifest*"))) == 1
-
-
-def test_a_view_without_features_is_named(tmp_path: Path) -> None:
-    store = build(tmp_path, Counting())
-    with pytest.raises(DataError, match="view 7 has no features"):
-        store.at(torch.tensor([0, 7]), torch.zeros(2, 2), torch.zeros(2, 3))
-    assert store.at(torch.zeros(0, dtype=torch.long), torch.zeros(0, 2), torch.zeros(0, 3)).shape == (0, 5)
-    with pytest.raises(DataError, match="no views"):
-        FeatureStore({})
-
-
-def test_encoders_that_break_their_promise_are_named(tmp_path: Path) -> None:
-    with pytest.raises(NumericsError, match=r"counting 2 nan .* view 0 are not finite"):
-        build(tmp_path, Counting(2, gain=float("nan")))
-
-    class Liar(Counting):
-        @property
-        def channels(self) -> int:
-            return 3
-
-    with pytest.raises(PluginError, match="promises"):
-        build(tmp_path, Liar(2))
-    assert not list(tmp_path.glob("*"))
 
 
 def test_files_stay_small(tmp_path: Path) -> None:

@@ -57,12 +57,6 @@ def test_headers_tell_the_size_without_decoding(tmp_path: Path, suffix: str) -> 
     assert (header.width, header.height, header.alpha) == (18, 12, False)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".webp", ".tiff"])
-def test_headers_tell_transparency(suffix: str) -> None:
-    header = header_of(encoded(suffix, np.dstack([NOISE, NOISE[:, :, 0]])))
-    assert header is not None and header.alpha
-
-
 def test_transparency_is_straight_and_shows_the_background(tmp_path: Path) -> None:
     image = np.dstack([np.full((1, 3, 3), (30, 20, 10), dtype=np.uint8), np.array([[255, 0, 51]], dtype=np.uint8)])
     (tmp_path / "a.png").write_bytes(encoded(".png", image))
@@ -194,20 +188,6 @@ def test_a_thumbnail_s_end_does_not_hide_truncation(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(whole[:-20])
     with pytest.raises(DataError, match="truncated"):
         load_image(tmp_path / "a.jpg")
-
-
-def test_an_absent_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"nothing\.png: cannot be read"):
-        load_image(tmp_path / "nothing.png")
-
-
-def test_all_views_of_a_scene_at_their_cameras_sizes(tmp_path: Path) -> None:
-    capture = Capture.make(3)
-    write_transforms(tmp_path, capture)
-    images = load_images(parse_scene(tmp_path, 2, None))
-    assert [image.shape for image in images] == [(8, 12, 3)] * 3
-    for name, image in zip(capture.names, images, strict=True):
-        assert np.array_equal(image, load_image(tmp_path / "images" / name, (12, 8)))
 
 
 def test_an_image_that_was_rotated_after_parsing_is_refused(tmp_path: Path) -> None:

@@ -1,9 +1,7 @@
 """Captures in the format of Mission Bay: TFRecord files, cameras behind rays; read, refused, and trained."""
 
-import json
 import math
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +15,7 @@ from record_files import example, record, town_records, varint
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, read_examples, read_records
 from fprf.datamanagers.parsers.config import BlockNerfConfig, parse_scene, recognise
-from fprf.errors import ConfigError, DataError
+from fprf.errors import DataError
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 
 
@@ -111,22 +109,6 @@ def test_bad_messages_are_named(tmp_path: Path, data: bytes, said: str) -> None:
         list(read_examples(path))
 
 
-def test_asking_for_something_else_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "a.tfrecord"
-    path.write_bytes(record(example({"a": b"x", "b": [1, 2], "c": np.array([1.0, np.inf], np.float32)})))
-    (one,) = read_examples(path)
-    for call in (
-        lambda: one.blob("b"),
-        lambda: one.integer("b"),
-        lambda: one.integer("none"),
-        lambda: one.numbers("a"),
-        lambda: one.numbers("c"),
-        lambda: one.numbers("c", 3),
-    ):
-        with pytest.raises(DataError, match=r"a.tfrecord: record 0: \w+ holds .* is needed"):
-            call()
-
-
 number = st.floats(-1, 1)
 
 
@@ -168,12 +150,6 @@ def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p
     np.testing.assert_allclose(found.focal, (40.0, 42.0), rtol=3e-4)
     np.testing.assert_allclose(found.centre, (31.0, 25.5), atol=2e-2)
     np.testing.assert_allclose(found.distortion, truth.distortion[0].numpy(), atol=2e-3)
-
-
-def test_directions_need_not_be_unit() -> None:
-    origin, direction = rays_of(camera(np.eye(3)))
-    found = fit_camera(origin, direction * np.float32(3.5))
-    np.testing.assert_allclose(found.focal, (40.0, 42.0), rtol=1e-4)
 
 
 def test_a_rolling_shutter_is_told_by_its_drift() -> None:
@@ -240,15 +216,6 @@ def test_a_complete_cache_is_not_read_again(bay: tuple[Path, Cameras], monkeypat
     assert parse_scene(bay[0], 1, None).paths[3].is_file()
 
 
-def test_some_cameras(bay: tuple[Path, Cameras]) -> None:
-    scene = parse_scene(bay[0], 1, BlockNerfConfig(cameras=(1,)))
-    assert len(scene.paths) == 8 and all(path.stem.startswith("cam01") for path in scene.paths)
-    with pytest.raises(DataError, match=r"no images of cameras \[7\]; parser.cameras may name \[0, 1\]"):
-        parse_scene(bay[0], 1, BlockNerfConfig(cameras=(7,)))
-    with pytest.raises(ConfigError, match=r"parser.cameras"):
-        BlockNerfConfig(cameras=(-1,))
-
-
 def test_rays_of_no_camera_are_refused_unless_told(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     town_records(folder, views=4)
@@ -295,47 +262,3 @@ def test_records_that_cannot_be_are_named(tmp_path: Path, change: dict[str, obje
     with pytest.raises(DataError, match=said) as caught:
         parse_scene(folder, 1, None)
     assert "a_train.tfrecord: record 0" in str(caught.value)
-
-
-def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
-    folder = tmp_path / "data"
-    folder.mkdir()
-    done, image = cv2.imencode(".png", np.full((12, 12, 3), 90, np.uint8))
-    assert done
-    (folder / "a.tfrecord").write_bytes(record(example(good_features() | {"image": image.tobytes()})))
-    with pytest.raises(DataError, match="12x12 pixels, but its camera has 32x24"):
-        parse_scene(folder, 1, None)
-
-
-def test_no_files(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no \*\.tfrecord files"):
-        parse_scene(tmp_path, 1, BlockNerfConfig())
-
-
-def test_it_trains_in_blocks_from_end_to_end(bay: tuple[Path, Cameras], tmp_path: Path) -> None:
-    from fprf.cli.train import train_scene
-    from fprf.config import StatisticsConfig
-    from fprf.datamanagers.config import RayBatchesConfig
-    from fprf.fields.config import PlanesConfig
-    from fprf.fields.layouts import StreetConfig
-    from fprf.methods import fprf_lite
-    from fprf.training.loading import load_run
-    from fprf.training.views import render_view
-
-    lite = fprf_lite()
-    config = replace(
-        lite,
-        data=bay[0],
-        output=tmp_path / "run",
-        steps=8,
-        device="cpu",
-        blocks=StreetConfig(segments=2),
-        datamanager=RayBatchesConfig(rays=128, semantic_share=0.5),
-        content=replace(lite.content, field=PlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1)),
-        statistics=StatisticsConfig(rays=256, regions=3),
-    )
-    train_scene(config, "fprf-lite", quiet=True)
-    trained = load_run(tmp_path / "run", "cpu")
-    assert json.loads((tmp_path / "run/blocks.json").read_text())["rays"]
-    image = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, config.render).rgb
-    assert image.shape == (24, 32, 3) and bool(torch.isfinite(image).all()) and float(image.std()) > 0

@@ -1,7 +1,6 @@
 """What a scene folder's files may say, and what they may not; poses made exact, sizes and numbers checked."""
 
 import io
-import json
 import os
 import struct
 import tracemalloc
@@ -10,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from capture_files import rotations, write_image
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.files import as_record, image_names, path_inside, read_json, read_npy, read_npz
-from fprf.datamanagers.parsers.views import View, assemble_scene, every_eighth, index_tensor, rigid_pose
+from fprf.datamanagers.parsers.files import as_record, path_inside, read_json, read_npy, read_npz
+from fprf.datamanagers.parsers.views import View, assemble_scene, rigid_pose
 from fprf.errors import DataError
 
 
@@ -41,13 +39,6 @@ def test_loose_json_is_refused(tmp_path: Path, text: bytes) -> None:
     with pytest.raises(DataError, match=r"a\.json: no valid JSON") as caught:
         read_json(path)
     assert len(str(caught.value)) < 500
-
-
-def test_plain_json_is_read_with_and_without_a_mark(tmp_path: Path) -> None:
-    value = {"a": [1, -2.5e3, True, None, "é"], "b": {"a": 1}}
-    for mark in (b"", b"\xef\xbb\xbf"):
-        (tmp_path / "a.json").write_bytes(mark + json.dumps(value).encode())
-        assert read_json(tmp_path / "a.json") == value
 
 
 @pytest.mark.parametrize(
@@ -76,17 +67,6 @@ def test_paths_that_leave_the_root_are_refused(text: str) -> None:
 def test_paths_inside_are_normalised() -> None:
     for text in ("images/a b.png", "./images/a b.png", "images//a b.png", ".\\images\\a b.png"):
         assert path_inside(Path("root"), "here", text) == ("images/a b.png", Path("root/images/a b.png"))
-
-
-def test_folders_are_listed_by_name(tmp_path: Path) -> None:
-    for name in ("b.PNG", "a.jpg", "notes.txt", ".hidden.png"):
-        (tmp_path / name).touch()
-    assert image_names(tmp_path) == ["a.jpg", "b.PNG"]
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="no image among 0 files"):
-        image_names(tmp_path / "empty")
-    with pytest.raises(DataError, match="no such image folder"):
-        image_names(tmp_path / "absent")
 
 
 def npy(array: np.ndarray) -> bytes:
@@ -142,12 +122,6 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
     assert not canary.exists()
 
 
-def test_an_archive_without_the_array_says_so(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", other=np.zeros(3))
-    with pytest.raises(DataError, match="no array 'xyz'"):
-        read_npz(tmp_path / "a.npz", "xyz")
-
-
 @pytest.mark.parametrize("field", [20, 24])
 def test_an_archive_that_claims_more_than_the_file_holds_takes_no_memory(tmp_path: Path, field: int) -> None:
     """Packed and unpacked size stand in the directory at its end; a gigabyte is allowed for an array."""
@@ -163,11 +137,6 @@ def test_an_archive_that_claims_more_than_the_file_holds_takes_no_memory(tmp_pat
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
         tracemalloc.stop()
-
-
-def test_what_deflates_well_is_read(tmp_path: Path) -> None:
-    np.savez_compressed(tmp_path / "a.npz", xyz=np.zeros((300_000, 3)))
-    assert read_npz(tmp_path / "a.npz", "xyz").shape == (300_000, 3)
 
 
 def test_records_fall_back_and_name_the_place() -> None:
@@ -186,22 +155,6 @@ def test_records_fall_back_and_name_the_place() -> None:
     for empty in ({}, {"frames": []}, {"frames": 3}):
         with pytest.raises(DataError, match="no list of frames"):
             as_record("f", empty).records("frames")
-
-
-def test_the_split_is_llff_s() -> None:
-    train, test = every_eighth(20)
-    assert test.tolist() == [0, 8, 16] and sorted(train.tolist() + test.tolist()) == list(range(20))
-    assert [part.tolist() for part in every_eighth(1)] == [[0], []]
-    assert [part.tolist() for part in every_eighth(2)] == [[1], [0]]
-    assert index_tensor([True, False, True]).tolist() == [0, 2]
-
-
-@pytest.mark.parametrize("shape", ["(3)", "((3, 2))", "(3 2)", "(-3, 2)", "(3,, 2)", "3, 2", "(1e1,)"])
-def test_shapes_that_are_none_are_refused(shape: str) -> None:
-    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + np.arange(6.0).tobytes()
-    with pytest.raises(DataError):
-        read_npy("x", data)
 
 
 def pose(seed: int = 0) -> np.ndarray:
@@ -244,26 +197,6 @@ def view(folder: Path, name: str = "a.png", **fields: object) -> View:
         write_image(folder / name, (24, 16))
     whole = View(name=name, path=folder / name, pose=pose(), size=(24, 16), focal=(20.0, 21.0), centre=(12.5, 8.0))
     return replace(whole, **fields)  # type: ignore[arg-type]
-
-
-def test_a_scene_has_what_its_views_have(tmp_path: Path) -> None:
-    views = [view(tmp_path, f"{k}.png", depths=(1.0, 2.0 + k)) for k in range(9)]
-    scene = assemble_scene(tmp_path, views, downscale=1, points=np.ones((4, 3)))
-    assert scene.name == tmp_path.name and scene.paths == tuple(v.path for v in views)
-    assert scene.cameras.focal[3].tolist() == [20.0, 21.0] and scene.cameras.centre[3].tolist() == [12.5, 8.0]
-    assert scene.cameras.pose.dtype == torch.float64 and scene.cameras.size.dtype == torch.int64
-    assert scene.test.tolist() == [0, 8] and not scene.alpha
-    assert scene.depths is not None and scene.depths[8].tolist() == [1.0, 10.0]
-    assert scene.points is not None and scene.points.shape == (4, 3)
-
-
-@pytest.mark.parametrize("downscale", [2, 3, 5, 1000])
-def test_downscaling_keeps_the_exact_ratio(tmp_path: Path, downscale: int) -> None:
-    cameras = assemble_scene(tmp_path, [view(tmp_path)], downscale=downscale).cameras
-    size = [max(1, round(24 / downscale)), max(1, round(16 / downscale))]
-    assert cameras.size[0].tolist() == size
-    assert cameras.focal[0].tolist() == pytest.approx([20 * size[0] / 24, 21 * size[1] / 16], rel=1e-15)
-    assert cameras.centre[0].tolist() == pytest.approx([12.5 * size[0] / 24, 8 * size[1] / 16], rel=1e-15)
 
 
 def test_reduced_images_scale_the_cameras(tmp_path: Path) -> None:

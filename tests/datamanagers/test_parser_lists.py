@@ -43,17 +43,6 @@ def test_a_meganerf_folder_is_the_capture(tmp_path: Path, unit: float | None) ->
     assert parse_scene(tmp_path, 2, None).cameras.size[0].tolist() == [12, 8]
 
 
-def test_smaller_copies_of_meganerf_images(tmp_path: Path) -> None:
-    """Metadata keep the size of the original; images may be reduced."""
-    capture = Capture.make(3)
-    write_meganerf(tmp_path, capture, held=())
-    for k, name in enumerate(capture.names):
-        write_image(tmp_path / "train/rgbs" / name, (12, 8), seed=k)
-    scene = parse_scene(tmp_path, 1, None)
-    assert scene.cameras.size[0].tolist() == [12, 8] and scene.cameras.focal[0].tolist() == [10.0, 10.0]
-    assert scene.test.tolist() == [0], "without val every eighth is held out"
-
-
 class Evil:
     def __reduce__(self) -> tuple[object, tuple[str]]:
         return print, ("ran",)
@@ -85,28 +74,6 @@ def test_metadata_that_cannot_be_are_named(tmp_path: Path, content: object, said
     assert "0001.pt" in str(caught.value)
 
 
-def test_meganerf_files_that_are_missing(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no \*.pt files"):
-        parse_scene(tmp_path, 1, MegaNerfConfig())
-    write_meganerf(tmp_path, Capture.make(3))
-    (tmp_path / "train/rgbs/0001.png").unlink()
-    with pytest.raises(DataError, match=r"no image .*0001\.jpg"):
-        parse_scene(tmp_path, 1, None)
-    (tmp_path / "coordinates.pt").write_bytes(b"nonsense")
-    with pytest.raises(DataError, match=r"coordinates.pt: no tensors"):
-        parse_scene(tmp_path, 1, None)
-    torch.save({"pose_scale_factor": -1.0}, tmp_path / "coordinates.pt")
-    with pytest.raises(DataError, match="pose_scale_factor is -1"):
-        parse_scene(tmp_path, 1, None)
-
-
-def test_an_image_on_both_sides_is_refused(tmp_path: Path) -> None:
-    write_meganerf(tmp_path, Capture.make(3), held=())
-    write_meganerf(tmp_path, Capture.make(3), held=(0, 1, 2))
-    with pytest.raises(DataError, match=r"000\d is in train and in val"):
-        parse_scene(tmp_path, 1, None)
-
-
 def write_table(path: Path, rows: list[tuple[str, str, str]]) -> None:
     lines = ["filename\tid\tsplit\tdataset", *("\t".join((*row, "gate")) for row in rows)]
     path.write_text("\n".join(lines) + "\n")
@@ -133,20 +100,6 @@ def test_the_table_says_who_is_in_and_for_what(tmp_path: Path, inner: str) -> No
     assert int(scene.seen[:, 0].max()) <= 4
 
 
-def test_tables_that_do_not_fit(tmp_path: Path) -> None:
-    capture = Capture.make(3)
-    write_colmap(tmp_path, capture)
-    with pytest.raises(DataError, match=r"0 tables \*.tsv; exactly one"):
-        parse_scene(tmp_path, 1, PhotoTourismConfig())
-    with pytest.raises(DataError, match=r"gone.tsv: no such table"):
-        parse_scene(tmp_path, 1, PhotoTourismConfig(list="gone.tsv"))
-    write_table(tmp_path / "a.tsv", [("elsewhere.png", "1", "train")])
-    with pytest.raises(DataError, match="none of its training photographs"):
-        parse_scene(tmp_path, 1, None)
-    write_table(tmp_path / "b.tsv", [(name, str(k), "train") for k, name in enumerate(capture.names)])
-    assert len(parse_scene(tmp_path, 1, PhotoTourismConfig(list="b.tsv")).train) == 3
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -165,12 +118,3 @@ def test_bad_tables_are_named(tmp_path: Path, text: str, said: str) -> None:
         read_list(path)
     with pytest.raises(DataError, match="cannot be read"):
         read_list(tmp_path / "none.tsv")
-
-
-@pytest.mark.parametrize("unit", [float("inf"), float("nan"), 0.0, torch.zeros(2), "metres", None, 10**400])
-def test_a_unit_of_meganerf_that_is_none(tmp_path: Path, unit: object) -> None:
-    write_meganerf(tmp_path, Capture.make(3))
-    torch.save({"pose_scale_factor": unit}, tmp_path / "coordinates.pt")
-    with pytest.raises(DataError, match=r"coordinates.pt: pose_scale_factor is .*write it again") as told:
-        parse_scene(tmp_path, 1, MegaNerfConfig())
-    assert "\n" not in str(told.value)
