@@ -1,20 +1,18 @@
 """Looks: strengths, regions, luminance and mixes, against their definitions point by point."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import pytest
 import torch
 from torch import Tensor
 
-from fprf.errors import ConfigError
 from fprf.interfaces import Decoder, Stylizer
-from fprf.plugins.stylizers.config import AdainConfig, RegionOtConfig, RegionToneConfig
-from fprf.style.colours import colour_maps
-from fprf.style.controls import keep_luminance, luma
+from fprf.plugins.stylizers.config import AdainConfig, RegionOtConfig
+from fprf.style.controls import keep_luminance
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.look import Restyle
 from fprf.style.regional import RegionWeight
-from fprf.style.scene import SceneStyle, membership, scene_style
+from fprf.style.scene import SceneStyle, scene_style
 from fprf.types import Want
 
 
@@ -95,13 +93,6 @@ def test_kept_regions_stay_bit_for_bit_and_the_others_are_styled() -> None:
     assert float(match[kept].abs().max()) == 0
 
 
-def test_kept_luminance_is_the_plain_colours() -> None:
-    content, _, scene, d = setting()
-    decoder = Sigmoid()
-    look = Restyle(AdainConfig().build(dictionary=d, scene=scene), luminance=1.0)
-    torch.testing.assert_close(luma(look.colour(decoder, content, None)), luma(decoder(content)), rtol=0.0, atol=2e-6)
-
-
 @pytest.mark.parametrize("at", [0.25, 0.5])
 def test_between_two_styles_features_strengths_and_luminances_are_linear(at: float) -> None:
     content, semantic, scene, d = setting()
@@ -144,65 +135,3 @@ def test_a_faded_look_is_the_scene_and_a_mix_with_it_a_strength() -> None:
     half = look.faded.mixed(look, 0.5).applied(content, None)
     torch.testing.assert_close(half[0], Restyle(look.stylizer, 0.4).applied(content, None)[0], rtol=1e-5, atol=1e-5)
     assert half[1] == pytest.approx(0.4)
-
-
-def test_a_scene_of_one_region_can_be_kept_without_semantics() -> None:
-    content, _ = points()
-    scene = scene_style(content, None, torch.ones(300), None, 3, 0)
-    d = build_dictionary([Reference("r", points(seed=5)[0], torch.zeros(300, 0))])
-    look = Restyle(AdainConfig().build(dictionary=d, scene=scene), 1.0, RegionWeight(scene, torch.zeros(1, 1)))
-    assert look.needs == Want.CONTENT and torch.equal(look.applied(content, None)[0], content)
-
-
-@pytest.mark.parametrize("at", [-0.1, 1.1, float("nan")])
-def test_a_mix_has_a_range(at: float) -> None:
-    with pytest.raises(ConfigError, match="at"):
-        Restyle(Never()).mixed(Restyle(Never()), at)
-
-
-class Silent(Stylizer):
-    """Keeps what it knows of regions to itself."""
-
-    def __init__(self, inner: Stylizer) -> None:
-        super().__init__()
-        self.inner = inner
-
-    @property
-    def needs(self) -> Want:
-        return self.inner.needs
-
-    def forward(self, content: Tensor, semantic: Tensor | None) -> Tensor:
-        styled: Tensor = self.inner(content, semantic)
-        return styled
-
-    def match(self, semantic: Tensor) -> Tensor:
-        return self.inner.match(semantic)
-
-
-@pytest.mark.parametrize("others", [False, True])
-def test_regions_that_a_stylizer_has_found_are_not_looked_for_again(others: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    content, semantic, scene, d = setting()
-    tint = torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(1))
-    d = d._replace(colour_mean=tint.flatten(0, 1), colour_covariance=0.02 * torch.eye(3).expand(4, 3, 3))
-    weight, decoder = RegionWeight(scene, torch.tensor([[1.0], [0.0], [0.5]])), Sigmoid()
-    looks = []
-    for wrap in (lambda stylizer: stylizer, Silent):
-        stylizer = wrap(RegionToneConfig().build(dictionary=d, scene=scene))
-        maps = colour_maps(stylizer, d, scene, decoder)
-        look = Restyle(stylizer, 0.9, weight, 0.5, maps)
-        looks.append(look.mixed(Restyle(AdainConfig().build(dictionary=d, scene=scene)), 0.25) if others else look)
-    found = [look.colour(decoder, content, semantic) for look in looks]
-    assert torch.equal(*found) and not torch.equal(found[0], decoder(content))
-    calls: list[int] = []
-    counted = membership
-
-    def count(*args: Any) -> Tensor:
-        calls.append(1)
-        return counted(*args)
-
-    for place in ("fprf.style.regional", "fprf.style.colours", "fprf.plugins.stylizers.region"):
-        monkeypatch.setattr(f"{place}.membership", count)
-    for look, times in zip(looks, (1, 4), strict=True):
-        calls.clear()
-        look.colour(decoder, content, semantic)
-        assert len(calls) == times, "the stylizer; and by itself each strength, and the colours"

@@ -8,7 +8,7 @@ from photo_files import turned_jpeg
 
 from fprf.datamanagers.basis import Basis
 from fprf.datamanagers.config import GuidedConfig
-from fprf.errors import ConfigError, DataError
+from fprf.errors import DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.style.dictionary import build_dictionary
@@ -66,24 +66,11 @@ def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path)
         assert turned.colour is not None and plain.colour is not None and torch.equal(turned.colour, plain.colour)
 
 
-def test_without_semantics_there_are_none(tmp_path: Path) -> None:
-    path = photo(tmp_path, 80, 90)
-    for semantic, basis in ((None, None), (None, BASIS), (SEMANTIC, None)):
-        r = read_reference(path, content=CONTENT, semantic=semantic, basis=basis)
-        assert r.semantic.shape == (len(r.content), 0)
-
-
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 700), (700, 3), (64, 64), (65, 1000)])
 def test_any_shape_gives_a_dictionary(tmp_path: Path, height: int, width: int) -> None:
     r = read_reference(photo(tmp_path, height, width), content=CONTENT, semantic=SEMANTIC, basis=BASIS)
     assert len(r.content) == len(r.semantic) > 0
     assert all(bool(t.isfinite().all()) for t in build_dictionary([r])[:6])
-
-
-def test_a_photograph_of_one_colour_gives_a_dictionary(tmp_path: Path) -> None:
-    d = build_dictionary([read_reference(photo(tmp_path, 90, 90, flat=True), content=CONTENT, semantic=SEMANTIC, basis=BASIS)])
-    assert all(bool(t.isfinite().all()) for t in d[:6])
-    assert float(d.covariance.abs().max()) < 1e-6
 
 
 def test_the_encoder_sees_what_longest_says_and_nothing_is_enlarged(tmp_path: Path) -> None:
@@ -101,14 +88,6 @@ def test_the_scenes_filter_is_used(tmp_path: Path) -> None:
         for g in (None, GuidedConfig(radius=0.3, eps=0.1))
     )
     assert not torch.allclose(a.content, b.content)
-
-
-def test_unreadable_files_and_sizes_are_named(tmp_path: Path) -> None:
-    (tmp_path / "x.jpg").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"x\.jpg"):
-        read_reference(tmp_path / "x.jpg", content=CONTENT, semantic=None, basis=None)
-    with pytest.raises(ConfigError, match="longest"):
-        read_reference(photo(tmp_path, 9, 9), content=CONTENT, semantic=None, basis=None, longest=8)
 
 
 def two_halves(folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: int = 255) -> tuple[Path, Path]:
@@ -132,12 +111,6 @@ def test_a_mask_leaves_only_what_is_white(tmp_path: Path) -> None:
     assert torch.equal(some.content, grid[:, 60:].reshape(-1, grid.shape[-1])), "the same features, of fewer pixels"
 
 
-def test_a_mask_may_be_smaller_or_larger_than_its_photograph(tmp_path: Path) -> None:
-    path, mask = two_halves(tmp_path, mask_size=(40, 60))
-    half = read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
-    assert len(half.content) == pytest.approx(80 * 60, rel=0.05)
-
-
 def test_a_mask_of_one_pixel_is_one_sample_and_a_code(tmp_path: Path) -> None:
     path, mask = two_halves(tmp_path, white=0)
     pixels = np.zeros((80, 120), np.uint8)
@@ -150,13 +123,6 @@ def test_a_mask_of_one_pixel_is_one_sample_and_a_code(tmp_path: Path) -> None:
         assert len(made.keys) >= 1 and all(bool(t.isfinite().all()) for t in made[:6])
 
 
-def test_of_a_large_mask_a_regular_share_is_sampled(tmp_path: Path) -> None:
-    path = photo(tmp_path, 400, 600)
-    cv2.imwrite(str(tmp_path / "mask.png"), np.full((400, 600), 255, np.uint8))
-    found = read_reference(path, content=CONTENT, semantic=None, basis=None, longest=600, mask=tmp_path / "mask.png")
-    assert 10_000 < len(found.content) <= 30_000
-
-
 def test_masks_that_cannot_be_are_named(tmp_path: Path) -> None:
     path, mask = two_halves(tmp_path, white=0)
     with pytest.raises(DataError, match=r"mask\.png: the mask selects no pixel of photo\.png"):
@@ -166,10 +132,3 @@ def test_masks_that_cannot_be_are_named(tmp_path: Path) -> None:
         read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
     with pytest.raises(DataError, match=r"absent\.png"):
         read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=tmp_path / "absent.png")
-
-
-def test_a_reference_may_be_called_otherwise(tmp_path: Path) -> None:
-    path, _ = two_halves(tmp_path)
-    assert (
-        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, name="a/photo.png").name == "a/photo.png"
-    )

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import ConfigError, UsageError
-from fprf.style.config import Pixel, RegionValue, find_reference, labels, parse_region_value, parse_strength, pixel_of
+from fprf.style.config import RegionValue, find_reference, labels, parse_region_value, parse_strength
 
 PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
 
@@ -20,22 +20,11 @@ def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: RegionValue) -
     assert parse_region_value("pin", text) == wish
 
 
-@pytest.mark.parametrize("text", ["3", "=a.jpg", "3=", "="])
-def test_half_a_wish_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"^pin: .* is not REGION=VALUE; write for example 3=autumn\.jpg"):
-        parse_region_value("pin", text)
-
-
 def test_strengths_are_numbers_in_a_range() -> None:
     assert parse_strength("region_strength", "sky=0.5") == ("sky", 0.5)
     for text, said in (("3=1.5", "must lie in"), ("3=nan", "not a finite number"), ("3=much", "'much' is no number")):
         with pytest.raises(ConfigError, match=f"^region_strength: .*{said}"):
             parse_strength("region_strength", text)
-
-
-def test_pixels_and_what_is_none() -> None:
-    assert pixel_of("120,80") == Pixel(120.0, 80.0) and pixel_of("-1,2.5") == Pixel(-1.0, 2.5)
-    assert pixel_of("mask.png") is pixel_of("1,2,3") is pixel_of("1,") is pixel_of("") is None
 
 
 @pytest.mark.parametrize(
@@ -44,10 +33,6 @@ def test_pixels_and_what_is_none() -> None:
 )
 def test_references_are_found_by_path_name_number_and_stem(text: str, index: int) -> None:
     assert find_reference(text, PHOTOS) == index
-
-
-def test_a_number_that_is_no_index_may_be_a_stem() -> None:
-    assert find_reference("7", PHOTOS) == 2
 
 
 def test_what_is_not_found_or_not_clear_is_told() -> None:

@@ -14,10 +14,9 @@ from fprf.plugins.stylizers.config import (
     StylizerConfig,
 )
 from fprf.plugins.stylizers.region import TwoSidedStylizer
-from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, code_odds, whole_style
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, whole_style
 from fprf.style.regional import RegionStylizer, RegionWeight, regional
 from fprf.style.scene import SceneStyle, membership, region_units, scene_style
-from fprf.testing import cases
 from fprf.types import Want
 
 ALL = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
@@ -153,20 +152,3 @@ def test_values_of_regions_are_mixed_by_membership(values: list[float]) -> None:
     torch.testing.assert_close(mixed[:, 0], share @ torch.tensor(values), rtol=0.0, atol=1e-6)
     zero = torch.tensor(values) == 0
     assert bool((mixed[(share[:, ~zero] == 0).all(1)] == 0).all()), "exactly"
-
-
-def test_an_undivided_scene_has_one_value_and_needs_no_semantics() -> None:
-    content, _ = points()
-    weight = RegionWeight(scene_style(content, None, torch.ones(300), None, 8, 0), torch.tensor([[0.25]]))
-    assert not weight.divided and weight(content[:4, :0]).tolist() == [[0.25]] * 4
-
-
-def test_odds_of_a_choice_are_those_of_the_references_that_are_left() -> None:
-    _, _, _, d = setting()
-    part, codes = choose(d, torch.tensor([False, True, True]))
-    torch.testing.assert_close(code_odds(part), code_odds(d)[codes] / code_odds(d)[codes].sum())
-
-
-@pytest.mark.parametrize(("regions", "divided"), [(1, False), (2, True), (5, True)])
-def test_two_regions_are_already_divided(regions: int, divided: bool) -> None:
-    assert RegionWeight(cases.scene(regions, 3, 4), torch.ones(regions, 1)).divided is divided
