@@ -73,25 +73,17 @@ FRAME = {"camera_to_world": IDENTITY, "fov": 60}
     [
         ({"camera_type": "equirectangular"}, "camera_type is \"equirectangular\"; must be 'perspective'"),
         ({"render_width": 0}, "render_width is 0; must be a whole number"),
-        ({"render_height": 10.5}, "render_height is 10.5"),
-        ({"render_height": None}, "render_height is null"),
         ({"render_height": float("inf")}, "render_height is Infinity"),
         ({"render_width": 10**400}, "render_width is 1000"),
         ({"fps": 0}, "fps is 0; must be a number between 0 and 1000"),
-        ({"fps": True}, "fps is true"),
         ({"camera_path": []}, r"camera_path is \[\]; must be a list of at least one frame"),
-        ({"camera_path": {}}, "camera_path is {}"),
-        ({"camera_path": [3]}, r"camera_path\[0\] is 3"),
         ({"camera_path": [FRAME, {**FRAME, "fov": 180}]}, r"camera_path\[1\].fov is 180"),
-        ({"camera_path": [{**FRAME, "fov": None}]}, "fov is null"),
         ({"camera_path": [{"fov": 60}]}, "camera_to_world is null; must be 16 finite numbers"),
-        ({"camera_path": [{**FRAME, "camera_to_world": IDENTITY[:12]}]}, "must be 16 finite numbers"),
         ({"camera_path": [{**FRAME, "camera_to_world": [*IDENTITY[:15], "x"]}]}, "must be 16 finite numbers"),
         ({"camera_path": [{**FRAME, "camera_to_world": [float("nan"), *IDENTITY[1:]]}]}, "must be 16 finite numbers"),
         ({"camera_path": [{**FRAME, "camera_to_world": [10**400, *IDENTITY[1:]]}]}, "must be 16 finite numbers"),
         ({"camera_path": [{**FRAME, "camera_to_world": [2, *IDENTITY[1:]]}]}, "without scale or mirroring"),
         ({"camera_path": [{**FRAME, "camera_to_world": [-1, *IDENTITY[1:]]}]}, "without scale or mirroring"),
-        ({"camera_path": [{**FRAME, "camera_to_world": [0] * 16}]}, "without scale or mirroring"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -104,11 +96,3 @@ def test_what_is_no_camera_path_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "p.json").write_text(text)
     with pytest.raises(DataError, match="export the camera path again"):
         read_camera_path(tmp_path / "p.json")
-
-
-def test_files_that_are_not_there_and_paths_of_nothing(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such camera path; give spiral"):
-        read_camera_path(tmp_path / "none.json")
-    empty = read_camera_path(file(tmp_path / "p.json"))[0].select(torch.tensor([], dtype=torch.int64))
-    with pytest.raises(DataError, match="no frames"):
-        write_camera_path(tmp_path / "q.json", empty, 24)

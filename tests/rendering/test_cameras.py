@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.rendering.cameras import Cameras, pixel_grid, project, rays_through, sees
+from fprf.rendering.cameras import Cameras, project, rays_through, sees
 from fprf.rendering.lens import FISHEYE, OPENCV, PINHOLE, lens_reach
 
 QUICK = settings(max_examples=25, deadline=None)
@@ -75,16 +75,6 @@ def test_any_lens_round_trips_where_it_sees_and_says_where_it_does_not(lens: int
     assert (again - pixel[seen])[inside].abs().max() < 1e-5 if inside.any() else True
     near_axis = (pixel - scene.centre).abs().max(-1).values < 8
     assert seen[near_axis].all()
-
-
-def test_the_pinhole_is_the_formula() -> None:
-    scene = cameras([PINHOLE])
-    view, pixel = pixels(scene, 32)
-    _, direction = rays_through(scene, view, pixel)
-    plane = (pixel - scene.centre[0]) / scene.focal[0]
-    local = torch.stack([plane[:, 0], -plane[:, 1], -torch.ones(32, dtype=torch.float64)], -1)
-    expected = local @ scene.pose[0, :, :3].T
-    assert torch.allclose(direction, expected / expected.norm(dim=-1, keepdim=True), atol=1e-15)
 
 
 def test_axes_are_opengl_s() -> None:
@@ -195,18 +185,6 @@ def test_scaling_commutes_with_rays(factor: int, seed: int) -> None:
         assert torch.allclose(one, other, atol=1e-12)
 
 
-def test_something_is_left_of_the_smallest_image() -> None:
-    scene = cameras([PINHOLE, OPENCV])
-    assert torch.equal(scene.scaled(1e4).size, torch.ones(2, 2, dtype=torch.int64))
-
-
-def test_scaling_by_one_and_back_is_the_identity() -> None:
-    scene = cameras([PINHOLE, OPENCV])
-    assert torch.equal(scene.scaled(1).focal, scene.focal)
-    back = scene.scaled(3).resized(scene.size)
-    assert torch.allclose(back.focal, scene.focal, rtol=1e-14) and torch.allclose(back.centre, scene.centre, rtol=1e-14)
-
-
 def test_select_takes_views_in_order() -> None:
     scene = cameras([PINHOLE, OPENCV, FISHEYE])
     some = scene.select(torch.tensor([2, 0]))
@@ -217,28 +195,3 @@ def test_select_takes_views_in_order() -> None:
     whole = rays_through(scene, view[keep], pixel[keep])
     part = rays_through(some, renumbered, pixel[keep])
     assert all(torch.equal(a, b) for a, b in zip(whole, part, strict=True))
-
-
-def test_the_grid_is_row_by_row_at_pixel_centres() -> None:
-    scene = cameras([PINHOLE])
-    width, height = scene.size[0].tolist()
-    grid = pixel_grid(scene, 0).reshape(height, width, 2)
-    assert grid[0, 0].tolist() == [0.5, 0.5] and grid[-1, -1].tolist() == [width - 0.5, height - 0.5]
-    assert grid[2, 3].tolist() == [3.5, 2.5]
-
-
-def test_no_rays_are_no_rays() -> None:
-    scene = cameras([OPENCV, FISHEYE])
-    none = torch.zeros(0, dtype=torch.int64)
-    origin, direction = rays_through(scene, none, torch.zeros(0, 2))
-    assert origin.shape == direction.shape == (0, 3)
-    assert project(scene, none, origin)[0].shape == (0, 2)
-
-
-def test_the_centre_of_a_distorted_image_looks_along_the_axis() -> None:
-    for lens in (OPENCV, FISHEYE):
-        scene = cameras([lens], [(0.1, 0.0, 0.0, 0.0, 0.0, 0.0)])
-        view = torch.zeros(1, dtype=torch.int64)
-        origin, direction = rays_through(scene, view, scene.centre)
-        assert torch.allclose(direction, -scene.pose[:, :, 2], atol=1e-15)
-        assert torch.allclose(project(scene, view, origin + direction)[0], scene.centre, atol=1e-12)

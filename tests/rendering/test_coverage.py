@@ -25,13 +25,3 @@ def test_the_middle_of_a_row_is_covered_better_than_its_ends_and_strays_least(ki
     assert len(shown) == 4 and shown == sorted(set(shown)) and set(shown) <= set(range(3, 18)), "strays and ends are left out"
     assert max(shown) - min(shown) >= 6, "and they are spread"
     assert bool((coverage(cameras, range(0, 23, 5), space) <= score).all()), "fewer cameras cover less"
-
-
-def test_of_few_views_all_are_shown_and_of_many_some_are_looked_at() -> None:
-    place = torch.nn.functional.normalize(torch.randn(600, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1) * 3
-    up = torch.tensor([0.0, 1.0, 0.0]).double()
-    cameras = pinhole(look_at(place, torch.zeros_like(place), up), width=8, height=8, fov=50.0)
-    few = cameras.select(torch.arange(5))
-    assert well_covered(few, [0, 1], SPACE, 5) == [0, 1, 2, 3, 4]
-    shown = well_covered(cameras, range(600), SPACE, 8)
-    assert len(set(shown)) == 8 and shown[-1] > 300 > shown[0]

@@ -4,15 +4,11 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fprf.rendering.lens import (
     OPENCV,
     PANORAMA,
     PINHOLE,
-    _brown,
-    _brown_step,
     _powers,
     _radial_inverse,
     bend,
@@ -20,37 +16,7 @@ from fprf.rendering.lens import (
     unbend,
 )
 
-QUICK = settings(max_examples=50, deadline=None)
 DOUBLE = torch.float64
-COEFFICIENTS = st.tuples(*[st.floats(-0.3, 0.3)] * 4, *[st.floats(-0.02, 0.02)] * 2)
-
-
-@QUICK
-@given(COEFFICIENTS, st.floats(0.0, 2.0))
-def test_the_slope_is_the_derivative_of_the_radius(k: tuple[float, ...], rho: float) -> None:
-    at = torch.tensor([rho], dtype=DOUBLE, requires_grad=True)
-    share, slope = _powers(torch.tensor([k[:4]], dtype=DOUBLE), at)
-    (wanted,) = torch.autograd.grad(share * at, at)
-    assert slope.item() == pytest.approx(wanted.item(), rel=1e-12, abs=1e-12)
-    assert share.item() == pytest.approx(1 + sum(c * rho ** (2 * i + 2) for i, c in enumerate(k[:4])), rel=1e-12, abs=1e-12)
-
-
-@QUICK
-@given(COEFFICIENTS, st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
-def test_the_step_is_newton_s(k: tuple[float, ...], x: float, y: float) -> None:
-    """The inverse of the Jacobian, which autograd gives, times the error."""
-    distortion, xy = torch.tensor([k], dtype=DOUBLE), torch.tensor([[x, y]], dtype=DOUBLE)
-    error = torch.tensor([[0.03, -0.02]], dtype=DOUBLE)
-    jacobian = torch.autograd.functional.jacobian(lambda at: _brown(distortion, at)[0], xy)[:, 0]
-    if torch.linalg.det(jacobian).abs() > 1e-3:
-        wanted = torch.linalg.solve(jacobian, error[0])
-        assert torch.allclose(_brown_step(distortion, xy, error)[0], wanted, rtol=1e-9, atol=1e-12)
-
-
-def test_where_the_lens_is_singular_a_step_is_finite() -> None:
-    """k1 = -1/3: the radius turns at 1, and the Jacobian has no inverse there."""
-    distortion, xy = torch.tensor([[-1 / 3, 0, 0, 0, 0, 0]], dtype=DOUBLE), torch.tensor([[1.0, 0.0]], dtype=DOUBLE)
-    assert _brown_step(distortion, xy, torch.tensor([[0.1, 0.1]], dtype=DOUBLE)).isfinite().all()
 
 
 @pytest.mark.parametrize("k1", [-0.3, -0.1, -1.0, 0.2])
@@ -64,12 +30,6 @@ def test_a_radius_that_hardly_grows_is_inverted(k1: float, flat: float) -> None:
     share, slope = _powers(k.expand(len(u), 4), rho)
     assert ((share * rho - u).abs() <= 1e-13 * (1 + u) + 1e-14 * slope * rho).all()
     assert (rho.diff()[:300] > 0).all()
-
-
-def test_beyond_the_reach_lies_the_reach() -> None:
-    k, reach = torch.tensor([[-1 / 3, 0, 0, 0]], dtype=DOUBLE).expand(3, 4), torch.ones(3, dtype=DOUBLE)
-    rho = _radial_inverse(k, torch.tensor([0.0, 2 / 3, 5.0], dtype=DOUBLE), reach)
-    assert rho[0] == 0 and rho[1].item() == pytest.approx(1.0, abs=1e-6) and rho[2] == 1
 
 
 def test_tangential_terms_are_undone_to_rounding() -> None:

@@ -7,7 +7,7 @@ import torch
 from fprf.errors import DataError, UsageError
 from fprf.rendering.camera_path import write_camera_path
 from fprf.rendering.cameras import Cameras, project
-from fprf.rendering.paths import MOTIONS, interpolate, look_at, make_path, orbit, pinhole, spiral, tour, upwards
+from fprf.rendering.paths import look_at, make_path, pinhole, upwards
 
 
 def around(count: int = 12) -> Cameras:
@@ -16,20 +16,6 @@ def around(count: int = 12) -> Cameras:
     position = torch.stack([5 * angle.cos(), 5 * angle.sin(), torch.full_like(angle, 2.0)], -1)
     up = torch.tensor([0.0, 0, 1], dtype=torch.float64)
     return pinhole(look_at(position, torch.zeros_like(position), up), width=64, height=48, fov=50)
-
-
-def same(a: Cameras, b: Cameras) -> bool:
-    return torch.equal(a.pose, b.pose) and torch.equal(a.focal, b.focal) and torch.equal(a.size, b.size)
-
-
-def test_names_mean_the_functions() -> None:
-    cameras, views = around(), [0, 2, 4, 6]
-    assert set(MOTIONS) == {"spiral", "orbit", "interpolate", "dataset"}
-    assert same(make_path(cameras, views, "spiral", 7), spiral(cameras, 7))
-    assert same(make_path(cameras, views, "orbit", 7), orbit(cameras, 7))
-    assert same(make_path(cameras, views, "dataset", 7), cameras.select(torch.tensor(views)))
-    order = tour(cameras, torch.tensor(views))
-    assert same(make_path(cameras, views, "interpolate", 10), interpolate(cameras, order, 2))
 
 
 @pytest.mark.parametrize("frames", [1, 2, 11, 100])

@@ -51,34 +51,6 @@ def test_every_pixel_of_mixed_cameras(offset: float, limit: int) -> None:
     assert (direction.norm(dim=-1) - 1).abs().max() <= 1e-14
 
 
-def test_views_of_one_camera_share_a_table_and_others_do_not() -> None:
-    cameras = rig(*MIXED)
-    rays = PixelRays(cameras)
-    # Views 1 and 3 are one lens in two places; 0 and 4 have the same area but not the same shape.
-    assert rays.table is not None and len(rays.table) == 9 * 6 + 12 * 5 + 7 * 7 + 6 * 9
-    assert rays.kind[1] == rays.kind[3] and len(rays.kind.unique()) == 4
-
-
-def test_above_the_limit_nothing_is_kept() -> None:
-    cameras = rig([OPENCV], [(10, 10)])
-    assert PixelRays(cameras, limit=2400).table is not None
-    assert PixelRays(cameras, limit=2399).table is None
-
-
-def test_a_focal_length_of_its_own_is_a_camera_of_its_own() -> None:
-    cameras = rig([OPENCV, OPENCV], [(8, 8), (8, 8)])
-    changed = replace(cameras, focal=cameras.focal * torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64))
-    assert len(PixelRays(changed).kind.unique()) == 2
-    view, pixel = every_pixel(changed)
-    assert (PixelRays(changed)(view, pixel)[1] - rays_through(changed, view, pixel)[1]).abs().max() <= 1e-14
-
-
-def test_no_pixels() -> None:
-    rays = PixelRays(rig([PINHOLE], [(4, 4)]))
-    origin, direction = rays(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2))
-    assert origin.shape == direction.shape == (0, 3)
-
-
 @pytest.mark.parametrize("offset", [0.0, 4.5e6])
 def test_whole_views_of_mixed_cameras(offset: float) -> None:
     """Twice, in turn: what is remembered of one lens must not be taken for another's, nor one place for another."""

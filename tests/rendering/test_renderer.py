@@ -150,11 +150,6 @@ def test_semantics_never_move_density() -> None:
     assert all(g is None for g in gradients(found.rgb.sum(), parts.semantic))
 
 
-def test_content_moves_density_unless_it_is_told_not_to() -> None:
-    found = render_rays(rays_of("contraction", 3), parts := parts_of(), want=Want.CONTENT, budget=0.0)
-    assert found.content is not None and all(g is not None for g in gradients(found.content.sum(), parts.field))
-
-
 @pytest.mark.parametrize("moves", [False, True])
 def test_content_moves_density_only_where_it_may(moves: bool) -> None:
     parts, rays = parts_of(), rays_of("contraction", 12)
@@ -187,14 +182,6 @@ def test_a_background_is_seen_through_and_density_learns_from_it(density: float)
         (gradient,) = gradients(found.rgb[0, channel], parts.field)
         assert gradient is not None
         assert float(gradient) == pytest.approx(2 * (colour - float(background[channel])) * through, rel=1e-4, abs=1e-6)
-
-
-@torch.no_grad()
-def test_a_wall_has_its_depth() -> None:
-    parts = Parts(space_of("contraction"), UniformConfig(samples=64).build(seed=0), Uniform(1e6), None, Squash())
-    found = render_rays(rays_of("contraction", 6), parts, want=Want.DENSITY, budget=0.0)
-    assert found.sampled is not None
-    assert torch.allclose(found.depth, found.sampled.t[:, :2].mean(-1)) and (found.opacity == 1).all()
 
 
 @torch.no_grad()
