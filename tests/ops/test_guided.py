@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.errors import ConfigError, DataError
 from fprf.ops import guided
 
 UNIT = 2.0**-24
@@ -200,20 +199,6 @@ def test_packed_views_answer_what_each_one_says(seed: int, views: int, channels:
         assert (found[mine] - expected).abs().le(32 * UNIT * largest).all()
 
 
-def test_groups_of_channels_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    guide, features = photo(20, 20), torch.randn(7, 6, 6)
-    whole = guided.upsample(features, guide, radius=4, eps=1e-3)
-    monkeypatch.setattr(guided, "GROUP", 1)
-    torch.testing.assert_close(guided.upsample(features, guide, radius=4, eps=1e-3), whole)
-
-
-def test_windows_are_placed_as_far_apart_as_their_size_allows() -> None:
-    """Else the cheap form would be the exact one, at its price: a window at every pixel."""
-    cheap = guided._axis(pixels=504, cells=63, radius=30, stride=8, fineness=8.0)
-    assert cheap.window.shape[0] <= 2 * 504 / (61 / 8) and cheap.hat.shape[0] <= 3 * 504 / (61 / 8)
-    assert guided._axis(pixels=504, cells=63, radius=30, stride=8, fineness=math.inf).window.shape[0] == 504
-
-
 def error(features: Tensor, guide: Tensor, radius: int, stride: int) -> float:
     """RMS difference from the exact filter, half precision included, in standard deviations of its output."""
     truth = exact(features, guide, radius, 1e-3)
@@ -238,17 +223,3 @@ def test_cheap_is_close_to_exact_on_photographs(shared: Path, name: str) -> None
     convolution = F.conv2d(guide.permute(2, 0, 1)[None], torch.randn(8, 3, 5, 5), stride=2, padding=2).relu()
     assert error(convolution[0], guide, 30, 8) <= 0.02
     assert error(F.avg_pool2d(convolution, 8)[0], guide, 30, 8) <= 0.02
-
-
-@pytest.mark.parametrize(
-    "change", [{"eps": 1e-7}, {"eps": math.nan}, {"radius": -1}, {"stride": 0}, {"fineness": 0.5}, {"fineness": math.nan}]
-)
-def test_values_out_of_range_are_refused(change: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match="guided"):
-        guided.coefficients(torch.zeros(1, 2, 2), photo(4, 4), **({"radius": 1, "eps": 1e-3, "stride": 1} | change))
-
-
-@pytest.mark.parametrize("shapes", [((2, 2), (4, 4, 3)), ((1, 2, 2), (4, 4)), ((1, 0, 2), (4, 4, 3)), ((1, 2, 2), (4, 4, 1))])
-def test_shapes_that_do_not_fit_are_named(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
-    with pytest.raises(DataError, match="guided filter: features"):
-        guided.coefficients(torch.zeros(shapes[0]), torch.zeros(shapes[1]), radius=1, eps=1e-3, stride=1)

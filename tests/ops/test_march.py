@@ -156,22 +156,6 @@ def test_what_is_kept_is_gathered_in_order(latents: int) -> None:
     assert torch.equal(found.view, view[index // 8])
 
 
-@torch.no_grad()
-def test_nothing_is_kept_where_nothing_is() -> None:
-    weighed = march.weigh(torch.zeros(3, 4), torch.arange(5.0).repeat(3, 1), 0.0)
-    assert not weighed.keep.any() and not weighed.opacity.any() and (weighed.transmittance == 1).all()
-    assert len(march.gather(weighed, torch.zeros(3, 4, 3), torch.zeros(12, 3), torch.zeros(3, 3)).ray) == 0
-
-
-@torch.no_grad()
-def test_of_no_samples_nothing_is_seen() -> None:
-    weighed = march.weigh(torch.zeros(3, 0), torch.ones(3, 1), 0.0)
-    assert weighed.weights.shape == weighed.keep.shape == (3, 0)
-    assert torch.equal(weighed.start, torch.zeros(4, dtype=torch.int64))
-    assert torch.equal(weighed.opacity, torch.zeros(3)) and torch.equal(weighed.depth, torch.zeros(3))
-    assert torch.equal(weighed.transmittance, torch.ones(3))
-
-
 def proposal(seed: int = 0, thickness: float = 4.0, resolution: int = 9, channels: int = 8) -> ProposalField:
     field = ProposalField(resolution, channels, seed=seed)
     with torch.no_grad():
@@ -254,10 +238,3 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
         weighed = march.weigh(torch.rand(333, 12, generator=torch.Generator().manual_seed(0)), t, 0.01)
         results.append((new, t, march.place(rays, t, space.warp), *weighed))
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
-
-
-def test_kernels_are_for_float32_without_gradients() -> None:
-    x = torch.zeros(4, 3)
-    assert not march.usable(x)
-    with torch.no_grad():
-        assert march.usable(x) and march.usable(x[:1, :1]) and not march.usable(x, x.double()) and not march.usable(x[:0])

@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.ops import mixture
 from fprf.ops.lanes import BLOCK
 from fprf.ops.mixture import affine, affine_reference, attention, scaled, scaled_reference
 
@@ -65,30 +64,6 @@ def test_nothing_of_a_region_without_a_share_is_seen() -> None:
     clean = affine(x, share, matrix, bias, centre=x[0])
     matrix[1], bias[1] = float("nan"), float("inf")
     assert torch.equal(affine(x, share, matrix, bias, centre=x[0]), clean)
-
-
-@torch.no_grad()
-def test_what_fits_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*given: Tensor, centre: Tensor) -> Tensor:
-        raise AssertionError("the plain form was taken")
-
-    for name in ("affine_reference", "scaled_reference"):
-        monkeypatch.setattr(mixture, name, refuse)
-    x, share, centre, bias = draw(1, 16), shares(1, 3), draw(16), draw(3, 16)
-    assert affine(x, share, draw(3, 16, 16), bias, centre=centre).shape == (1, 16)
-    assert scaled(x, share, bias, bias, centre=centre).shape == (1, 16)
-
-
-@torch.no_grad()
-def test_other_types_and_no_points_take_the_plain_form() -> None:
-    x, share, centre = draw(7, 16).double(), shares(7, 3).double(), draw(16).double()
-    matrix, bias = draw(3, 16, 16).double(), draw(3, 16).double()
-    plain = affine_reference(x, share, matrix, bias, centre=centre), scaled_reference(x, share, bias, bias, centre=centre)
-    fast = affine(x, share, matrix, bias, centre=centre), scaled(x, share, bias, bias, centre=centre)
-    assert all(torch.equal(a, b) and a.dtype == torch.float64 for a, b in zip(plain, fast, strict=True))
-    x, share, centre, matrix, bias = (each.float() for each in (x[:0], share[:0], centre, matrix, bias))
-    assert affine(x, share, matrix, bias, centre=centre).shape == (0, 16)
-    assert scaled(x, share, bias, bias, centre=centre).shape == (0, 16)
 
 
 @torch.no_grad()

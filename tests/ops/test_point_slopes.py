@@ -123,10 +123,3 @@ def test_slopes_are_the_same_bits_with_any_threads() -> None:
         numba.set_num_threads(count)
         results.append(triplane_numba.point_slopes(points, table, (17, 9), grad))
     assert torch.equal(*results)
-
-
-def test_points_learn_where_the_table_does_not() -> None:
-    points, table = points_of(20, 9).requires_grad_(True), table_of((9,), 8)
-    (alone,) = torch.autograd.grad(lookup(points, table, (9,)).square().sum(), points)
-    (both,) = torch.autograd.grad(lookup(points, table.requires_grad_(True), (9,)).square().sum(), points)
-    assert torch.equal(alone, both) and alone.any()

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.ops import triplane, triplane_numba
+from fprf.ops import triplane_numba
 from fprf.ops.triplane import AXES, lookup, lookup_reference, rows, split, variation
 
 QUICK = settings(max_examples=20, deadline=None)
@@ -216,13 +216,3 @@ def test_one_thread_and_two_give_the_same_bits() -> None:
         results.append((found, gradient))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
-
-
-def test_the_fused_form_is_for_float32_with_whole_vectors() -> None:
-    points, table = points_of(2), table_of((3,), 8)
-    assert triplane_numba.usable(points, table)
-    assert not triplane_numba.usable(points.double(), table)
-    assert not triplane_numba.usable(points, table.double())
-    assert not triplane_numba.usable(points, table[:, :5])
-    assert not triplane_numba.usable(points, table.to("meta")) and not triplane_numba.usable(points.to("meta"), table)
-    assert triplane.rows((3, 4)) == 75

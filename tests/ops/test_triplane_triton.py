@@ -13,7 +13,7 @@ import torch
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
-from fprf.ops import backend, triplane_triton
+from fprf.ops import triplane_triton
 from fprf.ops.triplane import lookup, lookup_reference, rows
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
@@ -96,13 +96,6 @@ def test_no_coordinate_leaves_the_table(size: int, channels: int) -> None:
     assert padded[:edge].isnan().all() and padded[edge + total :].isnan().all()
 
 
-def test_no_points_at_all() -> None:
-    table = table_of((4, 9), 8).requires_grad_(True)
-    found = lookup(points_of(0), table, (4, 9))
-    assert found.shape == (0, 16)
-    assert not torch.autograd.grad(found.sum(), table)[0].any()
-
-
 def test_half_tables_are_for_those_who_do_not_learn() -> None:
     """What is stored in half is rounded, and nothing else: the arithmetic is that of the rounded table in float32."""
     resolutions, points = (16, 64), points_of(300)
@@ -116,19 +109,6 @@ def test_half_tables_are_for_those_who_do_not_learn() -> None:
     assert torch.equal(found, lookup(points, half.float(), resolutions))
     exact = lookup(points, table, resolutions)
     assert 1e-5 * exact.norm() < (found - exact).norm() <= 5e-4 * exact.norm()
-
-
-def test_plain_means_plain() -> None:
-    points, table = points_of(3), table_of((4,), 8)
-    with backend.plain():
-        assert not triplane_triton.usable(points, table)
-    assert not triplane_triton.usable(points.double(), table) and not triplane_triton.usable(points, table.double())
-
-
-def test_kernels_are_not_for_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-    points, table = torch.zeros(3, 3), torch.zeros(rows((4,)), 8)
-    assert not triplane_triton.interpreted() and not triplane_triton.usable(points, table)
 
 
 @pytest.fixture
