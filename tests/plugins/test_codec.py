@@ -77,25 +77,17 @@ def test_any_config_survives_json_text(leaf: Leaf) -> None:
     ("data", "message"),
     [
         ({"whole": True}, "config.whole: expected a whole number, found true"),
-        ({"whole": 1.0}, "config.whole: expected a whole number, found 1.0"),
         ({"whole": "5"}, 'config.whole: expected a whole number, found "5"'),
-        ({"whole": None}, "config.whole: expected a whole number, found null"),
-        ({"real": False}, "config.real: expected a number, found false"),
         ({"real": 10**400}, "config.real: expected a finite number"),
         ({"real": math.inf}, "config.real: expected a finite number"),
         ({"yes": 1}, "config.yes: expected true or false, found 1"),
-        ({"path": 3}, "config.path: expected a text, found 3"),
         ({"colour": "blue"}, "config.colour: 'blue' is not one of 'red', 1"),
-        ({"colour": True}, "config.colour: True is not one of"),
         ({"pick": True}, "config.pick: True is not one of 'a', 1"),
-        ({"pair": [1]}, "config.pair: expected 2 values, found 1"),
         ({"pair": [1, "x"]}, 'config.pair.1: expected a number, found "x"'),
         ({"many": 3}, "config.many: expected a list, found 3"),
-        ({"table": []}, "config.table: expected an object, found []"),
         ({"either": "x"}, "config.either: expected a whole number, found"),
         ({"wholes": 3}, "config: Leaf has no field 'wholes'; did you mean 'whole'?"),
         ({"encoder": {}}, 'config.encoder: expected the plug-in\'s name as "type", found None'),
-        ({"encoder": "vgg19"}, "config.encoder: expected an object"),
         ({"encoder": {"type": "random", "chanels": 3}}, "config.encoder: RandomConfig has no field 'chanels'; did you mean"),
         ({"encoder": {"type": "random", "channels": 0}}, "config.encoder: channels: 0 must be at least 1"),
         ([], "config: expected an object, found []"),
@@ -149,11 +141,8 @@ def _saved(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     [
         (lambda w: w.pop("format"), 'expected an object with "format": 1'),
         (lambda w: w.update(format=2, fprf="9.0"), "is of format 2, written by fprf 9.0"),
-        (lambda w: w.update(format=True), "is of format True"),
         (lambda w: w.pop("plugins"), "'plugins' is absent"),
         (lambda w: w.update(metod="x"), "unknown key 'metod'; did you mean 'method'?"),
-        (lambda w: w.update(method=3), "method: expected a name, found 3"),
-        (lambda w: w.update(plugins={"a": 1}), "plugins: expected an object of texts"),
         (lambda w: w["config"].update(stepz=1), "config: TrainConfig has no field 'stepz'; did you mean 'steps'?"),
         (lambda w: w["config"]["loss"].update(rgb="1"), 'config.loss.rgb: expected a number, found "1"'),
         (lambda w: w["config"].update(downscale=0), "config: downscale: 0 must be at least 1"),
@@ -175,12 +164,10 @@ def test_a_file_that_was_edited_wrongly_is_refused(
         (b'{"format": 1', "is not JSON"),
         (b'{"format": NaN}', "NaN is not a number that JSON knows"),
         (b'{"format": 1, "config": {"x": -1e999}}', "-1e999 is beyond the largest number of float64"),
-        (b'{"format": -Infinity}', "-Infinity is not a number"),
         (b'{"format": 1, "format": 1}', "the key 'format' stands twice"),
         (b"\xff\xfe", "is not UTF-8 text"),
         (b"[" * 100_000, "is not a config"),
         (b'{"format": ' + b"9" * 5000 + b"}", "is not a config"),
-        (b"[1]", 'expected an object with "format": 1'),
     ],
 )
 def test_a_file_that_is_no_config_is_refused(tmp_path: Path, text: bytes, message: str) -> None:
@@ -189,13 +176,6 @@ def test_a_file_that_is_no_config_is_refused(tmp_path: Path, text: bytes, messag
     with pytest.raises(ConfigError, match=re.escape(str(path))) as caught:
         load_config(path)
     assert message in str(caught.value)
-
-
-def test_a_file_that_is_absent_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_config(tmp_path / "none.json")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_config(tmp_path)
 
 
 def test_a_missing_plugin_is_kept_as_data_and_fails_when_built(packages: Packages, tmp_path: Path) -> None:
@@ -224,23 +204,6 @@ def test_a_broken_plugin_in_a_file_is_kept_like_a_missing_one(packages: Packages
     assert isinstance(config.semantic.encoder, Missing)
     with pytest.raises(PluginError, match="ZeroDivisionError"):
         config.semantic.encoder.build(anything=1)
-
-
-def test_a_plugin_field_called_type_is_refused(packages: Packages) -> None:
-    source = ENCODER.format(name="Typed").replace("tile: int", "type: int")
-    packages.install("acme-typed", {"fprf.encoders": {"typed": "acme_typed:TypedConfig"}}, code={"acme_typed": source})
-    chosen = registry.load("fprf.encoders", "typed", EncoderConfig)
-    with pytest.raises(ConfigError, match="has a field `type`"):
-        to_json(Leaf(encoder=chosen()))
-
-
-def test_a_class_without_entry_point_cannot_be_saved() -> None:
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Local(EncoderConfig):
-        pass
-
-    with pytest.raises(PluginError, match="has no entry point"):
-        to_json(Leaf(encoder=Local()))
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

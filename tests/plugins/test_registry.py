@@ -41,12 +41,6 @@ def test_a_strangers_plugin_is_listed_without_being_imported(packages: Packages)
     assert registry.entry(GROUP, "acme").origin == "acme_a:ClipConfig from acme-clip 1"
 
 
-def test_a_missing_name_suggests_the_nearest_and_lists_all() -> None:
-    with pytest.raises(PluginError, match=r"no plug-in 'vgg_19' is installed; did you mean 'vgg19'\?") as caught:
-        registry.load(GROUP, "vgg_19", EncoderConfig)
-    assert "bundled-content" in str(caught.value) and "\n" not in str(caught.value)
-
-
 def test_two_packages_of_one_name_are_named_and_hurt_only_that_name(packages: Packages) -> None:
     for name in ("acme-one", "acme-two"):
         module = name.replace("-", "_")
@@ -101,11 +95,6 @@ def test_a_reexported_class_has_its_name(packages: Packages) -> None:
     assert registry.name_of(GROUP, found) == "outer"
 
 
-def test_a_class_without_entry_point_has_no_name() -> None:
-    with pytest.raises(PluginError, match=r"has no entry point in fprf\.encoders.*NAME ="):
-        registry.name_of(GROUP, ContentFieldConfig)
-
-
 def test_damaged_metadata_hurts_nobody_else(packages: Packages) -> None:
     packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign here\n")
     packages.raw("acme-foreign", "[console_scripts]\nno equals sign here\n")
@@ -124,19 +113,6 @@ def test_the_first_copy_on_the_path_wins(packages: Packages) -> None:
         assert registry.entry(GROUP, "acme").package == "acme-clip 1"
     finally:
         sys.path.remove(str(second))
-
-
-def test_the_scan_is_kept_until_forgotten(packages: Packages) -> None:
-    before = registry.installed(GROUP)
-    assert registry.installed(GROUP) is before
-    registry.forget()
-    assert registry.installed(GROUP) == before and registry.installed(GROUP) is not before
-
-
-@given(st.text(max_size=20))
-def test_nearest_is_a_clause_about_an_allowed_name(name: str) -> None:
-    clause = registry.nearest(name, ["vgg19", "dino"])
-    assert clause in ("", "; did you mean 'vgg19'?", "; did you mean 'dino'?")
 
 
 @given(st.text(max_size=20).filter(lambda name: name not in registry.installed(GROUP)))

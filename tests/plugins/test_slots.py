@@ -6,13 +6,13 @@ from fake_packages import ENCODER, Packages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.config import SemanticConfig, TrainConfig
+from fprf.config import TrainConfig
 from fprf.errors import PluginError, UsageError
 from fprf.methods import fprf, fprf_lite
 from fprf.plugins.config import PluginConfig
-from fprf.plugins.encoders.config import BundledSemanticConfig, EncoderConfig, RandomConfig
+from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
-from fprf.plugins.slots import hints_of, is_slot, members, replace, resolve, slots, take_flag
+from fprf.plugins.slots import replace, resolve, slots, take_flag
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +40,6 @@ class Tree:
 SHAPES = {"fprf.shapes": {"round": "test_slots:RoundConfig", "group": "test_slots:GroupConfig"}}
 
 
-def test_a_slot_is_an_abstract_config_and_nothing_else() -> None:
-    assert is_slot(EncoderConfig) and is_slot(ShapeConfig)
-    assert not any(is_slot(kind) for kind in (RandomConfig, RoundConfig, PluginConfig, int, EncoderConfig | None))
-    assert set(members(EncoderConfig | None)) == {EncoderConfig, type(None)} and members(int) == (int,)
-
-
 def test_all_slots_of_the_knob_tree_are_found_outer_first() -> None:
     found = {slot.path: slot for slot in slots(fprf())}
     assert set(found) == {
@@ -70,12 +64,6 @@ def test_take_flag_both_forms_the_last_wins(flag: str) -> None:
     assert take_flag(["a", flag, "x", "b"], name) == ("x", ["a", "b"])
     assert take_flag([f"{flag}=x", "--other", flag, "y"], name) == ("y", ["--other"])
     assert take_flag(["--other", "z"], name) == (None, ["--other", "z"])
-
-
-@pytest.mark.parametrize("args", [["--sampler"], ["--sampler", "--steps"], ["--sampler="]])
-def test_a_flag_without_a_name_is_a_mistake(args: list[str]) -> None:
-    with pytest.raises(UsageError, match="--sampler: needs the name of a plug-in"):
-        take_flag(args, "sampler")
 
 
 @settings(max_examples=40, deadline=None)
@@ -113,23 +101,11 @@ def test_a_chosen_plugin_brings_slots_of_its_own(packages: Packages) -> None:
     assert resolve(Tree(), ["--other", "round"])[0].other == RoundConfig()
 
 
-def test_an_inner_slot_that_nothing_opens_stays_in_the_arguments(packages: Packages) -> None:
-    packages.install("shapes", SHAPES)
-    assert resolve(Tree(), ["--other.inner", "round"])[1] == ["--other.inner", "round"]
-
-
 def test_errors_say_which_slot() -> None:
     with pytest.raises(PluginError, match=r"^--sampler: fprf.samplers: no plug-in 'unifrom'.*did you mean 'uniform'"):
         resolve(fprf(), ["--sampler", "unifrom"])
     with pytest.raises(PluginError, match=r"^--content.field: .*not a ContentFieldConfig"):
         resolve(fprf(), ["--content.field", "semantic-planes"])
-
-
-def test_a_config_without_defaults_is_the_strangers_fault(packages: Packages) -> None:
-    source = ENCODER.format(name="Needy").replace("tile: int = 224", "tile: int")
-    packages.install("acme-needy", {"fprf.encoders": {"needy": "acme_needy:NeedyConfig"}}, code={"acme_needy": source})
-    with pytest.raises(PluginError, match=r"'needy' \(acme_needy.*acme-needy 1\) has no defaults"):
-        resolve(fprf(), ["--semantic.encoder", "needy"])
 
 
 def test_types_that_cannot_be_resolved_are_named(packages: Packages) -> None:
@@ -145,7 +121,3 @@ def test_a_broken_stranger_hurts_only_who_names_it(packages: Packages) -> None:
     assert config.semantic.encoder == BundledSemanticConfig()
     with pytest.raises(PluginError, match="ZeroDivisionError"):
         resolve(TrainConfig(), ["--semantic.encoder", "bad"])
-
-
-def test_hints_are_evaluated() -> None:
-    assert hints_of(SemanticConfig)["encoder"] == EncoderConfig | None

@@ -5,29 +5,14 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from fprf.cli.cluster import run as cluster
-from fprf.errors import ConfigError, DataError, PluginError
+from fprf.errors import DataError, PluginError
 from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.executors.executors import resources
-from fprf.testing import check_config, check_executor
-
-
-def test_the_config() -> None:
-    check_config(RayConfig())
-    for values in ({"workers": 0}, {"processors": 0.0}, {"retries": -1}, {"gpus": -1.0}):
-        with pytest.raises(ConfigError, match=rf"executor\.{next(iter(values))}"):
-            RayConfig(**values)  # type: ignore[arg-type]
-
-
-def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(PluginError, match=r'pip install "fprf\[cluster\]"'):
-        RayConfig().build().map(abs, [1])
+from fprf.testing import check_executor
 
 
 class Refusing:
@@ -81,13 +66,6 @@ def test_a_cluster_without_gpus_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
         RayConfig().on("cuda").build().map(abs, [1])
 
 
-def test_the_steps_name_the_machine_and_its_port(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cluster(["--head", "mars", "--port", "7777"]) == 0
-    said = capsys.readouterr().out
-    assert "ray start --address mars:7777" in said and "get-auth-token --generate" in said
-    assert said.count("RAY_USAGE_STATS_ENABLED=0 RAY_AUTH_MODE=token") == 2, "on the head and on the others"
-
-
 @pytest.fixture(scope="module")
 def executor() -> Iterator[RayConfig]:
     if importlib.util.find_spec("ray") is None:  # not imported here: it reads its environment when it is
@@ -112,13 +90,6 @@ def test_the_contract(executor: RayConfig) -> None:
     assert new or not Path("/proc/net/tcp").exists()
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert os.environ["RAY_AUTH_MODE"] == "token" and len(os.environ["RAY_AUTH_TOKEN"]) == 64
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_ray_itself_says_that_there_are_no_gpus(executor: RayConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    with pytest.raises(PluginError, match="the cluster has 0"):
-        replace(executor, gpus=1.0).build().map(abs, [1])
 
 
 @pytest.mark.filterwarnings("ignore")

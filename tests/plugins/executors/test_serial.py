@@ -12,17 +12,6 @@ def test_the_contract() -> None:
     assert isinstance(SerialConfig().build(), SerialExecutor)
 
 
-def test_tasks_run_one_after_the_other_in_this_process() -> None:
-    seen: list[int] = []
-
-    def work(task: int) -> int:
-        seen.append(task)
-        return -task
-
-    assert SerialExecutor().map(work, range(5)) == [0, -1, -2, -3, -4]
-    assert seen == [0, 1, 2, 3, 4]
-
-
 def test_the_first_error_stops_the_rest() -> None:
     seen: list[int] = []
 

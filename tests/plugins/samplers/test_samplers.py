@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from fprf.errors import ConfigError
 from fprf.interfaces import Sampler
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
 from fprf.plugins.samplers.samplers import ProposalSampler, even_edges
@@ -73,30 +72,12 @@ def test_edges_are_spaced_by_the_space(config: SamplerConfig) -> None:
     assert found.levels == ()
 
 
-@pytest.mark.parametrize("config", [UniformConfig(samples=8), SMALL])
-def test_draws_follow_the_generator_alone(config: SamplerConfig) -> None:
-    sampler, rays = config.build(seed=0), rays_of(6)
-    one = sample(sampler, rays, step=3, seed=1)
-    torch.rand(5)
-    assert torch.equal(one.t, sample(sampler, rays, step=3, seed=1).t)
-    assert not torch.equal(one.t, sample(sampler, rays, step=3, seed=2).t)
-    assert torch.equal(sample(sampler, rays).t, sample(sampler, rays).t)
-
-
 def test_every_ray_stands_alone() -> None:
     sampler, rays = SMALL.build(seed=0), rays_of(6)
     whole = sample(sampler, rays)
     for k in range(6):
         one = sample(sampler, Rays(*(x[k : k + 1] for x in rays)))
         assert torch.allclose(one.s, whole.s[k : k + 1], atol=1e-5)
-
-
-def test_the_seed_draws_the_planes() -> None:
-    one, same, other = (SMALL.build(seed=seed).state_dict() for seed in (1, 1, 2))
-    assert all(torch.equal(one[name], same[name]) for name in one)
-    assert not any(torch.equal(one[name], other[name]) for name in one)
-    levels = [value for name, value in one.items() if "to_density" in name]
-    assert not torch.equal(levels[0], levels[1])
 
 
 class Wall(nn.Module):
@@ -193,41 +174,3 @@ def test_the_interlevel_loss_reaches_every_level_and_lowers() -> None:
         loss().backward()
         optimizer.step()
     assert loss().item() < 0.5 * first.item()
-
-
-def test_penalties() -> None:
-    assert UniformConfig().build(seed=0).penalties() == {}
-    sampler = SMALL.build(seed=0)
-    (name, value), *rest = sampler.penalties().items()
-    assert name == "proposal_variation" and not rest and value.item() > 0
-    value.backward()
-    assert all(p.grad is not None for n, p in sampler.named_parameters() if n.endswith("table"))
-
-
-@pytest.mark.parametrize("value", [{"samples": 0}, {"samples": -3}])
-def test_uniform_refuses(value: dict[str, int]) -> None:
-    with pytest.raises(ConfigError, match=r"sampler\.samples"):
-        UniformConfig(**value)
-
-
-@pytest.mark.parametrize(
-    ("value", "name"),
-    [
-        ({"final": 0}, "final"),
-        ({"channels": 0}, "channels"),
-        ({"padding": 0.0}, "padding"),
-        ({"padding": 1.5}, "padding"),
-        ({"anneal_slope": 0.0}, "anneal_slope"),
-        ({"anneal_slope": float("nan")}, "anneal_slope"),
-        ({"anneal_steps": -1}, "anneal_steps"),
-        ({"update_every": 0}, "update_every"),
-        ({"warm_up": -1}, "warm_up"),
-        ({"samples": (1,), "resolutions": (8,)}, "samples"),
-        ({"samples": (8,), "resolutions": (1,)}, "resolutions"),
-        ({"samples": (8,)}, "1 levels but 2"),
-        ({"samples": (), "resolutions": ()}, "0 levels"),
-    ],
-)
-def test_proposal_refuses(value: dict[str, object], name: str) -> None:
-    with pytest.raises(ConfigError, match=name):
-        ProposalConfig(**value)  # type: ignore[arg-type]

@@ -5,9 +5,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import DataError
 from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, StylizerConfig
-from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
+from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene import SceneStyle, own_style, scene_style
 from fprf.types import Want
@@ -29,27 +28,6 @@ def scene_of(content: torch.Tensor, semantic: torch.Tensor | None, regions: int 
 
 def references(*weights: float) -> list[Reference]:
     return [Reference(f"r{i}", *points(seed=7 + i), weight=w) for i, w in enumerate(weights)]
-
-
-@pytest.mark.parametrize("config", ALL)
-@pytest.mark.parametrize("n", [0, 1, 7, 400])
-def test_shapes_types_and_rows_of_one(config: StylizerConfig, n: int) -> None:
-    content, semantic = points()
-    stylizer = config.build(dictionary=build_dictionary(references(1.0, 1.0)), scene=scene_of(content, semantic))
-    out = stylizer(content[:n], semantic[:n])
-    assert out.shape == (n, 6) and out.dtype == torch.float32 and bool(out.isfinite().all())
-    match = stylizer.match(semantic[:n])
-    assert match.shape[0] == n
-    torch.testing.assert_close(match.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
-    half = stylizer(content[:n].bfloat16(), semantic[:n].bfloat16())
-    assert half.dtype == torch.bfloat16
-
-
-def test_identity_returns_the_content_itself() -> None:
-    content, semantic = points()
-    stylizer = IdentityConfig().build(dictionary=build_dictionary(references(1.0)), scene=scene_of(content, semantic))
-    assert stylizer(content, None) is content
-    assert stylizer.needs == Want.CONTENT
 
 
 def test_adain_is_the_papers_equation_over_all_reference_pixels() -> None:
@@ -103,18 +81,6 @@ def test_the_order_of_the_references_plays_no_part(config: StylizerConfig) -> No
     a = config.build(dictionary=build_dictionary(refs), scene=scene)(content, semantic)
     b = config.build(dictionary=build_dictionary(refs[::-1]), scene=scene)(content, semantic)
     assert torch.equal(a, b)
-
-
-def test_one_code_or_no_semantics_need_none_and_give_the_global_style() -> None:
-    content, semantic = points()
-    for refs, scene in (
-        ([Reference("a", *points(seed=3))], scene_of(content, semantic)),
-        ([Reference("a", points(seed=3)[0], torch.zeros(400, 0))], scene_of(content, None)),
-    ):
-        d = build_dictionary(refs, clusters=1)
-        local, adain = (c.build(dictionary=d, scene=scene) for c in (LocalAdainConfig(), AdainConfig()))
-        assert local.needs == Want.CONTENT
-        torch.testing.assert_close(local(content, None), adain(content, None))
 
 
 def test_the_scenes_own_style_gives_the_scene() -> None:
@@ -172,11 +138,3 @@ def test_autocast_changes_nothing() -> None:
         with torch.autocast("cpu", dtype=torch.bfloat16):
             out = stylizer(content, semantic)
         assert torch.equal(out, stylizer(content, semantic))
-
-
-def test_other_encoders_references_are_refused() -> None:
-    content, semantic = points()
-    d: StyleDictionary = build_dictionary([Reference("a", torch.randn(9, 5), torch.randn(9, 4))])
-    for config in ALL[2:]:
-        with pytest.raises(DataError, match="5 content and 4 semantic channels"):
-            config.build(dictionary=d, scene=scene_of(content, semantic))
