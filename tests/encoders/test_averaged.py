@@ -2,14 +2,12 @@
 
 from typing import Annotated
 
-import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.errors import ConfigError
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.composed import AveragedEncoder
 from fprf.plugins.encoders.config import AveragedConfig, RandomConfig
@@ -62,15 +60,3 @@ def test_sizes_meet_on_the_finest_ones_cells() -> None:
     small = F.interpolate(image, (16, 24), mode="bilinear", antialias=True)
     coarse = F.interpolate(inner(small), (8, 12), mode="bilinear")
     torch.testing.assert_close(both, (coarse + inner(image)) / 2)
-
-
-def test_the_identity_holds_the_inner_one() -> None:
-    inner = RandomConfig().build()
-    assert AveragedConfig(inner=RandomConfig()).build().identity == f"averaged:flip:1.0:[{inner.identity}]"
-    assert AveragedConfig(inner=AveragedConfig(inner=RandomConfig())).build().identity.count("averaged") == 2
-
-
-@pytest.mark.parametrize("scales", [(), (0.0,), (1.0, -1.0), (float("nan"),)])
-def test_ranges(scales: tuple[float, ...]) -> None:
-    with pytest.raises(ConfigError, match=r"^scales"):
-        AveragedConfig(scales=scales)

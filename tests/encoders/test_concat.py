@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
@@ -11,17 +10,14 @@ from network_files import deeplab_file
 from torch import Tensor
 
 from fprf.cli.parsing import parse
-from fprf.errors import ConfigError, WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import from_json, to_json
-from fprf.plugins.encoders.composed import ConcatEncoder, unit_of
+from fprf.plugins.encoders.composed import ConcatEncoder
 from fprf.plugins.encoders.config import (
     AveragedConfig,
-    BundledContentConfig,
     BundledSemanticConfig,
     ConcatConfig,
     DeepLabConfig,
-    EncoderConfig,
     RandomConfig,
 )
 from fprf.plugins.encoders.frozen import street
@@ -58,35 +54,6 @@ def test_the_finest_of_each_axis_counts() -> None:
     assert encoder(torch.rand(1, 3, 31, 7)).shape[2:] == (7, 2)
 
 
-def test_an_image_depends_on_itself_alone() -> None:
-    encoder = ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1)).build()
-    images = torch.rand(2, 3, 24, 24)
-    torch.testing.assert_close(encoder(images)[:1], encoder(images[:1]))
-
-
-def test_units_are_rounded_and_never_0() -> None:
-    images = street()
-    assert images.shape[1] == 3 and 0 <= float(images.min()) < float(images.max()) <= 1
-    unit = unit_of(RandomConfig().build(), images)
-    assert unit == float(f"{unit:.3g}") > 0
-    assert unit_of(RandomConfig().build(), torch.full((1, 3, 16, 16), 0.5)) == 1
-
-
-def test_weights_left_out_are_1_and_more_than_parts_are_refused() -> None:
-    parts = {"first": RandomConfig(), "second": RandomConfig(seed=1)}
-    assert ConcatConfig(**parts).build().identity == ConcatConfig(**parts, weights=(1.0, 1.0)).build().identity
-    with pytest.raises(ConfigError, match=r"^weights: 3 for 2 encoders"):
-        ConcatConfig(**parts, weights=(1, 2, 3)).build()
-    for wrong in ((0.0,), (1.0, -1.0), (float("inf"),)):
-        with pytest.raises(ConfigError, match=r"^weights"):
-            ConcatConfig(**parts, weights=wrong)
-
-
-def test_a_missing_parts_weights_are_told(tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
-        ConcatConfig(first=DeepLabConfig(weights=tmp_path / "absent.safetensors")).build()
-
-
 def test_nested_on_the_command_line(tmp_path: Path) -> None:
     file = deeplab_file(tmp_path)
     line = (
@@ -107,9 +74,3 @@ def test_nested_on_the_command_line(tmp_path: Path) -> None:
     for part in (encoder.first, encoder.second, encoder.third):
         assert part.build().identity in built.identity
     assert built(torch.rand(1, 3, 48, 64)).shape == (1, built.channels, 12, 16)
-
-
-@pytest.mark.parametrize("second", [BundledContentConfig(), ConcatConfig(second=RandomConfig())])
-def test_any_encoder_is_a_part(second: EncoderConfig) -> None:
-    encoder = ConcatConfig(first=RandomConfig(), second=second).build()
-    assert encoder.channels == 16 + second.build().channels

@@ -81,23 +81,6 @@ def test_a_batch_is_its_images(built: tuple[Encoder, int]) -> None:
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4)
 
 
-def test_deterministic_and_frozen(built: tuple[Encoder, int]) -> None:
-    encoder, _ = built
-    image = torch.rand(1, 3, 24, 40, requires_grad=True)
-    features = encoder(image)
-    assert not features.requires_grad
-    assert torch.equal(features, encoder(image))
-    assert not any(parameter.requires_grad for parameter in encoder.parameters())
-    assert not encoder.training
-
-
-def test_the_image_is_not_changed(built: tuple[Encoder, int]) -> None:
-    image = torch.rand(1, 3, 16, 16)
-    before = image.clone()
-    built[0](image)
-    assert torch.equal(image, before)
-
-
 def test_a_bright_spot_answers_where_it_is(built: tuple[Encoder, int]) -> None:
     """The centre of the squared changes lies in its cell or beside it; deep networks with random weights look far around."""
     encoder, stride = built

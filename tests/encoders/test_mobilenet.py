@@ -5,15 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from network_files import CLASSES, deeplab_file, deeplab_tensors, mobilenet_file, mobilenet_tensors
 from safetensors.torch import save_file
 from torch import Tensor
 
-from fprf.errors import WeightsError
 from fprf.plugins.encoders.config import DeepLabConfig, MobileNetV2Config
-from fprf.plugins.encoders.mobilenet import CLASSIFIER, DEEPLAB, fold, stride_at
 
 STRIDES = (1, 2, 1, 2, 1, 1, 2, 1, 1, 1, 1, 1, 1, 2, 1, 1, 1)
 IMAGENET = torch.tensor([[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], dtype=torch.float64).view(2, 3, 1, 1)
@@ -95,34 +91,6 @@ def test_deeplabs_scores(tmp_path: Path) -> None:
     torch.testing.assert_close(encoder(image).double(), expected, rtol=1e-4, atol=1e-4)
 
 
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 17))
-def test_strides_multiply(last: int) -> None:
-    expected = 2
-    for stride in STRIDES[:last]:
-        expected *= stride
-    assert stride_at(CLASSIFIER, last) == expected
-    assert stride_at(DEEPLAB, last) == min(expected, 16)
-
-
-def test_folding_takes_norms_and_leaves_biases() -> None:
-    tensors = {
-        "f.0.0.weight": torch.full((1, 1, 1, 1), 3.0),
-        "f.0.1.weight": torch.tensor([2.0]),
-        "f.0.1.bias": torch.tensor([5.0]),
-        "f.0.1.running_mean": torch.tensor([7.0]),
-        "f.0.1.running_var": torch.tensor([4.0]),
-        "f.1.0.weight": torch.ones(1, 1, 1, 1),
-        "f.1.0.bias": torch.tensor([9.0]),
-        "f.weight": torch.ones(1, 1, 1, 1),
-        "g.0.0.weight": torch.ones(1, 1, 1, 1),
-    }
-    folded = fold(tensors, "f.", 0.0)
-    assert {name: float(value.flatten()[0]) for name, value in folded.items()} == {
-        "0.0.weight": 3.0, "0.0.bias": -2.0, "1.0.weight": 1.0, "1.0.bias": 9.0,
-    }  # fmt: skip
-
-
 def test_only_what_the_layer_needs_is_in_the_identity(tmp_path: Path) -> None:
     tensors = deeplab_tensors()
     save_file(tensors, tmp_path / "one.safetensors")
@@ -135,31 +103,3 @@ def test_only_what_the_layer_needs_is_in_the_identity(tmp_path: Path) -> None:
     assert identity("backbone.8", "one") == identity("backbone.8", "two")
     assert identity("backbone.9", "one") != identity("backbone.9", "two")
     assert identity("logits", "one") != identity("logits", "two")
-
-
-def test_files_that_do_not_fit(tmp_path: Path) -> None:
-    tensors = mobilenet_tensors(folded=False)
-    short = {name: value for name, value in tensors.items() if not name.startswith("features.14")}
-    save_file(short, tmp_path / "short.safetensors")
-    assert MobileNetV2Config(weights=tmp_path / "short.safetensors").build().channels == 4
-    with pytest.raises(WeightsError, match=r"does not hold MobileNetV2 features\.14 \(14\.conv.*is missing.*--semantic\.enc"):
-        MobileNetV2Config(layer="features.14", weights=tmp_path / "short.safetensors").build()
-    save_file(tensors, tmp_path / "eps.safetensors", {"bn_eps": "small"})
-    with pytest.raises(WeightsError, match="bn_eps' is 'small'"):
-        MobileNetV2Config(weights=tmp_path / "eps.safetensors").build()
-    with pytest.raises(WeightsError, match=r"does not hold DeepLabv3 backbone\.17"):
-        DeepLabConfig(weights=tmp_path / "short.safetensors").build()
-    tensors["features.3.conv.0.0.weight"] = torch.zeros(8, 9, 1, 1)
-    save_file(tensors, tmp_path / "wide.safetensors")
-    with pytest.raises(WeightsError, match=r"does not hold MobileNetV2 features\.13"):
-        MobileNetV2Config(weights=tmp_path / "wide.safetensors").build()
-    backbone = {name: value for name, value in deeplab_tensors().items() if name.startswith("backbone")}
-    save_file(backbone, tmp_path / "headless.safetensors")
-    with pytest.raises(WeightsError, match=r"DeepLabv3 logits \(image_pooling\.weight is missing"):
-        DeepLabConfig(layer="logits", weights=tmp_path / "headless.safetensors").build()
-
-
-def test_a_file_of_torch_save_is_torchvisions(tmp_path: Path) -> None:
-    torch.save(mobilenet_tensors(folded=False), tmp_path / "m.pth")
-    saved = MobileNetV2Config(weights=tmp_path / "m.pth").build()
-    assert saved.identity == MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=False)).build().identity

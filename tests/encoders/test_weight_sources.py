@@ -7,13 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 from network_files import deeplab_file, mobilenet_tensors
-from safetensors.torch import save_file
 
 from fprf.errors import WeightsError
 from fprf.plugins import weights
 from fprf.plugins.encoders.config import DeepLabConfig, EncoderConfig, EspNetConfig, MobileNetV2Config
 from fprf.plugins.encoders.mobilenet import DEEPLAB_SOURCE as DEEPLAB
-from fprf.plugins.weights import WeightSource, find_weights, read_tensors, stated_triple, torchvision_file
+from fprf.plugins.weights import WeightSource, find_weights, torchvision_file
 
 
 @pytest.fixture(autouse=True)
@@ -53,10 +52,6 @@ def test_both_caches_are_searched(folder: str, home: Path, tmp_path: Path) -> No
     assert DeepLabConfig().build().identity == DeepLabConfig(weights=file).build().identity
 
 
-def test_a_named_file_is_taken_as_it_is(tmp_path: Path) -> None:
-    assert find_weights(DEEPLAB, tmp_path / "any") == tmp_path / "any"
-
-
 def test_the_hash_in_a_name_is_a_promise(home: Path) -> None:
     cache = home / ".cache/fprf/weights"
     cache.mkdir(parents=True)
@@ -72,19 +67,3 @@ def test_pinned_files_alone_are_downloaded() -> None:
         find_weights(pinned, None)
     with pytest.raises(WeightsError, match=r"Net: net.pth is not in .*fprf/weights nor in .*torch.*\(somewhere\)"):
         find_weights(WeightSource("Net", "net.pth", "somewhere", "--flag"), None)
-
-
-def test_metadata_of_safetensors_alone(tmp_path: Path) -> None:
-    save_file({"a": torch.ones(1)}, tmp_path / "a.safetensors", {"mean": "[1,2,3]"})
-    torch.save({"a": torch.ones(1).half(), "note": "text"}, tmp_path / "a.pth")
-    assert read_tensors(tmp_path / "a.safetensors", DEEPLAB)[1] == {"mean": "[1,2,3]"}
-    tensors, metadata = read_tensors(tmp_path / "a.pth", DEEPLAB)
-    assert metadata == {} and list(tensors) == ["a"] and tensors["a"].dtype == torch.float32
-
-
-def test_three_numbers(tmp_path: Path) -> None:
-    assert stated_triple({}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [1, 2, 3]
-    assert stated_triple({"mean": "[4,5,6]"}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [4, 5, 6]
-    for wrong in ("[1,2]", "1", "null", "grey", '["a","b","c"]'):
-        with pytest.raises(WeightsError, match="not three numbers"):
-            stated_triple({"mean": wrong}, "mean", (1.0, 2.0, 3.0), tmp_path)
