@@ -1,5 +1,6 @@
 """`fprf restyle CAPTURE --references A.jpg B.jpg --output OUT`: new colours for a finished capture of 3D Gaussians."""
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from ..interfaces import Encoder
     from ..io.images import Picture
     from ..splats.files import Capture
-    from ..splats.scene import SplatScene
+    from ..splats.scene import Semantics, SplatScene
     from ..training.restyle import Styled
 
 __all__ = ["RestyleConfig", "run", "seen_capture"]
@@ -70,8 +71,6 @@ def run(args: list[str]) -> int:
     """Look at the capture, or take what the cache knows of it; build each style; write files, sheet and page."""
     config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("capture",))
     _check(config)
-    import torch
-
     from ..io.images import write_image
     from ..plugins.encoders.config import BundledSemanticConfig
     from ..splats.files import read_capture, write_capture
@@ -80,12 +79,13 @@ def run(args: list[str]) -> int:
 
     begun = time.perf_counter()
     capture, encoder = read_capture(config.capture), BundledSemanticConfig().build()
-    finite = capture.gaussians.finite
+    count = len(capture.gaussians)
     with Display() as display:
         look = LookConfig(up=config.up, inside=config.inside, views=config.views, size=config.size, regions=config.regions)
         scene = seen_capture(
             capture, encoder, look, config.cache, lambda done, total: display.count(done, total, "looking"), display.say
         )
+        scene.found()
         looked = time.perf_counter() - begun
         named, made, encoders = _styles(config, file), [], scene.encoders()
         for i, (name, each) in enumerate(named):
@@ -94,12 +94,8 @@ def run(args: list[str]) -> int:
             styled = apply_style(scene, each, encoders)
             shown = scene.restyled(styled.restyle)
             if config.output is not None:
-                harmonics = capture.gaussians.harmonics
-                if not styled.restyle.idle:
-                    harmonics = torch.zeros_like(harmonics).index_copy_(0, finite.nonzero()[:, 0], shown.shown.harmonics)
-                    harmonics = torch.where(finite[:, None, None], harmonics, capture.gaussians.harmonics)
                 output = _named(config.output, name)
-                write_capture(output, capture, harmonics)
+                write_capture(output, capture, shown.shown.harmonics)
                 write_style(_beside(output, "style.json"), styled.controls.saved)
             made.append((name, styled, shown, time.perf_counter() - start))
         display.count(len(named), len(named), "restyling")
@@ -118,9 +114,9 @@ def run(args: list[str]) -> int:
         if config.page is not None:
             _write_page(config, scene, made, pictures)
     each_seconds = sum(seconds for *_, seconds in made) / max(1, len(made))
-    lost = len(finite) - int(finite.sum())
+    lost = count - len(scene.gaussians)
     left = f", {lost} that are not finite left as they are" if lost else ""
-    print(f"{len(finite)} Gaussians{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles")
+    print(f"{count} Gaussians{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles")
     return 0
 
 
@@ -165,7 +161,10 @@ def seen_capture(
     progress: Callable[[int, int], None] = lambda done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> "SplatScene":
-    """The finite Gaussians of a capture with views and features from the cache; computed and stored where they are absent."""
+    """The finite Gaussians of a capture with views and features from the cache.
+
+    Where they are absent, views are found here, and features, which are then stored, when they are first asked for.
+    """
     from ..splats.scene import cache_name, load_scene, look_at_capture, scene_tensors
     from ..training.prepare import cache_folder
     from ..training.tensorfiles import load_sealed, save_sealed
@@ -183,10 +182,15 @@ def seen_capture(
             path.touch()
             return scene
     scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress)
-    save_sealed(path, scene_tensors(scene))
-    for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_KEPT]:
-        old.unlink(missing_ok=True)
-    return scene
+
+    def found() -> "Semantics":
+        semantics = scene.found()
+        save_sealed(path, scene_tensors(scene))
+        for old in sorted(folder.glob("*.safetensors"), key=lambda each: each.stat().st_mtime)[:-_KEPT]:
+            old.unlink(missing_ok=True)
+        return semantics
+
+    return replace(scene, found=functools.cache(found))
 
 
 def _named(path: Path, name: str) -> Path:

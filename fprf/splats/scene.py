@@ -9,6 +9,7 @@ themselves have less contrast (deviation 0.13 against 0.17 on a plant), since wh
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Annotated, NamedTuple
 
 import torch
@@ -196,19 +197,25 @@ def look_at_capture(
     config: LookConfig,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SplatScene:
-    """Find views of Gaussians that are all finite, and what they show. Raises DataError where nothing can be seen."""
+    """Find views of Gaussians that are all finite. What they show is found when it is first asked for.
+
+    Raises DataError where nothing can be seen.
+    """
     up = torch.tensor(config.up)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
     cameras = find_views(gaussians, count=config.views, size=config.size, up=up, inside=config.inside, antialiased=antialiased)
-    found = find_semantics(gaussians, antialiased, encoder, cameras, config.regions, progress=progress)
-    return captured(gaussians, antialiased, cameras, found)
+
+    def found() -> Semantics:
+        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, progress=progress)
+
+    return captured(gaussians, antialiased, cameras, cache(found))
 
 
-def captured(gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Semantics) -> SplatScene:
+def captured(gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Callable[[], Semantics]) -> SplatScene:
     """The scene of a capture; its views are numbered."""
     names = tuple(f"{view:02d}" for view in range(len(cameras)))
-    return SplatScene(gaussians, antialiased, cameras, names, lambda: found, int(cameras.size.amax()))
+    return SplatScene(gaussians, antialiased, cameras, names, found, int(cameras.size.amax()))
 
 
 @torch.inference_mode()
@@ -310,7 +317,8 @@ def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bo
         cameras = Cameras(**_group(tensors, "camera"))
     except TypeError as error:
         raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
-    return captured(gaussians, antialiased, cameras, load_semantics(tensors, len(gaussians)))
+    found = load_semantics(tensors, len(gaussians))
+    return captured(gaussians, antialiased, cameras, lambda: found)
 
 
 def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -60,11 +60,14 @@ def write_gaussians(path: Path, gaussians: Gaussians, *, antialiased: bool = Fal
 
 
 def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"]) -> None:
-    """Write a capture with new harmonics, in the format that the name ends with.
+    """Write a capture with new harmonics of all its Gaussians, or of all that are finite, in the format that the name says.
 
     In the format that it was read from everything else stays as it was, bit for bit; where no harmonic differs from those
     read, that is the whole file.
     """
+    finite, before = capture.gaussians.finite, capture.gaussians.harmonics
+    if len(harmonics) < len(finite):
+        harmonics = before.index_copy(0, finite.nonzero()[:, 0], harmonics)
     ending, here = _ending(path), _ending(capture.path)
     # A compressed file may be called .ply; under the same ending it stays what it is.
     plain = ending == ".ply" and here == ".compressed.ply"
@@ -72,7 +75,7 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
     if _FORMATS[ending].read is not _FORMATS[here].read or plain or packed:
         write_gaussians(path, capture.gaussians.recoloured(harmonics), antialiased=capture.antialiased)
         return
-    changed = (harmonics != capture.gaussians.harmonics).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
+    changed = (harmonics != before).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
     data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))
     _write(path, data)
 
