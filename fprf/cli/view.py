@@ -4,7 +4,7 @@ import contextlib
 import importlib.util
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -82,7 +82,7 @@ def run(args: list[str]) -> int:
         if path is None:
             stack.callback(_start(server, config, references).close)
         else:
-            server.open(lambda: _load(config, path), references, config.pixels)
+            server.open(lambda: _load(config, path, None, server.notify), references, config.pixels)
         try:
             threading.Event().wait()
         except KeyboardInterrupt:
@@ -107,7 +107,7 @@ def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path
     from ..viewer.start_page import StartPage
 
     def show(path: Path, name: str) -> None:
-        server.open(lambda: replace(_load(config, path), name=name), references, config.pixels)
+        server.open(lambda: _load(config, path, name, server.notify), references, config.pixels)
 
     def leave() -> None:
         server.show_start(page.routes)
@@ -117,7 +117,8 @@ def _start(server: "ViewerServer", config: ViewConfig, references: Sequence[Path
     return page
 
 
-def _load(config: ViewConfig, path: Path) -> "Viewed":
+def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[str], None]) -> "Viewed":
+    """The scene of a run or a capture, under its own name where none is given."""
     from ..viewer.scene_files import is_capture
     from ..viewer.session import Viewed, view_of_run
 
@@ -125,13 +126,19 @@ def _load(config: ViewConfig, path: Path) -> "Viewed":
         from ..training.loading import open_run
 
         run = open_run(path, config.device, config)
-        return view_of_run(run.scene, run.run, run.known)
+        viewed = view_of_run(run.scene, run.run, run.known)
+        return viewed if name is None else replace(viewed, name=name)
     from ..plugins.encoders.config import BundledSemanticConfig
     from ..plugins.stylizers.config import RegionToneConfig
     from ..splats.files import read_capture
     from ..splats.look_config import LookConfig
     from .restyle import seen_capture
 
-    scene = seen_capture(read_capture(path), BundledSemanticConfig().build(), LookConfig(up=config.up, inside=config.inside))
-    name = path.resolve().name.partition(".")[0]
-    return Viewed(scene, name, 0, stylizer=RegionToneConfig(centred=False))
+    def progress(done: int, total: int) -> None:
+        if done == 0:
+            notify("looking at the capture, once; a photograph can be dropped already")
+
+    capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside)
+    scene = seen_capture(capture, BundledSemanticConfig().build(), look, progress=progress)
+    name = name or path.resolve().name.partition(".")[0]
+    return Viewed(scene, name, 0, root=config.output / name, capture=capture, stylizer=RegionToneConfig(centred=False))

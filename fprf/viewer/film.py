@@ -22,6 +22,7 @@ from ..interfaces import Scene
 from ..io.atomic import write_json
 from ..io.images import Picture
 from ..io.video import write_video
+from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
@@ -84,17 +85,19 @@ def new_folder(root: Path) -> Path:
             number += 1
 
 
-def write_film_files(folder: Path, transform: PageTransform, plan: FilmPlan, encoder: str) -> None:
+def write_film_files(
+    folder: Path, transform: PageTransform, plan: FilmPlan, encoder: str, stylizer: RegionToneConfig | None = None
+) -> None:
     """Write path.json, keys.json, and a folder a look with style.json and its photographs.
 
-    `encoder` is the identity of the scene's semantic encoder.
+    `encoder` is the identity of the scene's semantic encoder, `stylizer` what its looks are based on; None = the default.
     """
     write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps)
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
     for i, key in enumerate(plan.keys):
         if not simplified(key.look).plain and key.look not in looks:
-            looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, encoder)
+            looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, encoder, stylizer)
         style = looks.get(key.look)
         rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
@@ -195,9 +198,9 @@ class FilmRecorder:
 
         try:
             if session.viewed.root is None:
-                raise UsageError("a capture has no run folder to put it in; films are made of runs")
+                raise UsageError("this scene has no folder to put a film in")
             folder = new_folder(session.viewed.root)
-            write_film_files(folder, session.transform, plan, session.viewed.scene.semantic_encoder)
+            write_film_files(folder, session.transform, plan, session.viewed.scene.semantic_encoder, session.viewed.stylizer)
             frames: Queue[Picture | None] = Queue(2)
             failed: list[Exception] = []
             self._worker.run_when_idle(
@@ -231,11 +234,11 @@ def _put(out: "Queue[Picture | None]", picture: Picture | None) -> bool:
     return True
 
 
-def _write_look(folder: Path, look: Look, encoder: str) -> Path:
+def _write_look(folder: Path, look: Look, encoder: str, stylizer: RegionToneConfig | None) -> Path:
     """Write the style file of a look, with that of what it goes towards in a folder of its own."""
     folder.mkdir(parents=True)
     look = simplified(look)
-    style = style_config(look)
+    style = style_config(look, stylizer)
     references = []
     for i, (photograph, _) in enumerate(look.mix):
         target = folder / f"{i + 1}-{_stem(photograph.name)}.png"
@@ -243,7 +246,7 @@ def _write_look(folder: Path, look: Look, encoder: str) -> Path:
         references.append(target)
     other = None
     if look.towards is not None:
-        other = _write_look(folder / "towards", look.towards, encoder)
+        other = _write_look(folder / "towards", look.towards, encoder, stylizer)
     style = replace(style, references=tuple(references), between=other, at=look.at if other is not None else 0.5)
     path = folder / "style.json"
     write_style(path, StyleFile(style, {}, encoder))

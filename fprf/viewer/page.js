@@ -60,6 +60,27 @@
   const shelf = make("div", { id: "fprf-shelf", className: "fprf" });
   const add = make("button", { id: "fprf-add", title: "Choose photographs, or drop them anywhere", onclick: () => picker.click() },
     make("b", { textContent: "+" }), "photograph");
+  const press = (text) => [...document.querySelectorAll("button")].find((each) => each.textContent.trim() === text)?.click();
+  const download = (href) => { const link = make("a", { href, download: "" }); document.body.append(link); link.click(); link.remove(); };
+  let awaited = false;
+  const act = (text, title, onclick) => make("button", { textContent: text, title, onclick });
+  const acts = make("div", { className: "acts" },
+    act("↓ .ply", "the Gaussians in this look, for other viewers", async () => {
+      const line = say("writing the Gaussians …", false, 0);
+      try {
+        const answer = await fetch("/fprf/gaussians");
+        if (!answer.ok) throw new Error(await answer.text());
+        const name = /filename="(.*)"/.exec(answer.headers.get("content-disposition"))?.[1] ?? "restyled.ply";
+        const link = make("a", { href: URL.createObjectURL(await answer.blob()), download: name });
+        link.click();
+        setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+      } catch (error) {
+        say(error.message, true);
+      }
+      line.remove();
+    }),
+    act("↓ picture", "this view, as large as it is here", () => { awaited = true; press("Save a picture"); }),
+    act("⌂ scenes", "another scene", () => ask("/fprf/start/leave", {}).then(() => location.replace("/"), (error) => say(error.message, true))));
   const cards = new Map();
   const card = (row) => {
     const picture = make("img", { src: `/fprf/card?card=${row.card}`, alt: row.name, draggable: false,
@@ -156,7 +177,6 @@
 
   // The flight: what a client's own camera does goes by viser's buttons, the rest by requests
   const flight = make("div", { id: "fprf-flight", className: "fprf" });
-  const press = (text) => [...document.querySelectorAll("button")].find((each) => each.textContent.trim() === text)?.click();
   const edit = (key, action, after) => ask("/fprf/keys", { key, action }).then(() => after && press(after)).catch((error) => say(error.message, true));
   let flown = "";
   const fillFlight = ({ keys, chosen, film, playing }) => {
@@ -183,10 +203,12 @@
   // What has changed
   let version = -1;
   let film = false;
+  let pictures = -1;
   const follow = async () => {
     for (;;) {
       try {
         const answer = await fetch(`/fprf/state?after=${version}`);
+        if (answer.status === 404) { location.replace("/"); return; }
         if (!answer.ok) throw new Error(await answer.text());
         const state = await answer.json();
         state.said.forEach((text) => say(text, /error|cannot|must|none|not /.test(text)));
@@ -202,13 +224,22 @@
           line.append(make("a", { href: "/fprf/film", textContent: "download the film", style: "color:#9cc4ff" }));
         }
         film = state.film.ready;
+        acts.children[0].hidden = !state.gaussians;
+        acts.children[2].hidden = !state.start;
+        if (state.pictures > pictures && pictures >= 0) {
+          const href = `/fprf/picture?number=${state.pictures - 1}`;
+          if (awaited) download(href);
+          else say("", false, 20).append(make("a", { href, textContent: "download the picture", style: "color:#9cc4ff" }));
+          awaited = false;
+        }
+        pictures = state.pictures;
       } catch (error) {
         await new Promise((done) => setTimeout(done, 1500));
       }
     }
   };
   const begin = () => {
-    shelf.append(add);
+    shelf.append(add, acts);
     document.body.append(veil, shelf, wipe, region, flight, training, told, picker);
     follow();
   };

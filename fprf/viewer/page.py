@@ -65,6 +65,8 @@ class Page:
             ("GET", "/fprf/state"): self._state,
             ("GET", "/fprf/card"): self._thumbnail,
             ("GET", "/fprf/film"): self._film,
+            ("GET", "/fprf/picture"): self._picture,
+            ("GET", "/fprf/gaussians"): self._gaussians,
             ("GET", "/fprf/key"): self._key,
             ("POST", "/fprf/keys"): self._edit_key,
             ("POST", "/fprf/photograph"): self._upload,
@@ -112,7 +114,8 @@ class Page:
                     self._waiting.discard(entry)
         with self._lock:
             version, said = self._version, [text for at, text in self._messages if at > after >= 0]
-        return json_response({"version": version, "said": said, "start": self._start, **described(self._session.state)})
+        scene = {"start": self._start, "gaussians": self._session.in_browser}
+        return json_response({"version": version, "said": said, **scene, **described(self._session.state)})
 
     async def _thumbnail(self, request: Request) -> Response:
         photograph = _photograph(self._session.state, request.query)
@@ -122,9 +125,23 @@ class Page:
         path = self._session.state.film.path
         if path is None or not path.is_file():
             return Response(404, "text/plain; charset=utf-8", b"no film yet\n")
-        name = f"{path.parent.parent.parent.name}-{path.parent.name}.mp4"
-        plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in name)
-        return Response(200, "video/mp4", path.read_bytes(), {"content-disposition": f'attachment; filename="{plain}"'})
+        return self._download("video/mp4", path.read_bytes(), f"{path.parent.name}.mp4")
+
+    async def _picture(self, request: Request) -> Response:
+        pictures, number = self._session.state.pictures, _integer(request.query.get("number", ""))
+        if not 0 <= number < len(pictures):
+            return Response(404, "text/plain; charset=utf-8", b"no such picture\n")
+        return self._download("image/png", pictures[number].read_bytes(), pictures[number].name)
+
+    async def _gaussians(self, request: Request) -> Response:
+        data = await asyncio.to_thread(self._session.gaussians)
+        return self._download("application/octet-stream", data, "restyled.ply")
+
+    def _download(self, content_type: str, data: bytes, name: str) -> Response:
+        """A file to be saved under the scene's name and its own."""
+        whole = f"{self._session.viewed.name}-{name}"
+        plain = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in whole)
+        return Response(200, content_type, data, {"content-disposition": f'attachment; filename="{plain}"'})
 
     async def _key(self, request: Request) -> Response:
         number = _integer(request.query.get("key", ""))
@@ -234,6 +251,7 @@ def described(state: State) -> dict[str, Any]:
         "keys": [0 if key.thumbnail is None else key.thumbnail.number for key in state.keys],
         "chosen": state.selected_key,
         "playing": state.playing,
+        "pictures": len(state.pictures),
         "film": {"done": state.film.done, "total": state.film.total, "ready": state.film.path is not None},
     }
 

@@ -143,6 +143,8 @@ class Panel:
             for control in (self._wipe, self._blocks, self._pixels):  # what needs pictures that are rendered here, or fields
                 control.visible = not drawn_there
             view = self._gui.add_slider("fly to view", 0, max(1, len(names) - 1), 1, 0)
+            save = self._gui.add_button("Save a picture", hint="of this view, as large as it is here; a PNG")
+        self._on_press(save, self._save_picture)
         self._on_change(self._map, lambda value: lambda state: replace(state, map=cast(Map, value)))
         self._on_change(self._map_opacity, lambda value: lambda state: replace(state, map_opacity=float(value)))
         self._on_change(self._wipe, lambda value: lambda state: replace(state, wipe=_wipe(state, bool(value))))
@@ -157,6 +159,12 @@ class Panel:
                 self._move_camera(event.client, self._session.transform.camera_state(cameras, int(view.value)))
 
         view.on_update(fly)
+
+    def _save_picture(self, client: "viser.ClientHandle") -> None:
+        size = (client.camera.image_width, client.camera.image_height)
+        share = min(1.0, MAX_PIXELS / max(size))
+        width, height = (max(1, round(share * side)) for side in size)
+        self._session.save_picture(self._camera_of(client), (width, height), client.client_id)
 
     def _add_saved_looks(self) -> None:
         with self._gui.add_folder("Looks", expand_by_default=False):

@@ -8,15 +8,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from ..errors import FprfError, UsageError
 from ..interfaces import Scene
-from ..io.images import Picture, encode, shrink
+from ..io.images import Picture, encode, shrink, write_image
 from ..plugins.stylizers.config import RegionToneConfig
 from ..rendering.space import Space
+from ..splats.files import Capture, write_capture, write_gaussians
 from ..splats.scene import SplatScene
 from ..training.loading import Trained
 from ..training.run import Known, Run
@@ -30,6 +33,8 @@ from .state import Look, Photograph, State, Thumbnail, ViewSettings, add_photogr
 from .uploads import Uploads, shown_name
 
 __all__ = ["Frontend", "Session", "Viewed", "view_of_run"]
+
+T = TypeVar("T")
 
 _POLL = 0.5
 """Seconds between looks whether the worker is closed."""
@@ -48,7 +53,9 @@ class Viewed:
     captured: tuple[int, ...] = ()
     """Views from which it was trained."""
     root: Path | None = None
-    """Its run folder; None = a capture has none."""
+    """Folder for films and pictures: that of a run; None = there is none."""
+    capture: Capture | None = None
+    """The file of Gaussians that it was read from; None = it is a run."""
     space: Space | None = None
     """Of fields, in which blocks lie."""
     stylizer: RegionToneConfig | None = None
@@ -58,7 +65,7 @@ class Viewed:
 def view_of_run(scene: Scene, run: Run, known: Known) -> Viewed:
     """A run, beginning at the middle one of the views that training did not see."""
     views = known.test or known.train
-    return Viewed(scene, known.name, views[len(views) // 2], tuple(known.train), run.root, known.facts.space)
+    return Viewed(scene, known.name, views[len(views) // 2], tuple(known.train), run.root, space=known.facts.space)
 
 
 class Frontend(ABC):
@@ -217,24 +224,49 @@ class Session:
 
     def add_photograph(self, path: Path, name: str) -> Photograph:
         """Encode a photograph of this machine and restyle the scene with it."""
-        done: Future[Photograph] = Future()
 
-        def job() -> None:
-            try:
-                photograph = self.restyler.encode(path, _unused_name(name, self.state))
-                self.update(lambda state: add_photograph(state, photograph))
-                self._delete_unused(photograph)
-                done.set_result(photograph)
-            except Exception as error:
-                done.set_exception(error)
+        def add() -> Photograph:
+            photograph = self.restyler.encode(path, _unused_name(name, self.state))
+            self.update(lambda state: add_photograph(state, photograph))
+            self._delete_unused(photograph)
+            return photograph
 
-        self._worker.run(("add", path), job)
-        while True:  # waiting for ever would keep the process from ending
+        return self._result(("add", path), add)
+
+    def gaussians(self) -> bytes:
+        """The Gaussians in the look of now, as a .ply file. Raises UsageError for a scene without any."""
+        viewed, scene = self.viewed, self.viewed.scene
+        if not isinstance(scene, SplatScene):
+            raise UsageError(f"{viewed.name}: no Gaussians; `fprf export` makes some of a field")
+
+        def written() -> bytes:
+            path = self.uploads.folder / "restyled.ply"
+            shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
+            if viewed.capture is None:
+                write_gaussians(path, shown, antialiased=scene.antialiased)
+            else:
+                write_capture(path, viewed.capture, shown.harmonics)
+            return path.read_bytes()
+
+        return self._result("gaussians", written)
+
+    def save_picture(self, camera: CameraState, size: tuple[int, int], client: Hashable | None = None) -> None:
+        """Render what a camera sees, at a width and height, into the scene's folder while no client waits for a picture."""
+        cameras, root = self.transform.cameras([camera], size), self.viewed.root or self.uploads.folder
+
+        def work() -> Iterator[None]:
             try:
-                return done.result(_POLL)
-            except TimeoutError:
-                if self._worker.closed and not done.done():
-                    raise UsageError("the viewer is ending") from None
+                picture = yield from self.renderer.frame(cameras, 0, self.restyler.restyle(self.state.look))
+                folder = root / "pictures"
+                path = next(each for n in count(1) if not (each := folder / f"{n:04d}.png").exists())
+                folder.mkdir(parents=True, exist_ok=True)
+                write_image(path, picture)
+            except FprfError as error:
+                self.notify(f"picture: {error}", client)
+            else:
+                self.update(lambda state: replace(state, pictures=(*state.pictures, path)))
+
+        self._worker.run_when_idle(work())
 
     def pick(self, client: Hashable, place: tuple[float, float]) -> None:
         """Select the region at a click, given as shares of the client's width and height; none where there is nothing."""
@@ -291,6 +323,24 @@ class Session:
         self._thumbnails += 1
         return Thumbnail(self._thumbnails, shrink(picture, _THUMBNAIL))
 
+    def _result(self, name: Hashable, call: Callable[[], T]) -> T:
+        """What a call returns that runs on the worker. Raises what it raises."""
+        done: Future[T] = Future()
+
+        def job() -> None:
+            try:
+                done.set_result(call())
+            except Exception as error:
+                done.set_exception(error)
+
+        self._worker.run(name, job)
+        while True:  # waiting for ever would keep the process from ending
+            try:
+                return done.result(_POLL)
+            except TimeoutError:
+                if self._worker.closed and not done.done():
+                    raise UsageError("the viewer is ending") from None
+
     def _make_renderer(self) -> SceneRenderer:
         scene = self.viewed.scene
         if isinstance(scene, SplatScene):
@@ -309,9 +359,9 @@ class Session:
         self.restyler.retain(used)
 
     def _select(self, region: int | None) -> None:
-        count = self.restyler.regions
-        if region is not None and not 0 <= region < count:
-            raise UsageError(f"region {region}: regions go from 0 to {count - 1}")
+        regions = self.restyler.regions
+        if region is not None and not 0 <= region < regions:
+            raise UsageError(f"region {region}: regions go from 0 to {regions - 1}")
         picked = None if region is None else self.restyler.region_info(self.state.look, region)
         self.update(lambda state: replace(state, picked=picked))
 
@@ -347,8 +397,5 @@ class Session:
 
 def _unused_name(name: str, state: State) -> str:
     """The name, with a number where a photograph on the shelf has it already."""
-    taken, count, unused = {photograph.name for photograph in state.shelf}, 1, name
-    while unused in taken:
-        count += 1
-        unused = f"{name} ({count})"
-    return unused
+    taken = {photograph.name for photograph in state.shelf}
+    return name if name not in taken else next(each for n in count(2) if (each := f"{name} ({n})") not in taken)

@@ -313,6 +313,8 @@ class State:
     playing: bool = False
     """Whether a flight is shown to somebody."""
     film: FilmProgress = FilmProgress()
+    pictures: tuple[Path, ...] = ()
+    """Pictures that were saved."""
     pixels: int = 640
     """Longest side of the sharpest picture."""
     training: TrainingProgress | None = None

@@ -16,6 +16,7 @@ from fprf.errors import UsageError
 from fprf.io.images import to_uint8
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
+from fprf.splats.files import read_capture, write_capture, write_gaussians
 from fprf.splats.look_config import LookConfig
 from fprf.splats.scene import SplatScene, look_at_capture
 from fprf.style.files import StyleFile
@@ -78,7 +79,7 @@ def test_maps_and_a_picked_region_are_colours_too(opened: tuple[Session, Listene
     assert 0 < same.mean() < 1  # the region stands out, the others are dimmed
 
 
-def test_films_are_rasterised_here_and_captures_have_none(opened: tuple[Session, Listener], scene: SplatScene) -> None:
+def test_films_are_rasterised_here_into_the_scene_s_folder(opened: tuple[Session, Listener], scene: SplatScene) -> None:
     session, listener = opened
     keys = tuple(Key(session.transform.camera_state(scene.cameras, view), Look()) for view in (0, 1))
     plan = FilmPlan(keys, 0.1, 30.0, (32, 24))
@@ -92,7 +93,34 @@ def test_films_are_rasterised_here_and_captures_have_none(opened: tuple[Session,
     assert np.abs(shown - to_uint8(scene.render(cameras, 0).rgb)).mean() < 6  # what the codec leaves
     session.viewed = replace(session.viewed, root=None)
     session.record_film(plan)
-    listener.until(lambda: any("no run folder" in text for text in listener.said))
+    listener.until(lambda: any("no folder" in text for text in listener.said))
+
+
+def test_pictures_and_gaussians_in_the_look_of_now_are_files(
+    opened: tuple[Session, Listener], scene: SplatScene, world: World, tmp_path: Path
+) -> None:
+    session, listener = opened
+    session.upload(world.references[0].read_bytes(), "dusk.png")
+    styled = scene.restyled(session.restyler.restyle(session.state.look))
+    camera = session.transform.camera_state(scene.cameras, 0)
+    session.save_picture(camera, (48, 36))
+    listener.until(lambda: len(session.state.pictures) == 1)
+    [path] = session.state.pictures
+    assert path.parent.parent == tmp_path
+    shown = cv2.imread(str(path))[..., ::-1]
+    assert np.array_equal(shown, to_uint8(styled.render(session.transform.cameras([camera], (48, 36)), 0).rgb))
+    (tmp_path / "x.ply").write_bytes(session.gaussians())
+    again = read_capture(tmp_path / "x.ply").gaussians
+    assert torch.equal(again.harmonics, styled.shown.harmonics) and torch.equal(again.means, scene.gaussians.means)
+    assert not torch.equal(again.harmonics, scene.gaussians.harmonics)
+    # A capture keeps all that is not a colour, its Gaussians that are not finite included.
+    broken = replace(scene.gaussians, means=torch.cat([scene.gaussians.means[:-1], torch.full((1, 3), torch.nan)]))
+    write_gaussians(tmp_path / "y.ply", broken)
+    capture = read_capture(tmp_path / "y.ply")
+    write_capture(tmp_path / "z.ply", capture, styled.shown.harmonics[:-1])
+    whole = read_capture(tmp_path / "z.ply").gaussians
+    assert torch.equal(whole.harmonics[:-1], styled.shown.harmonics[:-1])
+    assert torch.equal(whole.harmonics[-1], broken.harmonics[-1]) and bool(whole.means[-1].isnan().all())
 
 
 def test_a_flight_moves_the_browser_s_camera(opened: tuple[Session, Listener], scene: SplatScene) -> None:
