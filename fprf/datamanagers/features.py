@@ -286,6 +286,8 @@ def extract(
     if basis is None and dim is not None:
         basis = _basis(folder, prints, image, encoder, dim, remembered)
     projection = digest(*(t.numpy().tobytes() for t in basis.tensors().values())) if basis else "raw"
+    device = _device(encoder)
+    place = () if device.type == "cpu" else (device.type,)  # other devices round otherwise, TF32 by 1e-3
     entries: dict[int, Entry] = {}
     keys = {}
     for done, view in enumerate(views):
@@ -294,7 +296,7 @@ def extract(
         pixels = image(view)
         radius, stride = _window(config, pixels.shape)
         settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
-        keys[view] = key = digest(prints[view], encoder.identity, settings, projection)
+        keys[view] = key = digest(prints[view], encoder.identity, settings, projection, *place)
         entry = read_entry(folder, key)
         if entry is None:
             features = remembered.get(view)
@@ -332,11 +334,16 @@ def _fingerprint(pixels: Annotated[Tensor, "H W 3"]) -> str:
     return digest(str(tuple(pixels.shape)), pixels.contiguous().numpy().tobytes())
 
 
+def _device(encoder: Encoder) -> torch.device:
+    """Where its parameters are; the CPU where it has none."""
+    weight = next(chain(encoder.parameters(), encoder.buffers()), None)
+    return torch.device("cpu") if weight is None else weight.device
+
+
 @torch.no_grad()
 def _encode(encoder: Encoder, pixels: Annotated[Tensor, "H W 3"], view: int) -> Annotated[Tensor, "C h w"]:
-    weight = next(chain(encoder.parameters(), encoder.buffers()), None)
     image = (pixels.float() / 255).permute(2, 0, 1)[None]
-    features: Tensor = encoder(image if weight is None else image.to(weight.device))
+    features: Tensor = encoder(image.to(_device(encoder)))
     if features.ndim != 4 or features.shape[:2] != (1, encoder.channels) or not features.numel():
         raise PluginError(
             f"encoder {encoder.identity}: features {tuple(features.shape)} of one image; "

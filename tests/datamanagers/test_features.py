@@ -185,6 +185,16 @@ def test_coefficients_on_a_device_answer_as_those_of_the_host(tmp_path: Path) ->
         assert torch.equal(there.at(*where), expected), "what is asked in host memory is answered there"
 
 
+def test_another_device_makes_files_of_its_own(tmp_path: Path) -> None:
+    encoder = Counting(4)
+    build(tmp_path, encoder)
+    with pretend_cuda():
+        encoder.to(CUDA)
+        build(tmp_path, encoder)
+        build(tmp_path, encoder)
+    assert encoder.calls == 2 * len(SIZES)
+
+
 def test_offsets_and_magnitudes_cost_no_accuracy(tmp_path: Path) -> None:
     plain, where = Counting(4), draw()
     small = build(tmp_path, plain)
