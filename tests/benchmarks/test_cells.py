@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from benchmarks.paper_styles import CELL, cell_dictionary, cells
-from fprf.errors import DataError
 from fprf.evaluation.single_image import encoded
-from fprf.style.dictionary import StyleDictionary, whole_style
+from fprf.style.dictionary import StyleDictionary
 from fprf.style.references import Encoders
 
 
@@ -55,34 +54,3 @@ def test_a_code_is_the_mean_of_its_cell(world: World, encoders: Encoders) -> Non
         for spread, values in ((d.covariance, content), (d.colour_covariance, colour)):
             expected = torch.cov(values[inside].T, correction=0)
             torch.testing.assert_close(spread[k].double(), expected, rtol=1e-3, atol=1e-5)
-
-
-def test_references_keep_their_order_and_their_shares(world: World, encoders: Encoders) -> None:
-    d = made(world, encoders, a=image(16, 16), b=image(24, 17, 1))
-    assert d.names == ("a", "b") and d.reference.tolist() == [0] * 4 + [1] * 6
-    for k in range(2):
-        assert float(d.share[d.reference == k].sum()) == pytest.approx(1)
-    assert float(d.share[4:].max()) > float(d.share[4:].min()), "the last column is nine pixels wide"
-    assert d.blend == 0.1 and bool((d.weight == 1).all())
-
-
-def test_cells_together_are_the_whole_photograph(world: World, encoders: Encoders) -> None:
-    picture = image(24, 32, 3)
-    values = encoded(picture, encoders.content, world.load().config.datamanager.guided).double()
-    for blend in (0.0, 0.4):
-        mean, spread = whole_style(made(world, encoders, blend, a=picture))
-        torch.testing.assert_close(mean, values.mean(0), rtol=1e-4, atol=1e-4)
-        torch.testing.assert_close(spread, torch.cov(values.T, correction=0), rtol=1e-3, atol=1e-3)
-
-
-def test_full_blend_leaves_one_style(world: World, encoders: Encoders) -> None:
-    d = made(world, encoders, 1.0, a=image(24, 32))
-    torch.testing.assert_close(d.mean, d.mean[:1].expand_as(d.mean))
-    torch.testing.assert_close(d.covariance, d.covariance[:1].expand_as(d.covariance))
-    assert float((d.keys - d.keys[0]).abs().max()) > 0.01, "they are still told apart"
-
-
-def test_scenes_without_semantics_have_no_cells(world: World, encoders: Encoders) -> None:
-    for missing in (encoders._replace(semantic=None), encoders._replace(basis=None)):
-        with pytest.raises(DataError, match="no semantics"):
-            cell_dictionary({"a": image(16, 16)}, world.load(), missing)

@@ -2,7 +2,6 @@ import pytest
 import torch
 
 from benchmarks.false_edges import false_edges
-from fprf.errors import DataError
 
 H, W, REACH = 36, 48, 3
 
@@ -24,17 +23,3 @@ def test_a_style_that_ends_on_a_wall_cuts_the_pairs_across() -> None:
     pairs = H * (W - REACH) + (H - REACH) * W
     # Both pictures are blurred by a pixel, so that pairs which only touch the border count as well.
     assert false_edges(plain, styled) == pytest.approx(H * (REACH + 1) / pairs, rel=0.3)
-
-
-def test_it_is_no_cut_where_the_scene_has_an_edge() -> None:
-    plain, styled = wall(), wall()
-    plain[:, : W // 2] -= 0.3
-    styled[:, : W // 2, 0] += 0.5
-    assert false_edges(plain, styled) == 0
-
-
-def test_pictures_without_surfaces_and_of_other_sizes() -> None:
-    noise = (torch.arange(H)[:, None] // 3 % 2 + torch.arange(W) // 3 % 2).float()[..., None].repeat(1, 1, 3)
-    assert false_edges(noise, noise) is None
-    with pytest.raises(DataError, match="one size"):
-        false_edges(noise, noise[1:])

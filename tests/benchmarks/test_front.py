@@ -1,4 +1,3 @@
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -41,22 +40,3 @@ def test_the_front_goes_from_fast_to_exact(points: list[Point]) -> None:
     times = [p.seconds.median for p in chosen]
     errors = [p.rms for p in chosen]
     assert times == sorted(set(times)) and errors == sorted(set(errors), key=lambda e: -(e or 0.0))
-
-
-def test_more_can_be_better() -> None:
-    points = [
-        point(1.0, None, 20.0, "a"),
-        point(2.0, None, 19.0, "b"),
-        point(3.0, None, 25.0, "c"),
-        point(0.5, None, None, "d"),
-    ]
-    chosen = front(points, lambda p: None if p.psnr is None else -p.psnr)
-    assert [p.value for p in chosen] == ["a", "c"]
-
-
-def test_json_leaves_out_what_is_not_known() -> None:
-    known = point(0.25, None, 21.123456).json()
-    assert known == {
-        "knob": "k", "value": "x", "milliseconds": 250.0, "low": 250.0, "high": 250.0, "rays_per_second": 4.0, "psnr": 21.123,
-    }  # fmt: skip
-    assert point(1.0, 0.5).json()["rms_error"] == pytest.approx(0.5) and point(1.0, 0.5).name == "k x"

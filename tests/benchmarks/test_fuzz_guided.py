@@ -35,14 +35,6 @@ def test_faults_are_told_with_their_bytes_and_the_search_goes_on(
     assert found["faults"] == [{"said": "KeyError: 'w'", "bytes": ["AAE="]}]
 
 
-def test_a_reader_that_always_fails_is_left_after_ten(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(script, "run", lambda name, corpus, options: (1, "no such module"))
-    found = script.search("a reader", tmp_path / "corpus", 60.0)
-    assert len(found["faults"]) == 10 and found["faults"][0]["said"] == "no such module"
-
-
 def test_a_corpus_is_sealed_into_the_same_bytes(script: ModuleType, tmp_path: Path) -> None:
     corpus = tmp_path / "corpus"
     (corpus / "b").mkdir(parents=True)

@@ -1,6 +1,5 @@
 """`benchmarks/gpu.sh`: which commands it runs, that it goes on where one fails, and what its JSON then holds."""
 
-import importlib.metadata as metadata
 import json
 import os
 import subprocess
@@ -9,10 +8,6 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-
-from fprf.cli.parsing import parse
-from fprf.methods import fprf
-from fprf.plugins.encoders.config import BundledSemanticConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -84,33 +79,6 @@ def test_a_failed_step_is_reported_and_the_others_go_on(
         assert rows["stylised, local-adain, frames of 1008x756"]["goal"] == 60
         assert rows["a new style to its first frame"]["goal"] == 100
         assert any("against reference" in name and {"peer", "error", "peer_error"} <= rows[name].keys() for name in rows)
-
-
-@pytest.mark.parametrize("named", [(), ("--", "--semantic.encoder", "random")])
-def test_a_scene_is_trained_on_the_card_with_the_bundled_semantics_or_those_that_are_named(
-    tmp_path: Path, named: tuple[str, ...]
-) -> None:
-    code, commands = script(tmp_path / "run", "--scene", "flower", "--minutes", "2.5", *named)
-    assert code == 1 and len(commands) == 7, "torch is asked for a card first"
-    train = commands[2][4:]
-    config = parse(fprf(), train, prog="x", description="")
-    assert config.minutes == 2.5 and config.device == "cuda:0" and config.data == Path("flower")
-    assert isinstance(config.semantic.encoder, BundledSemanticConfig) == (not named)
-    assert "not pretended" in commands[1]
-    for command in commands[3:]:
-        assert command[command.index("--device") + 1] == "cuda:0"
-
-
-@pytest.mark.parametrize("words", [["--what"], []])
-def test_wrong_words_are_the_users_mistake(tmp_path: Path, words: list[str]) -> None:
-    assert script(tmp_path, *words) == (2, [])
-
-
-def test_a_checkout_that_is_not_installed_is_registered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module("gpu_check", monkeypatch).register(tmp_path)
-    (made,) = metadata.distributions(path=[str(tmp_path)])
-    assert made.metadata["Name"] == "fprf" and {"fprf.methods", "fprf.encoders"} <= made.entry_points.groups
-    assert all(callable(point.load()) for point in made.entry_points)
 
 
 @pytest.mark.slow

@@ -2,20 +2,14 @@
 
 import json
 import shutil
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from tiny_world import World
 
 from benchmarks.__main__ import main
-from benchmarks.paper import TRAINED, SceneDecoderConfig
-from fprf.config import TrainConfig
-from fprf.methods import fprf_lite
-from fprf.plugins.codec import to_json
+from benchmarks.paper import SceneDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig
 
 SMALL = ["--steps", "2", "--views", "1", "--palettes", "night", "--device", "cpu"]
@@ -29,56 +23,12 @@ def table(world: World, name: str, output: Path, *more: str) -> dict[str, Any]:
     return document
 
 
-def test_rows_are_trainings_with_one_thing_changed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = tmp_path / "page.md"
-    rows = table(world, "ablation", tmp_path / "a.json", "--page", str(page))["rows"]
-    assert list(rows) == list(TRAINED["ablation"])
-    for row in rows.values():
-        assert (
-            row["psnr"] > 5
-            and row["train_seconds"] > 0
-            and row["styled_psnr"] > 3
-            and row["paper_styled_psnr"] > 3
-            and 0 <= row["match_border"] <= 1
-        )
-    assert rows["as it is"]["psnr"] != rows["without pre-trained decoder"]["psnr"]
-    text = page.read_text()
-    assert text.startswith("# Ablation") and "without either" in text and text in capsys.readouterr().out
-
-
-def test_clusters_share_one_training(world: World, tmp_path: Path) -> None:
-    rows = table(world, "clusters", tmp_path / "a.json", "--clusters", "1", "3")["rows"]
-    assert list(rows)[:2] == ["1 clusters", "3 clusters"] and len(rows) == 6
-    assert all("psnr" not in row and row["style_seconds"] > 0 for row in rows.values())
-    assert rows["1 clusters"]["styled_psnr"] != rows["3 clusters"]["styled_psnr"]
-    cells, clusters = (rows[f"local-adain, {codes}"] for codes in ("every cell a code", "clusters"))
-    assert cells["styled_psnr"] != clusters["styled_psnr"] and 0 < cells["match_inside"] <= 1
-
-
 def test_statistics_of_views_differ_from_the_scenes(world: World, tmp_path: Path) -> None:
     rows = table(world, "statistics", tmp_path / "a.json", "--run", str(world.run))["rows"]
     for name in ("adain", "local-adain", "region-tone"):
         shared, alone = rows[f"{name}, of the scene"], rows[f"{name}, of each view"]
         assert shared["styled_psnr"] != alone["styled_psnr"]
         assert shared["consistency"] is not None and alone["consistency"] is not None
-
-
-def test_far_views_are_compared_on_one_path(world: World, tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    rows = table(world, "large-scale", tmp_path / "a.json", "--run", str(world.run), "--page", str(page))["rows"]
-    assert list(rows) == ["no change", "2d, every picture alone", "adain", "local-adain", "region-tone", "region-ot"]
-    assert rows["no change"]["consistency"] == 0 and rows["no change"]["structure"] == pytest.approx(1)
-    assert all(row["consistency"] >= 0 and row["structure"] <= 1 for row in rows.values())
-    assert page.read_text().startswith("# Large-scale") and "seven frames on" in page.read_text()
-
-
-def test_tables_of_styles_need_a_town(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = shared / "data/scenes/street_lund"
-    if not scene.is_dir():
-        pytest.skip("no such scene")
-    args = ["paper", "--table", "clusters", "--data", str(scene), "--downscale", "16", *SMALL]
-    assert main(args) == 2
-    assert "judged by a town's truth" in capsys.readouterr().err
 
 
 def test_a_decoder_of_the_scene_starts_grey_and_learns() -> None:
@@ -122,39 +72,3 @@ def test_other_scenes_are_restyled_by_photographs(world: World, tmp_path: Path) 
 
 
 DECODER, CONTENT, GUIDE = "content.decoder.type", "loss.content", "datamanager.guided.radius"
-CHANGED = {
-    ("reconstruction", "frozen decoder"): set(),
-    ("reconstruction", "frozen and residual"): {DECODER},
-    ("reconstruction", "decoder trained with the scene"): {DECODER},
-    ("ablation", "as it is"): set(),
-    ("ablation", "without content loss"): {CONTENT},
-    ("ablation", "without pre-trained decoder"): {DECODER},
-    ("ablation", "without either"): {DECODER, CONTENT},
-    ("guided-filter", "with guided filter"): set(),
-    ("guided-filter", "without"): {GUIDE},
-}
-
-
-def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from leaves(inner, f"{name}.{key}" if name else key)
-    else:
-        yield name, value
-
-
-def flat(config: TrainConfig) -> dict[str, Any]:
-    """Every field by name; the decoder of tables is no plug-in and goes by its class."""
-    kind = type(config.content.decoder).__name__
-    if isinstance(config.content.decoder, SceneDecoderConfig):
-        config = replace(config, content=replace(config.content, decoder=fprf_lite().content.decoder))
-    return dict(leaves(to_json(config))) | {DECODER: kind}
-
-
-@pytest.mark.parametrize(("table", "row"), [(table, row) for table, rows in TRAINED.items() for row in rows])
-def test_a_row_changes_what_it_says(table: str, row: str) -> None:
-    before, after = flat(fprf_lite()), flat(TRAINED[table][row](fprf_lite()))
-    differs = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
-    expected = CHANGED[(table, row)]
-    assert {name for name in differs if not name.startswith("content.decoder.") or name == DECODER} == expected
-    assert after[CONTENT] == (0.0 if CONTENT in expected else before[CONTENT])

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from benchmarks.semantic_matching import Triplet, class_match, matching_rate, palette_match, semantic_matching, shared_regions
+from benchmarks.semantic_matching import Triplet, class_match, matching_rate, semantic_matching
 from fprf.errors import DataError
 from fprf.evaluation.style_distance import MIXED, whole_cells
 from fprf.interfaces import Encoder
@@ -80,18 +80,6 @@ def test_the_rate_ignores_scale_and_common_offset() -> None:
     assert matching_rate(7 * a + 2, 7 * b + 2, la, lb, [0, 1, 2]) == plain
 
 
-def test_a_region_without_cells_is_named() -> None:
-    with pytest.raises(DataError, match="region 4"):
-        matching_rate(torch.ones(2, 2), torch.ones(2, 2), torch.tensor([0, 4]), torch.tensor([0, 0]), [0, 4])
-
-
-def test_cells_are_whole_or_mixed() -> None:
-    regions = halves(8, 12, at=5)
-    assert whole_cells(regions, (4, 6)).tolist() == [[0, 0, MIXED, 1, 1, 1]] * 4
-    assert whole_cells(regions, (8, 12)).equal(regions)
-    assert whole_cells(regions, (1, 1)).tolist() == [[MIXED]]
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 1000), st.integers(3, 20), st.integers(3, 20), st.integers(1, 3), st.integers(1, 3))
 def test_a_whole_cell_holds_nothing_else(seed: int, height: int, width: int, h: int, w: int) -> None:
@@ -119,24 +107,6 @@ def test_colours_that_tell_the_parts_match_and_swapped_ones_do_not() -> None:
         semantic_matching(Shades(8), [single])
 
 
-def test_a_fine_encoder_is_averaged_to_eight_pixels() -> None:
-    regions = halves()
-    noise = torch.rand(64, 96, 3, generator=torch.Generator().manual_seed(1))
-    image = painted(regions, {0: (0.8, 0.5, 0.5), 1: (0.5, 0.5, 0.8)}) * 0.3 + noise
-    triplet = Triplet("one", image, image.flip(0), regions, regions)
-    assert semantic_matching(Shades(1), [triplet])["matching"] == semantic_matching(Shades(8), [triplet])["matching"]
-
-
-def test_slivers_are_no_shared_regions() -> None:
-    regions = halves()
-    thin = regions.clone()
-    thin[:, :3] = 8
-    image = torch.rand(64, 96, 3)
-    assert shared_regions(Triplet("thin", image, image, thin, thin)) == [0, 1]
-    gone = torch.where(regions == 1, 5, regions)
-    assert shared_regions(Triplet("gone", image, image, regions, gone)) == [0]
-
-
 def test_classes_are_found_in_another_light() -> None:
     draw = torch.Generator().manual_seed(2)
     labels = torch.arange(60) % 3
@@ -145,21 +115,3 @@ def test_classes_are_found_in_another_light() -> None:
     assert class_match(night, labels, day, labels) == (1.0, {0: 1.0, 1: 1.0, 2: 1.0})
     turned = (labels + 1) % 3
     assert class_match(night, turned, day, labels)[0] == 0.0
-
-
-def test_mixed_cells_and_unknown_classes_do_not_count() -> None:
-    features = torch.eye(4)[[0, 1, 2, 3]]
-    known_labels, labels = torch.tensor([0, 1, MIXED, MIXED]), torch.tensor([0, 1, MIXED, 7])
-    share, kinds = class_match(features, labels, features, known_labels)
-    assert (share, kinds) == (1.0, {0: 1.0, 1: 1.0})
-    with pytest.raises(DataError, match="no cell of a class"):
-        class_match(features, torch.full((4,), 9), features, known_labels)
-
-
-def test_palettes_are_averaged_without_the_known_one() -> None:
-    labels = torch.tensor([0, 0, 1, 1])
-    day = torch.tensor([[1.0, 0.0], [1.0, 0.1], [0.0, 1.0], [0.1, 1.0]])
-    found = palette_match({"day": (day, labels), "night": (day, labels), "odd": (day.flip(0), labels)}, "day")
-    assert found == {"match": 0.5, "class_mean": 0.5, "itself": 1.0, "per_palette": {"night": 1.0, "odd": 0.0}}
-    with pytest.raises(DataError, match="only palette"):
-        palette_match({"day": (day, labels)}, "day")
