@@ -3,12 +3,9 @@
 from pathlib import Path
 
 import pytest
-from tiny_world import World
 
 from fprf.errors import UsageError
-from fprf.export.config import KINDS, Named, make_looks, named_styles, plan
-from fprf.style.config import StyleConfig
-from fprf.style.files import StyleFile
+from fprf.export.config import KINDS, plan
 
 
 def test_a_folder_takes_all_kinds_or_those_that_are_named(tmp_path: Path) -> None:
@@ -43,29 +40,3 @@ def test_a_file_holds_what_its_ending_says(kinds: list[str], name: str, kind: st
 def test_mistakes(kinds: list[str], output: str, told: str) -> None:
     with pytest.raises(UsageError, match=told):
         plan(kinds, Path(output))
-
-
-def test_photographs_take_the_other_settings_and_leave_what_names_photographs() -> None:
-    base = StyleFile(StyleConfig(references=(Path("a.jpg"),), weights=(2.0,), strength=0.5, pin=("0=a.jpg",), keep=("1",)))
-    [one, two] = named_styles(["dusk=b.jpg", "snow=c.jpg,d.jpg"], base)
-    assert (one.name, two.name) == ("dusk", "snow")
-    assert one.file.style.references == (Path("b.jpg"),) and two.file.style.references == (Path("c.jpg"), Path("d.jpg"))
-    assert two.file.style.strength == 0.5 and two.file.style.keep == ("1",)
-    assert two.file.style.weights == () and two.file.style.pin == ()
-
-
-@pytest.mark.parametrize("text", ["dusk", "=a.jpg", "dusk=", "du sk=a.jpg", "../x=a.jpg"])
-def test_other_forms_are_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"write NAME=PHOTO,PHOTO or NAME=STYLE\.json"):
-        named_styles([text], StyleFile(StyleConfig()))
-
-
-def test_looks_of_a_run(world: World) -> None:
-    trained = world.load()
-    file = StyleFile(StyleConfig(references=world.references))
-    looks = make_looks(trained, [Named("a", file), Named("b", file)])
-    assert [look.name for look in looks] == ["", "a", "b"]
-    assert looks[0].restyle is None and looks[1].restyle is not None
-    assert [look.name for look in make_looks(trained, [])] == [""]
-    with pytest.raises(UsageError, match="two styles of this name"):
-        make_looks(trained, [Named("a", file), Named("a", file)])

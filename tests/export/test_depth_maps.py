@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from analytic import RADIUS, globe, plane_depth, ring
+from analytic import plane_depth, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
@@ -12,14 +12,12 @@ from tiny_world import World
 from fprf.export.colours import Coloured, point_colours, single_view
 from fprf.export.depth_maps import (
     DepthMaps,
-    default_reach,
     depth_gaps,
     ray_quantile,
     render_depth_maps,
     surface_points,
 )
 from fprf.rendering.cameras import pixel_grid, rays_through
-from fprf.rendering.space import Space
 from fprf.style.look import Restyle
 from fprf.training.views import render_view
 
@@ -56,15 +54,6 @@ def test_normals_at_an_edge_are_those_of_the_pixels_own_surface() -> None:
     assert torch.allclose(seen.normal.double(), back.expand(80, 3), atol=1e-6)
 
 
-def test_what_is_a_pixel_thin_faces_the_camera() -> None:
-    cameras = ring(1, size=(9, 9))
-    depth = torch.full((9, 9), torch.inf)
-    depth[:, 4] = 2.0
-    seen = surface_points(DepthMaps(cameras, (depth,)), 0)
-    assert len(seen.point) == 7
-    assert bool((seen.facing > 0.99).all())
-
-
 @settings(deadline=None)
 @given(offset=st.floats(-0.5, 0.5))
 def test_the_gap_is_how_far_in_front_of_the_surface_a_point_is(offset: float) -> None:
@@ -79,18 +68,6 @@ def test_the_gap_is_how_far_in_front_of_the_surface_a_point_is(offset: float) ->
     # 1/distance of a plane is linear up to the cosine's curvature over a pixel, (1/focal)^2 / 8 of it a direction.
     assert torch.allclose(gap, torch.full_like(gap, offset), atol=3 * 3 / 4 / 50**2)
     assert torch.allclose(distance, there - offset, atol=1e-9)
-
-
-def test_gaps_outside_and_towards_the_sky() -> None:
-    maps = globe(4)
-    place = maps.cameras.pose[0, :, 3]
-    _, corner = rays_through(maps.cameras, torch.tensor([0]), torch.tensor([[2.0, 2.0]]))
-    points = torch.stack([2 * place, torch.zeros(3, dtype=torch.float64), place + 2 * corner[0]])
-    gap, distance = depth_gaps(maps, 0, points)
-    assert bool(gap[0].isnan()), "behind the camera"
-    assert float(gap[1]) == pytest.approx(-RADIUS, abs=2e-3), "hidden inside the sphere"
-    assert bool(gap[2].isinf()) and float(gap[2]) > 0, "floating before the sky"
-    assert torch.allclose(distance, (points - place).norm(dim=-1))
 
 
 def test_lookups_do_not_mix_two_surfaces() -> None:
@@ -117,13 +94,6 @@ def test_half_way_is_where_that_much_weight_has_been_met(seed: int, share: float
     for ray in range(4):
         part = ((found[ray] - t[ray, :-1]) / (t[ray, 1:] - t[ray, :-1])).clamp(0, 1)
         assert float((weights[ray] * part).sum()) == pytest.approx(share, abs=1e-9)
-
-
-def test_reach() -> None:
-    turn = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    assert default_reach(Space("contraction", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == 40
-    assert default_reach(Space("ndc", (0.0, 0.0, 0.0), turn, 1.0, 2.0, 1.0)) == 100
-    assert default_reach(Space("box", (0.0, 0.0, 0.0), turn, 0.5, 0.05, 1e3)) == math.inf
 
 
 def test_depth_maps_are_world_distances_at_a_bounded_size(world: World) -> None:

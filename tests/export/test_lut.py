@@ -113,16 +113,6 @@ def pairs_of(world: World, *styles: Restyle) -> ColourPairs:
     return colour_pairs(trained.model, scene, known.cameras, known.train, trained.config.render, styles, rays=2000)
 
 
-def test_pairs_are_colours_of_pixels_and_shares_of_regions(world: World) -> None:
-    found = pairs_of(world, style(world), Restyle(style(world).stylizer, 0.0))
-    assert found.plain.shape == (2000, 3) and found.styled.shape == (2, 2000, 3)
-    assert torch.equal(found.styled[1], found.plain), "strength 0 is the scene itself"
-    assert float((found.styled[0] - found.plain).abs().mean()) > 0.01
-    assert found.share.shape == (2000, len(load_style(world.load().run)[0].share))
-    total = found.share.sum(1)
-    assert float(total.amax()) < 1 + 1e-5 and float(found.share.amin()) >= 0
-
-
 def test_a_table_does_to_pictures_most_of_what_the_style_does(world: World) -> None:
     """Applied to the plain render of a test view, it is far closer to the restyled one than no table is.
 

@@ -8,13 +8,10 @@ import torch
 import trimesh
 from analytic import RADIUS, globe
 
-from fprf.errors import DataError
 from fprf.export.mesh import (
     Mesh,
     build_mesh,
     components,
-    integrate,
-    lattice_near,
     surface_nets,
     write_mesh_glb,
     write_mesh_ply,
@@ -47,18 +44,6 @@ def test_surface_nets_of_a_ball_are_closed_and_turned_outwards(radius: float) ->
     assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.12), "negative if it were inside out"
 
 
-def test_distances_are_positive_outside() -> None:
-    maps = globe(10)
-    cell, origin, edge = lattice_near(fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2), 0.1, 10**6)
-    lattice = integrate(maps, cell, origin, edge)
-    away = (origin + edge * lattice.cell.double()).norm(dim=1) - RADIUS
-    clear = away.abs() > 0.06
-    agrees = (lattice.value > 0) == (away > 0)
-    assert float(agrees[clear].double().mean()) > 0.97 and lattice.value.abs().amax() <= 1
-    coarse = lattice_near(fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2), 0.1, 20_000)
-    assert len(coarse[0]) <= 20_000 and coarse[2] > 0.1, "wider until it fits"
-
-
 def test_the_mesh_lies_on_the_sphere_with_its_normals(mesh: Mesh) -> None:
     away = mesh.point.norm(dim=1)
     assert float((away - RADIUS).abs().quantile(0.95)) < 0.03
@@ -66,13 +51,6 @@ def test_the_mesh_lies_on_the_sphere_with_its_normals(mesh: Mesh) -> None:
     assert float((outwards * mesh.normal).sum(1).quantile(0.05)) > 0.9
     assert torch.allclose(mesh.normal.norm(dim=1), torch.ones(len(mesh.point)), atol=1e-5)
     assert int(mesh.face.amax()) == len(mesh.point) - 1 and len(torch.unique(mesh.face)) == len(mesh.point)
-
-
-def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake() -> None:
-    maps = globe(10)
-    cloud = fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
-    with pytest.raises(DataError, match="no surface for a mesh; raise --mesh-edge"):
-        build_mesh(maps, cloud, edge=50.0)
 
 
 def test_components_of_three_balls() -> None:

@@ -44,14 +44,3 @@ def test_our_own_parser_reads_the_cameras_back(tmp_path: Path, kind: str) -> Non
         assert torch.equal(getattr(scene.cameras, name), getattr(cameras, name)), name
     assert torch.allclose(scene.cameras.pose, cameras.pose, atol=1e-12)
     assert scene.train.tolist() == [1, 2, 4] and scene.test.tolist() == [0, 3]
-
-
-def test_what_nerfstudio_looks_for(tmp_path: Path) -> None:
-    document = written(tmp_path, ring(5), cloud="points.ply")
-    assert document["camera_model"] == "PINHOLE" and document["ply_file_path"] == "points.ply"
-    assert document["w"] == 48 and document["h"] == 40 and document["cx"] == 24.0
-    assert document["train_filenames"] == ["images/01.png", "images/02.png", "images/04.png"]
-    assert document["val_filenames"] == document["test_filenames"] == ["images/00.png", "images/03.png"]
-    frames = document["frames"]
-    assert isinstance(frames, list) and np.array(frames[0]["transform_matrix"]).shape == (4, 4)
-    assert frames[0]["transform_matrix"][3] == [0.0, 0.0, 0.0, 1.0]
