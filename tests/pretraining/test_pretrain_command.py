@@ -12,12 +12,11 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fprf.cli.pretrain import run
-from fprf.errors import UsageError
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig
 from fprf.plugins.weights import read_weights
 from fprf.pretraining.config import PretrainConfig
-from fprf.pretraining.loop import checkpoint_path, generator_of, train
+from fprf.pretraining.loop import checkpoint_path, train
 
 QUICK = ["--steps", "2", "--batch", "2"]
 
@@ -98,27 +97,6 @@ def test_content_and_decoder_repeat_exactly(photos: str, tmp_path: Path, capsys:
     assert all(torch.equal(value, second[0][name]) for name, value in first[0].items())
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        ([], "allowed are content, semantic, decoder"),
-        (["field"], "'field' to train"),
-        (["content"], "--images DIR"),
-        (["content", "--images", "."], "--output FILE"),
-        (["decoder", "--images", ".", "--teachers", "x"], "--teachers"),
-    ],
-)
-def test_mistakes(args: list[str], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        run(args)
-
-
-@pytest.mark.parametrize("kind", ["content", "semantic"])
-def test_distilling_needs_teachers(kind: str, photos: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--teachers"):
-        run([kind, "--images", photos, "--output", str(tmp_path / "w.safetensors")])
-
-
 def quadratic(network: nn.Linear, broken_at: int | None = None) -> Callable[[torch.Generator], Tensor]:
     calls = [0]
 
@@ -161,13 +139,3 @@ def test_a_checkpoint_of_another_config_is_not_resumed(tmp_path: Path, monkeypat
     said: list[str] = []
     train(network(), quadratic(net), PretrainConfig(steps=1, seed=1), output, said.append)
     assert not said[0].startswith("resumed")
-
-
-def test_a_time_limit_ends_a_run(tmp_path: Path) -> None:
-    net = network()
-    assert train(net, quadratic(net), PretrainConfig(minutes=0.002), tmp_path / "w.safetensors", lambda _: None) >= 1
-
-
-def test_generators_differ_by_seed_and_step() -> None:
-    draws = {float(torch.rand(1, generator=generator_of(seed, step))) for seed in range(3) for step in range(3)}
-    assert len(draws) == 9

@@ -12,12 +12,11 @@ from photo_folder import photo_folder
 from safetensors.torch import save_file
 
 from fprf.cli.pretrain import run
-from fprf.errors import ConfigError, WeightsError
+from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.plugins.weights import read_weights
-from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.pretraining.loop import report_path, samples_folder
 from fprf.training.model import build_decoder
 
@@ -59,17 +58,6 @@ def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: P
     assert styled["psnr_db"] < plain["psnr_db"] - 3, "what the style gains, the identity pays"
 
 
-@pytest.mark.parametrize(
-    "second", [["--crops", "3"], ["--size", "20"], ["--pairs", "2"], ["--every", "1"], ["--content", "0.1"], ["--style", "0.5"]]
-)
-def test_every_knob_of_the_losses_changes_the_weights(second: list[str], photos: str, vgg: str, tmp_path: Path) -> None:
-    base = ["--steps", "6", "--samples", "0", "--style-weights", vgg, "--style", "0.1", "--every", "2"]
-    made(photos, tmp_path / "a.safetensors", *base)
-    made(photos, tmp_path / "b.safetensors", *base, *second)
-    first, other = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
-    assert any(not torch.equal(first[name], other[name]) for name in first)
-
-
 def test_runs_with_a_style_repeat_exactly(photos: str, vgg: str, tmp_path: Path) -> None:
     for name in "ab":
         made(
@@ -86,11 +74,6 @@ def test_without_weights_for_it_no_style_is_measured(photos: str, vgg: str, tmp_
     assert measured["style_loss"] > 0
     first, second = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
     assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
-
-
-def test_absent_style_weights_are_named(photos: str, tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
-        made(photos, tmp_path / "d.safetensors", "--style", "1", "--style-weights", "absent.safetensors")
 
 
 def test_the_report_says_what_was_done(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,20 +97,6 @@ def test_samples_are_pictures_of_photo_decoded_and_restyled(photos: str, tmp_pat
     assert len({picture.shape for picture in pictures}) == 1
     assert pictures[0].shape[1] > 3 * 60
     assert (pictures[0] != pictures[-1]).any()
-
-
-def test_no_samples_where_nobody_wants_them(photos: str, tmp_path: Path) -> None:
-    output = tmp_path / "decoder.safetensors"
-    made(photos, output, "--steps", "2", "--samples", "0")
-    assert {file.name for file in tmp_path.iterdir()} == {"decoder.safetensors", "decoder.report.json"}
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"style": -1}, {"content": -0.1}, {"crops": 1}, {"size": 4}, {"pairs": 0}, {"every": 0}, {"samples": -1}]
-)
-def test_ranges(wrong: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        PretrainDecoderConfig(**wrong)  # type: ignore[arg-type]
 
 
 def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: str, tmp_path: Path) -> None:

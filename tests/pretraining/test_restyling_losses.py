@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from photo_folder import photo_folder
 from safetensors.torch import save_file
 
-from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import WeightsError
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.pretraining.loop import GAP, sheet
-from fprf.pretraining.photos import filtered_crop, filtered_whole, find_photos, load_photo
+from fprf.pretraining.photos import find_photos, load_photo
 from fprf.pretraining.restyling import (
     CONTENT,
     StyleNetwork,
@@ -101,12 +99,6 @@ def test_style_statistics_and_their_distance(seed: int, shift: float, gain: floa
     assert float(style_distance([own, own], [own, own])) == 0
 
 
-def test_a_constant_filter_has_a_finite_gradient() -> None:
-    x = torch.zeros(1, 3, 4, 4, requires_grad=True)
-    style_distance(style_statistics([x]), [torch.ones(1, 6)]).backward()  # type: ignore[no-untyped-call]
-    assert x.grad is not None and bool(x.grad.isfinite().all())
-
-
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 99), channels=st.integers(1, 6))
 def test_adain_gives_the_style_its_mean_and_deviation(seed: int, channels: int) -> None:
@@ -123,21 +115,6 @@ def test_adain_gives_the_style_its_mean_and_deviation(seed: int, channels: int) 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return find_photos([photo_folder(tmp_path_factory.mktemp("photos") / "all", 4)])
-
-
-def test_a_crop_is_a_part_of_the_whole(photos: list[Path]) -> None:
-    photo, encoder = load_photo(photos[0]), RandomConfig(channels=3, stride=2).build()
-    features, rgb = filtered_crop(encoder, photo, 20, GuidedConfig(), torch.Generator().manual_seed(0))
-    whole = filtered_whole(encoder, photo, GuidedConfig()).view(*photo.shape[:2], 3)
-    matches = [
-        (y, x)
-        for y in range(photo.shape[0] - 19)
-        for x in range(photo.shape[1] - 19)
-        if torch.equal(photo[y : y + 20, x : x + 20].reshape(-1, 3), rgb)
-    ]
-    assert len(matches) == 1
-    ((y, x),) = matches
-    torch.testing.assert_close(features, whole[y : y + 20, x : x + 20].reshape(-1, 3), rtol=1e-4, atol=1e-5)
 
 
 def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: list[Path]) -> None:
@@ -183,18 +160,3 @@ def test_gradients_reach_the_decoder_alone(photos: list[Path]) -> None:
     for loss in losses:
         (gradient,) = torch.autograd.grad(loss, [decoder.weight], retain_graph=True)
         assert bool(gradient.isfinite().all()) and float(gradient.abs().sum()) > 0
-
-
-@settings(max_examples=20, deadline=None)
-@given(
-    sizes=st.lists(st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=3), min_size=1, max_size=3)
-)
-def test_a_sheet_holds_every_picture(sizes: list[list[tuple[int, int]]]) -> None:
-    rows = [[torch.full((h, w, 3), (y * 3 + x + 1) / 20) for x, (h, w) in enumerate(row)] for y, row in enumerate(sizes)]
-    whole = sheet(rows)
-    for y, row in enumerate(rows):
-        for x, picture in enumerate(row):
-            assert int((whole[..., 0] == picture[0, 0, 0]).sum()) == picture[..., 0].numel(), (y, x)
-    height = sum(max(h for h, _ in row) for row in sizes) + GAP * (len(rows) - 1)
-    assert whole.shape[0] == height
-    assert float(whole.max()) == (1.0 if whole.shape[:2] != rows[0][0].shape[:2] else float(rows[0][0].max()))
