@@ -12,13 +12,9 @@ from fprf.config import TrainConfig
 from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
-from fprf.plugins.decoders.decoders import DECODER_KIND, MlpDecoder
 from fprf.plugins.decoders.remedy import pretrain_line
 from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, EncoderConfig, RandomConfig, Vgg19Config
-from fprf.plugins.typed_json import Missing
-from fprf.plugins.weights import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig
-from fprf.training.model import build_decoder
 from fprf.training.prepare import prepare
 
 ENCODERS = [
@@ -43,28 +39,6 @@ def test_the_line_is_one_that_the_command_line_takes(encoder: EncoderConfig) -> 
     assert found == replace(PretrainDecoderConfig(), encoder=encoder, images=(Path("DIR"),), output=Path("my own.safetensors"))
 
 
-def test_defaults_are_left_out() -> None:
-    expected = "fprf pretrain decoder --encoder random --images DIR --output decoder.safetensors"
-    assert pretrain_line(RandomConfig()) == expected
-
-
-def test_encoders_within_encoders() -> None:
-    composed = pytest.importorskip("fprf.plugins.encoders.config")
-    inner = Vgg19Config(layer="relu1_2", weights=Path("w"))
-    encoder = composed.ConcatConfig(first=inner, third=composed.AveragedConfig(flip=False), weights=(1.0, 0.5))
-    words = shlex.split(pretrain_line(encoder))
-    found = parse(PretrainDecoderConfig(), words[3:], prog="fprf pretrain decoder", description="")
-    assert found.encoder == encoder
-
-
-def test_an_encoder_that_is_not_installed_is_still_named() -> None:
-    missing = Missing(
-        slot="content.encoder", kind="fprf.encoders", name="foreign", data='{"depth": 3, "inner": {"type": "x"}}',
-        package="foreign 1.0", reason="absent",
-    )  # fmt: skip
-    assert "--encoder foreign --encoder.depth 3 --images" in pretrain_line(missing)
-
-
 @pytest.mark.parametrize("decoder", [MlpDecoderConfig(), ResidualDecoderConfig()])
 def test_an_encoder_without_a_decoder_is_refused_before_its_features_are_made(decoder: DecoderConfig, world: World) -> None:
     config = replace(with_encoder(RandomConfig(channels=5), decoder), data=world.town)
@@ -78,12 +52,3 @@ def test_an_encoder_without_a_decoder_is_refused_before_its_features_are_made(de
     assert "no decoder ships for the encoder random:5:" in text
     assert f"`{pretrain_line(RandomConfig(channels=5))}` makes its decoder" in text
     assert "\n" not in text
-
-
-def test_a_decoder_of_another_encoder_is_refused_with_the_line(tmp_path: Path) -> None:
-    file = tmp_path / "d.safetensors"
-    write_weights(file, MlpDecoder(5, 4).state_dict(), {"kind": DECODER_KIND, "encoder": "random:5:stride4:seed9"})
-    encoder = RandomConfig(channels=5)
-    config = with_encoder(encoder, MlpDecoderConfig(weights=file))
-    with pytest.raises(WeightsError, match=r"random:5:stride4:seed9.*--encoder random --encoder\.channels 5"):
-        build_decoder(config, encoder=encoder.build().identity, channels=5)

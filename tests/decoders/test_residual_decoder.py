@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from tiny_world import World, parameters, rays_of, trained_for
 
 from fprf.config import TrainConfig
-from fprf.errors import ConfigError
 from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
 from fprf.plugins.decoders.decoders import MlpDecoder, ResidualDecoder, residual_share
 from fprf.plugins.encoders.config import BundledContentConfig
@@ -143,14 +142,6 @@ def test_the_share_falls_with_the_change_and_with_the_strength(strength: float, 
     assert float(at_fade) == pytest.approx(1 / math.e, rel=1e-5)
 
 
-def test_strengths_may_differ_from_point_to_point() -> None:
-    made, content, styled = decoder_of(), torch.randn(5, C), torch.randn(5, C)
-    strength = torch.tensor([[0.0], [0.25], [0.5], [0.75], [1.0]])
-    found = made.restyled(content, styled, strength)
-    for i, each in enumerate(strength[:, 0].tolist()):
-        torch.testing.assert_close(found[i : i + 1], made.restyled(content[i : i + 1], styled[i : i + 1], each))
-
-
 @torch.no_grad()
 def test_saturated_colours_of_the_scene_do_not_leak() -> None:
     """A head that turns a grey scene green: a full style that changes the colour shows the style's colour alone."""
@@ -164,49 +155,6 @@ def test_saturated_colours_of_the_scene_do_not_leak() -> None:
     leak = float((made.restyled(content, styled, 1.0) - made.frozen(styled)).abs().max())
     assert leak < 0.05 * own
     assert own > 0.3
-
-
-def test_the_start_of_the_head_is_a_function_of_the_seed(world: World) -> None:
-    config, facts = residual_config(world), world.prepared.facts
-    first, again = (build_model(config, facts).decoder.state_dict() for _ in range(2))
-    other = build_model(replace(config, seed=9), facts).decoder.state_dict()
-    assert all(torch.equal(first[name], again[name]) for name in first)
-    assert not torch.equal(first["head.first"], other["head.first"])
-    assert torch.equal(first["frozen.first.weight"], other["frozen.first.weight"])
-
-
-def test_training_moves_the_head_and_nothing_frozen(world: World, trained: Trained) -> None:
-    start = build_model(trained.config, world.prepared.facts).state_dict()
-    end = trained.model.state_dict()
-    moved = {name for name in start if name.startswith("decoder.") and not torch.equal(start[name], end[name])}
-    assert moved == {name for name in start if name.startswith("decoder.head.")}
-
-
-@pytest.mark.parametrize(
-    ("knob", "where"), [({"hidden": 5}, "training"), ({"fade": 2.0}, "restyling"), ({"weights": Path("absent")}, "file")]
-)
-def test_every_knob_changes_something(knob: dict[str, float], where: str, world: World) -> None:
-    config = residual_config(world, **knob)
-    if where == "file":
-        with pytest.raises(Exception, match="absent: no such weights file"):
-            build_model(config, world.prepared.facts)
-        return
-    decoders = [build_model(each, world.prepared.facts).decoder for each in (residual_config(world), config)]
-    shapes = [{name: value.shape for name, value in each.state_dict().items()} for each in decoders]
-    assert (shapes[0] != shapes[1]) == (where == "training")
-    if where == "restyling":
-        content = torch.randn(4, world.prepared.facts.channels)
-        for each in decoders:
-            with torch.no_grad():
-                each.head.second_bias.fill_(1.0)  # type: ignore[union-attr]
-        one, other = (each.restyled(content, content + 0.1, 1.0) for each in decoders)
-        assert not torch.equal(one, other)
-
-
-@pytest.mark.parametrize(("knob", "value"), [("hidden", 0), ("fade", 0.0), ("fade", -1.0)])
-def test_ranges(knob: str, value: float) -> None:
-    with pytest.raises(ConfigError, match=knob):
-        ResidualDecoderConfig(**{knob: value})  # type: ignore[arg-type]
 
 
 def test_a_resumed_run_is_the_one_that_never_stopped(world: World, tmp_path: Path) -> None:
