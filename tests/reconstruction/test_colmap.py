@@ -42,14 +42,6 @@ def database(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_known_of_images(database: Path) -> None:
-    found = MatchTables(database)
-    assert [found.features_of(name) for name in ("a", "b", "sub/c", "e", "absent")] == [70, 0, 60, 0, 0]
-    assert found.matches == {("a", "sub/c"): 30, ("sub/c", "e"): 5}, "a pair of unknown images is left out"
-    assert [found.partners(name, 15) for name in ("a", "b", "sub/c", "e")] == [1, 0, 1, 0]
-    assert found.partners("sub/c", 5) == 2
-
-
 def test_progress_and_descriptors(database: Path, tmp_path: Path) -> None:
     assert count_rows(database) == (3, 3)
     assert np.array_equal(descriptors(database, "a"), np.arange(128, dtype=np.uint8)[None].repeat(2, 0))
@@ -123,18 +115,3 @@ def test_images_of_one_place_are_alike() -> None:
     pairs = similar_pairs(found, 2)
     same = [(a, b) for a in range(24) for b in range(a + 1, 24) if a // 3 == b // 3]
     assert len(set(pairs) & set(same)) >= 0.9 * len(same), "of each image's two nearest"
-
-
-def test_images_without_features() -> None:
-    nothing = np.zeros((0, 128), np.uint8)
-    assert not vlad_vectors(lambda _: nothing, 2, np.ones((4, 128), np.float32)).any()
-    assert build_vocabulary(lambda _: nothing, 2, 4).shape == (0, 128) and build_vocabulary(lambda _: nothing, 0, 4).shape == (
-        0,
-        128,
-    )
-    few = np.ones((3, 128), np.uint8)
-    assert build_vocabulary(lambda _: few, 1, 64).shape == (3, 128)
-    many = np.random.default_rng(0).integers(0, 255, (5001, 128), dtype=np.uint8)
-    assert np.linalg.norm(vlad_vectors(lambda _: many, 1, build_vocabulary(lambda _: many, 1, 4))[0]) == pytest.approx(
-        1, abs=1e-5
-    )

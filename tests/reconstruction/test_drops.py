@@ -1,6 +1,6 @@
 from typing import Any
 
-from fprf.reconstruction.scene_folder import Drop, dropped_images, report, summary_rows
+from fprf.reconstruction.scene_folder import dropped_images
 
 
 class Matches:
@@ -43,19 +43,3 @@ def test_every_image_has_its_reason() -> None:
     assert reasons["broken.jpg"] == "the JPEG is truncated" and "no other image" in reasons["lonely"]
     assert reasons["apart"] == "in part 2 (2 images), apart from the rest; take views in between"
     assert reasons["odd"] == "fits 4 images, but no pose was found for it"
-
-
-def test_the_report_counts() -> None:
-    content = report(STATE, "exhaustive", FOUND, MODELS, "1.2")
-    assert content["images"] == {"given": 7, "used": 6, "posed": 2} and content["parts"] == [2, 2]
-    assert content["points"] == 10 and content["matching"] == "exhaustive" and content["fprf"] == "1.2"
-    assert content["images"]["given"] == content["images"]["posed"] + len(content["dropped"])
-    assert content["dropped"][0] == Drop("broken.jpg", "choosing", "the JPEG is truncated")._asdict()
-
-
-def test_many_of_a_step_are_told_as_a_number() -> None:
-    drops = [Drop(f"frame {k}", "choosing", f"less sharp {k}")._asdict() for k in range(40)]
-    drops += [Drop("x", "mapping", "why")._asdict()]
-    rows = summary_rows({"dropped": drops}, most=12)
-    assert rows == [("choosing", "40 images", "for example frame 0: less sharp 0"), ("mapping", "x", "why")]
-    assert summary_rows({"dropped": drops[-1:]}) == [("mapping", "x", "why")] and summary_rows({"dropped": []}) == []

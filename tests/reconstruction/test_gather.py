@@ -1,4 +1,3 @@
-import json
 import struct
 import sys
 from dataclasses import asdict
@@ -12,14 +11,13 @@ from hypothesis import strategies as st
 from photo_files import HEIC
 
 from fprf.datamanagers.images import load_image
-from fprf.errors import ConfigError, DataError, UsageError
+from fprf.errors import DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
 from fprf.reconstruction.images import (
     Lens,
     choose_frames,
     frame_name,
-    frame_scores,
     gather_images,
     lens_of,
     natural_order,
@@ -89,13 +87,6 @@ def video(tmp_path: Path) -> Path:
     return tmp_path / "clip.mp4"
 
 
-def test_scores_tell_blurred_frames(video: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    scores = frame_scores(video, lambda done, total, what: seen.append((done, total)))
-    assert len(scores) == 8 and seen[-1] == (8, 8) and all(done <= total for done, total in seen)
-    assert max(scores[k] for k in BLURRED) < 0.5 * min(scores[k] for k in range(8) if k not in BLURRED)
-
-
 def test_saved_frames_are_those_asked_for(video: Path, tmp_path: Path) -> None:
     save_frames(video, [0, 3, 7], tmp_path / "out", lambda *_: None)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [frame_name(k) for k in (0, 3, 7)]
@@ -105,23 +96,6 @@ def test_saved_frames_are_those_asked_for(video: Path, tmp_path: Path) -> None:
             found = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
             assert np.abs(found.astype(int) - truth).mean() < 12, "coded twice, but the same picture"
             assert sharpness(found) > 0
-
-
-def test_frames_that_are_there_stay(video: Path, tmp_path: Path) -> None:
-    (tmp_path / frame_name(3)).write_bytes(b"mine")
-    save_frames(video, [3, 4], tmp_path, lambda *_: None)
-    assert (tmp_path / frame_name(3)).read_bytes() == b"mine" and (tmp_path / frame_name(4)).is_file()
-    before = (tmp_path / frame_name(4)).stat().st_mtime_ns
-    save_frames(tmp_path / "gone.mp4", [3, 4], tmp_path, lambda *_: None)
-    assert (tmp_path / frame_name(4)).stat().st_mtime_ns == before
-
-
-def test_what_is_no_video_is_named(tmp_path: Path, video: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "no.mp4").write_bytes(b"nothing of the kind" * 100)
-    with pytest.raises(DataError, match=r"no\.mp4: no video that can be opened"):
-        frame_scores(tmp_path / "no.mp4", lambda *_: None)
-    with pytest.raises(DataError, match="frame 99 was there before"):
-        save_frames(video, [2, 99], tmp_path / "out", lambda *_: None)
 
 
 def tiff(order: str, model: bytes = b"Phone 9\0", focal: tuple[int, int] = (425, 100), short: int = 26) -> bytes:
@@ -154,13 +128,6 @@ def test_model_and_focal_length_in_both_byte_orders(order: str, tmp_path: Path) 
     assert cv2.imread(str(path)).shape == (8, 8, 3), "still a photograph"
 
 
-def test_files_that_say_nothing(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
-    assert (
-        read_lens(tmp_path / "a.png") == read_lens(photo_of(tmp_path / "a.jpg", None)) == read_lens(tmp_path / "gone") == Lens()
-    )
-
-
 @settings(deadline=None)
 @given(st.binary(max_size=200))
 def test_no_damage_makes_it_fail(noise: bytes) -> None:
@@ -191,10 +158,6 @@ def gathered(source: Path, place: SceneFolder, **knobs: object) -> State:
 
 def names(place: SceneFolder) -> list[str]:
     return natural_order([p.relative_to(place.images).as_posix() for p in place.images.rglob("*") if p.is_file()])
-
-
-def test_numbers_are_in_peoples_order() -> None:
-    assert natural_order(["b1", "a10", "a2", "a", "10", "9"]) == ["9", "10", "a", "a2", "a10", "b1"]
 
 
 def test_images_are_copied_as_they_are(photos: Path, tmp_path: Path) -> None:
@@ -244,13 +207,6 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
     assert abs(load_image(jpeg).astype(int) - load_image(source / "IMG 0.HEIC")).mean() < 3
 
 
-def test_a_folder_of_other_files_is_told_by_what_it_holds(tmp_path: Path) -> None:
-    for name in ("a.dng", "b.DNG", "c.txt"):
-        (tmp_path / name).write_bytes(b"x")
-    with pytest.raises(DataError, match=r"0 usable images.*holds \.dng \.txt files.*convert"):
-        gathered(tmp_path, SceneFolder(tmp_path / "scene"))
-
-
 def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) -> None:
     place = SceneFolder(tmp_path / "scene")
     before = {name: (place.images / name).stat().st_mtime_ns for name in gathered(photos, place).images}
@@ -289,28 +245,3 @@ def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
     gathered(tmp_path / "clip.mp4", place, frames=4)
     assert (place.images / "frame_000004.jpg").stat().st_mtime_ns == stamp
     assert len(gathered(tmp_path / "clip.mp4", place, frames=6, blurred=0.0).images) == len(names(place)) == 6
-
-
-def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
-    place = SceneFolder(tmp_path / "scene")
-    with pytest.raises(UsageError, match="neither a folder of images nor a video"):
-        gathered(tmp_path / "absent", place)
-    with pytest.raises(UsageError, match="neither a folder of images nor a video"):
-        gathered(photos / "IMG_1.jpg", place)
-    (tmp_path / "few").mkdir()
-    photo(tmp_path / "few" / "a.jpg")
-    (tmp_path / "few" / "b.jpg").write_bytes(b"")
-    with pytest.raises(DataError, match=r"1 usable images, at least 3 are needed; b\.jpg: the file is empty"):
-        gathered(tmp_path / "few", place)
-    gathered(photos, place)
-    (tmp_path / "other").mkdir()
-    with pytest.raises(UsageError, match=f"was begun with {photos}"):
-        gathered(tmp_path / "other", place)
-    with pytest.raises(UsageError, match="holds something else"):
-        State.load(SceneFolder(tmp_path))
-    (place.work / "state.json").write_text(json.dumps({"format": 1, "wrong": 3}))
-    with pytest.raises(DataError, match=r"state\.json: cannot be read"):
-        State.load(place)
-    for knob, value in {"frames": 2, "blurred": 1.5, "features": 5, "side": 9, "overlap": 0, "threads": 0}.items():
-        with pytest.raises(ConfigError, match=knob):
-            SfmConfig(**{knob: value})
