@@ -1,6 +1,4 @@
 import math
-import re
-import sys
 import xml.etree.ElementTree as ET
 from itertools import pairwise
 from pathlib import Path
@@ -9,11 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import UsageError
-from fprf.io.report import Series, axis_ticks, bar_chart, line_chart, sparkline, write_scalars
+from fprf.io.report import Series, axis_ticks, line_chart, write_scalars
 from fprf.training.run import History
-
-EVIL = """<script>"'&"""
 
 
 @settings(deadline=None)
@@ -53,39 +48,7 @@ def test_logarithms_space_by_factors_and_leave_out_nothing_else() -> None:
     assert points[1][1] - points[0][1] == pytest.approx(points[2][1] - points[1][1], abs=0.11)
 
 
-def test_several_lines_have_a_legend_and_one_has_none() -> None:
-    one, two = Series("a", [0, 1], [1.0, 2.0]), Series(EVIL, [0, 1], [2.0, 2.0])
-    whole, found = drawn(line_chart(EVIL, [one, two], EVIL, EVIL))
-    assert len(found) == 2 and len(list(whole.iter("li"))) == 2
-    assert len({line.attrib["stroke"] for line in whole.iter("polyline")}) == 2
-    assert not list(drawn(line_chart("A", [one], "", ""))[0].iter("li"))
-
-
-def test_what_has_no_points_is_no_chart() -> None:
-    assert line_chart("A", [], "", "") == line_chart("A", [Series("a", [1], [None])], "", "") == ""
-    assert line_chart("A", [Series("a", [1.0], [-1.0])], "", "", log=True) == ""
-    assert drawn(line_chart("A", [Series("a", [7.0], [3.0])], "", ""))[1][0], "a single point is one"
-
-
-def test_bars_are_as_long_as_their_share() -> None:
-    text = bar_chart([("a", 4.0, "4 s"), (EVIL, 1.0, EVIL), ("none", 0.0, "0 s")])
-    assert re.findall(r"width:([\d.]+)%", text) == ["100.00", "25.00", "0.00"]
-    assert "<script>" not in text and ET.fromstring(text) is not None and bar_chart([]) == ""
-
-
-def test_sparks_rise_with_their_values() -> None:
-    assert sparkline([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]) == "▁▂▃▄▅▆▇█"
-    assert sparkline([3.0, 3.0]) == "▁▁" and sparkline([]) == "" and sparkline([0.0, 0.0, 4.0, 4.0], 2) == "▁█"
-
-
 HISTORY = History("", [10, 20], [1.5, 3.0], {"psnr": [12.0, None], "colour": [0.5, 0.25]}, {}, [])
-
-
-def test_without_the_package_one_line_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
-    with pytest.raises(UsageError, match=r"--tensorboard: .* pip install 'fprf\[tensorboard\]'"):
-        write_scalars(tmp_path, [HISTORY])
-    assert list(tmp_path.iterdir()) == []
 
 
 def read(folder: Path) -> dict[str, list[tuple[int, float, float]]]:

@@ -1,6 +1,6 @@
 import pytest
 
-from fprf.io.figures import Figure, figures, number
+from fprf.io.figures import figures, number
 
 
 @pytest.mark.parametrize(
@@ -22,12 +22,3 @@ def test_keys_become_labels_with_units() -> None:
     assert [(row.label, row.unit) for row in rows] == [
         ("PSNR", "dB"), ("Time", "s"), ("Peak memory", "MiB"), ("Feature", "B"), ("Train", "s"), ("X", ""),
     ]  # fmt: skip
-
-
-def test_shares_become_percent_and_nested_objects_groups() -> None:
-    rows = list(figures({"consistency": {"short": {"valid_share": 0.932, "rmse": None}}, "ssim": 0.5}))
-    assert rows == [
-        Figure("", "SSIM", "0.500", ""),
-        Figure("Consistency · next frame", "Pixels compared", "93.2", "%"),
-        Figure("Consistency · next frame", "Warp error, RMSE", "–", "of [0, 1]"),
-    ]

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from fprf.errors import DataError
 from fprf.io.gallery import Reference, Style, write_gallery
 from fprf.io.video import write_video
 
@@ -132,12 +131,6 @@ def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
     assert page.all("img")[0]["alt"] == f"View {EVIL}, {EVIL}"
 
 
-def test_parts_that_are_not_there_leave_no_trace(tmp_path: Path) -> None:
-    page = page_of(tmp_path / "g.html", styles=[], references=[], depth=[], metrics=None, scene={})
-    assert not page.all("section", id="compare") and not page.all("table") and not page.all("dl")
-    assert not page.all("a", href="#styles")
-
-
 def film(path: Path, size: int = 32, h264: bool = True) -> Path:
     frames = (np.full((size, size, 3), index * 20, np.uint8) for index in range(6))
     write_video(path, frames, 12, h264=h264)
@@ -161,11 +154,6 @@ def test_a_large_film_is_linked_beside_the_page(tmp_path: Path) -> None:
     assert video["src"] == "../films/my%20flight%20%231.mp4"
 
 
-def test_a_film_that_browsers_cannot_play_is_offered_as_a_file(tmp_path: Path) -> None:
-    page = page_of(tmp_path / "g.html", video=film(tmp_path / "flight.mp4", h264=False))
-    assert not page.all("video") and page.all("a", href="flight.mp4")
-
-
 def test_an_animated_picture_plays_without_h264_and_stands_beside_upright_views(tmp_path: Path) -> None:
     flight = tmp_path / "flight.webp"
     write_video(flight, (np.full((32, 24, 3), index * 20, np.uint8) for index in range(6)), 12)
@@ -176,19 +164,3 @@ def test_an_animated_picture_plays_without_h264_and_stands_beside_upright_views(
     upright = [picture(index, 40, 30) for index in range(3)]
     page = page_of(tmp_path / "upright.html", video=flight, originals=upright, styles=[Style("dusk", upright)])
     assert page.all("figure", **{"class": "beside"}) and not page.all("section", id="flight")
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"view_names": ["a"]}, "3 originals and 1 view names"),
-        ({"view_names": [], "originals": [], "styles": []}, "0 originals"),
-        ({"styles": [Style("s", [picture(0)])]}, "style s has 1 views, there are 3"),
-        ({"styles": [Style("s", [picture(0)] * 3, ["sea"])]}, "names reference sea; known are city, field"),
-        ({"styles": [Style("s", [picture(0)] * 3, ["city"], [0.5, 0.5])]}, "2 shares of 1 references"),
-    ],
-)
-def test_what_does_not_fit_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(DataError, match=message):
-        write_gallery(tmp_path / "g.html", **content(**changes))
-    assert not list(tmp_path.iterdir())
