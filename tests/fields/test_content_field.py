@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig
 from fprf.fields.fields import PlanesField
 from fprf.fields.planes import density, harmonics
@@ -83,30 +82,3 @@ def test_the_start_is_thin_and_different_for_each_seed() -> None:
     for values in thickness:
         assert 0.2 < values.detach().mean().item() < 0.8
     assert not torch.equal(thickness[0], thickness[1])
-
-
-@pytest.mark.parametrize(
-    ("value", "name"),
-    [
-        ({"resolutions": ()}, "resolutions"),
-        ({"resolutions": (64, 1)}, "resolutions: 1 must be at least 2"),
-        ({"channels": 0}, "channels"),
-        ({"hidden": 0}, "hidden"),
-        ({"layers": -1}, "layers"),
-        ({"degree": 0}, "degree"),
-        ({"degree": 5}, "degree"),
-    ],
-)
-def test_values_out_of_range_are_refused(value: dict[str, object], name: str) -> None:
-    with pytest.raises(ConfigError, match=rf"content\.field\.{name}"):
-        PlanesConfig(**value)  # type: ignore[arg-type]
-
-
-def test_nothing_kept_has_no_features() -> None:
-    """Rays through thin air may keep no sample at all, with kernels (no gradients) and without."""
-    field = SMALL.build(channels=6, seed=0)
-    points, view = cloud(12)
-    for quiet in (True, False):
-        with torch.set_grad_enabled(not quiet):
-            latent = field.density(points).latent
-            assert field.content(latent[:0], view[:0]).shape == (0, 6)

@@ -5,7 +5,6 @@ import inspect
 import pytest
 import torch
 
-from fprf.errors import ConfigError
 from fprf.fields.config import SemanticPlanesConfig
 from fprf.fields.fields import SemanticPlanes
 from fprf.testing import check_semantic_field
@@ -28,18 +27,3 @@ def test_it_is_planes_then_a_network() -> None:
         assert torch.equal(field(points), learnt)
     assert field.penalties() == {}
     assert list(inspect.signature(field.forward).parameters) == ["points"]
-
-
-@pytest.mark.parametrize(
-    ("value", "name"),
-    [
-        ({"resolutions": ()}, "resolutions"),
-        ({"resolutions": (1,)}, "resolutions"),
-        ({"channels": 0}, "channels"),
-        ({"hidden": 0}, "hidden"),
-        ({"layers": -1}, "layers"),
-    ],
-)
-def test_values_out_of_range_are_refused(value: dict[str, object], name: str) -> None:
-    with pytest.raises(ConfigError, match=rf"semantic\.field\.{name}"):
-        SemanticPlanesConfig(**value)  # type: ignore[arg-type]
