@@ -1,6 +1,5 @@
 """Fields of blocks against a plain loop in float64, seams, gradients, and what is evaluated at all."""
 
-import math
 from collections.abc import Sequence
 
 import pytest
@@ -10,7 +9,7 @@ from torch import Tensor, nn
 from fprf.blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, emission
 from fprf.blocks.routing import Blend, Everywhere, Inset, chart_of, shares, surroundings_of
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
+from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.space import Space
 from fprf.types import Boxes, Rays
 
@@ -145,13 +144,6 @@ def test_no_seam_at_any_border(face: float, beside: float) -> None:
         assert near <= 0.3 * far
 
 
-def test_without_a_margin_there_are_seams() -> None:
-    """What the test above would find."""
-    bare = row(4, margin=0.0)
-    for far, near in zip(jumps(bare, 2.0, 4e-3), jumps(bare, 2.0, 1e-3), strict=True):
-        assert near > 0.9 * far
-
-
 def test_emission_is_exact_over_thirty_orders_of_magnitude() -> None:
     density = torch.tensor([[1e-30, 3e6], [0.0, 0.0], [1e-30, 3e-30], [5.0, 0.0], [float("inf"), 1.0]])
     weight = torch.tensor([[0.5, 0.5], [0.3, 0.7], [0.5, 0.5], [1e-6, 1 - 1e-6], [0.5, 0.5]])
@@ -181,19 +173,6 @@ def test_an_inset_block_learns_inside_and_its_surroundings_outside() -> None:
             sum(float(p.grad.abs().sum()) for p in m.field.parameters() if p.grad is not None) for m in field.members.held
         ]
         assert touched[learns] > 0 and touched[rests] == 0
-
-
-def test_parameters_belong_to_the_field_once() -> None:
-    boxes = row(2)
-    held, router = Held(members(boxes)), Blend(boxes)
-    parts = nn.ModuleList([BlockedField(held, router), BlockedSemantic(held, router)])
-    names = [name for name, _ in parts.named_parameters()]
-    own = [name for member in held.held for name, _ in member.named_parameters()]
-    assert len(names) == len(own) and all(name.startswith("0.held.") for name in names)
-    assert set(parts[0].penalties()) == {"variation"}  # type: ignore[operator]
-    with torch.no_grad():
-        total = sum(float(m.field.penalties()["variation"]) for m in held.held)
-        assert float(parts[0].penalties()["variation"]) == pytest.approx(total)  # type: ignore[operator]
 
 
 def rays(count: int = 20) -> Rays:
@@ -232,12 +211,3 @@ def test_the_sampler_asks_the_blocks_where_to_look() -> None:
     assert torch.equal(found.t, wanted.t) and len(found.levels) == len(wanted.levels) == 2
     blended = BlockedSampler(config.build(seed=9), Held(parts), Blend(boxes))(r, space=SPACE, step=0, generator=None)
     assert not torch.equal(blended.t, wanted.t) and bool((blended.t[:, 1:] >= blended.t[:, :-1]).all())
-
-
-def test_a_sampler_without_fields_needs_none() -> None:
-    boxes = row(1)
-    parts = [Member(m.chart, UniformConfig().build(seed=0), m.field, m.semantic) for m in members(boxes)]
-    sampler = BlockedSampler(UniformConfig(samples=16).build(seed=0), Held(parts), Blend(boxes))
-    found = sampler(rays(5), space=SPACE, step=None, generator=None)
-    assert found.t.shape == (5, 17) and sampler.penalties() == {}
-    assert math.isclose(float(found.t[0, -1]), 1e3, rel_tol=1e-5)

@@ -95,17 +95,6 @@ def test_nodes_take_the_old_value_exactly() -> None:
     torch.testing.assert_close(relay(planes, chart, chart), planes.table.detach())
 
 
-def test_what_was_inherited_is_a_copy() -> None:
-    boxes = row()
-    around, own = member(surroundings_of(boxes), 0), member(chart_of(boxes, 1), 7)
-    inherit(own, around)
-    before = {name: t.clone() for name, t in around.state_dict().items()}
-    with torch.no_grad():
-        for parameter in own.parameters():
-            parameter.add_(1)
-    assert all(torch.equal(t, before[name]) for name, t in around.state_dict().items())
-
-
 class Odd(SemanticField):
     """A field that keeps something else than planes and linear maps."""
 

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.blocks.routing import SLIGHT, Blend, Chart, Everywhere, Group, Inset, chart_of, shares, surroundings_of
+from fprf.blocks.routing import Blend, Chart, Everywhere, Group, Inset, chart_of, shares, surroundings_of
 from fprf.types import Boxes
 
 
@@ -72,19 +72,6 @@ def test_blocks_that_no_point_needs_are_not_named() -> None:
     assert named == {1, 5}, "the second block, and the surroundings"
     far = blend(torch.tensor([[1e9, 0.0, 0.0], [-1e30, 1e30, 0.0], [float("nan"), 0.0, 0.0]]))
     assert [g.members for g in far] == [(5,)] and len(far[0].at) == 3
-
-
-def test_slight_weights_are_left_out() -> None:
-    boxes = row(2)
-    at = 2 - 0.3 + 2 * 0.3 * math.sqrt(SLIGHT / 3) * 0.9
-    groups = Blend(boxes)(torch.tensor([[at, 0.0, 0.75]]))
-    assert float(shares(torch.tensor([[at, 0.0, 0.75]]), boxes)[0, 1]) > 0
-    assert [g.members for g in groups] == [(0,)]
-
-
-def test_no_points_are_no_trouble() -> None:
-    assert all(not len(g.at) for g in Blend(row(2))(torch.zeros(0, 3)))
-    assert not Inset(chart_of(row(2), 0))(torch.zeros(0, 3))
 
 
 def test_insets_and_everywhere() -> None:
