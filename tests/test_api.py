@@ -11,9 +11,9 @@ from tiny_world import World
 import fprf
 from fprf.api import TrainedScene
 from fprf.cli import main as cli
-from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
+from fprf.errors import ConfigError, UsageError
 from fprf.rendering.cameras import project
-from fprf.style.config import StyleConfig, with_preset
+from fprf.style.config import StyleConfig
 
 
 @pytest.fixture(scope="module")
@@ -53,12 +53,6 @@ def test_views_go_by_number_and_name(scene: TrainedScene) -> None:
     assert len(scene.names) == len(scene.cameras) == 10
     by_name, by_number = scene.render("0003"), scene.render(3)
     assert torch.equal(by_name.rgb, by_number.rgb) and torch.equal(by_name.rgb, scene.render(scene.camera(3)).rgb)
-
-
-def test_a_preset_is_what_it_sets(scene: TrainedScene, world: World) -> None:
-    styled = scene.stylize(world.references[:1], luminance=1.0, preset="gentle").styled
-    assert styled is not None
-    assert styled.controls.saved.style == with_preset(StyleConfig(references=tuple(world.references[:1])), "gentle")
 
 
 def test_scenes_never_change(scene: TrainedScene, world: World) -> None:
@@ -141,37 +135,3 @@ def test_a_flight_is_lazy_and_as_long_as_asked(scene: TrainedScene) -> None:
     assert torch.equal(first.rgb, scene.render(cameras.select(torch.tensor([0]))).rgb)
     assert len(list(film)) == 2
     assert len(scene.path("dataset", split="test")) == 2
-
-
-def test_quality_is_heard(world: World, scene: TrainedScene) -> None:
-    draft = fprf.load(world.run, device="cpu", quality="draft").render(0)
-    assert draft.rgb.shape == (24, 32, 3) and not torch.equal(draft.rgb, scene.render(0).rgb)
-
-
-def test_mistakes_are_named(scene: TrainedScene, world: World, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="no run folder"):
-        fprf.load(tmp_path)
-    with pytest.raises(UsageError, match=r"camera '00003': no such view \(did you mean '0003'|camera '00003': no such view"):
-        scene.camera("00003")
-    with pytest.raises(UsageError, match="from 0 to 9"):
-        scene.camera(10)
-    with pytest.raises(UsageError, match="10 cameras; give one"):
-        scene.render(scene.cameras)
-    with pytest.raises(UsageError, match="in no style"):
-        scene.matches(0)
-    with pytest.raises(UsageError, match="in no style"):
-        scene.save_style(tmp_path / "style.json")
-    with pytest.raises(UsageError, match="styles of one loaded scene"):
-        scene.towards(scene.stylize([world.references[0]]), 0.5)
-    with pytest.raises(UsageError, match="at least one photograph"):
-        scene.stylize([])
-    with pytest.raises(DataError, match=r"absent\.png"):
-        scene.stylize([tmp_path / "absent.png"])
-    with pytest.raises(UsageError, match="two places"):
-        scene.camera_at([0, 0, 0], [0, 0, 0])
-    with pytest.raises(ConfigError, match="fov"):
-        scene.camera_at([0, 0, 0], [1, 0, 0], fov=180)
-    with pytest.raises(UsageError, match="neither a file nor one of"):
-        scene.path("spirale")
-    with pytest.raises(DataError, match="no picture format"):
-        scene.render(0).save(tmp_path / "x.txt")

@@ -19,7 +19,6 @@ from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
 from fprf.datamanagers.batches import RayBatches
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.errors import ConfigError
 from fprf.io.images import write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import from_json, to_json
@@ -264,13 +263,6 @@ def test_points_count_where_several_views_see_them(world: World, tmp_path: Path)
         there = replace(world, prepared=world.prepared._replace(scene=scene, manager=manager))
         found.append(checkpoint.load(trained_for(there, tmp_path / f"run{name}", config).checkpoints, 5).model)
     assert len(found) == 3 and all(differ(found[0], other) for other in found[1:])
-
-
-def test_penalties_are_looked_up_in_the_parts(world: World, tmp_path: Path) -> None:
-    """The built-in ones have fields of their own; tests/training/test_losses.py weighs another."""
-    assert shown("penalties") == ["loss.penalties"]
-    with pytest.raises(ConfigError, match=r"has a penalty 'opacity' \(penalties that can be named: none\)"):
-        trained_for(world, tmp_path / "run", changed(world.config, "loss.penalties", SECOND["loss.penalties"][0]))
 
 
 def test_masks_count_where_there_are_some(world: World, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pretend_cuda import pretend_cuda
 
 from fprf.cli import main as cli
 from fprf.errors import OutOfMemoryError
-from fprf.memory import LEAST, chunk_size, free_memory, in_parts, out_of_memory, shortage, wanted
+from fprf.memory import LEAST, chunk_size, free_memory, in_parts, out_of_memory, wanted
 
 TORCH = "[enforce fail at alloc_cpu.cpp:127] . DefaultCPUAllocator: can't allocate memory: you tried to allocate 4096 bytes."
 CUDA = "CUDA out of memory. Tried to allocate 1.50 GiB. GPU 0 has a total capacity of 79 GiB of which 1 GiB is free."
@@ -94,14 +94,6 @@ def test_other_errors_and_too_little_for_the_least_are_raised() -> None:
     assert tried == [5000, 2500, 1250, 1024]
     with pytest.raises(OutOfMemoryError, match="300 rays at a time"):
         list(in_parts(300, 300, short))
-
-
-def test_the_line_says_what_was_needed() -> None:
-    line = str(shortage("training step 7", MemoryError("Unable to allocate 8.00 GiB for an array"), "do this"))
-    assert line.startswith("training step 7: not enough memory; the process held up to ")
-    assert " and wanted 8.00 GiB more" in line and line.endswith("; do this") and "\n" not in line
-    line = str(shortage("training step 7", torch.OutOfMemoryError(CUDA), "do this"))
-    assert line.endswith(", 1.50 GiB more were wanted (GPU 0 has a total capacity of 79 GiB of which 1 GiB is free); do this")
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError(TORCH), opencv(-4)])

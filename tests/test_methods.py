@@ -1,13 +1,11 @@
-from dataclasses import replace
-
 import pytest
 
 from fprf.cli.parsing import load_method
-from fprf.config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
+from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig
 from fprf.methods import fprf, fprf_lite
-from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, DinoConfig, Vgg19Config
+from fprf.plugins.encoders.config import DinoConfig, Vgg19Config
 from fprf.plugins.samplers.config import ProposalConfig
 
 
@@ -18,11 +16,6 @@ def test_the_papers_method_has_the_papers_sizes() -> None:
     assert isinstance(sampler, ProposalConfig) and (*sampler.samples, sampler.final) == (256, 128, 48)
     assert config.content.encoder == Vgg19Config(layer="relu2_1") and isinstance(config.semantic.encoder, DinoConfig)
     assert config.render.train_budget == 0 and config.content.moves_density
-
-
-def test_lite_downloads_nothing() -> None:
-    config = fprf_lite()
-    assert config.content.encoder == BundledContentConfig() and config.semantic.encoder == BundledSemanticConfig()
 
 
 def test_methods_are_functions_of_nothing_and_differ() -> None:
@@ -60,8 +53,3 @@ def test_methods_are_functions_of_nothing_and_differ() -> None:
 def test_ranges_are_checked_where_the_field_lives(make: object) -> None:
     with pytest.raises(ConfigError):
         make()  # type: ignore[operator]
-
-
-def test_configs_are_values() -> None:
-    assert ContentConfig() == ContentConfig() and hash(fprf_lite()) == hash(fprf_lite())
-    assert replace(fprf_lite(), seed=1) != fprf_lite()

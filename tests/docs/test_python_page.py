@@ -30,16 +30,3 @@ def test_the_page_runs(
     assert "torch.Size([120, 160, 3])" in told and "'autumn.jpg'" in told and "'night.jpg'" in told
     made = {path.name for path in tmp_path.iterdir()}
     assert {"autumn.png", "film.mp4", "mine.json", "between-0.png", "between-2.png"} <= made
-
-
-def test_the_page_names_what_there_is() -> None:
-    from fprf.api import TrainedScene
-
-    used = set(re.findall(r"`scene\.(\w+)", PAGE.read_text("utf-8")))
-    assert used and not [
-        name for name in used if name not in dir(TrainedScene) and name not in TrainedScene.__dataclass_fields__
-    ]
-
-
-def test_the_first_example_has_five_lines() -> None:
-    assert len([line for line in blocks(PAGE)[0].splitlines() if line]) == 5

@@ -42,10 +42,6 @@ def test_it_builds_without_a_warning(tmp_path: Path) -> None:
     assert "restyle" in (tmp_path / "search" / "search_index.json").read_text()
 
 
-def test_completion_has_a_page_of_its_help(hooks: ModuleType) -> None:
-    assert "fprf completion fish >" in hooks.verb_page("completion", VERBS["completion"])
-
-
 @pytest.mark.parametrize("verb", sorted(VERBS.keys() - {"completion"}))
 def test_a_page_has_every_flag_of_its_verb(hooks: ModuleType, verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     page = hooks.verb_page(verb, VERBS[verb])

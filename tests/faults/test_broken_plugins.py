@@ -15,9 +15,7 @@ from torch import Tensor, nn
 from fprf.cli import main as cli
 from fprf.cli.train import train_scene
 from fprf.errors import PluginError
-from fprf.fields.config import PlanesConfig
 from fprf.interfaces import Stylizer
-from fprf.plugins.decoders.config import DecoderConfig
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.style.scene import own_style
 from fprf.testing import cases
@@ -239,13 +237,3 @@ def test_a_stylizer_that_breaks_its_contract_is_named(wrong: str, told: str) -> 
     check_stylizer(MineConfig(), Mine(""), codes, scene)
     with pytest.raises(PluginError, match=r"test_broken_plugins:MineConfig: " + told):
         check_stylizer(MineConfig(), Mine(wrong), codes, scene)
-
-
-def test_built_ins_are_asked_in_no_time_and_left_as_they_are(world: World) -> None:
-    facts = world.prepared.facts
-    assert isinstance(world.config.content.field, PlanesConfig) and isinstance(world.config.content.decoder, DecoderConfig)
-    model = build_model(world.config, facts)
-    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    check_parts(world.config, model.parts, facts.channels, facts.dim)
-    assert all(torch.equal(before[name], tensor) for name, tensor in model.state_dict().items())
-    assert all(parameter.grad is None for parameter in model.parameters())

@@ -14,7 +14,6 @@ import pytest
 import torch
 from tiny_world import World, flags, parameters
 
-from benchmarks import kills
 from fprf.cli import main as cli
 from fprf.training import checkpoint
 from fprf.training.run import Run
@@ -48,17 +47,6 @@ def test_kills_at_random_moments_leave_the_same_bits(tmp_path: Path, monkeypatch
     found = json.loads((tmp_path / "kills.json").read_text())
     assert found["kills"] >= 5 and found["bitwise_equal"] == found["runs"] > 0
     assert not found["unfinished_files_left"] and not found["other_failures"]
-
-
-def test_the_runner_of_kills_sees_what_is_left(world: World, tmp_path: Path) -> None:
-    shutil.copytree(world.run, tmp_path / "run")
-    assert kills.contents(tmp_path / "run") == kills.contents(world.run) and kills.strays(tmp_path / "run") == []
-    (tmp_path / "run" / "checkpoints" / "step-0000020").mkdir()
-    (tmp_path / "run" / ".tmpAbCdEf").touch()
-    assert sorted(kills.strays(tmp_path / "run")) == [".tmpAbCdEf", "checkpoints/step-0000020"]
-    style = tmp_path / "run" / "style.safetensors"
-    style.write_bytes(style.read_bytes()[:-1] + b"\x7f")
-    assert kills.contents(tmp_path / "run") != kills.contents(world.run)
 
 
 @pytest.mark.parametrize("harm", ["gone", "empty", "cut", "text", "rotated"])
