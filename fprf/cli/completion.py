@@ -25,7 +25,7 @@ Prints a script that lets the shell complete verbs, flags and files:
 Make it again after installing a plug-in."""
 
 _WORDS = {
-    "pretrain": ("content", "semantic", "decoder"),
+    "pretrain": ("decoder",),
     "bench": ("speed", "profile", "memory", "restyle", "peer"),
     "export": tuple(KINDS),
     "completion": ("bash", "zsh", "fish"),

@@ -49,7 +49,7 @@ VERBS = {
     "bench": Verb("speed|profile|memory|... [RUN]", "time and error, where time goes, memory, restyling"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
     "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),
-    "pretrain": Verb("content|semantic|decoder", "train the encoders and decoders that methods build on"),
+    "pretrain": Verb("decoder", "train the decoder of an encoder"),
     "plugins": Verb("[--check]", "list what is installed, and check that it loads"),
     "completion": Verb("bash|zsh|fish", "a script by which a shell completes verbs and flags"),
     "doctor": Verb("[RUN|DIR|METHOD]", "look over this machine, a run, a scene or a method's needs"),

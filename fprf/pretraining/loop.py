@@ -18,13 +18,11 @@ from torch import Tensor, nn
 from ..io.atomic import write_json
 from ..io.images import to_uint8, write_image
 from ..plugins.weights import read_weights, write_weights
-from .config import DistilConfig, PretrainConfig
+from .config import PretrainConfig
 
 __all__ = [
     "checkpoint_path",
     "generator_of",
-    "prepared",
-    "prepared_path",
     "report_path",
     "samples_folder",
     "sheet",
@@ -174,29 +172,3 @@ def _resume(network: nn.Module, optimizer: torch.optim.Adam, config: PretrainCon
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     step, seconds = json.loads(metadata["progress"])
     return _Progress(step=step, seconds=seconds)
-
-
-Pair = tuple[Tensor, Tensor]
-
-
-def prepared_path(output: Path) -> Path:
-    """Where the crops of an unfinished run lie."""
-    return output.with_name(output.name + ".prepared")
-
-
-def prepared(make: Callable[[], Pair], config: DistilConfig, output: Path) -> Pair:
-    """Inputs and targets: those of an interrupted run that would prepare the same, or made anew and kept."""
-    path = prepared_path(output)
-    if path.is_file():
-        tensors, metadata = read_weights(path)
-        if metadata.get("key") == _crops_key(config):
-            return tensors["inputs"], tensors["targets"]
-    inputs, targets = make()
-    write_weights(path, {"inputs": inputs, "targets": targets}, {"key": _crops_key(config)})
-    return inputs, targets
-
-
-def _crops_key(config: DistilConfig) -> str:
-    """What the crops depend on: a run may be made longer without preparing them again."""
-    free = replace(config, output=None, minutes=1.0, steps=None, batch=1, rate=1.0, samples=0.0, device="auto")
-    return repr(free)

@@ -26,7 +26,7 @@ def test_everything_that_ships_stays_below_three_megabytes_and_says_what_it_is()
 
 
 @pytest.mark.parametrize(
-    ("config", "verb"), [(BundledContentConfig, "fprf pretrain content"), (BundledSemanticConfig, "fprf pretrain semantic")]
+    ("config", "verb"), [(BundledContentConfig, "tools.distil content"), (BundledSemanticConfig, "tools.distil semantic")]
 )
 def test_other_files_are_refused_with_the_command_that_makes_the_right_one(
     config: type[BundledContentConfig], verb: str, tmp_path: Path

@@ -147,7 +147,8 @@ def test_labels_of_a_street(shared: Path) -> None:
 @pytest.mark.parametrize("layer", ["level3", "level4"])
 def test_cells_lie_where_they_look(shared: Path, layer: str) -> None:
     """The features of a mirrored photograph, mirrored back, agree best where they are, and to both sides alike."""
-    from fprf.pretraining.photos import crop, load_photo
+    from fprf.pretraining.photos import load_photo
+    from tools.distil.examples import crop
 
     encoder = EspNetConfig(layer=layer, weights=shared / "weights/espnetv2_s2.0_city.safetensors").build()
     photos = sorted((shared / "data/pretrain/bsds500").glob("*.jpg"))[:4]

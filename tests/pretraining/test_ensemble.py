@@ -4,7 +4,7 @@ import pytest
 import torch
 from photo_folder import teacher_files
 
-from fprf.pretraining.semantic import (
+from tools.distil.semantic import (
     COMPONENTS,
     LOOKS,
     Ensemble,

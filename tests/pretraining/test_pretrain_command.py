@@ -1,4 +1,4 @@
-"""`fprf pretrain`: two steps of each kind give files that load; a broken-off run goes on where it was."""
+"""`fprf pretrain` and `tools.distil`: two steps of each kind give files that load; a broken-off run goes on where it was."""
 
 import json
 from collections.abc import Callable
@@ -12,11 +12,13 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from fprf.cli.pretrain import run
+from fprf.errors import UsageError
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, RandomConfig
 from fprf.plugins.weights import read_weights
 from fprf.pretraining.config import PretrainConfig
 from fprf.pretraining.loop import checkpoint_path, train
+from tools.distil.__main__ import main
 
 QUICK = ["--steps", "2", "--batch", "2"]
 
@@ -44,7 +46,7 @@ def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
 def test_content(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "content.safetensors"
     args = ["--images", photos, "--teachers", vgg(tmp_path), "--output", str(output), "--size", "32", "--crops", "2"]
-    assert run(["content", *args, *QUICK]) == 0
+    assert main(["content", *args, *QUICK]) == 0
     report = report_of(capsys)
     assert report["steps"] == 2
     assert 0 < report["relative_l2"] < 10
@@ -60,7 +62,7 @@ def test_semantic(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
     output = tmp_path / "semantic.safetensors"
     teachers = [str(path) for path in teacher_files(tmp_path)]
     args = ["--images", photos, "--teachers", *teachers, "--output", str(output), "--size", "64", "--towns", "0"]
-    assert run(["semantic", *args, *QUICK]) == 0
+    assert main(["semantic", *args, *QUICK]) == 0
     report = report_of(capsys)
     assert -1 <= report["teacher_cosine"] <= 1
     assert -1 <= report["night_cosine"] <= 1
@@ -95,6 +97,28 @@ def test_content_and_decoder_repeat_exactly(photos: str, tmp_path: Path, capsys:
     first, second = (read_weights(file) for file in files)
     assert first[1] == second[1]
     assert all(torch.equal(value, second[0][name]) for name, value in first[0].items())
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ([], "allowed is decoder"),
+        (["field"], "'field' to train"),
+        (["content"], "tools.distil content"),
+        (["decoder"], "--images DIR"),
+        (["decoder", "--images", "."], "--output FILE"),
+        (["decoder", "--images", ".", "--teachers", "x"], "--teachers"),
+    ],
+)
+def test_mistakes(args: list[str], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        run(args)
+
+
+@pytest.mark.parametrize("kind", ["content", "semantic"])
+def test_distilling_needs_teachers(kind: str, photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([kind, "--images", photos, "--output", str(tmp_path / "w.safetensors")]) == 2
+    assert "--teachers" in capsys.readouterr().err
 
 
 def quadratic(network: nn.Linear, broken_at: int | None = None) -> Callable[[torch.Generator], Tensor]:

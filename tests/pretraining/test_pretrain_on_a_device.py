@@ -1,4 +1,4 @@
-"""`fprf pretrain --device cuda:0` learns what the CPU learns, bit for bit, where both take plain torch."""
+"""Pretraining and distillation on `cuda:0` learn what the CPU learns, bit for bit, where both take plain torch."""
 
 import json
 from pathlib import Path
@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 from fprf.cli.pretrain import run
 from fprf.ops import backend
 from fprf.plugins.weights import read_weights
+from tools.distil.__main__ import main
 
 SMALL = ["--steps", "2", "--batch", "2", "--samples", "1e9"]
 
@@ -39,13 +40,14 @@ def test_the_same_weights_and_report(kind: str, tmp_path: Path, capsys: pytest.C
     found = {}
     for device in ("cpu", "cuda:0"):
         output = tmp_path / device.replace(":", "") / "weights.safetensors"
+        train = run if kind == "decoder" else main
         args = [kind, "--images", images, "--output", str(output), "--device", device, *own, *SMALL]
         if device == "cpu":
             with backend.plain():
-                assert run(args) == 0
+                assert train(args) == 0
         else:
             with pretend_cuda() as seen:
-                assert run(args) == 0
+                assert train(args) == 0
             assert seen.uploads, "nothing was on the device"
         report = json.loads(capsys.readouterr().out)
         found[device] = read_weights(output), {k: v for k, v in report.items() if k not in ("seconds", "weights")}

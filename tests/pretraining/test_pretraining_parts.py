@@ -10,20 +10,17 @@ from photo_folder import photo_folder
 
 from fprf.datamanagers.config import GuidedConfig
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.pretraining.config import DistilConfig
-from fprf.pretraining.content import fit_basis
-from fprf.pretraining.loop import prepared, prepared_path
 from fprf.pretraining.photos import (
-    crop,
     filtered_at,
     filtered_whole,
     find_photos,
     load_photo,
-    nightfall,
     random_pixels,
     split,
-    toned,
 )
+from tools.distil.config import DistilConfig
+from tools.distil.content import fit_basis
+from tools.distil.examples import crop, nightfall, prepared, prepared_path, toned
 
 
 @pytest.fixture(scope="module")

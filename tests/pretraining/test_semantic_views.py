@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from photo_folder import photo_folder, teacher_files
 
 from fprf.plugins.encoders.config import BundledSemanticConfig
-from fprf.pretraining.config import SemanticDistilConfig
-from fprf.pretraining.semantic import STRIDE, pretrain_semantic, relations, view
+from tools.distil.config import SemanticDistilConfig
+from tools.distil.semantic import STRIDE, pretrain_semantic, relations, view
 
 
 @settings(max_examples=30, deadline=None)

@@ -9,9 +9,10 @@ import torch.nn.functional as F
 
 from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, Vgg19Config
-from fprf.pretraining.content import content_basis, content_report
 from fprf.pretraining.decoder import decoder_report
-from fprf.pretraining.photos import find_photos, load_photo, nightfall, split
+from fprf.pretraining.photos import find_photos, load_photo, split
+from tools.distil.content import content_basis, content_report
+from tools.distil.examples import nightfall
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,9 @@ import pytest
 import torch
 from photo_folder import teacher_files
 
-from fprf.pretraining.semantic import (
+from fprf.town.palettes import PALETTES
+from fprf.town.surface import CLASSES
+from tools.distil.semantic import (
     FIRST_SEED,
     VIEWS,
     Ensemble,
@@ -15,8 +17,6 @@ from fprf.pretraining.semantic import (
     street_targets,
     taught,
 )
-from fprf.town.palettes import PALETTES
-from fprf.town.surface import CLASSES
 
 SIZE, STRIDE = 32, 8
 

@@ -10,8 +10,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from fprf.errors import WeightsError
-from fprf.pretraining.photos import crop, load_photo
-from fprf.pretraining.semantic import load_teacher
+from fprf.pretraining.photos import load_photo
+from tools.distil.examples import crop
+from tools.distil.semantic import load_teacher
 
 
 def unfolded(tensors: dict[str, Tensor], image: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""The encoders that ship with the package, or others of the same making (`fprf pretrain`), and untrained convolutions."""
+"""The encoders that ship, others distilled by `tools.distil` of the repository, and untrained convolutions."""
 
 from pathlib import Path
 from typing import Annotated
@@ -156,7 +156,7 @@ def _read(path: Path, kind: str, verb: str) -> tuple[dict[str, Tensor], int]:
     if metadata.get("kind") != kind or "project.weight" not in tensors:
         raise WeightsError(
             f"{path}: its metadata says {metadata.get('kind', 'nothing')!r}, wanted {kind!r}; "
-            f"make one with `fprf pretrain {verb} --images DIR --teachers FILE --output {path.name}`"
+            f"make one with `python -m tools.distil {verb} --images DIR --teachers FILE --output {path.name}` in a clone"
         )
     return tensors, int(tensors["project.weight"].shape[0])
 

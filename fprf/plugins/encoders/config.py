@@ -50,7 +50,7 @@ class BundledContentConfig(EncoderConfig):
     """Ships with the package: a small network that imitates the principal components of VGG-19 relu2_1, stride 2."""
 
     weights: Path | None = None
-    """A file made by `fprf pretrain content`. By default the one that ships."""
+    """A file made by `python -m tools.distil content`. By default the one that ships."""
 
     def needs(self) -> tuple[Need, ...]:
         """The file, where one is named."""
@@ -68,7 +68,7 @@ class BundledSemanticConfig(EncoderConfig):
     """Ships with the package: a small network distilled from MobileNet-class features, stride 8, steady in any light."""
 
     weights: Path | None = None
-    """A file made by `fprf pretrain semantic`. By default the one that ships."""
+    """A file made by `python -m tools.distil semantic`. By default the one that ships."""
 
     def needs(self) -> tuple[Need, ...]:
         """The file, where one is named."""

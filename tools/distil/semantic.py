@@ -16,22 +16,24 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..errors import UsageError, WeightsError
-from ..interfaces import Encoder
-from ..ops.precision import double
-from ..plugins.encoders.bundled import SEMANTIC_KIND, SemanticStudent, load_semantic_encoder
-from ..plugins.encoders.frozen import replicate_to_multiple
-from ..plugins.encoders.mobilenet import CLASSIFIER, DEEPLAB, TENSORFLOW_EPS, MobileNetV2, fold
-from ..plugins.weights import read_weights, write_weights
-from ..town.layout import build_town
-from ..town.palettes import PALETTES
-from ..town.render import geometry, render, walk
-from ..town.surface import CLASSES
-from ..training.prepare import device_of
+from fprf.errors import UsageError, WeightsError
+from fprf.interfaces import Encoder
+from fprf.ops.precision import double
+from fprf.plugins.encoders.bundled import SEMANTIC_KIND, SemanticStudent, load_semantic_encoder
+from fprf.plugins.encoders.frozen import replicate_to_multiple
+from fprf.plugins.encoders.mobilenet import CLASSIFIER, DEEPLAB, TENSORFLOW_EPS, MobileNetV2, fold
+from fprf.plugins.weights import read_weights, write_weights
+from fprf.pretraining.loop import generator_of, train
+from fprf.pretraining.photos import find_photos, load_photo, split
+from fprf.town.layout import build_town
+from fprf.town.palettes import PALETTES
+from fprf.town.render import geometry, render, walk
+from fprf.town.surface import CLASSES
+from fprf.training.prepare import device_of
+
 from .config import SemanticDistilConfig
 from .content import Basis, fit_basis
-from .loop import generator_of, prepared, prepared_path, train
-from .photos import crop, find_photos, load_photo, nightfall, split, toned
+from .examples import crop, nightfall, prepared, prepared_path, toned
 
 __all__ = [
     "COMPONENTS",
@@ -217,8 +219,8 @@ def pretrain_semantic(config: SemanticDistilConfig, output: Path, say: Callable[
     metadata = {
         "kind": SEMANTIC_KIND,
         "imitates": f"{COMPONENTS} principal components each of {', '.join(teacher.name for teacher in teachers)}",
-        "made_by": f"fprf pretrain semantic, {steps} steps on {len(photos)} photographs and {config.towns} rendered streets, "
-        f"seed {config.seed}",
+        "made_by": f"python -m tools.distil semantic, {steps} steps on {len(photos)} photographs and {config.towns} rendered "
+        f"streets, seed {config.seed}",
         "licence": "Apache-2.0; trained by this project, holds no weights of its teachers",
     }
     write_weights(output, {name: _stored(value) for name, value in student.state_dict().items()}, metadata)

@@ -13,17 +13,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..datamanagers.config import GuidedConfig
-from ..errors import UsageError
-from ..interfaces import Encoder
-from ..ops.precision import double
-from ..plugins.encoders.bundled import CONTENT_KIND, ContentStudent, load_content_encoder
-from ..plugins.encoders.vgg import build_vgg19
-from ..plugins.weights import write_weights
-from ..training.prepare import device_of
+from fprf.datamanagers.config import GuidedConfig
+from fprf.errors import UsageError
+from fprf.interfaces import Encoder
+from fprf.ops.precision import double
+from fprf.plugins.encoders.bundled import CONTENT_KIND, ContentStudent, load_content_encoder
+from fprf.plugins.encoders.vgg import build_vgg19
+from fprf.plugins.weights import write_weights
+from fprf.pretraining.loop import generator_of, train
+from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
+from fprf.training.prepare import device_of
+
 from .config import DistilConfig
-from .loop import generator_of, prepared, prepared_path, train
-from .photos import crop, filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split, toned
+from .examples import crop, prepared, prepared_path, toned
 
 __all__ = ["Basis", "content_report", "fit_basis", "pretrain_content"]
 
@@ -99,7 +101,7 @@ def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], No
     metadata = {
         "kind": CONTENT_KIND,
         "imitates": f"{len(basis.axes)} principal components of {teacher.identity}",
-        "made_by": f"fprf pretrain content, {steps} steps on {len(photos)} photographs, seed {config.seed}",
+        "made_by": f"python -m tools.distil content, {steps} steps on {len(photos)} photographs, seed {config.seed}",
         "licence": "Apache-2.0; trained by this project, holds no weights of its teacher",
     }
     write_weights(output, {name: value.half() for name, value in student.state_dict().items()}, metadata)

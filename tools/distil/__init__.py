@@ -1,0 +1,1 @@
+"""Distillation of the encoders that ship: `python -m tools.distil content|semantic`."""
