@@ -39,10 +39,10 @@ _ARGUMENTS = [
 
 
 @contextmanager
-def served(run: Path, *args: str) -> Iterator[tuple[str, int]]:
-    """`fprf view` on a free port: its address and the number of its process."""
+def served(run: Path | None, *args: str) -> Iterator[tuple[str, int]]:
+    """`fprf view`, without a run its start page, on a free port: its address and the number of its process."""
     pytest.importorskip("viser", reason="the extra `viewer` is not installed")
-    command = [sys.executable, "-m", "fprf", "view", str(run), "--port", "0", *args]
+    command = [sys.executable, "-m", "fprf", "view", *([] if run is None else [str(run)]), "--port", "0", *args]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -114,8 +114,8 @@ class Front:
 
 
 @contextmanager
-def front(address: str, width: int = 640, height: int = 480) -> Iterator[Front]:
-    """A browser that has opened the address."""
+def front(address: str, width: int = 640, height: int = 480, ready: str = "canvas") -> Iterator[Front]:
+    """A browser that has opened the address and shows the element `ready`."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if _CHROMIUM is None or os.name != "posix":
         pytest.skip("no Chromium on this machine")
@@ -124,7 +124,7 @@ def front(address: str, width: int = 640, height: int = 480) -> Iterator[Front]:
         try:
             found = Front(browser.new_page(viewport={"width": width, "height": height}))
             found.page.goto(address, timeout=120_000)
-            found.page.wait_for_selector("canvas", timeout=120_000)
+            found.page.wait_for_selector(ready, timeout=120_000)
             yield found
         finally:
             browser.close()

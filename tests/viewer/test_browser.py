@@ -7,12 +7,19 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from urllib.parse import urljoin, urlsplit
 
+import cv2
 import pytest
+import torch
 from browser import Front, front, served
 from tiny_world import World, flags
+
+from fprf.splats.files import read_capture
+from fprf.splats.training import gaussians_of
+from fprf.training import checkpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -153,6 +160,45 @@ def test_a_film_is_made_from_the_page_and_can_be_downloaded(opened: tuple[Front,
     link.wait_for()
     answer = found.page.request.get(urljoin(found.page.url, link.get_attribute("href")))
     assert answer.status == 200 and b"ftyp" in answer.body()[:32]
+
+
+def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) -> None:
+    shipped, given = Path(str(files("fprf") / "garden")), tmp_path / "garden"
+    shutil.copytree(shipped / "images", given / "images")
+    for name in ("transforms.json", "points.npz"):
+        shutil.copyfile(shipped / name, given / name)
+    (tmp_path / "notes.txt").write_text("no photograph")
+    made = tmp_path / "made"
+    with served(None, "--output", str(made)) as (address, _), front(address, 1280, 800, "#drop") as found:
+        page = found.page
+        page.set_input_files("#files", str(tmp_path / "notes.txt"))
+        page.locator("#fault", has_text="notes.txt: cannot become a scene").wait_for()
+        page.set_input_files("#files", str(shipped / "references" / "night.jpg"))
+        page.locator("#fault", has_text="1 photograph is no scene").wait_for()
+        page.fill("#minutes", "5")
+        page.set_input_files("#folder", str(given))
+        page.locator("#picture").wait_for(timeout=240_000)  # of training, which need not end
+        page.locator("#show").click()
+        page.wait_for_selector("canvas", timeout=120_000)
+        assert {path.name for path in (made / "garden").iterdir()} == {"files", "run"}
+        assert len([*(made / "garden" / "files" / "images").iterdir()]) == 25
+        page.set_input_files("#fprf-files", str(shipped / "references" / "sunset.jpg"))
+        found.until(lambda state: len(state["shelf"]) == 1, 240)
+        acts = page.locator("#fprf-shelf .acts button")
+        with page.expect_download(timeout=120_000) as downloaded:
+            acts.filter(has_text=".ply").click()
+        assert downloaded.value.suggested_filename == "garden-restyled.ply"
+        downloaded.value.save_as(tmp_path / "restyled.ply")
+        plain = gaussians_of(checkpoint.load_latest(made / "garden" / "run" / "checkpoints")[0])
+        styled = read_capture(tmp_path / "restyled.ply").gaussians
+        assert torch.equal(styled.means, plain.means) and not torch.allclose(styled.harmonics, plain.harmonics, atol=0.1)
+        with page.expect_download(timeout=120_000) as downloaded:
+            acts.filter(has_text="picture").click()
+        downloaded.value.save_as(tmp_path / "picture.png")
+        assert cv2.imread(str(tmp_path / "picture.png")).std() > 20
+        acts.filter(has_text="scenes").click()
+        page.locator("#recent b", has_text="garden").wait_for()
+        assert found.errors == []
 
 
 def test_training_is_shown_live_and_goes_on_without_its_viewer(world: World, tmp_path: Path) -> None:
