@@ -44,7 +44,7 @@ VERBS = {
     "restyle": Verb("A.ply --references A.jpg ...", "restyle a capture of 3D Gaussians from its file alone"),
     "gallery": Verb("RUN --references DIR", "every view in every style, as one page that can be sent"),
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
-    "view": Verb("[RUN]", "in the browser: make a scene of photographs; drop one on it to restyle it"),
+    "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
     "report": Verb("RUN", "how training went: charts of loss, PSNR, speed, time per part"),
     "bench": Verb("speed|profile|memory|... [RUN]", "time and error, where time goes, memory, restyling"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
