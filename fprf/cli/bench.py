@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rich.console import Console
 
 from ..errors import UsageError
-from ..evaluation.config import BenchConfig, MemoryConfig, PeerConfig, ProfileConfig, ReportConfig, RestyleConfig, SpeedConfig
+from ..evaluation.config import BenchConfig, PeerConfig, ReportConfig, RestyleConfig, SpeedConfig
 from .parsing import load_field_method, parse
 from .progress import Display
 from .train import train_scene
@@ -22,14 +22,12 @@ __all__ = ["NAMES", "bench_run", "console", "run", "write_report"]
 
 NAMES: dict[str, BenchConfig | ReportConfig] = {
     "speed": SpeedConfig(),
-    "profile": ProfileConfig(),
-    "memory": MemoryConfig(),
     "restyle": RestyleConfig(),
     "peer": PeerConfig(),
 }
 """Defaults of each benchmark."""
-_MOVED = ("paper", "pareto", "scaling", "stress")
-"""Benchmarks of the repository, which the installed package does not hold."""
+_MOVED = {name: name for name in ("paper", "pareto", "scaling", "stress")} | {"memory": "peak_memory", "profile": "profiling"}
+"""Benchmarks that the installed package does not hold: what the repository calls them."""
 _WIDTH = 150
 """Columns of a table that goes to a file."""
 C = TypeVar("C", bound=BenchConfig)
@@ -44,20 +42,12 @@ def run(args: list[str]) -> int:
         return 0 if name else 2
     if name in _MOVED:
         raise UsageError(
-            f"fprf bench {name}: not in the installed package; run `python -m benchmarks {name}` in a clone of fprf"
+            f"fprf bench {name}: not in the installed package; run `python -m benchmarks {_MOVED[name]}` in a clone of fprf"
         )
     if name == "speed":
         from ..evaluation.speed import speed
 
         return bench_run(f"fprf bench {name}", SpeedConfig(), rest, speed)
-    if name == "profile":
-        from ..evaluation.profile import profile
-
-        return bench_run(f"fprf bench {name}", ProfileConfig(), rest, profile)
-    if name == "memory":
-        from ..evaluation.memory import memory
-
-        return bench_run(f"fprf bench {name}", MemoryConfig(), rest, memory)
     if name == "restyle":
         return _restyle(rest)
     if name == "peer":

@@ -26,7 +26,7 @@ Make it again after installing a plug-in."""
 
 _WORDS = {
     "pretrain": ("decoder",),
-    "bench": ("speed", "profile", "memory", "restyle", "peer"),
+    "bench": ("speed", "restyle", "peer"),
     "export": tuple(KINDS),
     "completion": ("bash", "zsh", "fish"),
 }

@@ -8,7 +8,7 @@ from ..checks import at_least, between, positive
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..style.config import StyleConfig
 
-__all__ = ["BenchConfig", "MemoryConfig", "PeerConfig", "ProfileConfig", "ReportConfig", "RestyleConfig", "SpeedConfig"]
+__all__ = ["BenchConfig", "PeerConfig", "ReportConfig", "RestyleConfig", "SpeedConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,23 +59,6 @@ class SpeedConfig(BenchConfig):
         super().__post_init__()
         at_least("points", self.points, 1)
         at_least("clusters", self.clusters, 1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProfileConfig(BenchConfig):
-    """Where the time of a training step and of a render chunk goes."""
-
-    operators: int = 0
-    """Also list so many of the most expensive torch operators."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        at_least("operators", self.operators, 0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MemoryConfig(BenchConfig):
-    """Most memory that each part of the work holds, each in a process of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,10 @@ def bench(world: World, name: str, output: Path, *more: str) -> dict[str, object
     args = [name, str(world.run), "--references", *references, *SMALL, "--output", str(output), *more]
     assert main(args) == 0
     document = json.loads(output.read_text())
-    assert document["benchmark"] == name and document["settings"]["without"] == ""
+    assert (
+        document["benchmark"] == {"profiling": "profile", "peak_memory": "memory"}.get(name, name)
+        and document["settings"]["without"] == ""
+    )
     return document
 
 
@@ -51,6 +54,31 @@ def test_scaling(world: World, tmp_path: Path) -> None:
     assert series["a batch"]["sizes"] == [2, 3] and series["tri-plane forward + backward"]["sizes"] == [200, 400]
     assert all(cost > 0 for each in series.values() for cost in each["milliseconds"])
     assert all(each["exponent"] is not None for each in series.values())
+
+
+def test_profile(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    document = bench(world, "profiling", tmp_path / "profile.json", "--operators", "3")
+    step, plain, styled = document["parts"].values()
+    for taken in (step, plain, styled):
+        shares = {name: part["share"] for name, part in taken["parts"].items()}
+        assert sum(shares.values()) == pytest.approx(1) and all(share > -1e-6 for share in shares.values())
+        assert taken["low"] <= taken["milliseconds"] <= taken["high"] and len(taken["operators"]) == 3
+    assert step["parts"].keys() >= {
+        "batch", "sampler", "density", "content", "semantic", "decoder", "losses", "optimizer",
+        "backward of density", "backward of content", "backward of decoder", "backward of semantic", "rest",
+    }  # fmt: skip
+    assert "stylizer" in styled["parts"] and "stylizer" not in plain["parts"]
+    assert not any(name.startswith("backward") for name in plain["parts"])
+    captured = capsys.readouterr()
+    assert "training step" in captured.out and all(line.startswith("{") for line in captured.err.splitlines())
+
+
+@pytest.mark.slow
+def test_memory(world: World, tmp_path: Path) -> None:
+    document = bench(world, "peak_memory", tmp_path / "memory.json")
+    rows = {row["name"]: row["figure"] for row in document["rows"]}
+    assert 20 < rows["interpreter and packages"] < rows["and a loaded run"] < rows["and training steps"] < 4000
+    assert rows["parameters of the field"] > 0
 
 
 def test_every_benchmark_runs_and_none_is_forgotten(capsys: pytest.CaptureFixture[str]) -> None:

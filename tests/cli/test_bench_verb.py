@@ -45,37 +45,12 @@ def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "faster" in text and all(name in text for name in compared), "nothing is cut off"
 
 
-def test_profile(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = bench(world, "profile", tmp_path / "profile.json", "--operators", "3")
-    step, plain, styled = document["parts"].values()
-    for taken in (step, plain, styled):
-        shares = {name: part["share"] for name, part in taken["parts"].items()}
-        assert sum(shares.values()) == pytest.approx(1) and all(share > -1e-6 for share in shares.values())
-        assert taken["low"] <= taken["milliseconds"] <= taken["high"] and len(taken["operators"]) == 3
-    assert step["parts"].keys() >= {
-        "batch", "sampler", "density", "content", "semantic", "decoder", "losses", "optimizer",
-        "backward of density", "backward of content", "backward of decoder", "backward of semantic", "rest",
-    }  # fmt: skip
-    assert "stylizer" in styled["parts"] and "stylizer" not in plain["parts"]
-    assert not any(name.startswith("backward") for name in plain["parts"])
-    captured = capsys.readouterr()
-    assert "training step" in captured.out and all(line.startswith("{") for line in captured.err.splitlines())
-
-
-@pytest.mark.slow
-def test_memory(world: World, tmp_path: Path) -> None:
-    document = bench(world, "memory", tmp_path / "memory.json")
-    rows = {row["name"]: row["figure"] for row in document["rows"]}
-    assert 20 < rows["interpreter and packages"] < rows["and a loaded run"] < rows["and training steps"] < 4000
-    assert rows["parameters of the field"] > 0
-
-
 @pytest.mark.parametrize(
     ("args", "told"),
     [
-        (["sped"], "fprf bench sped: no such benchmark; allowed are speed, profile, memory, restyle, peer"),
+        (["sped"], "fprf bench sped: no such benchmark; allowed are speed, restyle, peer"),
         (["speed", "nowhere"], "nowhere: no config.json here"),
-        (["pareto", "run"], "run `python -m benchmarks pareto` in a clone of fprf"),
+        (["profile", "run"], "run `python -m benchmarks profiling` in a clone of fprf"),
     ],
 )
 def test_mistakes(args: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:

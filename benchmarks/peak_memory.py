@@ -1,24 +1,34 @@
-"""`fprf bench memory`: peak memory of each part of the work, each in a process of its own, and the size of the model.
+"""Peak memory of each part of the work, each in a process of its own, and the size of the model.
 
-A part runs as `python -m fprf.evaluation.memory` with a JSON object on standard input. Resident memory only grows, so a fresh
+A part runs as `python -m benchmarks.peak_memory` with a JSON object on standard input. Resident memory only grows, so a fresh
 process that does nothing else tells what a part holds.
 """
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
-from ..errors import FprfError
-from .config import MemoryConfig
-from .report import Outcome, Row, document, rows_table
-from .subject import attempt, find, fresh_model, settings
+from fprf.cli.bench import bench_run
+from fprf.errors import FprfError
+from fprf.evaluation.config import BenchConfig
+from fprf.evaluation.report import Outcome, Row, document, rows_table
+from fprf.evaluation.subject import attempt, find, fresh_model, settings
 
-__all__ = ["PARTS", "main", "memory", "mib", "peak_mib"]
+from .common import ROOT
+
+__all__ = ["PARTS", "measure_part", "memory", "mib", "peak_mib"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MemoryConfig(BenchConfig):
+    """Most memory that each part of the work holds, each in a process of its own."""
 
 
 PARTS = ("import", "load", "render", "restyle", "prepare", "train")
@@ -33,12 +43,12 @@ def peak_mib(status: Path = Path("/proc/self/status")) -> float:
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 2**10
-    from .evaluate import peak_memory
+    from fprf.evaluation.evaluate import peak_memory
 
     return peak_memory()
 
 
-def main() -> int:
+def measure_part() -> int:
     """Do the part that standard input names, and print what it took."""
     asked = json.load(sys.stdin)
     device = _do(asked["part"], asked)
@@ -50,7 +60,7 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
     """Most device memory in MiB, where the device has its own."""
     import torch
 
-    from .subject import find, fresh_model, loop_of, test_view
+    from fprf.evaluation.subject import find, fresh_model, loop_of, test_view
 
     if part == "import":
         return None
@@ -65,9 +75,9 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
     trained = subject.trained
     known = trained.known
     if part in ("render", "restyle"):
-        from ..plugins.stylizers.config import RegionOtConfig
-        from ..training.restyle import restyle
-        from ..training.views import render_view
+        from fprf.plugins.stylizers.config import RegionOtConfig
+        from fprf.training.restyle import restyle
+        from fprf.training.views import render_view
 
         look = restyle(trained, subject.references, RegionOtConfig()).restyle if part == "restyle" else None
         render_view(trained.model, known.facts, test_view(config, trained), 0, trained.config.render, look)
@@ -79,10 +89,6 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
                 loop.step(trained.step + step, 0.5)
     device = trained.model.device
     return torch.cuda.max_memory_allocated(device) / 2**20 if device.type == "cuda" else None
-
-
-if __name__ == "__main__":
-    sys.exit(main())
 
 
 NAMES = {
@@ -133,10 +139,22 @@ def mib(module: nn.Module) -> float:
 
 
 def _measured(asked: dict[str, object]) -> dict[str, float | None]:
-    command = [sys.executable, "-m", "fprf.evaluation.memory"]
-    ended = subprocess.run(command, input=json.dumps(asked), capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "benchmarks.peak_memory"]
+    paths = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    ended = subprocess.run(
+        command, input=json.dumps(asked), capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": paths}
+    )
     if ended.returncode != 0:
         lines = ended.stderr.strip().splitlines()
-        raise FprfError(f"fprf bench memory: {asked['part']} ended with {ended.returncode}: {lines[-1] if lines else ''}")
+        raise FprfError(f"benchmark peak_memory: {asked['part']} ended with {ended.returncode}: {lines[-1] if lines else ''}")
     result: dict[str, float | None] = json.loads(ended.stdout.splitlines()[-1])
     return result
+
+
+def main(argv: list[str]) -> int:
+    """`python -m benchmarks peak_memory [RUN] [flags]`."""
+    return bench_run("python -m benchmarks peak_memory", MemoryConfig(), argv, memory)
+
+
+if __name__ == "__main__":
+    sys.exit(measure_part())

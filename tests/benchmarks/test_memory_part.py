@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tiny_world import World
 
-from fprf.evaluation.memory import PARTS, main, peak_mib
+from benchmarks.peak_memory import PARTS, measure_part, peak_mib
 
 
 def test_peak_is_read_from_the_systems_books(tmp_path: Path) -> None:
@@ -24,6 +24,6 @@ def test_a_part_does_its_work_and_prints_json(
         "references": [str(path) for path in world.references],
     }  # fmt: skip
     monkeypatch.setattr(sys, "stdin", io.StringIO(json.dumps(asked)))
-    assert main() == 0
+    assert measure_part() == 0
     taken = json.loads(capsys.readouterr().out)
     assert taken["peak_device_mib"] is None and 20 < taken["peak_rss_mib"] < 2**20

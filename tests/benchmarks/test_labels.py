@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tiny_world import World, rays_of
 from torch.autograd.profiler import profile
 
-from fprf.evaluation.profile import PREFIX, REST, Range, attribute, exclusive, labelled
+from benchmarks.profiling import PREFIX, REST, Range, attribute, exclusive, labelled
 from fprf.rendering.renderer import render_rays
 from fprf.types import Want
 

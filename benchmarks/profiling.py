@@ -1,4 +1,4 @@
-"""`fprf bench profile`: where the time of a training step, of a render chunk and of a restyled one goes, by named part.
+"""Profile: where the time of a training step, of a render chunk and of a restyled one goes, by named part.
 
 Shares are from profiled calls, milliseconds of the whole from calls without the profiler, which costs a few percent. On a
 GPU the times are those in which the host was busy.
@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -20,18 +21,32 @@ from torch import nn
 from torch.autograd.profiler import profile as recording
 from torch.profiler import record_function
 
-from ..interfaces import Stylizer
-from ..plugins.stylizers.config import RegionOtConfig
-from ..rendering.renderer import render_rays
-from ..training.model import Model, background_of
-from ..training.restyle import restyle
-from ..types import Rays, Want
-from .config import ProfileConfig
-from .naive import replaced
-from .report import Outcome, Spread, Watch, document, table
-from .subject import attempt, find, fresh_model, loop_of, settings, stepper, test_view, view_rays, watch_of
+from fprf.checks import at_least
+from fprf.cli.bench import bench_run
+from fprf.evaluation.config import BenchConfig
+from fprf.evaluation.naive import replaced
+from fprf.evaluation.report import Outcome, Spread, Watch, document, table
+from fprf.evaluation.subject import attempt, find, fresh_model, loop_of, settings, stepper, test_view, view_rays, watch_of
+from fprf.interfaces import Stylizer
+from fprf.plugins.stylizers.config import RegionOtConfig
+from fprf.rendering.renderer import render_rays
+from fprf.training.model import Model, background_of
+from fprf.training.restyle import restyle
+from fprf.types import Rays, Want
 
 __all__ = ["PREFIX", "REST", "Range", "attribute", "exclusive", "labelled", "profile"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileConfig(BenchConfig):
+    """Where the time of a training step and of a render chunk goes."""
+
+    operators: int = 0
+    """Also list so many of the most expensive torch operators."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least("operators", self.operators, 0)
 
 
 PREFIX = "fprf."
@@ -271,3 +286,8 @@ def _table(name: str, parts: Parts) -> Table:
     rows += [(f"operator {op}", f"{100 * share:.1f}", f"{share * milliseconds:.2f}") for op, share in parts.operators.items()]
     rows.append(("whole", "100", f"{milliseconds:.2f}"))
     return table(name, ("part", "%", "ms"), rows)
+
+
+def main(argv: list[str]) -> int:
+    """`python -m benchmarks profiling [RUN] [flags]`."""
+    return bench_run("python -m benchmarks profiling", ProfileConfig(), argv, profile)
