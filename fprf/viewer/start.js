@@ -125,7 +125,7 @@
     at("recent").hidden = !rows.length;
     at("recent").querySelector("ul").replaceChildren(...rows.map((row) => make("li", {}, make("button", {
       type: "button", title: row.path, onclick: () => open(row.path) },
-      make("b", { textContent: row.name }), make("small", { textContent: `${row.kind === "run" ? "trained" : "not trained yet"}, ${row.when}` })))));
+      make("b", { textContent: row.name }), make("small", { textContent: `${row.kind}, ${row.when}` })))));
   };
   const open = (path) => attempt(async () => { fault(""); await ask("/fprf/start/open", { path, minutes: minutes() }); });
   const stop = (then) => attempt(async () => {

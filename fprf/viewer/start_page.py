@@ -20,7 +20,7 @@ from typing import Any, Literal, TypeAlias
 
 from ..checks import between
 from ..errors import DataError, FprfError, UsageError
-from .scene_files import SceneFiles, Source, find_source
+from .scene_files import SceneFiles, Source, find_source, is_capture
 from .server import Handler, Request, Response, json_body, json_response
 
 __all__ = ["Progress", "StartPage"]
@@ -147,8 +147,13 @@ class StartPage:
             raise UsageError("name a run folder, a capture, a video or a folder of photographs")
         path = Path(text).expanduser()
         source = await asyncio.to_thread(find_source, path)
-        ours = path.name == _FILES and path.resolve().parent.parent == self._output
-        self._begin(source, path.resolve().parent.name if ours else self._unused(path.stem), _minutes(asked))
+        whole = path.resolve()
+        if source.kind == "run":
+            name = whole.parent.name if whole.name == _RUN else whole.name
+        else:
+            ours = whole.name == _FILES and whole.parent.parent == self._output
+            name = whole.parent.name if ours else self._unused(path.stem)
+        self._begin(source, name, _minutes(asked))
         return json_response({})
 
     async def _stop(self, request: Request) -> Response:
@@ -189,7 +194,7 @@ class StartPage:
                 self._call(["train", METHOD, *place, "--minutes", f"{minutes:g}", "--checkpoint-minutes", often])
                 path = root / _RUN
             self._set(stage="opening", what="opening the scene", share=None, detail="")
-            self._show(path, name if source.kind != "run" else path.resolve().name)
+            self._show(path, name)
             self._set(stage="open")
         except _Left:
             self._progress = Progress()
@@ -271,7 +276,7 @@ class StartPage:
             {
                 "path": str(path.resolve()),
                 "name": name,
-                "kind": "files" if path.name == _FILES else "run",
+                "kind": _kind(path),
                 "when": time.strftime("%d %b %H:%M", time.localtime(date)),
             }
             for date, path, name in sorted(dated, reverse=True)[:_RECENT]
@@ -310,6 +315,13 @@ def _newest(run: Path) -> int:
     """Step of the newest whole checkpoint; -1 where there is none."""
     steps = (path.parent.name.removeprefix("step-") for path in run.glob("checkpoints/step-*/manifest.json"))
     return max((int(step) for step in steps if step.isdigit()), default=-1)
+
+
+def _kind(path: Path) -> str:
+    """What a scene on the list is: `trained`, a `capture`, or photographs that are `not trained yet`."""
+    if path.name != _FILES:
+        return "trained"
+    return "capture" if any(is_capture(each) for each in (path, *path.iterdir())) else "not trained yet"
 
 
 def _runs(folder: Path) -> Iterator[Path]:
