@@ -1,0 +1,92 @@
+"""Every config refuses what lies outside of its ranges, and names the field."""
+
+from math import inf, nan
+from typing import Any
+
+import pytest
+
+from fprf.config import LossConfig, OptimizerConfig, RenderConfig, SemanticConfig, StatisticsConfig, TrainConfig
+from fprf.errors import ConfigError
+from fprf.evaluation.config import RestyleConfig
+from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.fields.layouts import AdaptiveConfig, GridConfig, StreetConfig
+from fprf.plugins.decoders.config import ResidualDecoderConfig
+from fprf.plugins.encoders.config import (
+    AveragedConfig,
+    ConcatConfig,
+    DeepLabConfig,
+    Dinov2Config,
+    MobileNetV2Config,
+    RandomConfig,
+    Vgg16Config,
+    Vgg19Config,
+)
+from fprf.plugins.executors.config import RayConfig
+from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionAdainConfig, RegionOtConfig, RegionToneConfig
+from fprf.pretraining.config import DistilConfig, PretrainDecoderConfig
+from fprf.training.quality import QualityConfig
+
+PLANES: dict[str, list[Any]] = {"resolutions": [(), (64, 1)], "channels": [0], "hidden": [0], "layers": [-1]}
+OUTSIDE: dict[type, dict[str, list[Any]]] = {
+    TrainConfig: {"downscale": [0], "steps": [-1], "seed": [2**31], "minutes": [0.0, inf], "checkpoint_minutes": [0.0]},
+    SemanticConfig: {"dim": [0], "samples": [0]},
+    LossConfig: {
+        "rgb": [-1.0],
+        "interlevel": [nan],
+        "penalty_every": [0],
+        "penalties": [(("a", -1.0),), (("variation", 1.0),)],
+    },
+    OptimizerConfig: {"rate": [0.0], "final": [1.5], "beta2": [-0.1], "eps": [0.0]},
+    RenderConfig: {"budget": [0.6], "train_budget": [-0.1], "chunk": [0], "background": [(0.0, 1.5, 0.0), (0.0, nan, 0.0)]},
+    StatisticsConfig: {"rays": [3], "regions": [0]},
+    QualityConfig: {"samples": [0.0], "budget": [0.6, -0.1], "chunk": [0], "resolution": [0.0, 1.5]},
+    PlanesConfig: PLANES | {"degree": [0, 5]},
+    SemanticPlanesConfig: PLANES,
+    GridConfig: {"cells": [(0, 1)], "size": [0.0], "margin": [0.0, 0.6]},
+    AdaptiveConfig: {"rays": [0], "smallest": [-1.0], "margin": [0.0]},
+    StreetConfig: {"segments": [0], "length": [0.0], "margin": [1.0]},
+    UniformConfig: {"samples": [0, -3]},
+    ProposalConfig: {
+        "final": [0],
+        "channels": [0],
+        "padding": [0.0, 1.5],
+        "anneal_slope": [0.0, nan],
+        "anneal_steps": [-1],
+        "update_every": [0],
+        "warm_up": [-1],
+        "samples": [(1, 8), ()],
+        "resolutions": [(1, 8)],
+    },
+    ResidualDecoderConfig: {"hidden": [0], "fade": [0.0, -1.0]},
+    RandomConfig: {"channels": [0], "stride": [0], "seed": [-1]},
+    Vgg16Config: {"layer": ["relu3_4", "fc7"]},
+    Vgg19Config: {"layer": ["relu0_1", "relu2_3", "relu2_1 "]},
+    MobileNetV2Config: {"layer": ["features.19", "13", "features.013"]},
+    DeepLabConfig: {"layer": ["backbone.18", "logits2"]},
+    Dinov2Config: {"layer": [0], "stride": [0]},
+    AveragedConfig: {"scales": [(), (0.0,), (nan,)]},
+    ConcatConfig: {"weights": [(0.0,), (1.0, -1.0), (inf,)]},
+    LocalAdainConfig: {"temperature": [0.0, nan, inf]},
+    RegionAdainConfig: {"temperature": [-1.0], "gain": [0.99]},
+    RegionOtConfig: {"temperature": [-1.0], "gain": [0.99]},
+    RegionToneConfig: {"temperature": [-1.0], "gain": [0.99]},
+    RayConfig: {"workers": [0], "processors": [0.0], "retries": [-1], "gpus": [-1.0]},
+    DistilConfig: {name: [0] for name in ("minutes", "steps", "batch", "rate", "crops")}
+    | {"seed": [-1], "photos": [1], "size": [8]},
+    PretrainDecoderConfig: {name: [-1] for name in ("noise", "style", "content", "samples")} | {"crops": [1], "pairs": [0]},
+    RestyleConfig: {"frames": [7], "seeds": [(1, 2)], "blend": [1.1], "palettes": [()], "longest": [8]},
+}
+ROWS = [(kind, name, value) for kind, fields in OUTSIDE.items() for name, values in fields.items() for value in values]
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), ROWS)
+def test_a_value_outside_of_its_range_is_refused_by_name(kind: type, name: str, value: Any) -> None:
+    with pytest.raises(ConfigError) as refused:
+        kind(**{name: value})
+    assert name in str(refused.value)
+
+
+def test_a_loss_that_weighs_nothing_is_refused() -> None:
+    with pytest.raises(ConfigError):
+        LossConfig(rgb=0.0, content=0.0, semantic=0.0)
