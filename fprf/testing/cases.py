@@ -21,25 +21,25 @@ from ..types import Batch, Rays, Site
 __all__ = ["batch", "capture", "dictionary", "normal", "parts", "points", "rays", "scene", "site", "space", "uniform"]
 
 
-def uniform(*shape: int, seed: int = 1) -> Tensor:
-    """In [0, 1]. Inputs of one function take different seeds, so that swapped arguments are seen."""
+def uniform(*shape: int, seed: int) -> Tensor:
+    """In [0, 1]. Every call in this package has a seed of its own, so that swapped arguments are seen."""
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def normal(*shape: int, seed: int = 2) -> Tensor:
+def normal(*shape: int, seed: int) -> Tensor:
     """Mean 0, deviation 1; seeds as in `uniform`."""
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
 def points(count: int) -> Annotated[Tensor, "N 3"]:
     """In the unit cube, among them its centre and two of its corners."""
-    inner = 2 * uniform(count - 3, 3) - 1
+    inner = 2 * uniform(count - 3, 3, seed=1) - 1
     return torch.cat([inner, torch.zeros(1, 3), torch.ones(1, 3), -torch.ones(1, 3)])
 
 
 def rays(count: int) -> Rays:
     """From outside the unit cube through it."""
-    direction = torch.nn.functional.normalize(normal(count, 3), dim=1)
+    direction = torch.nn.functional.normalize(normal(count, 3, seed=2), dim=1)
     near, far = torch.full((count,), 0.5), torch.full((count,), 3.5)
     return Rays(origin=-2 * direction, direction=direction, view=direction, near=near, far=far)
 
@@ -48,7 +48,7 @@ def site(views: int, points: int) -> Site:
     """Cameras along a winding path, and points around them."""
     way = torch.linspace(-3, 3, views, dtype=torch.float64)
     position = torch.stack([way, 0.3 * torch.sin(2 * way), torch.zeros_like(way)], 1)
-    spread = normal(points, 3).double() * torch.tensor([3.0, 1.0, 0.3], dtype=torch.float64)
+    spread = normal(points, 3, seed=16).double() * torch.tensor([3.0, 1.0, 0.3], dtype=torch.float64)
     return Site(position=position, rays=torch.full((views,), 640 * 480), points=spread, unit=10.0)
 
 
@@ -62,8 +62,8 @@ def capture(folder: Path) -> Scene:
     """Five pictures of noise of several sizes, written to a folder; the second is held out."""
     sizes = torch.tensor([[24, 16], [30, 20], [18, 26], [24, 16], [12, 10]])
     paths = [folder / f"{view}.png" for view in range(len(sizes))]
-    for path, (width, height) in zip(paths, sizes.tolist(), strict=True):
-        write_image(path, (255 * uniform(height, width, 3)).byte().numpy())
+    for view, (width, height) in enumerate(sizes.tolist()):
+        write_image(paths[view], (255 * uniform(height, width, 3, seed=30 + view)).byte().numpy())
     cameras = Cameras(
         pose=torch.eye(4, dtype=torch.float64)[:3].repeat(len(sizes), 1, 1),
         focal=torch.full((len(sizes), 2), 20.0, dtype=torch.float64),
@@ -86,7 +86,7 @@ def parts() -> Parts:
 def batch(count: int) -> Batch:
     """Targets of `rays` for `parts`; semantics of the first half."""
     view, pixel = torch.zeros(count, dtype=torch.int64), torch.full((count, 2), 0.5)
-    return Batch(view, pixel, uniform(count, 3), normal(count, 7, seed=3), normal(count // 2, 5, seed=4))
+    return Batch(view, pixel, uniform(count, 3, seed=17), normal(count, 7, seed=3), normal(count // 2, 5, seed=4))
 
 
 class _Sigmoid(Decoder):
