@@ -46,7 +46,7 @@ VERBS = {
     "render": Verb("RUN --path PATH --output X.mp4", "fly through a scene, plain or restyled"),
     "view": Verb("[RUN]", "in the browser: make a scene, drop a photograph on it"),
     "report": Verb("RUN", "how training went: charts of loss, PSNR, speed, time per part"),
-    "bench": Verb("speed|restyle|peer [RUN]", "time and error; restyling judged by the truth; frames of other systems"),
+    "bench": Verb("speed|restyle|peer [RUN]", "time and error; restyling against the truth; frames of peers"),
     "export": Verb("RUN [ply splat glb cameras lut]", "points, splats, meshes, cameras, lookup tables as files"),
     "cluster": Verb("[--head HOST]", "how to train blocks on many machines"),
     "pretrain": Verb("decoder", "train the decoder of an encoder"),
