@@ -16,14 +16,14 @@ from ..memory import chunk_size
 from ..plugins.samplers.config import UniformConfig
 from ..plugins.samplers.samplers import UniformSampler
 from ..rendering.cameras import Cameras, project
-from ..rendering.renderer import March, Parts, composite, march
+from ..rendering.renderer import March, Parts, composite, march_features, shade
 from ..style.look import Restyle
 from ..training.model import Facts, Model, background_of
 from ..training.views import on_host
 from ..types import Rays, Want
 from .depth_maps import DepthMaps, depth_gaps
 
-__all__ = ["BestViews", "Coloured", "best_views", "expected_presence", "point_colours", "shade", "single_view"]
+__all__ = ["BestViews", "Coloured", "best_views", "colours_in_styles", "expected_presence", "point_colours", "single_view"]
 
 
 _DECAY = math.log(9)
@@ -117,22 +117,17 @@ class Coloured(NamedTuple):
     and where that is thick (see `witness.expected_presence`)."""
 
 
-def shade(
-    rays: Rays, parts: Parts, budget: float, styles: Sequence[Restyle | None]
-) -> tuple[March, list[Annotated[Tensor, "R 3"]]]:
+def colours_in_styles(
+    rays: Rays, parts: Parts, budget: float, styles: Sequence[Restyle | None], *, semantic: bool = False
+) -> tuple[March, list[Annotated[Tensor, "R 3"]], Annotated[Tensor, "M D"] | None]:
     """March R rays once and composite their colours in several styles (None = plain), without any background.
 
-    Features and semantics are computed once for all styles.
+    Semantics of the kept samples are computed where a style needs them or `semantic` asks for them.
     """
-    marched = march(rays, parts, budget=budget)
-    kept = marched.kept
-    features = parts.field.content(kept.latent, kept.view)
-    shown = [None if style is None or style.idle else style for style in styles]
-    semantic = None
-    if parts.semantic is not None and any(style is not None and Want.SEMANTIC in style.needs for style in shown):
-        semantic = parts.semantic(kept.point)
-    colours = [parts.decoder(features) if s is None else s.colour(parts.decoder, features, semantic) for s in shown]
-    return marched, [composite(kept, colour, len(rays.near)) for colour in colours]
+    needed = any(style is not None and not style.idle and Want.SEMANTIC in style.needs for style in styles)
+    marched, content, semantics = march_features(rays, parts, budget=budget, semantic=semantic or needed)
+    colours = [composite(marched.kept, shade(parts.decoder, content, semantics, s), len(rays.near)) for s in styles]
+    return marched, colours, semantics
 
 
 @torch.inference_mode()
@@ -200,7 +195,7 @@ def _looked(
         rays = rays._replace(near=near, far=far)
     # Close to the point there is nothing to be found first: even steps are as good as proposals, and cost a third.
     parts = model.parts if tolerance is None else model.parts._replace(sampler=_CLOSE)
-    marched, colours = shade(Rays(*(x.to(device) for x in rays)), parts, config.budget, styles)
+    marched, colours, _ = colours_in_styles(Rays(*(x.to(device) for x in rays)), parts, config.budget, styles)
     background = background_of(facts, device) if tolerance is None else None
     behind = 0.0 if background is None else marched.transmittance[:, None] * background
     composited, opacity = on_host(torch.cat([colour + behind for colour in colours], 1), marched.opacity)

@@ -30,7 +30,7 @@ from ..style.scene import SceneStyle
 from ..training.model import Model
 from ..training.style_pass import lattice
 from ..types import Rays
-from .colours import shade
+from .colours import colours_in_styles
 
 __all__ = ["colour_pairs", "fit_quality", "write_cube"]
 
@@ -166,15 +166,16 @@ def colour_pairs(
     weight = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
     view, pixel = lattice(cameras, torch.tensor(list(views)), rays)
     every = model.space.rays(*rays_through(cameras, view, pixel))
-    found = []
+    chunks = []
     size = chunk_size(config.chunk, device)
     for start in range(0, len(view), size):
         part = Rays(*(x[start : start + size].to(device) for x in every))
-        marched, colours = shade(part, model.parts, config.budget, [None, *styles])
+        looks = [None, *styles]
+        marched, colours, semantic = colours_in_styles(part, model.parts, config.budget, looks, semantic=weight.divided)
         kept = marched.kept
-        semantic = model.semantic(kept.point) if model.semantic is not None and weight.divided else kept.point[:, :0]
-        found.append(torch.cat([*colours, composite(kept, weight(semantic), len(part.near))], 1))
-    whole = torch.cat(found).cpu()
+        shares = weight(kept.point[:, :0] if semantic is None or not weight.divided else semantic)
+        chunks.append(torch.cat([*colours, composite(kept, shares, len(part.near))], 1))
+    whole = torch.cat(chunks).cpu()
     solid = whole[:, 3 * len(styles) + 3 :].sum(1).clamp_min(1e-6)
     colour = (whole[:, : 3 * len(styles) + 3] / solid[:, None]).clamp(0, 1).view(len(whole), -1, 3)
     return ColourPairs(colour[:, 0], colour[:, 1:].transpose(0, 1), whole[:, 3 * len(styles) + 3 :])

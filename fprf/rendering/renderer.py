@@ -26,7 +26,7 @@ from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_wei
 if TYPE_CHECKING:
     from ..style.look import Restyle
 
-__all__ = ["Kept", "Parts", "enlarged", "march", "render_rays"]
+__all__ = ["Kept", "Parts", "composite", "composite_mean", "enlarged", "march", "march_features", "render_rays", "shade"]
 
 
 _NEAR_CAMERA = 4.0
@@ -143,6 +143,26 @@ def _near_camera_gradient_scale(rays: Rays, middle: Annotated[Tensor, "R S"]) ->
     return (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1)
 
 
+def march_features(
+    rays: Rays, parts: Parts, *, budget: float, semantic: bool = True
+) -> tuple[March, Annotated[Tensor, "M C"], Annotated[Tensor, "M D"] | None]:
+    """March rays, and evaluate content and, where they are asked for and exist, semantics at the kept samples."""
+    marched = march(rays, parts, budget=budget)
+    kept = marched.kept
+    content = parts.field.content(kept.latent, kept.view)
+    return marched, content, parts.semantic(kept.point) if semantic and parts.semantic is not None else None
+
+
+def shade(
+    decoder: Decoder, content: Annotated[Tensor, "M C"], semantic: Annotated[Tensor, "M D"] | None, restyle: "Restyle | None"
+) -> Annotated[Tensor, "M 3"]:
+    """Colours of samples in a style (None = plain)."""
+    if restyle is None or restyle.idle:
+        plain: Tensor = decoder(content)
+        return plain
+    return restyle.colour(decoder, content, semantic if Want.SEMANTIC in restyle.needs else None)
+
+
 def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
     """Weighted sum over the kept samples of each ray (paper, Eq. 2)."""
     values = values.to(kept.weight.dtype)  # under autocast networks answer in half precision
@@ -151,6 +171,12 @@ def composite(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annota
     if kept.whole and rays > 0:
         return (values * kept.weight[:, None]).view(rays, -1, values.shape[1]).sum(1)
     return values.new_zeros(rays, values.shape[1]).index_add(0, kept.ray, values * kept.weight[:, None])
+
+
+def composite_mean(kept: Kept, values: Annotated[Tensor, "M C"], rays: int) -> Annotated[Tensor, "rays C"]:
+    """Mean over the kept samples of each ray, by their weights; 0 where a ray meets nothing."""
+    mass = composite(kept, torch.ones_like(kept.weight)[:, None], rays)
+    return composite(kept, values, rays) / mass.clamp_min(1e-10)
 
 
 def render_rays(
@@ -185,7 +211,9 @@ def render_rays(
             content = composite(still, features, count)
         if Want.COLOUR in want:
             backdrop = 0.0 if background is None else marched.transmittance[:, None] * background
-            rgb = composite(kept, _colour(features, kept, parts, restyle), count) + backdrop
+            styled = restyle is not None and not restyle.idle and Want.SEMANTIC in restyle.needs
+            semantics = parts.semantic(kept.point) if styled and parts.semantic is not None else None
+            rgb = composite(kept, shade(parts.decoder, features, semantics, restyle), count) + backdrop
             if step is not None and (alone := parts.decoder.frozen_colour(features)) is not None:
                 frozen_rgb = composite(kept, alone, count) + backdrop
     if Want.SEMANTIC in want and parts.semantic is not None:
@@ -194,18 +222,6 @@ def render_rays(
     return Rendered(
         marched.depth, marched.opacity, rgb, content, semantic, marched.weights, marched.sampled, counts, frozen_rgb
     )
-
-
-def _colour(
-    features: Annotated[Tensor, "M C"], kept: Kept, parts: Parts, restyle: "Restyle | None"
-) -> Annotated[Tensor, "M 3"]:
-    if restyle is None or restyle.idle:
-        plain: Tensor = parts.decoder(features)
-        return plain
-    semantic = None
-    if Want.SEMANTIC in restyle.needs and parts.semantic is not None:
-        semantic = parts.semantic(kept.point)
-    return restyle.colour(parts.decoder, features, semantic)
 
 
 def _semantics(marched: March, rays: Rays, parts: Parts, count: int, samples: int | None) -> Tensor:

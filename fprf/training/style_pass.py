@@ -14,7 +14,7 @@ from torch import Tensor
 from ..config import TrainConfig
 from ..memory import in_parts
 from ..rendering.cameras import Cameras, rays_through
-from ..rendering.renderer import composite, march
+from ..rendering.renderer import composite_mean, march_features
 from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.statistics import Moments, merge, moments
 from .camera_optimizers import refined
@@ -69,8 +69,8 @@ def measure_style(config: TrainConfig, model: Model, cameras: Cameras, views: An
     def part_of(part: slice) -> tuple[Moments, Tensor, Tensor, Tensor | None]:
         rays = model.space.rays(*rays_through(cameras, view[part], pixel[part]))
         rays = type(rays)(*(x.to(device) for x in rays))
-        kept = march(rays, model.parts, budget=config.render.budget).kept
-        content = model.field.content(kept.latent, kept.view)
+        marched, content, _ = march_features(rays, model.parts, budget=config.render.budget, semantic=False)
+        kept = marched.kept
         own = Moments(*(x.cpu() for x in moments(content, kept.weight)))
         # Regions are found and measured on an even share of the points; whole moments above see every one.
         every = max(1, -(-len(content) * config.statistics.rays // (len(rays.near) * POINTS)))
@@ -107,12 +107,9 @@ def _contacts(
     def part_of(part: slice) -> Annotated[Tensor, "R 3+D"]:
         rays = model.space.rays(*rays_through(cameras, view[part], pixel[part]))
         rays = type(rays)(*(x.to(model.device) for x in rays))
-        kept = march(rays, model.parts, budget=config.render.budget).kept
-        assert model.semantic is not None  # else there is one region
-        shown = torch.cat([model.decoder(model.field.content(kept.latent, kept.view)), model.semantic(kept.point)], 1)
-        mass = composite(kept, torch.ones_like(kept.weight)[:, None], len(rays.near)).clamp_min(1e-10)
-        found: Tensor = composite(kept, shown, len(rays.near)) / mass
-        return found.cpu()
+        marched, content, semantic = march_features(rays, model.parts, budget=config.render.budget)
+        assert semantic is not None  # else there is one region
+        return composite_mean(marched.kept, torch.cat([model.decoder(content), semantic], 1), len(rays.near)).cpu()
 
     shown = torch.cat(list(in_parts(len(view), config.render.chunk, part_of)))
     shown = shown.view(-1, 2, shown.shape[1])

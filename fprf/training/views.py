@@ -12,7 +12,7 @@ from ..interfaces import Decoder
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, grid_rays, rays_through
-from ..rendering.renderer import Kept, composite, enlarged, march, render_rays
+from ..rendering.renderer import Kept, composite, composite_mean, enlarged, march, march_features, render_rays, shade
 from ..style.look import Restyle
 from ..types import Rays, Rendered, View, Want
 from .model import Facts, Model, background_of
@@ -126,9 +126,8 @@ def paint_pixels(
         chunk = Rays(*(x[here] for x in rays))
         marched = march(chunk, model.parts, budget=config.budget)
         kept, field = marched.kept, model.semantic if semantic else None
-        found = values(kept.point[:, :0] if field is None else field(kept.point))
-        mass = composite(kept, torch.ones_like(kept.weight)[:, None], len(chunk.near))
-        return composite(kept, found, len(chunk.near)) / mass.clamp_min(1e-10), marched.opacity
+        painted = values(kept.point[:, :0] if field is None else field(kept.point))
+        return composite_mean(kept, painted, len(chunk.near)), marched.opacity
 
     painted, opacity = zip(*in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), paint), strict=True)
     shown, seen = on_host(torch.cat(painted), torch.cat(opacity))
@@ -163,18 +162,13 @@ class Part:
     @torch.inference_mode()
     def colour(self, decoder: Decoder, restyle: Restyle | None) -> Annotated[Tensor, "R 3"]:
         """Colours of its pixels in a style, or as they are, in [0, 1]; on the CPU."""
-        if restyle is None or restyle.idle:
-            points: Tensor = decoder(self.content)
-        else:
-            points = restyle.colour(decoder, self.content, self.semantic if Want.SEMANTIC in restyle.needs else None)
-        rgb = composite(self.kept, points, self.rays) + self.behind
+        rgb = composite(self.kept, shade(decoder, self.content, self.semantic, restyle), self.rays) + self.behind
         return (rgb if self.tone == (1.0, 1.0, 1.0) else rgb * rgb.new_tensor(self.tone)).clamp(0, 1).cpu()
 
     @torch.inference_mode()
     def mean(self, values: Annotated[Tensor, "M X"]) -> Annotated[Tensor, "R X"]:
         """What each pixel sees of values at the samples, scaled to what it sees at all; 0 where that is nothing."""
-        mass = composite(self.kept, torch.ones_like(self.kept.weight)[:, None], self.rays)
-        return (composite(self.kept, values, self.rays) / mass.clamp_min(1e-10)).cpu()
+        return composite_mean(self.kept, values, self.rays).cpu()
 
 
 @dataclass(frozen=True)
@@ -227,10 +221,8 @@ def view_parts(model: Model, facts: Facts, cameras: Cameras, view: int, config: 
 
     def part(here: slice) -> Part:
         chunk = Rays(*(x[here] for x in rays))
-        marched = march(chunk, model.parts, budget=config.budget)
+        marched, content, semantic = march_features(chunk, model.parts, budget=config.budget)
         kept = marched.kept
-        content = model.field.content(kept.latent, kept.view)
-        semantic = model.semantic(kept.point) if model.semantic is not None else None
         behind = 0.0 if background is None else marched.transmittance[:, None] * background
         # Points and latents have done their part.
         bare = kept._replace(point=kept.point[:, :0].clone(), latent=kept.latent[:, :0].clone(), view=kept.view[:, :0].clone())
