@@ -183,13 +183,13 @@ def _table(config: PaperConfig, base: TrainConfig, folder: Path, progress: Progr
         for k, (name, change) in enumerate(TRAINED[config.table].items()):
             short = short_training(change(base), folder / str(k), progress)
             rows[name] = _held_out(short.trained, config.views) | {"train_seconds": short.seconds}
-            if town_folder(short.trained) is not None:
+            if town_folder(short.trained.config) is not None:
                 rows[name] |= _styled(set_up(short.trained, short.encoders, config, folder / f"references-{k}"))
             elif config.references:
                 rows[name] |= styled_by_photographs(short.trained, short.encoders, config)
         return rows
     short = short_training(base, folder / "run", progress) if config.run is None else _finished(config.run, config.device)
-    if town_folder(short.trained) is None:
+    if town_folder(short.trained.config) is None:
         raise UsageError(f"--table {config.table}: judged by a town's truth; --run or --data is another scene, leave it out")
     steady = config.table in ("statistics", "large-scale")
     return style_rows(set_up(short.trained, short.encoders, config, folder / "references", path=steady))

@@ -33,9 +33,11 @@ from fprf.evaluation.town_truth import (
     places,
     score,
     set_stage,
+    town_settings,
     true_views,
     winners,
 )
+from fprf.interfaces import SceneView
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
@@ -48,7 +50,7 @@ from fprf.style.scene import scene_style
 from fprf.style.statistics import covariance, group_moments, moments
 from fprf.training.loading import Trained
 from fprf.training.restyle import apply_style
-from fprf.training.views import CachedView, cache_view
+from fprf.training.views import cache_view
 
 from .style_runs import PLAIN, Exhibit, judge_exhibit
 
@@ -205,7 +207,15 @@ def set_up(trained: Trained, encoders: Encoders, config: PaperConfig, folder: Pa
     """Views at the size of the training, and a path where it is asked for (with long steps, for the table about those)."""
     side = int(trained.known.cameras.size.amax())
     stride = _STRIDE if config.table == "large-scale" else 1.0
-    stage = set_stage(trained, views=config.views, frames=_FRAMES if path else 0, longest=side, stride=stride)
+    stage = set_stage(
+        trained,
+        trained.known,
+        town_settings(trained.config),
+        views=config.views,
+        frames=_FRAMES if path else 0,
+        longest=side,
+        stride=stride,
+    )
     return Bench(trained, encoders, stage, config, folder)
 
 
@@ -308,7 +318,7 @@ def _cases(bench: Bench, references: str, clusters: int | None) -> list[Case]:
             made = cell_dictionary({path.name: r.image for path, r in zip(paths, shown, strict=True)}, trained, encoders)
         else:
             number = bench.config.codes if clusters is None else clusters
-            made = dictionary_of(trained, paths, encoders, clusters=number, blend=bench.config.blend)[0]
+            made = dictionary_of(paths, encoders, clusters=number, blend=bench.config.blend)[0]
         found.append(Case(light, shown, paths, made, time.perf_counter() - start))
     return found
 
@@ -339,7 +349,7 @@ def _judged(bench: Bench, case: Case, found: Shown) -> Row:
     return row | {"style_seconds": case.seconds + found.style_seconds, "view_seconds": found.view_seconds}
 
 
-def _views(bench: Bench) -> list[CachedView]:
+def _views(bench: Bench) -> list[SceneView]:
     return [*bench.stage.shown, *bench.stage.passed]
 
 
@@ -351,8 +361,8 @@ def _inside(bench: Bench, stylizer: StylizerConfig) -> Restyled:
 def _by_view(bench: Bench, stylizer: StylizerConfig) -> Restyled:
     """Every view by statistics and regions of its own, of the same samples."""
     settings = bench.trained.config
-    scenes = []
-    for view in _views(bench):
+    stage, scenes = bench.stage, []
+    for view in [bench.trained.cached(of, i) for of in (stage.views, stage.path) for i in range(len(of))]:
         content, weight = (torch.cat(parts) for parts in zip(*((p.content, p.kept.weight) for p in view.parts), strict=True))
         seen = [part.semantic for part in view.parts if part.semantic is not None]
         semantic = torch.cat(seen) if seen else None

@@ -17,6 +17,7 @@ from .plugins.samplers.config import ProposalConfig, SamplerConfig
 
 if TYPE_CHECKING:
     from .cli.verbs import Verbs
+    from .datamanagers.scene import Scene as ParsedScene
     from .interfaces import Scene
     from .training.loading import LoadedRun
     from .training.quality import QualityConfig
@@ -232,6 +233,10 @@ class RunConfig:
             f"{type(self).__name__} does not say how its runs are read; its method has to give a config that does"
         )
 
+    def read_scene(self) -> "ParsedScene":
+        """The scene that the config names, at its size. Raises UsageError for no scene, DataError for an unreadable one."""
+        raise ConfigError(f"{type(self).__name__} does not say how its scene is read; its method has to give one that does")
+
     def fields_only(self, run: Path) -> "TrainConfig":
         """This config where the run is of fields. Raises UsageError, with the way out, where it is of another kind."""
         raise UsageError(
@@ -295,6 +300,12 @@ class TrainConfig(RunConfig):
         from .training.loading import open_fields
 
         return open_fields(run, device, quality)
+
+    def read_scene(self) -> "ParsedScene":
+        """Parse the folder with the data manager's parser."""
+        from .training.prepare import scene_of
+
+        return scene_of(self)
 
     def fields_only(self, run: Path) -> "TrainConfig":
         """This config."""

@@ -39,6 +39,7 @@ __all__ = [
     "LossTerm",
     "Sampler",
     "Scene",
+    "SceneView",
     "SemanticField",
     "Stylizer",
 ]
@@ -181,6 +182,18 @@ class Stylizer(nn.Module, ABC):
         """Attention of each point to each style code; rows sum to 1."""
 
 
+class SceneView(ABC):
+    """One view of a scene, to be drawn in one look after the other; results are on the CPU."""
+
+    @abstractmethod
+    def restyled(self, restyle: "Restyle | None" = None) -> View:
+        """The view in a look, or as it was captured."""
+
+    @abstractmethod
+    def match(self, restyle: "Restyle") -> Annotated[Tensor, "N T"]:
+        """Mean share of each style code (`Restyle.match`) over what each pixel sees, row after row; 0 where that is nothing."""
+
+
 class Scene(ABC):
     """A trained representation of any kind with its views: all that verbs, styles and viewers need of it.
 
@@ -235,6 +248,15 @@ class Scene(ABC):
     @abstractmethod
     def restyled(self, look: "Restyle | None") -> "Scene":
         """The scene in a look; None = as it was captured."""
+
+    @abstractmethod
+    def cached(self, cameras: "Cameras", view: int) -> SceneView:
+        """One view; what no look changes is computed once, as far as that saves time."""
+
+    @property
+    @abstractmethod
+    def decoder(self) -> Decoder | None:
+        """Brings content features to colours; None where the content of the scene is its colours."""
 
     @abstractmethod
     def measured(self) -> "tuple[SceneStyle, Basis | None]":

@@ -12,6 +12,7 @@ import torch
 from fprf.cli.train import train_scene
 from fprf.config import StatisticsConfig, TrainConfig
 from fprf.datamanagers.config import RayBatchesConfig
+from fprf.evaluation.town_truth import Stage, set_stage, town_settings
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import DataManager
 from fprf.io.images import write_image
@@ -132,6 +133,12 @@ def make_world(folder: Path) -> World:
     config = tiny(town, folder / "run")
     train_scene(config, "fprf-lite", quiet=True)
     return World(folder, town, folder / "run", references, config, prepare(config))
+
+
+def stage_of(trained: Trained, *, views: int, frames: int, longest: int) -> Stage:
+    """The stage of a run of the tiny town."""
+    settings = town_settings(trained.config)
+    return set_stage(trained, trained.known, settings, views=views, frames=frames, longest=longest)
 
 
 def trained_for(

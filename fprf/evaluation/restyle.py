@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UsageError
+from ..interfaces import Scene, SceneView
 from ..io.images import Picture, to_uint8, write_image
 from ..plugins import registry
 from ..plugins.stylizers.config import (
@@ -23,11 +24,9 @@ from ..plugins.stylizers.config import (
 from ..style.config import StyleConfig, labels
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
-from ..style.look import Restyle
 from ..style.references import Encoders, encode_photograph
-from ..training.loading import Trained, load_run
+from ..training.loading import open_run
 from ..training.restyle import dress
-from ..training.views import CachedView
 from ..types import Want
 from .config import RestyleConfig
 from .consistency import steadiness
@@ -46,6 +45,7 @@ from .town_truth import (
     places,
     score,
     set_stage,
+    town_settings,
     true_class_maps,
     true_views,
     winners,
@@ -112,17 +112,15 @@ def lineup(recommended: StylizerConfig) -> dict[str, StylizerConfig]:
     return {**others, "nearest-code": LocalAdainConfig(temperature=_SHARP), name: recommended}
 
 
-def dictionary_of(
-    trained: Trained, paths: Sequence[Path], encoders: Encoders, *, clusters: int, blend: float
-) -> tuple[StyleDictionary, float]:
+def dictionary_of(paths: Sequence[Path], encoders: Encoders, *, clusters: int, blend: float) -> tuple[StyleDictionary, float]:
     """The style dictionary of photographs on a scene, and the seconds it took."""
     start = time.perf_counter()
     found = [encode_photograph(path, encoders, name=name) for path, name in zip(paths, labels(tuple(paths)), strict=True)]
-    made = build_dictionary(found, clusters=clusters, blend=blend, seed=trained.config.seed)
+    made = build_dictionary(found, clusters=clusters, blend=blend, seed=encoders.seed)
     return made, time.perf_counter() - start
 
 
-def nothing(views: Sequence[CachedView]) -> Shown:
+def nothing(views: Sequence[SceneView]) -> Shown:
     """The scene as it is."""
     pictures, seconds = _each(views, lambda view: view.restyled().rgb)
     return Shown(pictures, None, 0.0, seconds)
@@ -143,8 +141,8 @@ def transfers(plain: Sequence[Image], references: Sequence[Image]) -> dict[str, 
 
 
 def in_scene(
-    trained: Trained,
-    views: Sequence[CachedView],
+    scene: Scene,
+    views: Sequence[SceneView],
     config: StylizerConfig,
     dictionary: StyleDictionary,
     encoders: Encoders,
@@ -152,19 +150,18 @@ def in_scene(
 ) -> Shown:
     """A stylizer of the scene."""
     start = time.perf_counter()
-    look = dress(trained, StyleFile(StyleConfig(references=tuple(paths), stylizer=config)), encoders, dictionary).restyle
+    look = dress(scene, StyleFile(StyleConfig(references=tuple(paths), stylizer=config)), encoders, dictionary).restyle
     spent = time.perf_counter() - start
     pictures, seconds = _each(views, lambda view: view.restyled(look).rgb)
     matched = Want.SEMANTIC in look.stylizer.needs
-    return Shown(pictures, [_taken(view, look) for view in views] if matched else None, spent, seconds)
+    return Shown(pictures, [view.match(look) for view in views] if matched else None, spent, seconds)
 
 
 def one_by_one(
-    trained: Trained, plain: Sequence[Image], config: StylizerConfig, dictionary: StyleDictionary, encoders: Encoders
+    scene: Scene, plain: Sequence[Image], config: StylizerConfig, dictionary: StyleDictionary, encoders: Encoders
 ) -> Shown:
     """The stylizer on each picture as a photograph of its own: its own statistics and regions, the same dictionary."""
-    guided, decoder = trained.config.datamanager.guided, trained.model.decoder
-    regions, seed = trained.config.statistics.regions, trained.config.seed
+    guided, decoder, regions, seed = encoders.guided, scene.decoder, len(encoders.scene.share), encoders.seed
     taken = []
 
     def restyled(view: Image) -> Image:
@@ -172,7 +169,8 @@ def one_by_one(
         if encoders.semantic is not None:
             semantic = encoded(view, encoders.semantic, guided, encoders.basis)
         size = (view.shape[0], view.shape[1])
-        flat = flat_scene(encoded(view, encoders.content, guided), semantic, size, regions=regions, seed=seed)
+        content = view.flatten(0, 1) if decoder is None else encoded(view, encoders.content, guided)
+        flat = flat_scene(content, semantic, size, regions=regions, seed=seed)
         look = flat_look(flat, dictionary, config, decoder)
         if semantic is not None:
             taken.append(look.match(semantic).cpu())
@@ -181,16 +179,6 @@ def one_by_one(
     with torch.inference_mode():
         pictures, seconds = _each(plain, restyled)
     return Shown(pictures, taken or None, 0.0, seconds)
-
-
-@torch.inference_mode()
-def _taken(view: CachedView, look: Restyle) -> Annotated[Tensor, "N T"]:
-    """Composited shares of the codes."""
-    return torch.cat([part.mean(look.match(_semantic(part.semantic, part.content))) for part in view.parts])
-
-
-def _semantic(semantic: Tensor | None, content: Tensor) -> Tensor:
-    return content[:, :0] if semantic is None else semantic
 
 
 def _each(views: Sequence[T], function: Callable[[T], Image]) -> tuple[list[Image], float]:
@@ -234,29 +222,33 @@ class Case(NamedTuple):
 
 def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress) -> tuple[dict[str, Any], list[Case]]:
     """The document and the cases. `folder` takes the references' files."""
-    trained = load_run(root, config.device)
-    stage = set_stage(trained, views=config.views, frames=config.frames, longest=config.longest)
-    found = cases(config, stage, trained.encoders(), folder, progress)
+    opened = open_run(root, config.device)
+    trained, scene = opened.run.load_config()[0], opened.scene
+    settings = town_settings(trained)
+    stage = set_stage(scene, opened.known, settings, views=config.views, frames=config.frames, longest=config.longest)
+    encoders = scene.encoders()
+    found = cases(config, stage, encoders, folder, progress)
     sets = sorted({case.set for case in found}, key=[case.set for case in found].index)
     means = {name: mean_rows([case.rows for case in found if case.set == name]) for name in sets}
     best = list(lineup(config.stylizer))[-1]
     document = {
         "benchmark": "restyle",
         "settings": {
-            "method": trained.method,
-            "trained_steps": trained.step,
-            "train_seconds": round(trained.seconds, 1),
-            "town_seed": stage.settings.seed,
-            "trained_palette": stage.settings.palette,
+            "method": opened.method,
+            "trained_steps": opened.step,
+            "train_seconds": round(opened.seconds, 1),
+            "town_seed": settings.seed,
+            "trained_palette": settings.palette,
+            "trained_size": [settings.width, settings.height],
             "reference_seeds": list(config.seeds),
-            "seed": trained.config.seed,
+            "seed": trained.seed,
             "views": len(stage.views),
             "frames": len(stage.path),
             "view_size": [int(side) for side in stage.views.size[0]],
             "clusters": config.clusters,
             "blend": config.blend,
-            "regions": trained.config.statistics.regions,
-            "semantic_encoder": trained.known.facts.semantic_encoder,
+            "regions": len(encoders.scene.share),
+            "semantic_encoder": scene.semantic_encoder,
         },
         "lpips": None,
         "lpips_missing": LPIPS_MISSING,
@@ -287,7 +279,7 @@ def cases(config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path,
     """Every palette with every set of references. Raises UsageError for references that would show the run's own town."""
     if stage.settings.seed in config.seeds:
         raise UsageError(f"--seeds: {stage.settings.seed} is the town of the run itself; references show other towns")
-    width, height = (int(side) for side in stage.trained.known.cameras.size[0])
+    width, height = (int(side) for side in stage.scene.cameras.size[0])
     chosen = places(config.seeds, (width, height))
     total = len(config.palettes) * len(chosen)
     found: list[Case] = []
@@ -331,18 +323,18 @@ def _case(
     paths: Sequence[Path],
     truth: list[Tensor],
 ) -> Case:
-    trained, views = stage.trained, [*stage.shown, *stage.passed]
-    dictionary, spent = dictionary_of(trained, paths, encoders, clusters=config.clusters, blend=config.blend)
+    scene, views = stage.scene, [*stage.shown, *stage.passed]
+    dictionary, spent = dictionary_of(paths, encoders, clusters=config.clusters, blend=config.blend)
     stylizers = lineup(config.stylizer)
     best = list(stylizers)[-1]
     found = {PLAIN: nothing(views)}
     plain = found[PLAIN].pictures
     found |= transfers(plain, [reference.image for reference in references])
-    found[FLAT] = one_by_one(trained, plain, config.stylizer, dictionary, encoders)
+    found[FLAT] = one_by_one(scene, plain, config.stylizer, dictionary, encoders)
     for name, stylizer in stylizers.items():
-        found[name] = in_scene(trained, views, stylizer, dictionary, encoders, paths)
+        found[name] = in_scene(scene, views, stylizer, dictionary, encoders, paths)
     known = {path.name: reference for path, reference in zip(paths, references, strict=True)}
-    classes = code_classes(dictionary, known, encoders, trained.config.datamanager.guided)
+    classes = code_classes(dictionary, known, encoders, encoders.guided)
     count = len(stage.shown)
     rows, by_class, shown = {}, {}, {name: each.pictures[:count] for name, each in found.items()}
     labels = [each.labels for each in stage.truth]

@@ -16,6 +16,7 @@ from ..errors import DataError
 from ..interfaces import Decoder, Encoder
 from ..ops.guided import upsample
 from ..plugins.stylizers.config import StylizerConfig
+from ..splats.restyle import region_maps
 from ..style.colours import colour_maps
 from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
@@ -78,10 +79,31 @@ def flat_scene(
     return Flat(content, semantic, size, style)
 
 
-def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder) -> Restyle:
-    """What `fprf stylize` would do to the photograph."""
+class _Colours(Decoder):
+    """Colours that are their own content, as those of Gaussians are."""
+
+    def forward(self, content: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
+        return content
+
+    def restyled(
+        self,
+        content: Annotated[Tensor, "N 3"],
+        styled: Annotated[Tensor, "N 3"],
+        strength: float | Annotated[Tensor, "N 1"],
+    ) -> Annotated[Tensor, "N 3"]:
+        return styled.clamp(0, 1)
+
+    def frozen_colour(self, content: Annotated[Tensor, "N 3"]) -> None:
+        return None
+
+
+def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder | None) -> Restyle:
+    """What `fprf stylize` would do to the photograph. Without a decoder its content is its colours, as in `splats.restyle`."""
     device = flat.content.device
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
+    if decoder is None:
+        maps = region_maps(stylizer, dictionary, flat.style, config)
+        return Restyle(stylizer, features=config.features if maps is None else 0.0, colours=maps)
     smoothing = config.smoothing(flat.style)
     colours = colour_maps(
         stylizer, dictionary, flat.style, decoder, features=config.features, share=config.colours, smoothing=smoothing
@@ -90,9 +112,9 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
 
 
 @torch.no_grad()
-def render_flat(flat: Flat, look: Restyle, decoder: Decoder) -> Annotated[Tensor, "H W 3"]:
+def render_flat(flat: Flat, look: Restyle, decoder: Decoder | None) -> Annotated[Tensor, "H W 3"]:
     """The photograph in a new style, in [0, 1]."""
-    parts = []
+    parts, decoder = [], decoder or _Colours()
     for start in range(0, len(flat.content), _CHUNK):
         rows = slice(start, start + _CHUNK)
         semantic = flat.semantic[rows] if flat.semantic is not None and Want.SEMANTIC in look.needs else None

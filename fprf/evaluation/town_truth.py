@@ -22,8 +22,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..config import RunConfig
 from ..datamanagers.config import GuidedConfig
 from ..errors import DataError, UsageError
+from ..interfaces import Scene, SceneView
 from ..rendering.cameras import Cameras
 from ..style.dictionary import StyleDictionary
 from ..style.references import Encoders
@@ -33,9 +35,7 @@ from ..town.palettes import palette
 from ..town.render import View, geometry, render, walk
 from ..town.surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
 from ..town.write import TownSettings, is_town
-from ..training.loading import Trained
-from ..training.prepare import scene_of
-from ..training.views import CachedView, cache_view
+from ..training.run import Known
 from .metrics import delta_e, image_metrics, mean_metrics
 from .single_image import encoded
 
@@ -86,58 +86,53 @@ class Truth(NamedTuple):
 class Stage(NamedTuple):
     """A trained town and the cameras that it is judged from."""
 
-    trained: Trained
+    scene: Scene
     settings: TownSettings
     town: Town
     views: Cameras
-    shown: Sequence[CachedView]
+    shown: Sequence[SceneView]
     """The judged views."""
     truth: Sequence[Truth]
     path: Cameras
-    passed: Sequence[CachedView]
+    passed: Sequence[SceneView]
     """The frames of the path."""
     path_truth: Sequence[Truth]
 
 
-def set_stage(trained: Trained, *, views: int, frames: int, longest: int, stride: float = 1.0) -> Stage:
-    """Held-out views, evenly spread, and a path that begins at one of them (no frames, no path; longer steps with `stride`).
-
-    Raises UsageError where the run shows no town.
-    """
-    settings = town_settings(trained)
+def set_stage(
+    scene: Scene, known: Known, settings: TownSettings, *, views: int, frames: int, longest: int, stride: float = 1.0
+) -> Stage:
+    """Held-out views, evenly spread, and a path that begins at one of them (no frames, no path; longer steps with `stride`)."""
     town = build_town(settings.seed, settings.extra)
-    known = trained.known
     held_out = known.test or known.train
     count = min(views, len(held_out))
     chosen = torch.tensor([held_out[i * len(held_out) // count] for i in range(count)])
     cameras = known.cameras.scaled(max(1.0, float(known.cameras.size.amax()) / longest))
     judged = cameras.select(chosen)
     path = short_path(judged.select(torch.tensor([count // 2])), frames, stride)
-    render = trained.config.render
 
-    def cached(of: Cameras) -> list[CachedView]:
-        return [cache_view(trained.model, known.facts, of, i, render) for i in range(len(of))]
+    def cached(of: Cameras) -> list[SceneView]:
+        return [scene.cached(of, i) for i in range(len(of))]
 
     def true(of: Cameras) -> list[Truth]:
         found = [geometry(town, town_view(of, i)) for i in range(len(of))]
         return [Truth(torch.from_numpy(depth), torch.from_numpy(labels.astype("int64"))) for depth, labels in found]
 
-    return Stage(trained, settings, town, judged, cached(judged), true(judged), path, cached(path), true(path))
+    return Stage(scene, settings, town, judged, cached(judged), true(judged), path, cached(path), true(path))
 
 
-def town_folder(trained: Trained) -> Path | None:
+def town_folder(config: RunConfig) -> Path | None:
     """Where the town lies that a run was trained on; None where it was another scene."""
-    scene = scene_of(trained.config)
-    folder = scene.paths[0].parents[1]
+    folder = config.read_scene().paths[0].parents[1]
     return folder if is_town(folder) else None
 
 
-def town_settings(trained: Trained) -> TownSettings:
+def town_settings(config: RunConfig) -> TownSettings:
     """Which town a run was trained on. Raises UsageError where it was none, DataError where its record cannot be read."""
-    folder = town_folder(trained)
+    folder = town_folder(config)
     if folder is None:
         raise UsageError(
-            f"{trained.run.root}: trained on {trained.known.name}, whose looks in other light nobody knows; "
+            f"the run was trained on {config.data}, whose looks in other light nobody knows; "
             "train the embedded town, for example with `fprf train fprf-lite --data town`"
         )
     return _read_settings(folder)

@@ -12,6 +12,7 @@ from ..plugins.executors.config import ExecutorConfig, SerialConfig
 
 if TYPE_CHECKING:
     from ..cli.verbs import Verbs
+    from ..datamanagers.scene import Scene
     from ..training.loading import LoadedRun
     from ..training.quality import QualityConfig
     from .scene import SplatScene
@@ -74,6 +75,12 @@ class GaussiansConfig(RunConfig):
         from .training import open_gaussians
 
         return open_gaussians(run, self, quality)
+
+    def read_scene(self) -> "Scene":
+        """Parse the folder."""
+        from .training import scene_of
+
+        return scene_of(self)
 
     def verbs(self) -> "Verbs":
         """How such a run is trained, judged, filmed and exported."""

@@ -18,12 +18,12 @@ from torch import Tensor
 from ..datamanagers.basis import Basis, fit_basis
 from ..datamanagers.config import GuidedConfig
 from ..errors import CheckpointError, DataError, WeightsError
-from ..interfaces import Encoder, Scene, Stylizer
+from ..interfaces import Encoder, Scene, SceneView, Stylizer
 from ..ops.guided import upsample
 from ..ops.rasterise import Pinhole, lift
 from ..plugins.encoders.config import BundledSemanticConfig
 from ..plugins.stylizers.config import StylizerConfig
-from ..rendering.cameras import Cameras
+from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
 from ..style.colours import ColourMaps
 from ..style.dictionary import StyleDictionary
@@ -167,6 +167,15 @@ class SplatScene(Scene):
             return replace(self, harmonics=None)
         return replace(self, harmonics=restyled_harmonics(self.gaussians.harmonics, self.found().features, look))
 
+    def cached(self, cameras: Cameras, view: int) -> "GaussianView":
+        """A view, of which nothing is kept: drawing it again takes milliseconds."""
+        return GaussianView(self, cameras, view)
+
+    @property
+    def decoder(self) -> None:
+        """None: the content is the colours."""
+        return None
+
     def measured(self) -> tuple[SceneStyle, Basis | None]:
         """Statistics of pixels, and the basis."""
         return self.found().style, self.found().basis
@@ -188,6 +197,23 @@ class SplatScene(Scene):
     ) -> ColourMaps | None:
         """From region to codes; the stylizer knows what is allowed."""
         return region_maps(stylizer, dictionary, style, config)
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianView(SceneView):
+    """A view of a scene of Gaussians."""
+
+    scene: SplatScene
+    cameras: Cameras
+    view: int
+
+    def restyled(self, restyle: Restyle | None = None) -> View:
+        """Recolour all Gaussians and draw the view."""
+        return self.scene.restyled(restyle).render(self.cameras, self.view)
+
+    def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
+        """Draw the shares of the style codes."""
+        return self.scene.paint(self.cameras, self.view, pixel_grid(self.cameras, self.view), restyle.match)[0]
 
 
 def look_at_capture(

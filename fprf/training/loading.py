@@ -15,7 +15,7 @@ from ..blocks.routing import Blend, chart_of
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
 from ..errors import CheckpointError, WeightsError
-from ..interfaces import Scene, Stylizer
+from ..interfaces import Decoder, Scene, Stylizer
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
 from ..style.colours import ColourMaps, colour_maps
@@ -30,7 +30,7 @@ from .model import Model, build_model
 from .prepare import device_of
 from .quality import QualityConfig, at_quality
 from .run import Known, Run
-from .views import paint_pixels, render_view
+from .views import CachedView, cache_view, paint_pixels, render_view
 
 __all__ = ["LoadedRun", "Shelf", "Trained", "encoders_of", "load_run", "load_style", "open_fields", "open_run"]
 
@@ -160,6 +160,15 @@ class Trained(Scene):
     def restyled(self, look: Restyle | None) -> "Trained":
         """The same model in a look."""
         return replace(self, look=look)
+
+    def cached(self, cameras: Cameras, view: int) -> CachedView:
+        """A view with its geometry and features, as it was captured."""
+        return cache_view(self.model, self.known.facts, cameras, view, self.config.render)
+
+    @property
+    def decoder(self) -> Decoder:
+        """The model's."""
+        return self.model.decoder
 
     def measured(self) -> tuple[SceneStyle, Basis | None]:
         """What training measured."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..interfaces import Decoder
+from ..interfaces import Decoder, SceneView
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, grid_rays, rays_through
@@ -172,8 +172,8 @@ class Part:
 
 
 @dataclass(frozen=True)
-class CachedView:
-    """One view of one model."""
+class CachedView(SceneView):
+    """One view of one model, with its geometry and features."""
 
     decoder: Decoder
     parts: tuple[Part, ...]
@@ -205,6 +205,14 @@ class CachedView:
         """The view in a style, or as it is."""
         rgb = torch.cat([part.colour(self.decoder, restyle) for part in self.parts])
         return View(rgb.view(*self.size, 3), self.depth, self.opacity, self.kept)
+
+    @torch.inference_mode()
+    def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
+        """Composited shares of the style codes."""
+        shares = [
+            part.mean(restyle.match(part.content[:, :0] if part.semantic is None else part.semantic)) for part in self.parts
+        ]
+        return torch.cat(shares)
 
 
 def cache_view(model: Model, facts: Facts, cameras: Cameras, view: int, config: RenderConfig) -> CachedView:

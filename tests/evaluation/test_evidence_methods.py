@@ -32,7 +32,7 @@ class Stand:
         self.dictionary: StyleDictionary = self.of(self.paths)
 
     def of(self, paths: tuple[Path, ...], clusters: int = 4, blend: float = 0.1) -> StyleDictionary:
-        return dictionary_of(self.trained, paths, self.encoders, clusters=clusters, blend=blend)[0]
+        return dictionary_of(paths, self.encoders, clusters=clusters, blend=blend)[0]
 
     def plain(self) -> list[torch.Tensor]:
         return [view.restyled().rgb for view in self.views]

@@ -24,7 +24,7 @@ def measured(world: World, device: str, folder: Path) -> list[Any]:
     encoders = trained.encoders()
     bench = set_up(trained, encoders, PaperConfig(table="time", views=1), folder)
     paths, tone = world.references[:1], RegionToneConfig()
-    dictionary = dictionary_of(trained, paths, encoders, clusters=3, blend=0.1)[0]
+    dictionary = dictionary_of(paths, encoders, clusters=3, blend=0.1)[0]
     image = torch.from_numpy(load_image(paths[0])).float() / 255
     shown = Reference(paths[0].name, image, torch.arange(image[..., 0].numel()).view(image.shape[:2]) % 3)
     plain = nothing(bench.stage.shown).pictures

@@ -1,13 +1,13 @@
 import torch
-from tiny_world import World
+from tiny_world import World, stage_of
 
 from fprf.evaluation.metrics import psnr
-from fprf.evaluation.town_truth import set_stage, true_views
+from fprf.evaluation.town_truth import true_views
 from fprf.town.write import read_truth
 
 
 def test_the_truth_is_the_town_itself(world: World) -> None:
-    stage = set_stage(world.load(), views=2, frames=8, longest=32)
+    stage = stage_of(world.load(), views=2, frames=8, longest=32)
     assert stage.settings.seed == 0 and stage.settings.palette == "day"
     assert len(stage.shown) == len(stage.truth) == 2 and len(stage.passed) == len(stage.path_truth) == 8
     held_out = world.load().known.test
@@ -23,6 +23,6 @@ def test_the_truth_is_the_town_itself(world: World) -> None:
 
 
 def test_smaller_views_are_the_same_views(world: World) -> None:
-    small = set_stage(world.load(), views=1, frames=8, longest=16)
+    small = stage_of(world.load(), views=1, frames=8, longest=16)
     assert [v.restyled().rgb.shape for v in small.shown] == [(12, 16, 3)]
     assert small.truth[0].labels.shape == (12, 16)

@@ -6,10 +6,10 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tiny_world import World
+from tiny_world import World, stage_of
 
 from fprf.errors import DataError
-from fprf.evaluation.town_truth import PARTS, places, set_stage, short_path, shows, town_view
+from fprf.evaluation.town_truth import PARTS, places, short_path, shows, town_view
 from fprf.town.surface import FACADE, FOLIAGE, LAWN, ROAD, SKY
 
 FIXTURE = [HealthCheck.function_scoped_fixture]
@@ -17,7 +17,7 @@ FIXTURE = [HealthCheck.function_scoped_fixture]
 
 def test_more_views_than_were_held_out_are_all_of_them(world: World) -> None:
     known = world.load().known
-    stage = set_stage(world.load(), views=50, frames=0, longest=32)
+    stage = stage_of(world.load(), views=50, frames=0, longest=32)
     assert len(stage.shown) == len(known.test) == len(stage.truth)
     assert torch.equal(stage.views.pose, known.cameras.pose[list(known.test)])
     assert len(stage.passed) == len(stage.path) == 0
@@ -26,7 +26,7 @@ def test_more_views_than_were_held_out_are_all_of_them(world: World) -> None:
 def test_views_are_spread_over_what_was_held_out(world: World) -> None:
     trained = world.load()
     every = replace(trained, known=replace(trained.known, test=(1, 3, 5, 7, 9)))
-    stage = set_stage(every, views=2, frames=8, longest=16)
+    stage = stage_of(every, views=2, frames=8, longest=16)
     assert torch.equal(stage.views.pose, trained.known.cameras.pose[[1, 5]])
     assert torch.equal(stage.path.pose[0], stage.views.pose[1]), "the path begins in the middle"
 
