@@ -8,14 +8,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...errors import WeightsError
-from ...interfaces import Encoder
-from ..weights import read_weights, tensors_hash
-from .frozen import freeze, reflect_pad, replicate_to_multiple
+from ..weights import read_weights
+from .frozen import FrozenEncoder, NetworkEncoder, freeze, reflect_pad, replicate_to_multiple
 
 __all__ = [
     "CONTENT_KIND",
     "SEMANTIC_KIND",
-    "BundledEncoder",
     "ContentStudent",
     "RandomEncoder",
     "SemanticStudent",
@@ -101,46 +99,16 @@ CONTENT_KIND, SEMANTIC_KIND = "bundled-content", "bundled-semantic"
 FOLDER = Path(__file__).parent / "weights"
 
 
-class BundledEncoder(Encoder):
-    """A trained student. The image is resized to multiples of `multiple`, so that cells cover it exactly."""
-
-    def __init__(self, name: str, student: nn.Module, *, channels: int, multiple: int) -> None:
-        super().__init__()
-        self._identity = f"{name}:{tensors_hash(student.state_dict())}"
-        self._channels, self._multiple = channels, multiple
-        self.student = student
-        freeze(self)
-
-    @property
-    def identity(self) -> str:
-        """Name and a hash of the weights."""
-        return self._identity
-
-    @property
-    def channels(self) -> int:
-        """Channels of the features."""
-        return self._channels
-
-    @torch.no_grad()
-    def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features, centred over photographs and O(1)."""
-        height, width = (max(self._multiple, round(n / self._multiple) * self._multiple) for n in image.shape[-2:])
-        if (height, width) != tuple(image.shape[-2:]):
-            image = F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
-        features: Tensor = self.student(image)
-        return features
-
-
-def load_content_encoder(path: Path | None) -> BundledEncoder:
+def load_content_encoder(path: Path | None) -> NetworkEncoder:
     """Stride 2. Raises WeightsError where the file is absent or of another kind."""
     path = path or FOLDER / "content.safetensors"
     tensors, channels = _read(path, CONTENT_KIND, "content")
-    # At stride 2 an odd border is better mirrored than the whole image blurred by resizing it.
     student = ContentStudent(channels, (_outputs(tensors, "first.weight"), _outputs(tensors, "second.weight")))
-    return _loaded(CONTENT_KIND, student, tensors, path, channels=channels, multiple=1)
+    # Stride 1: an odd border is better mirrored than the whole image blurred by resizing it.
+    return _loaded(CONTENT_KIND, student, tensors, path, stride=1)
 
 
-def load_semantic_encoder(path: Path | None) -> BundledEncoder:
+def load_semantic_encoder(path: Path | None) -> NetworkEncoder:
     """Stride 8. Raises WeightsError where the file is absent or of another kind."""
     path = path or FOLDER / "semantic.safetensors"
     tensors, channels = _read(path, SEMANTIC_KIND, "semantic")
@@ -148,7 +116,7 @@ def load_semantic_encoder(path: Path | None) -> BundledEncoder:
     half, quarter, fine, coarse = (_outputs(tensors, f"{stage}.conv.weight") for stage in stages)
     residuals = sum(name.startswith("coarse.") and name.endswith(".narrow.weight") for name in tensors)
     student = SemanticStudent(channels, (half, quarter, fine, coarse), rounds=residuals // 3)
-    return _loaded(SEMANTIC_KIND, student, tensors, path, channels=channels, multiple=8)
+    return _loaded(SEMANTIC_KIND, student, tensors, path, stride=8)
 
 
 def _read(path: Path, kind: str, verb: str) -> tuple[dict[str, Tensor], int]:
@@ -166,40 +134,28 @@ def _outputs(tensors: dict[str, Tensor], name: str) -> int:
     return len(tensors[name]) if name in tensors else 1
 
 
-def _loaded(
-    name: str, student: nn.Module, tensors: dict[str, Tensor], path: Path, *, channels: int, multiple: int
-) -> BundledEncoder:
+def _loaded(name: str, student: nn.Module, tensors: dict[str, Tensor], path: Path, *, stride: int) -> NetworkEncoder:
+    """The image is resized to multiples of `stride`, so that cells cover it exactly."""
     try:
         student.load_state_dict(tensors)
     except RuntimeError as error:
         first = str(error).splitlines()[-1].strip()
         raise WeightsError(f"{path}: does not fit this version's network ({first}); train it again") from error
-    return BundledEncoder(name, student, channels=channels, multiple=multiple)
+    return NetworkEncoder(name, student, stride=stride)
 
 
-class RandomEncoder(Encoder):
+class RandomEncoder(FrozenEncoder):
     """Means over cells of `stride` pixels, then a 3x3 convolution with weights ~ N(0, 1/27), then tanh."""
 
     def __init__(self, *, channels: int, stride: int, seed: int) -> None:
-        super().__init__()
-        self._settings = (channels, stride, seed)
+        super().__init__(f"random:{channels}:stride{stride}:seed{seed}", channels)
+        self._stride = stride
         generator = torch.Generator().manual_seed(seed)
         self.register_buffer("weight", torch.randn(channels, 3, 3, 3, generator=generator) / 27**0.5)
         freeze(self)
 
-    @property
-    def identity(self) -> str:
-        """Name, channels, stride and seed: they fix the weights."""
-        return "random:{}:stride{}:seed{}".format(*self._settings)
-
-    @property
-    def channels(self) -> int:
-        """Channels of the features."""
-        return self._settings[0]
-
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features in (-1, 1), one per cell of stride x stride pixels (the last may reach over the border)."""
-        stride = self._settings[1]
-        cells = F.avg_pool2d(replicate_to_multiple(image, stride), stride)
+        cells = F.avg_pool2d(replicate_to_multiple(image, self._stride), self._stride)
         return torch.tanh(F.conv2d(reflect_pad(4 * cells - 2), self.get_buffer("weight").to(cells)))

@@ -15,30 +15,20 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...interfaces import Encoder
-from .frozen import finest, freeze, street
+from .frozen import FrozenEncoder, finest, freeze, street
 
 __all__ = ["AveragedEncoder", "ConcatEncoder", "build_concat", "unit_of"]
 
 
-class AveragedEncoder(Encoder):
+class AveragedEncoder(FrozenEncoder):
     """Mean of `inner` over `scales` of the image, and over its mirror images if `flip`."""
 
     def __init__(self, inner: Encoder, *, flip: bool, scales: Sequence[float]) -> None:
-        super().__init__()
+        sizes = "+".join(repr(scale) for scale in scales)
+        super().__init__(f"averaged:{'flip' if flip else 'plain'}:{sizes}:[{inner.identity}]", inner.channels)
         self.inner = inner
         self._flip, self._scales = flip, tuple(scales)
         freeze(self)
-
-    @property
-    def identity(self) -> str:
-        """What is averaged, and the inner encoder's identity."""
-        sizes = "+".join(repr(scale) for scale in self._scales)
-        return f"averaged:{'flip' if self._flip else 'plain'}:{sizes}:[{self.inner.identity}]"
-
-    @property
-    def channels(self) -> int:
-        """The inner encoder's."""
-        return self.inner.channels
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
@@ -60,34 +50,21 @@ DIGITS = 3
 """Of a unit: more would differ between machines, and with them the identity."""
 
 
-class ConcatEncoder(Encoder):
+class ConcatEncoder(FrozenEncoder):
     """`parts` side by side, each divided by its `unit` and multiplied by its weight."""
 
     def __init__(self, parts: Sequence[Encoder], weights: Sequence[float], units: Sequence[float]) -> None:
-        super().__init__()
+        names = [f"{weight!r}/{unit!r}*[{part.identity}]" for weight, unit, part in zip(weights, units, parts, strict=True)]
+        super().__init__("concat:" + "+".join(names), sum(part.channels for part in parts))
         self.parts = nn.ModuleList(parts)
         self._factors = [weight / unit for weight, unit in zip(weights, units, strict=True)]
-        self._channels = sum(part.channels for part in parts)
-        self._identity = "concat:" + "+".join(
-            f"{weight!r}/{unit!r}*[{part.identity}]" for weight, unit, part in zip(weights, units, parts, strict=True)
-        )
         freeze(self)
-
-    @property
-    def identity(self) -> str:
-        """Weight, unit and identity of every part."""
-        return self._identity
-
-    @property
-    def channels(self) -> int:
-        """The parts' together."""
-        return self._channels
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features at the stride of the finest part; coarser ones are interpolated."""
-        found = [part(image) * factor for part, factor in zip(self.parts, self._factors, strict=True)]
-        return torch.cat(finest(found), dim=1)
+        maps = [part(image) * factor for part, factor in zip(self.parts, self._factors, strict=True)]
+        return torch.cat(finest(maps), dim=1)
 
 
 def build_concat(parts: Sequence[Encoder], weights: Sequence[float]) -> ConcatEncoder:

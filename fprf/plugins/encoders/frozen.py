@@ -15,6 +15,7 @@ from ...interfaces import Encoder
 from ..weights import tensors_hash
 
 __all__ = [
+    "FrozenEncoder",
     "FrozenTensors",
     "NetworkEncoder",
     "finest",
@@ -90,25 +91,35 @@ def resize_to_multiple(image: Annotated[Tensor, "B 3 H W"], multiple: int) -> Te
     return F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
 
 
-class NetworkEncoder(Encoder):
-    """A network of one feature per `stride` pixels. `name` says everything that changes the output but the tensors."""
+class FrozenEncoder(Encoder):
+    """An encoder that knows its identity and channels when it is built."""
 
-    def __init__(self, name: str, network: nn.Module, *, stride: int) -> None:
+    def __init__(self, identity: str, channels: int) -> None:
         super().__init__()
-        self._identity, self._stride = f"{name}:{tensors_hash(network.state_dict())}", stride
-        self.network = network
-        freeze(self)
-        self._channels = int(self(torch.zeros(1, 3, stride, stride)).shape[1])
+        self._identity, self._channels = identity, channels
 
     @property
     def identity(self) -> str:
-        """Name and a hash of every tensor that is used."""
+        """Name, settings and a hash of every tensor that is used."""
         return self._identity
 
     @property
     def channels(self) -> int:
         """Channels of the features."""
         return self._channels
+
+
+class NetworkEncoder(FrozenEncoder):
+    """A network of one feature per `stride` pixels. `name` says everything that changes the output but the tensors."""
+
+    def __init__(self, name: str, network: nn.Module, *, stride: int) -> None:
+        freeze(network)
+        with torch.no_grad():
+            channels = int(network(torch.zeros(1, 3, stride, stride)).shape[1])
+        super().__init__(f"{name}:{tensors_hash(network.state_dict())}", channels)
+        self._stride = stride
+        self.network = network
+        freeze(self)
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:

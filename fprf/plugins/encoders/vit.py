@@ -12,9 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...errors import WeightsError
-from ...interfaces import Encoder
 from ..weights import tensors_hash
-from .frozen import freeze
+from .frozen import FrozenEncoder, freeze
 
 __all__ = ["VitEncoder", "build_vit"]
 
@@ -29,26 +28,15 @@ TYPES: Mapping[str, tuple[str, ...]] = {
 """What transformers calls the models of each family."""
 
 
-class VitEncoder(Encoder):
+class VitEncoder(FrozenEncoder):
     """Patch tokens of a vision transformer `model` with patches of `patch` pixels."""
 
     def __init__(self, family: str, model: nn.Module, *, name: str, patch: int, channels: int, stride: int) -> None:
-        super().__init__()
-        self._call, self._patch, self._stride, self._channels = CALLS[family], patch, stride, channels
         used = {key: value for key, value in model.state_dict().items() if not key.startswith("pooler.")}
-        self._identity = f"{family}:{name}:stride{stride}:{tensors_hash(used)}"
+        super().__init__(f"{family}:{name}:stride{stride}:{tensors_hash(used)}", channels)
+        self._call, self._patch, self._stride = CALLS[family], patch, stride
         self.model = model
         freeze(self)
-
-    @property
-    def identity(self) -> str:
-        """Family, model, block, stride and a hash of the weights."""
-        return self._identity
-
-    @property
-    def channels(self) -> int:
-        """Width of the tokens."""
-        return self._channels
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
