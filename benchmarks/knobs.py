@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from fprf.config import RenderConfig, TrainConfig
 from fprf.errors import ConfigError
 from fprf.evaluation.metrics import psnr
-from fprf.evaluation.naive import plain_planes, replaced
 from fprf.evaluation.report import Spread, Watch, spread
+from fprf.evaluation.speed import plain_planes, replaced
 from fprf.evaluation.subject import Subject, difference, plainly, view_rays
 from fprf.fields.planes import Planes
 from fprf.interfaces import SemanticField

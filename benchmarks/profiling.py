@@ -24,8 +24,8 @@ from torch.profiler import record_function
 from fprf.checks import at_least
 from fprf.cli.bench import bench_run
 from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.naive import replaced
 from fprf.evaluation.report import Outcome, Spread, Watch, document, table
+from fprf.evaluation.speed import replaced
 from fprf.evaluation.subject import attempt, find, fresh_model, loop_of, settings, stepper, test_view, view_rays, watch_of
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import RegionOtConfig

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from fprf.cli.bench import bench_run
 from fprf.evaluation.config import SpeedConfig
-from fprf.evaluation.naive import draw_points, largest_planes
 from fprf.evaluation.report import Outcome, Row, Watch, document, rows_table, spread
+from fprf.evaluation.speed import draw_points, largest_planes
 from fprf.evaluation.subject import find, settings, watch_of
 from fprf.ops import triplane
 from fprf.training.loading import Trained

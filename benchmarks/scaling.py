@@ -10,8 +10,8 @@ from typing import NamedTuple
 from fprf.checks import at_least
 from fprf.cli.bench import bench_run
 from fprf.evaluation.config import BenchConfig
-from fprf.evaluation.naive import draw_points, forward_backward, largest_planes
 from fprf.evaluation.report import Outcome, Spread, document, spread, table
+from fprf.evaluation.speed import draw_points, forward_backward, largest_planes
 from fprf.evaluation.subject import Subject, attempt, find, settings, test_view, watch_of
 from fprf.io.figures import number
 from fprf.ops import triplane

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.evaluation.naive import plain_planes
+from fprf.evaluation.speed import plain_planes
 from fprf.evaluation.subject import count, difference, exact, plainly, view_rays
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.rendering.renderer import march

@@ -2,7 +2,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.evaluation.naive import grid_sample_lookup
+from fprf.evaluation.speed import grid_sample_lookup
 from fprf.ops import triplane
 
 
