@@ -3,6 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import NumericsError
 from fprf.style.clusters import kmeans
 
 
@@ -46,6 +47,16 @@ def test_any_size_gives_non_empty_clusters_and_finite_centres(n: int, k: int, d:
     assert torch.equal(found.label, again.label) and torch.equal(found.centres, again.centres)
 
 
+def test_equal_points_are_one_cluster_at_their_place() -> None:
+    found = kmeans(torch.full((50, 3), 7.25), 10, seed=0)
+    assert found.centres.tolist() == [[7.25, 7.25, 7.25]]
+
+
+def test_three_distinct_values_give_exactly_these() -> None:
+    x = torch.tensor([[0.0], [5.0], [100.0]]).repeat(20, 1)
+    assert kmeans(x, 10, seed=3).centres.sort(0).values.flatten().tolist() == [0.0, 5.0, 100.0]
+
+
 def test_weights_count_rows_several_times_and_zero_not_at_all() -> None:
     x, _ = blobs(60, 3, 3, spread=0.2, norm=0.0)
     weights = torch.randint(0, 4, (60,), generator=torch.Generator().manual_seed(0)).float()
@@ -56,6 +67,19 @@ def test_weights_count_rows_several_times_and_zero_not_at_all() -> None:
         inside = found.label[:-1] == i
         expected = (weights[inside].double() @ x[inside].double()) / weights[inside].sum()
         torch.testing.assert_close(found.centres[i].double(), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_weights_of_zero_throughout_are_equal_weights() -> None:
+    x, _ = blobs(30, 2, 3, spread=0.1, norm=0.0)
+    a, b = kmeans(x, 3, seed=0, weights=torch.zeros(30)), kmeans(x, 3, seed=0)
+    assert torch.equal(a.label, b.label)
+
+
+def test_bad_values_are_refused() -> None:
+    with pytest.raises(NumericsError, match="k-means"):
+        kmeans(torch.tensor([[float("nan")]]), 1, seed=0)
+    with pytest.raises(NumericsError, match="negative"):
+        kmeans(torch.ones(2, 1), 1, seed=0, weights=torch.tensor([1.0, -1.0]))
 
 
 def test_of_many_rows_a_sample_is_clustered_and_all_are_labelled() -> None:
@@ -75,3 +99,9 @@ def test_up_to_so_many_rows_centres_are_the_means_of_all_their_members(rows: int
     found = kmeans(x, 2, seed=0)
     means = torch.stack([x[found.label == k].mean(0) for k in range(2)])
     assert bool(((found.centres - means).abs() < 1e-9).all()) is not sampled
+
+
+@pytest.mark.parametrize(("rows", "k"), [(0, 3), (4, 0), (0, 0)])
+def test_no_rows_or_no_clusters(rows: int, k: int) -> None:
+    found = kmeans(torch.ones(rows, 2), k, seed=0)
+    assert found.centres.shape == (0, 2) and found.label.tolist() == [0] * rows

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from fprf.errors import CheckpointError, DataError
 from fprf.interfaces import Decoder
 from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, RegionToneConfig
 from fprf.style.colours import ColourMaps, colour_maps, decoded_colours
@@ -116,6 +117,26 @@ def test_any_stylizer_can_be_followed(config: AdainConfig | LocalAdainConfig | R
     assert bool(found.isfinite().all()) and float(found.min()) >= -1e-6 and float(found.max()) <= 1 + 1e-6
 
 
+def test_nothing_asked_nothing_made() -> None:
+    *_, scene, d = setting()
+    stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
+    assert colour_maps(stylizer, d, scene, Straight(), share=0.0) is None
+    bare = build_dictionary([reference(1), reference(2, coloured=False)], clusters=2)
+    assert bare.colour_mean is None and colour_maps(stylizer, bare, scene, Straight()) is None
+    assert colour_maps(stylizer, own_style(scene), scene, Straight()) is None
+
+
+def test_one_region_needs_no_semantics() -> None:
+    content, _, _ = points(0)
+    scene = scene_style(content, None, torch.ones(COUNT), None, 1, 0)
+    d = build_dictionary([Reference("r", points(1)[0], torch.zeros(COUNT, 0), colour=points(7)[0][:, :3])])
+    stylizer = IdentityConfig().build(dictionary=d, scene=scene)
+    maps = colour_maps(stylizer, d, scene, Straight())
+    assert maps is not None and maps.needs == Want.CONTENT
+    found = carried(maps, content[:, :3], None)
+    assert torch.allclose(found.mean(0), points(7)[0][:, :3].mean(0), atol=2e-3)
+
+
 @pytest.mark.parametrize(
     ("own", "theirs", "gain", "error"),
     [
@@ -178,6 +199,16 @@ def test_dictionaries_know_the_colours_of_their_pixels(tmp_path: Path) -> None:
     flipped = build_dictionary([reference(2), reference(1)], clusters=KINDS)
     assert both.colour_mean is not None and flipped.colour_mean is not None
     assert torch.equal(both.colour_mean, flipped.colour_mean), "the order of files plays no part"
+
+
+def test_mistakes(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"colours of shape \(5, 3\)"):
+        build_dictionary([reference(1)._replace(colour=torch.zeros(5, 3))])
+    d = build_dictionary([reference(1)], clusters=2)
+    assert d.colour_mean is not None
+    save_dictionary(tmp_path / "d.safetensors", d._replace(colour_mean=d.colour_mean[:, :2]))
+    with pytest.raises(CheckpointError, match="colour_mean"):
+        load_dictionary(tmp_path / "d.safetensors")
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 50])

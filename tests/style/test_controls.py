@@ -37,6 +37,12 @@ def test_between_it_is_linear(strength: float) -> None:
         torch.testing.assert_close(blend_strength(content, styled, given_as).double(), expected, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("strength", [-0.1, 1.1, float("nan"), float("inf")])
+def test_strength_has_a_range(strength: float) -> None:
+    with pytest.raises(UsageError, match="strength"):
+        blend_strength(torch.zeros(1, 1), torch.zeros(1, 1), strength)
+
+
 @settings(max_examples=200, deadline=None)
 @given(COLOUR, COLOUR, st.sampled_from([0.0, 0.3, 1.0]))
 @example((0.0, 0.0, 1.1754943508222875e-38), (0.0, 0.0, 0.0), 0.0)
@@ -82,6 +88,12 @@ def test_a_channel_at_the_luma_of_black_is_a_colour() -> None:
 def test_pins_exclude_the_others_and_forbidding_leaves_the_rest() -> None:
     allowed = allowed_references(4, 3, pin={0: {1}, 3: {0, 2}}, forbid=[(1, 2), (3, 0)])
     assert allowed.tolist() == [[False, True, False], [True, True, False], [True, True, True], [False, False, True]]
+
+
+@pytest.mark.parametrize("wish", [{"pin": {2: {0}}}, {"pin": {0: {2}}}, {"forbid": [(0, -1)]}])
+def test_unknown_numbers_are_named(wish: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="regions go from 0 to 1, references from 0 to 1"):
+        allowed_references(2, 2, **wish)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("wish", [{"forbid": [(1, 0), (1, 1)]}, {"pin": {1: {0}}, "forbid": [(1, 0)]}])

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import CheckpointError, DataError
+from fprf.errors import CheckpointError, ConfigError, DataError
 from fprf.style.dictionary import (
     Reference,
     StyleDictionary,
@@ -101,6 +101,12 @@ def test_weights_weigh_references_and_not_pixels() -> None:
     assert float(odds[d.reference == d.names.index("a")].sum()) == pytest.approx(0.75)
 
 
+def test_without_semantics_a_reference_is_one_code() -> None:
+    d = build_dictionary([reference("a", d=0), reference("b", d=0, seed=1)])
+    assert d.keys.shape == (2, 0)
+    assert d.reference.tolist() == [0, 1]
+
+
 @pytest.mark.parametrize(
     ("refs", "said"),
     [
@@ -116,6 +122,12 @@ def test_weights_weigh_references_and_not_pixels() -> None:
 def test_unusable_references_are_named(refs: list[Reference], said: str) -> None:
     with pytest.raises(DataError, match=said):
         build_dictionary(refs)
+
+
+def test_knobs_have_ranges() -> None:
+    for knob in ({"clusters": 0}, {"blend": 1.5}, {"blend": float("nan")}, {"min_members": 0}):
+        with pytest.raises(ConfigError):
+            build_dictionary([reference("a")], **knob)
 
 
 def test_saved_and_loaded_it_is_the_same_bit_for_bit(tmp_path: Path) -> None:
@@ -162,6 +174,16 @@ def test_every_flipped_bit_and_cut_is_found(tmp_path: Path) -> None:
             load_dictionary(file)
 
 
+def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    with pytest.raises(CheckpointError, match="no style dictionary"):
+        load_dictionary(tmp_path / "none")
+    save_file({"keys": torch.zeros(1, 1)}, tmp_path / "other")
+    with pytest.raises(CheckpointError, match="not a style dictionary"):
+        load_dictionary(tmp_path / "other")
+
+
 @pytest.mark.parametrize(
     ("field", "value", "said"),
     [
@@ -177,3 +199,30 @@ def test_whole_files_with_wrong_contents_are_refused(tmp_path: Path, field: str,
     save_dictionary(tmp_path / "d", d)
     with pytest.raises(CheckpointError, match=said):
         load_dictionary(tmp_path / "d")
+
+
+@pytest.mark.parametrize("clusters", [1, 2, 7, 500])
+@pytest.mark.parametrize("kind", ["one pixel", "one colour", "three colours", "huge norms", "zero"])
+def test_degenerate_photographs_have_codes(kind: str, clusters: int) -> None:
+    content, semantic = {
+        "one pixel": (torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, 4.0, 5.0]])),
+        "one colour": (torch.full((400, 2), 0.3), torch.full((400, 3), -2.0)),
+        "three colours": (torch.eye(3, 2).repeat(50, 1), torch.eye(3).repeat(50, 1)),
+        "huge norms": (torch.randn(300, 2) * 0.3 + 3000, torch.randn(300, 3) * 0.3 + 3000),
+        "zero": (torch.zeros(100, 2), torch.zeros(100, 3)),
+    }[kind]
+    d = build_dictionary([Reference("x", content, semantic)], clusters=clusters)
+    distinct = len(semantic.unique(dim=0))
+    assert 1 <= len(d.keys) <= min(clusters, distinct) and all(bool(t.isfinite().all()) for t in d[:6])
+    assert float(d.share.sum()) == pytest.approx(1.0)
+    if distinct <= 3:
+        assert len(d.keys) == min(clusters, distinct), "a code for each kind, where there may be so many"
+        torch.testing.assert_close(d.share @ d.mean, content.mean(0), rtol=1e-5, atol=1e-5)
+
+
+def test_one_reference_and_one_code_are_the_whole_photograph() -> None:
+    r = reference("a")
+    d = build_dictionary([r], clusters=1)
+    content = r.content.double()
+    torch.testing.assert_close(d.mean[0].double(), content.mean(0), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(d.covariance[0].double(), torch.cov(content.T, correction=0), rtol=1e-5, atol=1e-5)

@@ -135,3 +135,11 @@ def test_a_faded_look_is_the_scene_and_a_mix_with_it_a_strength() -> None:
     half = look.faded.mixed(look, 0.5).applied(content, None)
     torch.testing.assert_close(half[0], Restyle(look.stylizer, 0.4).applied(content, None)[0], rtol=1e-5, atol=1e-5)
     assert half[1] == pytest.approx(0.4)
+
+
+def test_a_scene_of_one_region_can_be_kept_without_semantics() -> None:
+    content, _ = points()
+    scene = scene_style(content, None, torch.ones(300), None, 3, 0)
+    d = build_dictionary([Reference("r", points(seed=5)[0], torch.zeros(300, 0))])
+    look = Restyle(AdainConfig().build(dictionary=d, scene=scene), 1.0, RegionWeight(scene, torch.zeros(1, 1)))
+    assert look.needs == Want.CONTENT and torch.equal(look.applied(content, None)[0], content)

@@ -3,6 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import ConfigError
 from fprf.style.matching import Similarity, attention, compared, point_shares, score_spread, unit
 
 
@@ -33,6 +34,18 @@ def test_attention_is_always_finite_and_sums_to_one(n: int, t: int, temperature:
     a = attention(torch.randn(n, 5, generator=g) * norm, torch.randn(t, 5, generator=g) * norm, temperature)
     assert bool(a.isfinite().all())
     torch.testing.assert_close(a.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan")])
+def test_temperatures_that_are_not_above_zero_are_refused(temperature: float) -> None:
+    with pytest.raises(ConfigError, match="temperature"):
+        attention(torch.ones(1, 2), torch.ones(1, 2), temperature)
+
+
+def test_zero_queries_and_keys_match_everything_alike() -> None:
+    k = unit(torch.randn(4, 3), torch.zeros(3))
+    torch.testing.assert_close(attention(torch.zeros(2, 3), k, 0.1), torch.full((2, 4), 0.25))
+    torch.testing.assert_close(attention(torch.randn(2, 3), torch.zeros(4, 3), 0.1), torch.full((2, 4), 0.25))
 
 
 def test_prior_multiplies_the_odds() -> None:
@@ -69,6 +82,12 @@ def test_spread_follows_the_scale_of_the_scores_and_ignores_common_offsets() -> 
     assert spread == pytest.approx(plain, rel=1e-6)
 
 
+@pytest.mark.parametrize("shape", [(0, 3), (3, 0), (1, 3)])
+def test_spread_without_anything_to_tell_apart_is_one(shape: tuple[int, int]) -> None:
+    assert score_spread(torch.randn(shape[0], 4), torch.zeros(shape[1], 4)) == 1.0
+    assert score_spread(torch.randn(3, 4), torch.randn(1, 4)) == 1.0
+
+
 @pytest.mark.parametrize("temperature", [1e-38, 1e-30, 1e-3, 1.0, 100.0, 1e6])
 def test_duplicate_keys_share_evenly_at_any_temperature(temperature: float) -> None:
     k = torch.randn(3, 8) * 50
@@ -76,6 +95,11 @@ def test_duplicate_keys_share_evenly_at_any_temperature(temperature: float) -> N
     assert bool(a.isfinite().all())
     torch.testing.assert_close(a[:, :3], a[:, 3:], rtol=0.0, atol=1e-6)
     torch.testing.assert_close(a.sum(1), torch.ones(20), rtol=0.0, atol=1e-6)
+
+
+def test_one_key_takes_everything() -> None:
+    for scale in (0.0, 1.0, 7e4):
+        assert torch.equal(attention(torch.randn(5, 3) * scale, torch.randn(1, 3) * scale, 0.4), torch.ones(5, 1))
 
 
 @pytest.mark.parametrize("similarity", ["cosine", "dot"])
@@ -137,6 +161,11 @@ def test_a_common_offset_of_keys_costs_no_digits() -> None:
     a, b = compared(q, k, "dot", queries_centre=q.mean(0), keys_centre=k.mean(0))
     r, exact = a @ b.T, q.double() @ (k.double() - k.double().mean(0)).T
     assert float(((r - r[:, :1]).double() - (exact - exact[:, :1])).abs().max()) < 1e-4
+
+
+def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
+    keys = torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)
+    assert score_spread(torch.tensor([[1e6], [0.0]]), keys) == score_spread(torch.tensor([[-1e6]]), keys) == 1.0
 
 
 def test_directions_begin_just_above_rounding_and_have_gradients_at_the_centre() -> None:

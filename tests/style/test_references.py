@@ -8,7 +8,7 @@ from photo_files import turned_jpeg
 
 from fprf.datamanagers.basis import Basis
 from fprf.datamanagers.config import GuidedConfig
-from fprf.errors import DataError
+from fprf.errors import ConfigError, DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.style.dictionary import build_dictionary
@@ -66,11 +66,24 @@ def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path)
         assert turned.colour is not None and plain.colour is not None and torch.equal(turned.colour, plain.colour)
 
 
+def test_without_semantics_there_are_none(tmp_path: Path) -> None:
+    path = photo(tmp_path, 80, 90)
+    for semantic, basis in ((None, None), (None, BASIS), (SEMANTIC, None)):
+        r = read_reference(path, content=CONTENT, semantic=semantic, basis=basis)
+        assert r.semantic.shape == (len(r.content), 0)
+
+
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 700), (700, 3), (64, 64), (65, 1000)])
 def test_any_shape_gives_a_dictionary(tmp_path: Path, height: int, width: int) -> None:
     r = read_reference(photo(tmp_path, height, width), content=CONTENT, semantic=SEMANTIC, basis=BASIS)
     assert len(r.content) == len(r.semantic) > 0
     assert all(bool(t.isfinite().all()) for t in build_dictionary([r])[:6])
+
+
+def test_a_photograph_of_one_colour_gives_a_dictionary(tmp_path: Path) -> None:
+    d = build_dictionary([read_reference(photo(tmp_path, 90, 90, flat=True), content=CONTENT, semantic=SEMANTIC, basis=BASIS)])
+    assert all(bool(t.isfinite().all()) for t in d[:6])
+    assert float(d.covariance.abs().max()) < 1e-6
 
 
 def test_the_encoder_sees_what_longest_says_and_nothing_is_enlarged(tmp_path: Path) -> None:
@@ -88,6 +101,14 @@ def test_the_scenes_filter_is_used(tmp_path: Path) -> None:
         for g in (None, GuidedConfig(radius=0.3, eps=0.1))
     )
     assert not torch.allclose(a.content, b.content)
+
+
+def test_unreadable_files_and_sizes_are_named(tmp_path: Path) -> None:
+    (tmp_path / "x.jpg").write_bytes(b"no image")
+    with pytest.raises(DataError, match=r"x\.jpg"):
+        read_reference(tmp_path / "x.jpg", content=CONTENT, semantic=None, basis=None)
+    with pytest.raises(ConfigError, match="longest"):
+        read_reference(photo(tmp_path, 9, 9), content=CONTENT, semantic=None, basis=None, longest=8)
 
 
 def two_halves(folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: int = 255) -> tuple[Path, Path]:

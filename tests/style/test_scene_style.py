@@ -3,8 +3,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import CheckpointError
-from fprf.style.dictionary import whole_style
+from fprf.errors import CheckpointError, DataError
+from fprf.style.dictionary import Reference, build_dictionary, whole_style
 from fprf.style.scene import (
     check_fit,
     from_tensors,
@@ -88,6 +88,11 @@ def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: floa
     torch.testing.assert_close(share.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
 
 
+def test_an_empty_scene_is_an_error() -> None:
+    with pytest.raises(DataError, match="no point has weight"):
+        scene_style(torch.ones(3, 2), None, torch.zeros(3), None, 1, 0)
+
+
 def test_membership_is_a_point_by_point_function_and_drops_the_faintest() -> None:
     content, semantic, weights = points()
     scene = scene_style(content, semantic, weights, None, 8, 0)
@@ -109,6 +114,14 @@ def test_own_style_is_the_scene() -> None:
         torch.testing.assert_close(mean.float(), scene.mean, rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(total.float(), scene.covariance, rtol=1e-4, atol=1e-4)
         check_fit(own, scene)
+
+
+def test_a_dictionary_of_other_encoders_does_not_fit() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 3, 0)
+    other = build_dictionary([Reference("a", torch.randn(50, 6), torch.randn(50, 4))])
+    with pytest.raises(DataError, match="6 content and 4 semantic channels, but the scene has 5 and 4"):
+        check_fit(other, scene)
 
 
 def test_tensors_round_trip() -> None:

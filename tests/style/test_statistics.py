@@ -56,6 +56,23 @@ def test_any_order_and_partition_gives_the_same(n: int, pieces: int, seed: int, 
         assert float((merged.weight - whole.weight).abs()) <= 1e-12 * max(1.0, float(whole.weight))
 
 
+def test_order_independent_within_1e_12_at_production_size() -> None:
+    x, w = rows(50_000, 16, offset=5.0)
+    whole, parts = moments(x, w), empty(16)
+    for i in torch.randperm(50_000).split(4096):
+        parts = merge(parts, moments(x[i], w[i]))
+    assert relative(parts.scatter, whole.scatter) < 1e-12
+    assert relative(parts.mean, whole.mean) < 1e-12
+
+
+def test_nothing_is_neutral_and_finite() -> None:
+    x, w = rows(9, 4)
+    for m in (merge(empty(4), moments(x, w)), merge(moments(x, w), empty(4))):
+        assert all(torch.equal(a, b) for a, b in zip(m, moments(x, w), strict=True))
+    assert torch.equal(covariance(empty(4)), torch.zeros(4, 4).double())
+    assert float(merge(empty(2), empty(2)).weight) == 0
+
+
 def test_rows_of_weight_zero_count_for_nothing_whatever_they_hold() -> None:
     x, w = rows(9, 4)
     bad = torch.cat([x, torch.full((2, 4), float("nan"))])
@@ -90,6 +107,12 @@ def test_groups_taken_together_are_the_whole() -> None:
     torch.testing.assert_close(total, covariance(whole), rtol=1e-10, atol=1e-12)
 
 
+def test_an_empty_group_is_zero_and_not_nan() -> None:
+    mean, covariances, share = group_moments(torch.ones(4, 2), torch.tensor([[1.0, 0.0]] * 4))
+    assert torch.equal(mean[1], torch.zeros(2).double()) and torch.equal(covariances[1], torch.zeros(2, 2).double())
+    assert share.tolist() == [1.0, 0.0]
+
+
 def test_deviation_biases_no_live_channel_and_floors_dead_ones() -> None:
     sigma = torch.tensor([5e-3, 1e-2, 2e-2, 1e-6, 0.0], dtype=torch.float64)
     floored = deviation(torch.zeros(5).double(), sigma.square())
@@ -103,11 +126,26 @@ def test_deviation_follows_the_scale(scale: float) -> None:
     torch.testing.assert_close(deviation(x * scale, x * scale**2), deviation(x, x) * scale, rtol=1e-12, atol=0.0)
 
 
+def test_deviation_of_nothing_is_above_zero() -> None:
+    assert bool((deviation(torch.zeros(3), torch.zeros(3)) > 0).all())
+    assert float(deviation(torch.full((3,), 100.0), torch.zeros(3)).min()) == pytest.approx(1e-4)
+
+
 def test_dead_channels_are_those_that_are_floored() -> None:
     sigma = torch.tensor([1.0, 0.5, 2.0, 1e-3, 0.0, 0.9, 0.006])
     assert dead_channels(torch.zeros(6), sigma.square()).tolist() == [False, False, False, True, True, False, False]
     assert dead_channels(torch.full((3,), 1e6), torch.full((3,), 0.25)).all(), "rounding of the mean"
     assert not dead_channels(torch.zeros(4), torch.ones(4)).any()
+
+
+def test_groups_of_nothing_have_no_share() -> None:
+    mean, spread, share = group_moments(torch.randn(5, 3), torch.zeros(5, 2))
+    assert share.tolist() == [0.0, 0.0] and not bool(mean.any()) and not bool(spread.any())
+
+
+def test_the_largest_mean_says_what_rounding_is() -> None:
+    found = deviation(torch.tensor([1e4, 0.0, 1.0]), torch.zeros(3))
+    assert found.tolist() == pytest.approx([1e-2] * 3)
 
 
 @pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
@@ -132,3 +170,9 @@ def test_weights_are_shares_of_whatever_they_sum_to() -> None:
     share = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
     for one, other in zip(mix(means, spreads, share), mix(means, spreads, 7 * share), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
+
+
+def test_a_variance_that_rounding_made_negative_is_none() -> None:
+    mean, variance = torch.zeros(3), torch.tensor([-1e-9, 1.0, 1.0])
+    assert deviation(mean, variance).tolist() == pytest.approx([0.01, 1.0, 1.0])
+    assert dead_channels(mean, variance).tolist() == [True, False, False]
