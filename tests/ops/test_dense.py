@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from fprf.ops import dense
 from fprf.ops.dense import Last, network, network_reference, runs
 from fprf.ops.lanes import BLOCK
 
@@ -137,6 +138,18 @@ def test_where_somebody_learns_the_plain_form_runs() -> None:
     weights, biases = layers_of((10, 16, 4))
     x = draw(70, 10).requires_grad_(True)
     assert torch.equal(network(x, weights, biases), network_reference(x, weights, biases))
+
+
+def test_other_types_take_the_plain_form() -> None:
+    weights, biases = layers_of((6, 9, 2))
+    x = draw(10, 6)
+    assert not dense.usable(x)
+    with torch.no_grad():
+        assert dense.usable(x) and not dense.usable(x.double())
+    found = network(x.double(), [w.double() for w in weights], [None if b is None else b.double() for b in biases])
+    assert found.dtype == torch.float64
+    double = [w.double().requires_grad_(True) for w in weights]
+    assert torch.autograd.gradcheck(lambda a, b: network(x[:3].double(), [a, b], [None, None]), tuple(double))
 
 
 @QUICK

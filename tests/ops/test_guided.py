@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from fprf.errors import ConfigError, DataError
 from fprf.ops import guided
 
 UNIT = 2.0**-24
@@ -223,3 +224,17 @@ def test_cheap_is_close_to_exact_on_photographs(shared: Path, name: str) -> None
     convolution = F.conv2d(guide.permute(2, 0, 1)[None], torch.randn(8, 3, 5, 5), stride=2, padding=2).relu()
     assert error(convolution[0], guide, 30, 8) <= 0.02
     assert error(F.avg_pool2d(convolution, 8)[0], guide, 30, 8) <= 0.02
+
+
+@pytest.mark.parametrize(
+    "change", [{"eps": 1e-7}, {"eps": math.nan}, {"radius": -1}, {"stride": 0}, {"fineness": 0.5}, {"fineness": math.nan}]
+)
+def test_values_out_of_range_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="guided"):
+        guided.coefficients(torch.zeros(1, 2, 2), photo(4, 4), **({"radius": 1, "eps": 1e-3, "stride": 1} | change))
+
+
+@pytest.mark.parametrize("shapes", [((2, 2), (4, 4, 3)), ((1, 2, 2), (4, 4)), ((1, 0, 2), (4, 4, 3)), ((1, 2, 2), (4, 4, 1))])
+def test_shapes_that_do_not_fit_are_named(shapes: tuple[tuple[int, ...], tuple[int, ...]]) -> None:
+    with pytest.raises(DataError, match="guided filter: features"):
+        guided.coefficients(torch.zeros(shapes[0]), torch.zeros(shapes[1]), radius=1, eps=1e-3, stride=1)

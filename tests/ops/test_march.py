@@ -156,6 +156,22 @@ def test_what_is_kept_is_gathered_in_order(latents: int) -> None:
     assert torch.equal(found.view, view[index // 8])
 
 
+@torch.no_grad()
+def test_nothing_is_kept_where_nothing_is() -> None:
+    weighed = march.weigh(torch.zeros(3, 4), torch.arange(5.0).repeat(3, 1), 0.0)
+    assert not weighed.keep.any() and not weighed.opacity.any() and (weighed.transmittance == 1).all()
+    assert len(march.gather(weighed, torch.zeros(3, 4, 3), torch.zeros(12, 3), torch.zeros(3, 3)).ray) == 0
+
+
+@torch.no_grad()
+def test_of_no_samples_nothing_is_seen() -> None:
+    weighed = march.weigh(torch.zeros(3, 0), torch.ones(3, 1), 0.0)
+    assert weighed.weights.shape == weighed.keep.shape == (3, 0)
+    assert torch.equal(weighed.start, torch.zeros(4, dtype=torch.int64))
+    assert torch.equal(weighed.opacity, torch.zeros(3)) and torch.equal(weighed.depth, torch.zeros(3))
+    assert torch.equal(weighed.transmittance, torch.ones(3))
+
+
 def proposal(seed: int = 0, thickness: float = 4.0, resolution: int = 9, channels: int = 8) -> ProposalField:
     field = ProposalField(resolution, channels, seed=seed)
     with torch.no_grad():

@@ -67,6 +67,18 @@ def test_nothing_of_a_region_without_a_share_is_seen() -> None:
 
 
 @torch.no_grad()
+def test_other_types_and_no_points_take_the_plain_form() -> None:
+    x, share, centre = draw(7, 16).double(), shares(7, 3).double(), draw(16).double()
+    matrix, bias = draw(3, 16, 16).double(), draw(3, 16).double()
+    plain = affine_reference(x, share, matrix, bias, centre=centre), scaled_reference(x, share, bias, bias, centre=centre)
+    fast = affine(x, share, matrix, bias, centre=centre), scaled(x, share, bias, bias, centre=centre)
+    assert all(torch.equal(a, b) and a.dtype == torch.float64 for a, b in zip(plain, fast, strict=True))
+    x, share, centre, matrix, bias = (each.float() for each in (x[:0], share[:0], centre, matrix, bias))
+    assert affine(x, share, matrix, bias, centre=centre).shape == (0, 16)
+    assert scaled(x, share, bias, bias, centre=centre).shape == (0, 16)
+
+
+@torch.no_grad()
 @pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 10), (5, 4), (16, 1), (72, 3)])
 @pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
 def test_gains_and_biases_stay_within_the_bound(channels: int, regions: int, count: int) -> None:

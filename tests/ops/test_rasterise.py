@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from fprf.errors import FprfError
 from fprf.ops import backend, rasterise
 
 ROUGH = 1.1e-4
@@ -194,6 +195,17 @@ def test_no_input_leaves_the_image_or_a_gradient_without_a_number(spoil: Callabl
         images.append(found.image.double().detach())
     # Alphas of 0.99 let factors of 1 - alpha err by 99 ROUGH.
     assert (images[0] - images[1]).abs().median() < 100 * ROUGH
+
+
+def test_shapes_that_do_not_fit_are_refused() -> None:
+    given = cloud()
+    for spoilt in (given[0][:-1], given[0][:, :2]):
+        with pytest.raises(FprfError, match="Gaussians of shapes"):
+            rasterise.rasterise(spoilt, *given[1:5], camera())
+    with pytest.raises(FprfError, match="Gaussians of shapes"):
+        rasterise.rasterise(*given[:4], given[4][:, :5], camera())
+    with pytest.raises(FprfError, match="pixels"):
+        rasterise.lift(*given[:4], camera(), torch.zeros(40, 30, 2))
 
 
 def test_the_plain_form_on_request() -> None:

@@ -96,6 +96,13 @@ def test_no_coordinate_leaves_the_table(size: int, channels: int) -> None:
     assert padded[:edge].isnan().all() and padded[edge + total :].isnan().all()
 
 
+def test_no_points_at_all() -> None:
+    table = table_of((4, 9), 8).requires_grad_(True)
+    found = lookup(points_of(0), table, (4, 9))
+    assert found.shape == (0, 16)
+    assert not torch.autograd.grad(found.sum(), table)[0].any()
+
+
 def test_half_tables_are_for_those_who_do_not_learn() -> None:
     """What is stored in half is rounded, and nothing else: the arithmetic is that of the rounded table in float32."""
     resolutions, points = (16, 64), points_of(300)

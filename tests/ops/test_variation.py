@@ -12,6 +12,9 @@ from fprf.ops.triplane import rows, split, variation, variation_reference
 """Unit round-off of float32."""
 
 
+U = 2.0**-24
+
+
 def table_of(resolutions: Sequence[int], channels: int) -> Tensor:
     return torch.empty(rows(resolutions), channels).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
 
@@ -49,3 +52,10 @@ def test_gradient_of_variation(resolutions: tuple[int, ...], channels: int, scal
     assert (found.double() - exact).norm() <= 1e-6 * exact.norm()
     # Opposite neighbours cancel: a constant shift of the planes costs nothing.
     assert abs(float(found.double().sum())) <= 1e-5 * float(found.double().abs().sum()) + 1e-30
+
+
+def test_variation_of_a_constant_is_nothing() -> None:
+    table = torch.full((rows((9,)), 8), 0.37, requires_grad=True)
+    loss = variation(table, (9,))
+    (gradient,) = torch.autograd.grad(loss, table)
+    assert loss.item() == 0.0 and gradient.abs().max() <= 4 * U
