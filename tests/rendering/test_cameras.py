@@ -185,6 +185,11 @@ def test_scaling_commutes_with_rays(factor: int, seed: int) -> None:
         assert torch.allclose(one, other, atol=1e-12)
 
 
+def test_something_is_left_of_the_smallest_image() -> None:
+    scene = cameras([PINHOLE, OPENCV])
+    assert torch.equal(scene.scaled(1e4).size, torch.ones(2, 2, dtype=torch.int64))
+
+
 def test_select_takes_views_in_order() -> None:
     scene = cameras([PINHOLE, OPENCV, FISHEYE])
     some = scene.select(torch.tensor([2, 0]))
@@ -195,3 +200,11 @@ def test_select_takes_views_in_order() -> None:
     whole = rays_through(scene, view[keep], pixel[keep])
     part = rays_through(some, renumbered, pixel[keep])
     assert all(torch.equal(a, b) for a, b in zip(whole, part, strict=True))
+
+
+def test_no_rays_are_no_rays() -> None:
+    scene = cameras([OPENCV, FISHEYE])
+    none = torch.zeros(0, dtype=torch.int64)
+    origin, direction = rays_through(scene, none, torch.zeros(0, 2))
+    assert origin.shape == direction.shape == (0, 3)
+    assert project(scene, none, origin)[0].shape == (0, 2)

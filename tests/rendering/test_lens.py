@@ -9,6 +9,7 @@ from fprf.rendering.lens import (
     OPENCV,
     PANORAMA,
     PINHOLE,
+    _brown_step,
     _powers,
     _radial_inverse,
     bend,
@@ -17,6 +18,12 @@ from fprf.rendering.lens import (
 )
 
 DOUBLE = torch.float64
+
+
+def test_where_the_lens_is_singular_a_step_is_finite() -> None:
+    """k1 = -1/3: the radius turns at 1, and the Jacobian has no inverse there."""
+    distortion, xy = torch.tensor([[-1 / 3, 0, 0, 0, 0, 0]], dtype=DOUBLE), torch.tensor([[1.0, 0.0]], dtype=DOUBLE)
+    assert _brown_step(distortion, xy, torch.tensor([[0.1, 0.1]], dtype=DOUBLE)).isfinite().all()
 
 
 @pytest.mark.parametrize("k1", [-0.3, -0.1, -1.0, 0.2])
@@ -30,6 +37,12 @@ def test_a_radius_that_hardly_grows_is_inverted(k1: float, flat: float) -> None:
     share, slope = _powers(k.expand(len(u), 4), rho)
     assert ((share * rho - u).abs() <= 1e-13 * (1 + u) + 1e-14 * slope * rho).all()
     assert (rho.diff()[:300] > 0).all()
+
+
+def test_beyond_the_reach_lies_the_reach() -> None:
+    k, reach = torch.tensor([[-1 / 3, 0, 0, 0]], dtype=DOUBLE).expand(3, 4), torch.ones(3, dtype=DOUBLE)
+    rho = _radial_inverse(k, torch.tensor([0.0, 2 / 3, 5.0], dtype=DOUBLE), reach)
+    assert rho[0] == 0 and rho[1].item() == pytest.approx(1.0, abs=1e-6) and rho[2] == 1
 
 
 def test_tangential_terms_are_undone_to_rounding() -> None:

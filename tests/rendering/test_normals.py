@@ -49,6 +49,11 @@ def test_units_do_not_matter(size: float) -> None:
     assert torch.allclose(found, wall.float().expand_as(found), atol=1e-3 if size < 1 else 1e-5)
 
 
+@pytest.mark.parametrize(("width", "height"), [(1, 9), (9, 1), (1, 1)])
+def test_a_line_of_pixels_has_no_normals(width: int, height: int) -> None:
+    assert torch.equal(normals(camera(width, height), 0, torch.ones(height, width)), torch.zeros(height, width, 3))
+
+
 def test_an_edge_belongs_to_one_of_its_sides() -> None:
     cameras = camera()
     wall = torch.tensor([-1.0, 0, 0], dtype=torch.float64)

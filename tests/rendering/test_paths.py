@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import UsageError
 from fprf.rendering.cameras import Cameras, project
 from fprf.rendering.paths import interpolate, look_at, orbit, spiral, tour
 
@@ -119,6 +120,13 @@ def test_a_spiral_looks_at_what_the_central_camera_sees(capture: Callable[[int],
     assert bool((depth > 0).all())
 
 
+def test_one_camera_stands_still_and_points_behind_are_ignored() -> None:
+    cameras = looking(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([0.0, 5, 0], dtype=torch.float64))
+    path = spiral(cameras, 5, points=torch.tensor([[0.0, -5, 0]]).repeat(20, 1).double())
+    torch.testing.assert_close(path.pose, cameras.pose.repeat(5, 1, 1), atol=1e-12, rtol=0)
+    assert_rigid(orbit(cameras, 5))
+
+
 @pytest.mark.parametrize("capture", CAPTURES)
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 1000))
@@ -215,3 +223,16 @@ def test_look_at_is_level_and_survives_looking_along_up(seed: int) -> None:
     pose = look_at(position, target, UP)
     assert float((pose[:, :, :3].mT @ pose[:, :, :3] - torch.eye(3)).abs().max()) < 1e-12
     assert float(pose[2:, 2, 0].abs().max()) < 1e-12 and bool((pose[2:, 2, 1] >= 0).all())
+
+
+def test_wrong_requests() -> None:
+    cameras = forward_facing()
+    for wrong in (
+        lambda: spiral(cameras, 0),
+        lambda: spiral(cameras, 5, turns=0),
+        lambda: orbit(cameras, 0),
+        lambda: interpolate(cameras, torch.tensor([0, 1]), -1),
+        lambda: interpolate(cameras, torch.tensor([], dtype=torch.int64), 3),
+    ):
+        with pytest.raises(UsageError, match="must be at least"):
+            wrong()

@@ -51,6 +51,12 @@ def test_every_pixel_of_mixed_cameras(offset: float, limit: int) -> None:
     assert (direction.norm(dim=-1) - 1).abs().max() <= 1e-14
 
 
+def test_no_pixels() -> None:
+    rays = PixelRays(rig([PINHOLE], [(4, 4)]))
+    origin, direction = rays(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2))
+    assert origin.shape == direction.shape == (0, 3)
+
+
 @pytest.mark.parametrize("offset", [0.0, 4.5e6])
 def test_whole_views_of_mixed_cameras(offset: float) -> None:
     """Twice, in turn: what is remembered of one lens must not be taken for another's, nor one place for another."""

@@ -57,6 +57,14 @@ def rays_of(parts: Parts, count: int) -> Rays:
     return parts.space.rays(origin, direction)
 
 
+@torch.no_grad()
+def test_no_rays() -> None:
+    parts = parts_of("contraction", 8)
+    found = render_rays(rays_of(parts, 0), parts, want=Want.COLOUR, budget=0.1, background=torch.ones(3))
+    assert found.rgb is not None and found.rgb.shape == (0, 3)
+    assert found.counts == {"rays": 0, "samples": 0, "kept": 0}
+
+
 def test_scaled_gradients_leave_values_alone() -> None:
     x = torch.randn(5, 3, dtype=torch.float64, requires_grad=True)
     scale = torch.rand(5, 1, dtype=torch.float64)
@@ -112,6 +120,13 @@ def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
     assert gradient.isfinite().all() and (gradient.norm(dim=1) > 0).all()
     assert torch.autograd.grad(other.semantic.sum(), moved.origin, allow_unused=True, retain_graph=True) == (None,)
     assert not other.sampled.t.requires_grad
+
+
+@torch.no_grad()
+def test_where_nothing_is_semantics_are_nothing() -> None:
+    parts = toys.parts_of()._replace(field=toys.Uniform(0.0))
+    found = render_rays(toys.rays_of("contraction", 4), parts, want=Want.SEMANTIC | Want.DENSITY, budget=0.0)
+    assert found.semantic is not None and not found.semantic.any() and found.depth.isfinite().all()
 
 
 class Aided(toys.Squash):

@@ -102,6 +102,16 @@ def test_spacing_keeps_its_relative_accuracy_and_its_order(near: float, far: flo
         assert abs(b - exact) <= 16 * U * exact + 4 * U * min(far, 1.0) * a
 
 
+@QUICK
+@given(st.floats(1e-3, 10.0), st.floats(1.0, 1e6), st.integers(0, 99))
+def test_spacing_is_sorted_for_any_bounds(near: float, ratio: float, seed: int) -> None:
+    s = torch.rand(1, 400, generator=torch.Generator().manual_seed(seed)).sort(-1).values
+    n = torch.tensor([near])
+    t = space_of("contraction").distance(s, n, n * ratio)
+    assert (t.diff(dim=-1) >= 0).all()
+    assert (t >= n * (1 - 4 * U)).all() and (t <= n * ratio * (1 + 4 * U)).all()
+
+
 @pytest.mark.parametrize("kind", ["box", "ndc"])
 def test_spacing_is_even_in_bounded_spaces(kind: Kind) -> None:
     s = torch.linspace(0, 1, 5)[None].repeat(2, 1)
@@ -146,6 +156,14 @@ def test_ndc_is_nerfs_projection(offset: float, seed: int) -> None:
         back = space.metric(origin, direction, torch.full((50,), t, dtype=torch.float64))
         assert ((back - along) / along.abs()).abs().max() <= 1e-9 + offset * 1e-14
         assert (space.parameter(origin, direction, along) - t).abs().max() <= 1e-9 + offset * 1e-14
+
+
+def test_ndc_bends_rays_that_look_backwards() -> None:
+    space = space_of("ndc", near=1.0)
+    direction = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.6, 0.0, -0.8]], dtype=torch.float64)
+    rays = space.rays(torch.zeros(3, 3, dtype=torch.float64), direction)
+    assert all(x.isfinite().all() for x in rays)
+    assert (rays.direction[:, 2] > 0).all()
 
 
 @pytest.mark.parametrize("kind", ["box", "contraction"])
@@ -200,3 +218,11 @@ def test_box_rays_enter_and_leave_where_slabs_say(seed: int, axis_aligned: bool)
             assert near == pytest.approx(expected[0], rel=1e-6) and far == pytest.approx(expected[1], rel=1e-6)
             ends = origin[k] + torch.tensor([[near], [far]], dtype=torch.float64) * direction[k]
             assert ends.abs().max() <= 1 + 1e-5
+
+
+@pytest.mark.parametrize("kind", ["box", "contraction", "ndc"])
+def test_no_rays(kind: Kind) -> None:
+    none = torch.zeros(0, 3, dtype=torch.float64)
+    rays = space_of(kind).rays(none, none)
+    assert all(len(x) == 0 for x in rays)
+    assert space_of(kind).locate(torch.zeros(0, 3)).shape == (0, 3)

@@ -115,6 +115,12 @@ def test_weights_differentiate() -> None:
     assert torch.autograd.gradcheck(lambda x: transmittance_weights(x, t), (tau,))
 
 
+def test_no_samples_and_no_rays() -> None:
+    assert transmittance_weights(torch.zeros(3, 0), torch.zeros(3, 1)).shape == (3, 0)
+    assert transmittance_weights(torch.zeros(0, 4), torch.zeros(0, 5)).shape == (0, 4)
+    assert torch.equal(midpoints(torch.tensor([[0.0, 1.0, 4.0]])), torch.tensor([[0.5, 2.5]]))
+
+
 def inverse_cdf(s: list[float], w: list[float], padding: float, u: float) -> float:
     """Where a share u of the padded distribution lies before, float64."""
     w = [x + padding / len(w) for x in w]
@@ -260,3 +266,11 @@ def test_the_heaviest_are_kept_and_no_more_than_needed(samples: int, seed: int, 
         if len(inside):  # dropping the lightest of the kept as well would exceed the budget
             assert float(dropped[ray]) + float(inside.min()) > budget - slack
     assert not kept[0].any()
+
+
+def test_budget_zero_keeps_everything_above_zero() -> None:
+    w = torch.tensor([[0.0, 1e-38, 0.5, 0.0], [0.0, 0.0, 0.0, 0.0], [1e-45, 1.0, 0.0, 1e-10]])
+    assert torch.equal(keep_heaviest(w, 0.0), w > 0)
+    assert keep_heaviest(torch.zeros(0, 4), 0.1).shape == (0, 4)
+    equal = keep_heaviest(torch.full((1, 8), 0.125), 0.25)
+    assert int(equal.sum()) == 6
