@@ -74,6 +74,11 @@ def test_blocks_that_no_point_needs_are_not_named() -> None:
     assert [g.members for g in far] == [(5,)] and len(far[0].at) == 3
 
 
+def test_no_points_are_no_trouble() -> None:
+    assert all(not len(g.at) for g in Blend(row(2))(torch.zeros(0, 3)))
+    assert not Inset(chart_of(row(2), 0))(torch.zeros(0, 3))
+
+
 def test_insets_and_everywhere() -> None:
     boxes = row(3)
     points = spread(boxes, 300, 0)

@@ -57,6 +57,11 @@ def test_faces_share_evenly_and_reach_is_the_margin() -> None:
     assert weight[4].tolist() == weight[5].tolist() == [0.0, 0.0, 1.0]
 
 
+def test_corner_of_four_cells_is_a_quarter_each() -> None:
+    weight = shares(torch.tensor([[1.0, 1.0, 0.5]]).double(), grid(2, 2, 0.2))
+    assert weight[0].tolist() == pytest.approx([0.25] * 4 + [0.0])
+
+
 @pytest.mark.parametrize("boxes", [grid(3, 2), bend()], ids=["grid", "bend"])
 def test_weights_change_no_faster_than_the_margins_allow(boxes: Boxes) -> None:
     """Steepest slope of a smoothstep over two margins is 3 / (4 m) an axis; scaling at most doubles it."""
@@ -85,6 +90,12 @@ def test_float32_far_from_the_origin_keeps_the_blend() -> None:
     exact, found = shares(points, boxes), shares((points + shift).float(), moved)
     assert float((found - exact).abs().max()) < 3 * 6.2e-5 / 0.2
     assert torch.allclose(found.sum(1), torch.ones(500), atol=1e-6)
+
+
+def test_no_blocks_are_surroundings_and_no_points_are_none() -> None:
+    none = Boxes(*(torch.zeros(0, 3).double() for _ in range(2)), torch.zeros(0, 3, 3).double(), 0.1)
+    assert shares(torch.zeros(4, 3), none).tolist() == [[1.0]] * 4
+    assert shares(torch.zeros(0, 3), grid(2, 1)).shape == (0, 3)
 
 
 def test_on_cuda_places_are_no_products_of_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
