@@ -82,3 +82,13 @@ def test_the_start_is_thin_and_different_for_each_seed() -> None:
     for values in thickness:
         assert 0.2 < values.detach().mean().item() < 0.8
     assert not torch.equal(thickness[0], thickness[1])
+
+
+def test_nothing_kept_has_no_features() -> None:
+    """Rays through thin air may keep no sample at all, with kernels (no gradients) and without."""
+    field = SMALL.build(channels=6, seed=0)
+    points, view = cloud(12)
+    for quiet in (True, False):
+        with torch.set_grad_enabled(not quiet):
+            latent = field.density(points).latent
+            assert field.content(latent[:0], view[:0]).shape == (0, 6)
