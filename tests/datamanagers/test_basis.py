@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.datamanagers.basis import Basis, fit_basis
+from fprf.errors import ConfigError, DataError, NumericsError
 
 UNIT = 2.0**-24
 
@@ -56,3 +57,16 @@ def test_through_tensors_and_back() -> None:
     again = Basis.from_tensors(basis.tensors())
     assert torch.equal(again.matrix, basis.matrix) and torch.equal(again.mean, basis.mean)
     assert again.energy == basis.energy
+
+
+def test_what_cannot_be_fitted_or_read_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"semantic\.dim"):
+        fit_basis(torch.randn(3, 3), 0)
+    with pytest.raises(DataError, match="at least one"):
+        fit_basis(torch.zeros(0, 3), 1)
+    with pytest.raises(NumericsError, match="not finite"):
+        fit_basis(torch.tensor([[1.0, float("nan")]]), 1)
+    with pytest.raises(DataError, match="matrix missing"):
+        Basis.from_tensors({"mean": torch.zeros(2), "energy": torch.tensor(1.0)})
+    with pytest.raises(DataError, match="must be"):
+        Basis.from_tensors({"mean": torch.zeros(2), "matrix": torch.zeros(3, 1), "energy": torch.tensor(1.0)})

@@ -1,6 +1,8 @@
 """Training batches: pure in (seed, step), uniform over the pixels that masks leave, right at every pixel, through points."""
 
+import errno
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +17,12 @@ from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
 from torch import Tensor
 
-from fprf.datamanagers.batches import PixelRuns, RayBatches
+import fprf.datamanagers.batches as pixel_file
+from fprf.datamanagers.batches import PixelRuns, RayBatches, allocate_pixels
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_mask
 from fprf.datamanagers.parsers.config import TransformsConfig
+from fprf.datamanagers.parsers.views import find_masks
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
 from fprf.interfaces import DataManager, Encoder
@@ -145,6 +149,15 @@ def test_transparency_shows_the_background_that_is_given(tmp_path: Path, channel
             assert (rgb - expected[pixel[1], pixel[0]]).abs().max() <= 0.51 / 255
 
 
+def test_a_scene_without_training_views_is_refused(tmp_path: Path) -> None:
+    scene, _ = make_scene(tmp_path)
+    empty = Scene(
+        name="empty", paths=scene.paths, cameras=scene.cameras, train=torch.zeros(0, dtype=torch.long), test=scene.train
+    )
+    with pytest.raises(DataError, match="empty: no training views"):
+        make(empty, tmp_path)
+
+
 def test_a_device_draws_what_the_host_draws(tmp_path: Path) -> None:
     """Pixels, colours, features, masks, sky and depths; its generator is the CPU's here, which on a card is another one."""
     scene, _ = make_scene(tmp_path)
@@ -192,6 +205,21 @@ def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
     assert runs.pick(torch.arange(len(wanted))).tolist() == wanted
     everything = torch.arange(start + 3)
     assert everything[runs.holds(everything)].tolist() == wanted
+
+
+def test_nothing_is_a_set_too() -> None:
+    runs = PixelRuns.of([])
+    assert len(runs) == 0 and not runs.holds(torch.tensor([0, 5])).any()
+    assert len(PixelRuns.of([(4, torch.zeros(9, dtype=torch.bool))])) == 0
+
+
+def test_a_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file: int, offset: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(pixel_file.os, "posix_fallocate", full, raising=False)
+    with pytest.raises(DataError, match="No space left"):
+        allocate_pixels(1000, tmp_path, held=0)
 
 
 def manager(world: World, folder: Path, share: float, **fields: object) -> DataManager:
@@ -273,6 +301,23 @@ def test_frames_name_their_masks(tmp_path: Path) -> None:
         TransformsConfig().build().parse(tmp_path, 1)
 
 
+def test_folders_of_cameras_and_splits_have_theirs(tmp_path: Path) -> None:
+    images = [
+        tmp_path / "images/left/1.jpg",
+        tmp_path / "images/right/1.jpg",
+        tmp_path / "train/rgbs/7.jpg",
+        Path("/other/8.jpg"),
+    ]
+    wanted = [
+        write_mask(tmp_path / "masks/left/1.jpg.png", np.ones((2, 2), np.uint8)),
+        None,
+        write_mask(tmp_path / "train/masks/7.png", np.ones((2, 2), np.uint8)),
+        None,
+    ]
+    assert list(find_masks(tmp_path, images, "masks")) == wanted
+    assert find_masks(tmp_path, images, "sky_masks") == ()
+
+
 @pytest.mark.parametrize(
     ("low", "high", "kind"), [(0, 255, np.uint8), (0, 1, np.uint8), (20, 200, np.uint8), (0, 65535, np.uint16)]
 )
@@ -284,6 +329,12 @@ def test_bright_is_true(tmp_path: Path, low: int, high: int, kind: type, channel
     assert np.array_equal(load_mask(path, (7, 9)), mask)
     double = load_mask(path, (14, 18))
     assert np.array_equal(double, mask.repeat(2, 0).repeat(2, 1))
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
+    path = write_mask(tmp_path / "m.png", np.ones((40, 10), np.uint8))
+    with pytest.raises(DataError, match="10x40 pixels do not fit an image of 60x40"):
+        load_mask(path, (60, 40))
 
 
 def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
@@ -302,6 +353,13 @@ def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
     build = {"content": None, "semantic": None, "dim": 4, "cache": tmp_path, "seed": 0}
     ours, theirs = (plain.build(scene=each, **build).batch(1) for each in (masked, scene))  # type: ignore[arg-type]
     assert torch.equal(ours.pixel, theirs.pixel)
+
+
+def test_a_mask_that_leaves_nothing_is_told(tmp_path: Path) -> None:
+    scene, _ = make_scene(tmp_path)
+    paths = tuple(write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES))
+    with pytest.raises(DataError, match="none of 4 training views"):
+        make(replace(scene, masks=paths), tmp_path)
 
 
 def test_rays_know_whether_they_look_into_the_sky(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from fprf.datamanagers import features as store_files
 from fprf.datamanagers.config import GuidedConfig
 from fprf.datamanagers.features import FeatureStore, extract
+from fprf.errors import DataError, NumericsError, PluginError
 from fprf.interfaces import Encoder
 from fprf.ops import guided
 
@@ -40,6 +41,12 @@ def test_half_precision_keeps_eleven_bits_of_the_largest_coefficient(
     error = (entry.plain() - coefs).abs().amax((0, 1, 3))
     # b is kept at mid-grey: its own rounding and that of three halved slopes.
     assert (error <= 2.5 * store_files.TOP * 2.0**-11 * entry.scale + 2.0**-22 * abs(offset) * size).all()
+
+
+def test_constant_and_zero_features() -> None:
+    coefs = torch.zeros(2, 2, 3, 4)
+    coefs[..., 3] = torch.tensor([0.0, 5.0, -2.0])
+    assert torch.equal(store_files.pack(coefs, (2, 2)).plain(), coefs)
 
 
 def make(folder: Path) -> tuple[str, store_files.Entry]:
@@ -220,6 +227,13 @@ def test_mean_and_spread_are_those_of_the_targets(tmp_path: Path) -> None:
     assert store.scale == store.std
 
 
+def test_features_that_never_change_have_scale_one(tmp_path: Path) -> None:
+    store = build(tmp_path, Counting(2, gain=0.0, offset=3.0))
+    assert store.std <= 1e-6 and store.scale == 1.0
+    assert (store.at(*draw(5)) - 3.0).abs().max() <= 1e-6
+    assert build(tmp_path, Counting(2, gain=0.0)).scale == 1.0
+
+
 def test_semantics_are_the_projected_features(tmp_path: Path) -> None:
     """The filter is linear, so projecting before it or after is the same."""
     encoder, where = Counting(12), draw()
@@ -278,6 +292,29 @@ def test_an_interrupted_extraction_goes_on(tmp_path: Path) -> None:
     encoder.calls, encoder.fail_after = 0, 99
     build(tmp_path, encoder)
     assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.glob("manifest*"))) == 1
+
+
+def test_a_view_without_features_is_named(tmp_path: Path) -> None:
+    store = build(tmp_path, Counting())
+    with pytest.raises(DataError, match="view 7 has no features"):
+        store.at(torch.tensor([0, 7]), torch.zeros(2, 2), torch.zeros(2, 3))
+    assert store.at(torch.zeros(0, dtype=torch.long), torch.zeros(0, 2), torch.zeros(0, 3)).shape == (0, 5)
+    with pytest.raises(DataError, match="no views"):
+        FeatureStore({})
+
+
+def test_encoders_that_break_their_promise_are_named(tmp_path: Path) -> None:
+    with pytest.raises(NumericsError, match=r"counting 2 nan .* view 0 are not finite"):
+        build(tmp_path, Counting(2, gain=float("nan")))
+
+    class Liar(Counting):
+        @property
+        def channels(self) -> int:
+            return 3
+
+    with pytest.raises(PluginError, match="promises"):
+        build(tmp_path, Liar(2))
+    assert not list(tmp_path.glob("*"))
 
 
 def test_files_stay_small(tmp_path: Path) -> None:

@@ -190,6 +190,11 @@ def test_a_thumbnail_s_end_does_not_hide_truncation(tmp_path: Path) -> None:
         load_image(tmp_path / "a.jpg")
 
 
+def test_an_absent_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"nothing\.png: cannot be read"):
+        load_image(tmp_path / "nothing.png")
+
+
 def test_an_image_that_was_rotated_after_parsing_is_refused(tmp_path: Path) -> None:
     write_transforms(tmp_path, Capture.make(3))
     scene = parse_scene(tmp_path, 1, None)

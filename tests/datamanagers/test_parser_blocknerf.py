@@ -15,7 +15,7 @@ from record_files import example, record, town_records, varint
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, read_examples, read_records
 from fprf.datamanagers.parsers.config import BlockNerfConfig, parse_scene, recognise
-from fprf.errors import DataError
+from fprf.errors import ConfigError, DataError
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 
 
@@ -107,6 +107,22 @@ def test_bad_messages_are_named(tmp_path: Path, data: bytes, said: str) -> None:
     path.write_bytes(record(data))
     with pytest.raises(DataError, match=said):
         list(read_examples(path))
+
+
+def test_asking_for_something_else_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.tfrecord"
+    path.write_bytes(record(example({"a": b"x", "b": [1, 2], "c": np.array([1.0, np.inf], np.float32)})))
+    (one,) = read_examples(path)
+    for call in (
+        lambda: one.blob("b"),
+        lambda: one.integer("b"),
+        lambda: one.integer("none"),
+        lambda: one.numbers("a"),
+        lambda: one.numbers("c"),
+        lambda: one.numbers("c", 3),
+    ):
+        with pytest.raises(DataError, match=r"a.tfrecord: record 0: \w+ holds .* is needed"):
+            call()
 
 
 number = st.floats(-1, 1)
@@ -216,6 +232,15 @@ def test_a_complete_cache_is_not_read_again(bay: tuple[Path, Cameras], monkeypat
     assert parse_scene(bay[0], 1, None).paths[3].is_file()
 
 
+def test_some_cameras(bay: tuple[Path, Cameras]) -> None:
+    scene = parse_scene(bay[0], 1, BlockNerfConfig(cameras=(1,)))
+    assert len(scene.paths) == 8 and all(path.stem.startswith("cam01") for path in scene.paths)
+    with pytest.raises(DataError, match=r"no images of cameras \[7\]; parser.cameras may name \[0, 1\]"):
+        parse_scene(bay[0], 1, BlockNerfConfig(cameras=(7,)))
+    with pytest.raises(ConfigError, match=r"parser.cameras"):
+        BlockNerfConfig(cameras=(-1,))
+
+
 def test_rays_of_no_camera_are_refused_unless_told(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     town_records(folder, views=4)
@@ -262,3 +287,18 @@ def test_records_that_cannot_be_are_named(tmp_path: Path, change: dict[str, obje
     with pytest.raises(DataError, match=said) as caught:
         parse_scene(folder, 1, None)
     assert "a_train.tfrecord: record 0" in str(caught.value)
+
+
+def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    done, image = cv2.imencode(".png", np.full((12, 12, 3), 90, np.uint8))
+    assert done
+    (folder / "a.tfrecord").write_bytes(record(example(good_features() | {"image": image.tobytes()})))
+    with pytest.raises(DataError, match="12x12 pixels, but its camera has 32x24"):
+        parse_scene(folder, 1, None)
+
+
+def test_no_files(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no \*\.tfrecord files"):
+        parse_scene(tmp_path, 1, BlockNerfConfig())

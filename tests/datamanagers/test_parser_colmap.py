@@ -86,6 +86,14 @@ def test_models_are_found_in_three_places(tmp_path: Path) -> None:
         parse(tmp_path)
 
 
+def test_points_are_optional(tmp_path: Path) -> None:
+    for binary, suffix in ((True, "bin"), (False, "txt")):
+        sparse = write_colmap(tmp_path / suffix, Capture.make(2), binary=binary)
+        (sparse / f"points3D.{suffix}").unlink()
+        scene = parse(tmp_path / suffix)
+        assert scene.points is None and scene.depths is None
+
+
 def test_reduced_images_must_be_named(tmp_path: Path) -> None:
     small = Capture.make(2, size=(12, 8), focal=(10.0, 10.0))
     write_colmap(tmp_path, small, images="images_2", model=(1, "PINHOLE"), params=(10.0, 10.0, 6.0, 4.0))
@@ -152,3 +160,11 @@ def test_bad_text_names_its_line(tmp_path: Path, file: str, text: str, finding: 
     (write_colmap(tmp_path, Capture.make(2), binary=False) / file).write_text(text)
     with pytest.raises(DataError, match=finding):
         parse(tmp_path)
+
+
+def test_an_image_without_features_and_a_name_with_spaces(tmp_path: Path) -> None:
+    sparse = write_colmap(tmp_path, Capture.make(2), binary=False)
+    (tmp_path / "images" / "0000.png").rename(tmp_path / "images" / "a b.png")
+    (sparse / "images.txt").write_text("1 1 0 0 0 0 0 0 7 a b.png\n\n2 1 0 0 0 1 0 0 7 0001.png\n")
+    scene = parse(tmp_path)
+    assert [path.name for path in scene.paths] == ["0001.png", "a b.png"] and scene.depths is None

@@ -13,7 +13,7 @@ from capture_files import rotations, write_image
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.files import as_record, path_inside, read_json, read_npy, read_npz
+from fprf.datamanagers.parsers.files import as_record, image_names, path_inside, read_json, read_npy, read_npz
 from fprf.datamanagers.parsers.views import View, assemble_scene, rigid_pose
 from fprf.errors import DataError
 
@@ -69,6 +69,17 @@ def test_paths_inside_are_normalised() -> None:
         assert path_inside(Path("root"), "here", text) == ("images/a b.png", Path("root/images/a b.png"))
 
 
+def test_folders_are_listed_by_name(tmp_path: Path) -> None:
+    for name in ("b.PNG", "a.jpg", "notes.txt", ".hidden.png"):
+        (tmp_path / name).touch()
+    assert image_names(tmp_path) == ["a.jpg", "b.PNG"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="no image among 0 files"):
+        image_names(tmp_path / "empty")
+    with pytest.raises(DataError, match="no such image folder"):
+        image_names(tmp_path / "absent")
+
+
 def npy(array: np.ndarray) -> bytes:
     stream = io.BytesIO()
     np.save(stream, array)
@@ -122,6 +133,12 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
     assert not canary.exists()
 
 
+def test_an_archive_without_the_array_says_so(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", other=np.zeros(3))
+    with pytest.raises(DataError, match="no array 'xyz'"):
+        read_npz(tmp_path / "a.npz", "xyz")
+
+
 @pytest.mark.parametrize("field", [20, 24])
 def test_an_archive_that_claims_more_than_the_file_holds_takes_no_memory(tmp_path: Path, field: int) -> None:
     """Packed and unpacked size stand in the directory at its end; a gigabyte is allowed for an array."""
@@ -155,6 +172,14 @@ def test_records_fall_back_and_name_the_place() -> None:
     for empty in ({}, {"frames": []}, {"frames": 3}):
         with pytest.raises(DataError, match="no list of frames"):
             as_record("f", empty).records("frames")
+
+
+@pytest.mark.parametrize("shape", ["(3)", "((3, 2))", "(3 2)", "(-3, 2)", "(3,, 2)", "3, 2", "(1e1,)"])
+def test_shapes_that_are_none_are_refused(shape: str) -> None:
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + np.arange(6.0).tobytes()
+    with pytest.raises(DataError):
+        read_npy("x", data)
 
 
 def pose(seed: int = 0) -> np.ndarray:

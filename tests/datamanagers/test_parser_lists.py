@@ -74,6 +74,28 @@ def test_metadata_that_cannot_be_are_named(tmp_path: Path, content: object, said
     assert "0001.pt" in str(caught.value)
 
 
+def test_meganerf_files_that_are_missing(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no \*.pt files"):
+        parse_scene(tmp_path, 1, MegaNerfConfig())
+    write_meganerf(tmp_path, Capture.make(3))
+    (tmp_path / "train/rgbs/0001.png").unlink()
+    with pytest.raises(DataError, match=r"no image .*0001\.jpg"):
+        parse_scene(tmp_path, 1, None)
+    (tmp_path / "coordinates.pt").write_bytes(b"nonsense")
+    with pytest.raises(DataError, match=r"coordinates.pt: no tensors"):
+        parse_scene(tmp_path, 1, None)
+    torch.save({"pose_scale_factor": -1.0}, tmp_path / "coordinates.pt")
+    with pytest.raises(DataError, match="pose_scale_factor is -1"):
+        parse_scene(tmp_path, 1, None)
+
+
+def test_an_image_on_both_sides_is_refused(tmp_path: Path) -> None:
+    write_meganerf(tmp_path, Capture.make(3), held=())
+    write_meganerf(tmp_path, Capture.make(3), held=(0, 1, 2))
+    with pytest.raises(DataError, match=r"000\d is in train and in val"):
+        parse_scene(tmp_path, 1, None)
+
+
 def write_table(path: Path, rows: list[tuple[str, str, str]]) -> None:
     lines = ["filename\tid\tsplit\tdataset", *("\t".join((*row, "gate")) for row in rows)]
     path.write_text("\n".join(lines) + "\n")
@@ -98,6 +120,20 @@ def test_the_table_says_who_is_in_and_for_what(tmp_path: Path, inner: str) -> No
         mine = scene.seen[scene.seen[:, 0] == new][:, 1]
         assert torch.equal(mine, whole.seen[whole.seen[:, 0] == old][:, 1])
     assert int(scene.seen[:, 0].max()) <= 4
+
+
+def test_tables_that_do_not_fit(tmp_path: Path) -> None:
+    capture = Capture.make(3)
+    write_colmap(tmp_path, capture)
+    with pytest.raises(DataError, match=r"0 tables \*.tsv; exactly one"):
+        parse_scene(tmp_path, 1, PhotoTourismConfig())
+    with pytest.raises(DataError, match=r"gone.tsv: no such table"):
+        parse_scene(tmp_path, 1, PhotoTourismConfig(list="gone.tsv"))
+    write_table(tmp_path / "a.tsv", [("elsewhere.png", "1", "train")])
+    with pytest.raises(DataError, match="none of its training photographs"):
+        parse_scene(tmp_path, 1, None)
+    write_table(tmp_path / "b.tsv", [(name, str(k), "train") for k, name in enumerate(capture.names)])
+    assert len(parse_scene(tmp_path, 1, PhotoTourismConfig(list="b.tsv")).train) == 3
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from capture_files import Capture, write_odm, write_polycam, write_record3d, write_transforms
+from capture_files import Capture, write_image, write_odm, write_polycam, write_record3d, write_transforms
 
 from fprf.datamanagers.parsers.config import OdmConfig, PolycamConfig, Record3DConfig, parse_scene, recognise
 from fprf.datamanagers.scene import Scene
@@ -55,6 +55,12 @@ def test_polycam_s_images_without_a_camera_are_left_out(tmp_path: Path) -> None:
         parse_scene(tmp_path, 1, None)
 
 
+def test_what_is_no_export_says_what_is_needed(tmp_path: Path) -> None:
+    for config, told in ((PolycamConfig(), "raw data"), (Record3DConfig(), "EXR and JPG"), (OdmConfig(), "ODM project")):
+        with pytest.raises(DataError, match=told):
+            config.build().parse(tmp_path, 1)
+
+
 @pytest.mark.parametrize("packed", [False, True])
 def test_record3d(tmp_path: Path, packed: bool) -> None:
     capture = Capture.make(9, focal=(20.0, 21.0))
@@ -81,6 +87,15 @@ def test_record3d_s_lenses_may_change_from_image_to_image(tmp_path: Path) -> Non
     write_record3d(tmp_path, Capture.make(3), perFrameIntrinsicCoeffs=rows)
     cameras = parse_scene(tmp_path, 1, None).cameras
     assert torch.cat([cameras.focal, cameras.centre], 1).tolist() == rows
+
+
+def test_record3d_without_numbered_images(tmp_path: Path) -> None:
+    file = write_record3d(tmp_path, Capture.make(2))
+    for path in (tmp_path / "rgb").iterdir():
+        path.rename(path.with_name(f"frame-{path.name}"))
+    with pytest.raises(DataError, match="nothing numbered"):
+        parse_scene(tmp_path, 1, None)
+    assert file.is_file()
 
 
 @pytest.mark.parametrize("report", [False, True])
@@ -130,3 +145,37 @@ def test_of_several_reconstructions_the_largest_is_read(tmp_path: Path) -> None:
     small = {**whole[0], "shots": {"0003.png": whole[0]["shots"].pop("0003.png")}}
     file.write_text(json.dumps([small, *whole]))
     assert [path.name for path in parse_scene(tmp_path, 1, None).paths] == ["0000.png", "0001.png", "0002.png"]
+
+
+def test_a_report_of_several_cameras_must_say_which(tmp_path: Path) -> None:
+    file = write_odm(tmp_path, Capture.make(2), report=True)
+    cameras = json.loads((tmp_path / "cameras.json").read_text())
+    (tmp_path / "cameras.json").write_text(json.dumps({**cameras, "other": cameras["v2 phone"]}))
+    with pytest.raises(DataError, match="which of 2 cameras"):
+        parse_scene(tmp_path, 1, None)
+    shots = json.loads(file.read_text())
+    for feature in shots["features"]:
+        feature["properties"]["camera"] = "other"
+    file.write_text(json.dumps(shots))
+    assert len(parse_scene(tmp_path, 1, None).paths) == 2
+    shots["features"] *= 2
+    file.write_text(json.dumps(shots))
+    with pytest.raises(DataError, match="occurs twice"):
+        parse_scene(tmp_path, 1, None)
+
+
+def test_odm_s_images_stay_inside_and_missing_ones_are_named(tmp_path: Path) -> None:
+    file = write_odm(tmp_path, Capture.make(2))
+    whole = json.loads(file.read_text())
+    whole[0]["shots"]["../x.png"] = whole[0]["shots"]["0001.png"]
+    file.write_text(json.dumps(whole))
+    with pytest.raises(DataError, match="leaves"):
+        parse_scene(tmp_path, 1, None)
+    del whole[0]["shots"]["../x.png"]
+    file.write_text(json.dumps(whole))
+    (tmp_path / "images" / "0001.png").unlink()
+    with pytest.raises(DataError, match="1 of 2 images are missing"):
+        parse_scene(tmp_path, 1, None)
+    write_image(tmp_path / "photos" / "0000.png", (24, 16))
+    write_image(tmp_path / "photos" / "0001.png", (24, 16))
+    assert len(OdmConfig(images="photos").build().parse(tmp_path, 1).paths) == 2

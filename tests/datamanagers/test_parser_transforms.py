@@ -10,6 +10,7 @@ from capture_files import Capture, write_image, write_transforms
 
 from fprf.datamanagers.parsers.config import TransformsConfig
 from fprf.datamanagers.scene import Scene
+from fprf.errors import DataError
 
 
 def parse(folder: Path, downscale: int = 1, file: str = "") -> Scene:
@@ -74,6 +75,16 @@ def test_what_is_left_out_follows_from_the_image(tmp_path: Path) -> None:
     assert parse(tmp_path).cameras.focal[0].tolist() == pytest.approx([30.0, 8.0])
 
 
+def test_another_file_is_named_by_the_config(tmp_path: Path) -> None:
+    content = write_transforms(tmp_path, Capture.make(3))
+    (tmp_path / "transforms_4.json").write_text(json.dumps({**content, "frames": content["frames"][:2]}))  # type: ignore[index]
+    assert len(parse(tmp_path, file="transforms_4.json").paths) == 2
+    with pytest.raises(DataError, match="leaves"):
+        parse(tmp_path, file="../transforms.json")
+    with pytest.raises(DataError, match="cannot be read"):
+        parse(tmp_path, file="absent.json")
+
+
 def blender(folder: Path, part: str, count: int) -> None:
     frames = []
     for k in range(count):
@@ -105,3 +116,13 @@ def test_the_capture_says_what_is_held_out(tmp_path: Path, lists: dict[str, obje
     write_transforms(tmp_path, Capture.make(4), **lists)
     scene = parse(tmp_path)
     assert scene.train.tolist() == train and scene.test.tolist() == test
+
+
+def test_points_of_another_shape_are_refused_and_infinite_ones_dropped(tmp_path: Path) -> None:
+    write_transforms(tmp_path, Capture.make(2))
+    np.savez(tmp_path / "points.npz", xyz=np.array([[0, 0, 1], [np.inf, 0, 0], [np.nan, 0, 0]]))
+    points = parse(tmp_path).points
+    assert points is not None and points.tolist() == [[0.0, 0.0, 1.0]]
+    np.savez(tmp_path / "points.npz", xyz=np.zeros((4, 2)))
+    with pytest.raises(DataError, match=r"\(4, 2\), not \[P 3\]"):
+        parse(tmp_path)

@@ -15,6 +15,7 @@ from fprf.datamanagers.parsers.config import (
     DataParserConfig,
     LlffConfig,
     Recognised,
+    TownConfig,
     TransformsConfig,
     parse_scene,
     recognise,
@@ -76,6 +77,25 @@ def test_blender_and_a_single_file_of_another_name(tmp_path: Path) -> None:
         recognise(tmp_path)
     (tmp_path / "transforms_train.json").write_text("{}")
     assert recognise(tmp_path) == TransformsConfig()
+
+
+def test_the_town_is_a_name_and_not_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert recognise(Path("town")) == TownConfig()
+    (tmp_path / "town").mkdir()
+    with pytest.raises(DataError, match="but nothing"):
+        recognise(Path("town"))
+
+
+def test_what_was_found_is_said(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such folder"):
+        recognise(tmp_path / "absent")
+    for name in "abcdefg":
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=r"but 7 entries \(a, b, c, d, e, \.\.\.\)"):
+        recognise(tmp_path)
+    with pytest.raises(DataError, match="a file; give the scene folder"):
+        recognise(tmp_path / "a")
 
 
 PARSER = """
