@@ -11,7 +11,7 @@ from torch import nn
 from fprf.config import TrainConfig
 from fprf.errors import NumericsError
 from fprf.training import checkpoint
-from fprf.training.loop import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, unfit_gradients
+from fprf.training.loop import CLEAR_EVERY, SMOOTHING, StepStatistics, clear_denormals, unfit_gradients, unfit_terms
 from fprf.training.model import build_model
 from fprf.training.run import Run
 from fprf.training.trainer import train
@@ -48,6 +48,13 @@ def bad_gradients(world: World, folder: Path, config: TrainConfig, value: float,
 
 def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_terms_that_are_not_finite_are_named() -> None:
+    parts = {"rgb": torch.tensor(1.0), "content": torch.tensor(NAN), "semantic": torch.tensor(INF)}
+    assert unfit_terms(torch.tensor(3.0), parts) is None
+    assert unfit_terms(torch.tensor(NAN), parts) == "content, semantic"
+    assert unfit_terms(torch.tensor(INF), {"rgb": torch.tensor(3e38)}) == "the sum of the loss terms"
 
 
 @settings(max_examples=60, deadline=None)
@@ -157,6 +164,23 @@ def test_moments_fade_to_zero_and_not_into_denormals() -> None:
     assert denormal(before) > 0, "else there is nothing to guard against"
     assert denormal(after) == 0
     assert float((plain - cleared).detach().abs().max()) < 1e-12
+
+
+def test_clearing_leaves_what_matters_alone_and_can_be_repeated() -> None:
+    parameter, optimizer = faded(1, clear=False)
+    (state,) = optimizer.state.values()
+    state["exp_avg"][:3] = torch.tensor([1e-40, -1e-40, -1e-30])
+    before = {key: value.clone() for key, value in state.items()}
+    clear_denormals(optimizer)
+    assert all(torch.equal(before[key], state[key]) for key in before if key == "step")
+    for key in ("exp_avg", "exp_avg_sq"):
+        kept = state[key] != 0
+        assert torch.equal(before[key][kept], state[key][kept]) and bool((before[key][~kept].abs() < 1e-32).all())
+    assert state["exp_avg"][:3].tolist() == pytest.approx([0, 0, -1e-30])
+    once = {key: value.clone() for key, value in state.items()}
+    clear_denormals(optimizer)
+    assert all(torch.equal(once[key], state[key]) for key in once)
+    clear_denormals(torch.optim.SGD([parameter], lr=1.0, momentum=0.9))
 
 
 def test_means_and_counts_are_those_of_a_plain_loop() -> None:

@@ -11,7 +11,7 @@ from fprf.cli.parsing import load_method
 from fprf.cli.train import train_scene
 from fprf.config import IncompleteConfig
 from fprf.errors import CheckpointError, UsageError
-from fprf.training.loading import load_run
+from fprf.training.loading import load_run, load_style
 from fprf.training.views import render_view
 
 
@@ -45,12 +45,34 @@ def test_rendering_needs_no_encoder(moved: Path) -> None:
     assert bool(view.rgb.isfinite().all())
 
 
+def test_a_scene_without_semantics_has_no_basis(moved: Path) -> None:
+    run = load_run(moved).run
+    tensors = run.load_tensors("style")
+    one = {name: tensors[name][:1] for name in ("region_mean", "region_covariance")} | {"share": torch.ones(1)}
+    run.save_tensors(
+        "style", tensors | one | {"keys": torch.zeros(1, 0), "semantic_mean": torch.zeros(0), "contacts": torch.zeros(1, 1)}
+    )
+    scene, basis = load_style(run)
+    assert basis is None and scene.keys.shape == (1, 0)
+
+
 def test_a_damaged_newest_checkpoint_is_stepped_over_and_named(world: World, moved: Path) -> None:
     copy = moved / "checkpoints" / "step-0000020"
     shutil.copytree(moved / "checkpoints" / "step-0000015", copy)
     (copy / "model.safetensors").write_bytes(b"no")
     trained = load_run(moved)
     assert trained.step == 15 and len(trained.damaged) == 1 and "step-0000020" in trained.damaged[0]
+
+
+def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="so it is no run folder; `fprf train` makes one"):
+        load_run(tmp_path)
+    shutil.rmtree(moved / "checkpoints")
+    with pytest.raises(CheckpointError, match=r"no checkpoint yet; go on with `fprf train elsewhere/run/config\.json"):
+        load_run(moved)
+    (moved / "scene.json").unlink()
+    with pytest.raises(CheckpointError, match=r"scene\.json: cannot be read.*train the scene again"):
+        load_run(moved)
 
 
 def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp_path: Path) -> None:

@@ -56,6 +56,20 @@ def test_an_empty_folder_is_not_left_behind_and_a_full_one_is(tmp_path: Path) ->
     assert [p.name for p in (tmp_path / "c").iterdir()] == ["file"]
 
 
+def test_a_file_in_its_place_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(DataError, match="file"), held(folder):
+            pass
+
+
+def test_a_note_of_nonsense_is_not_repeated(tmp_path: Path) -> None:
+    with held(tmp_path):
+        (tmp_path / LOCK).write_bytes(b"\x1b[31m\n\xff" * 9)
+        with pytest.raises(DataError, match="another process is training here"), held(tmp_path):
+            pass
+
+
 def _count(folder: Path, rounds: int) -> None:
     """Add to a number that only one may touch at a time."""
     done = 0

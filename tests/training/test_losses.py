@@ -105,6 +105,13 @@ def test_a_penalty_of_any_name_counts(world: World, monkeypatch: pytest.MonkeyPa
     assert "(penalties that can be named: entropy)" in str(caught.value)
 
 
+def test_a_penalty_that_is_called_like_a_term_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = world.load().model
+    monkeypatch.setattr(model.field, "penalties", lambda: {"content": torch.tensor(3.0)})
+    with pytest.raises(PluginError, match="is called 'content'"):
+        check_penalties(LossConfig(), model)
+
+
 class Weights(LossTerm):
     """Mean square of the weights, times noise."""
 

@@ -13,7 +13,7 @@ from fprf.rendering.cameras import pixel_grid
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.training.loading import Trained
-from fprf.training.matches import MatchMap, match_map, summarize, write_pixels
+from fprf.training.matches import MatchMap, match_map, match_pictures, summarize, write_pixels
 from fprf.training.restyle import Codes, Styled, apply_style
 from fprf.training.views import paint_pixels, render_view
 
@@ -101,6 +101,14 @@ def test_summaries_count_what_is_there() -> None:
     assert summary["codes"][0] == {"reference": "a.jpg", "cluster": 0, "share": pytest.approx(1 / 3)}
     assert {(c["reference"], c["cluster"]) for c in summary["codes"][1:]} == {("b.jpg", 0), ("b.jpg", 1)}
     assert summary["regions"] == [{"region": 0, "share": pytest.approx(1 / 3)}, {"region": 1, "share": pytest.approx(2 / 3)}]
+
+
+def test_an_empty_view_has_a_summary_too() -> None:
+    found, codes = made_up()
+    nothing = MatchMap(*(torch.zeros_like(t) for t in found))
+    summary = summarize(nothing, codes)
+    assert summary["kept_share"] == summary["score"] == summary["entropy_bits"] == 0 and summary["codes"] == []
+    assert all(picture.shape == (2, 2, 3) for picture in match_pictures(nothing, codes).values())
 
 
 def test_numbers_of_pixels(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from block_world import BlockWorld, small, tensors_of
 from hypothesis import given, settings
@@ -73,6 +74,12 @@ def test_moving_all_cameras_as_one_moves_none(seed: int) -> None:
     place = centres / 2.0
     common = torch.cat([axis.expand(6, 3), torch.linalg.cross(axis.expand(6, 3), place) + shift + scale * place], -1)
     assert float(poses_with(common, centres).moves().detach().abs().max()) < 1e-4 * float(common.abs().max())
+
+
+@pytest.mark.parametrize("views", [0, 1])
+def test_one_view_alone_can_be_put_anywhere(views: int) -> None:
+    poses = poses_with(draw(3, 6, seed=1), draw(3, 3, seed=2), tuple(range(views, 3)))
+    assert float(poses.moves().detach().abs().max()) < 1e-6
 
 
 def test_rays_are_those_of_the_refined_cameras(world: World) -> None:

@@ -1,11 +1,13 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from tiny_world import World
 
 from fprf.datamanagers.scene import Scene
-from fprf.training.prepare import cache_folder, exposure_of, prepare
+from fprf.errors import PluginError
+from fprf.training.prepare import cache_folder, device_of, exposure_of, prepare
 
 
 def test_features_are_computed_once(world: World) -> None:
@@ -19,6 +21,20 @@ def test_features_are_computed_once(world: World) -> None:
     assert again.facts == world.prepared.facts
     assert before and files() == before, "nothing new, nothing written twice"
     assert told[-1][:2] == (8, 8) and told[-1][2].startswith("features of bundled-semantic")
+
+
+def test_without_semantics(world: World) -> None:
+    found = prepare(replace(world.config, semantic=replace(world.config.semantic, encoder=None)))
+    assert found.facts.dim == 0 and found.facts.semantic_encoder == "" and found.basis is None
+    assert found.manager.batch(0).semantic is None
+
+
+def test_devices() -> None:
+    assert device_of("cpu") == torch.device("cpu")
+    assert device_of("auto").type in ("cpu", "cuda", "mps")
+    for name in ("gpu", "", "cuda:99"):
+        with pytest.raises(PluginError, match="not available here; use cpu or auto"):
+            device_of(name)
 
 
 def test_tones_are_learnt_where_exposures_differ(world: World) -> None:

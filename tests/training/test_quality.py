@@ -87,3 +87,12 @@ def test_a_reduced_view_is_the_small_oneenlarged(world: World) -> None:
     blocks = half.opacity.view(12, 2, 16, 2).mean((1, 3))
     assert torch.allclose(blocks[1:-1, 1:-1], small.opacity[1:-1, 1:-1], atol=0.05)
     assert float((half.rgb - whole.rgb).abs().mean()) < 0.05 and not torch.equal(half.rgb, whole.rgb)
+
+
+def test_infinite_depths_are_enlarged_too(world: World) -> None:
+    from fprf.rendering.renderer import enlarged
+    from fprf.types import View
+
+    depth = torch.tensor([[1.0, torch.inf]])
+    found = enlarged(View(torch.rand(1, 2, 3), depth, torch.ones(1, 2), 1.0), [4, 2])
+    assert found.depth.tolist() == [[1.0, 1.0, torch.inf, torch.inf]] * 2

@@ -8,10 +8,10 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.errors import UsageError
+from fprf.errors import DataError, UsageError
 from fprf.style.files import Key
 from fprf.training.loading import Trained, load_style
-from fprf.training.regions import ALIKE, Regions, find_regions, key_of, membership_view
+from fprf.training.regions import ALIKE, Found, Regions, find_regions, key_of, membership_view
 
 
 def regions_of(world: World, keys: dict[str, Key] | None = None) -> Regions:
@@ -24,6 +24,14 @@ def trained_of(regions: Regions) -> Trained:
     return regions.views
 
 
+def test_numbers_are_the_scenes(world: World) -> None:
+    regions = regions_of(world)
+    count = len(regions.scene.share)
+    assert find_regions(regions, "1") == [Found(1, "1")] and count >= 2
+    with pytest.raises(UsageError, match=f"region 17: regions go from 0 to {count - 1}; --explain lists them"):
+        find_regions(regions, "17")
+
+
 def test_a_pixel_means_the_region_that_most_of_it_belongs_to(world: World) -> None:
     regions = regions_of(world)
     share, _ = membership_view(regions, 2, 32)
@@ -31,6 +39,20 @@ def test_a_pixel_means_the_region_that_most_of_it_belongs_to(world: World) -> No
         (found,) = find_regions(regions, f"0002:{x},{y}")
         assert found.number == int(share[y, x].argmax()) and found.name == str(found.number)
     assert find_regions(regions, "0002:7.9,3.2") == find_regions(regions, "0002:7,3")
+
+
+@pytest.mark.parametrize("place", ["32,0", "0,24", "-1,0", "5,99"])
+def test_pixels_outside_are_refused(world: World, place: str) -> None:
+    with pytest.raises(UsageError, match=r"0002:.*: outside of the view; x goes from 0 to 31, y from 0 to 23"):
+        find_regions(regions_of(world), f"0002:{place}")
+
+
+def test_a_pixel_that_sees_nothing_is_refused(world: World) -> None:
+    regions = regions_of(world)
+    with torch.no_grad():
+        trained_of(regions).model.get_parameter("field.to_density.weight").fill_(-1e6)
+    with pytest.raises(UsageError, match="there is nothing at that pixel"):
+        find_regions(regions, "0002:5,5")
 
 
 def draw(folder: Path, white: np.ndarray) -> Path:
@@ -51,6 +73,13 @@ def test_a_mask_means_what_it_covers(world: World, tmp_path: Path) -> None:
     everything = find_regions(regions, f"0002:{draw(tmp_path, np.ones((24, 32)))}")
     mass = (share * opacity[..., None]).sum((0, 1))
     assert {each.number for each in everything} == set((mass >= 1).nonzero().flatten().tolist()) | {int(mass.argmax())}
+
+
+def test_masks_that_say_nothing_are_named(world: World, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"drawn = 1\.png: the mask selects nothing of view 0002"):
+        find_regions(regions_of(world), f"0002:{draw(tmp_path, np.zeros((24, 32)))}")
+    with pytest.raises(DataError, match=r"absent\.png"):
+        find_regions(regions_of(world), f"0002:{tmp_path / 'absent.png'}")
 
 
 @pytest.mark.parametrize("text", ["sky", "0099:1,1", "a-view", "-1", "1.5", "²"])

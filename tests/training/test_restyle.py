@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.errors import WeightsError
+from fprf.errors import ConfigError, DataError, UsageError, WeightsError
 from fprf.io.images import write_image
 from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig
 from fprf.style.config import NO_MASK, StyleConfig
@@ -33,6 +33,19 @@ def test_weights_and_blend_count(world: World) -> None:
     for of in whole.reference.unique():
         codes = whole.mean[whole.reference == of]
         assert torch.allclose(codes, codes[:1].expand_as(codes), atol=1e-5), "all of its reference's overall style"
+
+
+def test_mistakes(world: World, tmp_path: Path) -> None:
+    trained = world.load()
+    with pytest.raises(UsageError, match="--references: at least one photograph"):
+        restyle(trained, [], RegionOtConfig())
+    with pytest.raises(ConfigError, match="weights: 3 weights for 2 references"):
+        restyle(trained, world.references, RegionOtConfig(), weights=(1.0, 2.0, 3.0))
+    with pytest.raises(DataError, match=r"absent\.jpg"):
+        restyle(trained, [tmp_path / "absent.jpg"], RegionOtConfig())
+    (tmp_path / "text.jpg").write_text("no picture")
+    with pytest.raises(DataError, match=r"text\.jpg"):
+        restyle(trained, [tmp_path / "text.jpg"], RegionOtConfig())
 
 
 @pytest.mark.parametrize("which", ["content", "semantic"])

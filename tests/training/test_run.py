@@ -44,6 +44,12 @@ def test_the_config_comes_back_without_its_folder(world: World) -> None:
     assert config == type(config)(**{**vars(world.config), "output": None})
 
 
+def test_a_folder_that_is_no_run_says_so(tmp_path: Path) -> None:
+    assert not Run(tmp_path).exists
+    with pytest.raises(CheckpointError, match=r"no config\.json here, so it is no run folder"):
+        Run(tmp_path).load_config()
+
+
 def _without(key: str) -> Any:
     return lambda d: {k: v for k, v in d.items() if k != key}
 

@@ -50,6 +50,13 @@ def test_the_least_recently_used_goes_first(block_world: BlockWorld, room: int) 
     assert told == fetched
 
 
+def test_one_block_stays_however_small_the_limit_is(block_world: BlockWorld) -> None:
+    shelf = shelf_of(block_world.root, 1)
+    for block in (0, 1, 2):
+        assert not next(iter(shelf.member(block).parameters())).requires_grad
+        assert shelf.here == (block,)
+
+
 def test_members_are_the_finished_blocks_in_their_own_charts(block_world: BlockWorld) -> None:
     shelf = shelf_of(block_world.root, 1)
     boxes = load_boxes(block_world.root)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.errors import UsageError
+from fprf.errors import ConfigError, UsageError
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.controls import luma
@@ -97,6 +97,15 @@ def test_between_two_styles(bench: Bench, tmp_path: Path) -> None:
     away = [float((mix - bench.first).abs().mean()) for mix in mixes]
     assert away == sorted(away) and away[1] > 0
     assert float((mixes[2] - end).abs().mean()) < float((mixes[1] - end).abs().mean())
+
+
+def test_styles_that_lead_back_to_themselves_are_refused(bench: Bench, tmp_path: Path) -> None:
+    a, b = tmp_path / "a.json", tmp_path / "b.json"
+    b.write_text("{}")
+    for path, towards in ((a, b), (b, a)):
+        write_style(path, StyleFile(replace(bench.base, between=towards)))
+    with pytest.raises(ConfigError, match=r"a\.json: lies between styles that lead back to it"):
+        bench.show(replace(bench.base, between=a))
 
 
 @pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda s: type(s).__name__)

@@ -85,6 +85,19 @@ def test_an_absent_file_and_other_names_are_told(tmp_path: Path) -> None:
         tensorfiles.load(tmp_path / "x", entry | {"new": entry["b"]})
 
 
+def test_a_mangled_entry_is_damage_too(tmp_path: Path) -> None:
+    entry = tensorfiles.save(tmp_path / "x", {"t": torch.ones(2)})
+    for mangled in ({}, {"crc32": "text", "finite": True}, {"crc33": entry["t"]["crc32"], "finite": True}, 3, None):
+        with pytest.raises(CheckpointError):
+            tensorfiles.load(tmp_path / "x", {"t": mangled})  # type: ignore[dict-item]
+
+
+def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="memory format"):
+        tensorfiles.save(tmp_path / "x", {"t": torch.zeros(2).to_sparse()})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_sealed_file_comes_back_and_carries_its_own_checksums(tmp_path: Path) -> None:
     made = tensors() | {"none": torch.zeros(0, 3)}
     tensorfiles.save_sealed(tmp_path / "x", made)
@@ -108,6 +121,12 @@ def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, dat
         assert str(path) in str(error) and "\n" not in str(error)
     else:
         assert all(torch.equal(found[name], made[name]) and found[name].dtype == made[name].dtype for name in made)
+
+
+def test_a_sealed_file_that_was_not_finite_is_refused(tmp_path: Path) -> None:
+    tensorfiles.save_sealed(tmp_path / "x", {"t": torch.tensor([1.0, float("inf")])})
+    with pytest.raises(CheckpointError, match="tensor t was not finite"):
+        tensorfiles.load_sealed(tmp_path / "x")
 
 
 @pytest.mark.parametrize("seal", ["", "3", "{", '{"a.weight": 3}', '{"a.weight": {}}', "[" * 9999, "{}"])

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+import pytest
 import torch
 from tiny_world import World
 
+from fprf.errors import UsageError
 from fprf.training.camera_optimizers import Tones
 from fprf.training.loading import Trained
 from fprf.training.model import Model
@@ -52,3 +54,31 @@ def test_between_two_views_means_of_logarithms_are_taken(world: World) -> None:
     for texts, share in (((str(a), str(b)), 0.5), ((f"{a}=1", f"{b}=3"), 0.25), ((f"{a}=0.5", f"{b}=0"), 1.0)):
         wanted = plain * (share * log[0] + (1 - share) * log[1]).exp()
         torch.testing.assert_close(shown(trained, *texts)[0], wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("nowhere", "no view or VIEW=WEIGHT"),
+        ("0=x", "no view"),
+        ("=", "no view"),
+        ("99", "not learnt from"),
+        ("1=-2", "weight"),
+    ],
+)
+def test_what_is_no_view_is_told(world: World, text: str, match: str) -> None:
+    with pytest.raises(UsageError, match=match):
+        shown(lit(world), text)
+
+
+def test_views_without_tones_are_told(world: World) -> None:
+    trained = lit(world)
+    held, first = trained.known.test[0], trained.known.train[0]
+    with pytest.raises(UsageError, match="not learnt from"):
+        shown(trained, str(held))
+    with pytest.raises(UsageError, match="all weights are 0"):
+        shown(trained, f"{first}=0")
+    with pytest.raises(UsageError, match="--tones true"):
+        shown(world.load(), str(first))
+    bare = replace(trained.config.render, tone=(1.0, 1.0, 1.0))
+    assert bare.tone == (1.0, 1.0, 1.0)
