@@ -41,3 +41,11 @@ def test_counts_are_those_of_the_march(world: World) -> None:
     assert (found.rays, found.samples, found.kept) == (768, 768 * 8, len(kept.ray))
     assert found.empty == 768 - len(set(kept.ray.tolist()))
     assert found.shares["kept_samples_per_ray"] == pytest.approx(len(kept.ray) / 768)
+
+
+def test_rays_that_see_nothing_are_counted(world: World) -> None:
+    trained = world.load()
+    with torch.no_grad():
+        trained.model.get_parameter("field.to_density.weight").fill_(-1e6)
+    found = count(trained.model.parts, view_rays(trained.model, trained.known.cameras, 0), 1 / 512)
+    assert found.kept == 0 and found.shares["empty_rays_share"] == 1

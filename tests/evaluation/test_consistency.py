@@ -4,6 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fprf.errors import DataError, NumericsError
 from fprf.evaluation.consistency import consistency, path_pairs, warp
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.paths import look_at
@@ -139,3 +140,16 @@ def test_the_relative_error_does_not_reward_dullness() -> None:
     assert consistency(unrelated, depths[:1] * 2, still, [(0, 1)])["relative"] == pytest.approx(math.sqrt(2), rel=0.05)
     flat = [torch.full((HEIGHT, WIDTH, 3), 0.5)] * 2
     assert consistency(flat, depths, cameras, [(0, 1)])["relative"] is None
+
+
+def test_what_does_not_fit_is_named() -> None:
+    cameras = row_of_cameras(2)
+    image, depth = seen(cameras, 0)
+    with pytest.raises(DataError, match="1 images, 2 depths, 2 cameras"):
+        consistency([image], [depth] * 2, cameras, [])
+    with pytest.raises(DataError, match="view 1: the image is 48x35, its camera 48x36"):
+        warp(image[:-1], depth, depth, cameras, 0, 1)
+    with pytest.raises(DataError, match="view 0: the depth is 36x48"):
+        warp(image, depth.T, depth, cameras, 0, 1)
+    with pytest.raises(NumericsError, match="not finite"):
+        consistency([image * math.nan] * 2, [depth] * 2, cameras, [(0, 0)])

@@ -1,9 +1,12 @@
+import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from tiny_world import World
 
+from fprf.errors import DataError
 from fprf.evaluation.peer import read_cameras, read_depths, read_pictures
 from fprf.rendering.cameras import pixel_grid, project, rays_through
 from fprf.town.write import read_truth
@@ -41,6 +44,31 @@ def test_depths_along_the_axis_become_distances(world: World, tmp_path: Path) ->
     origin, direction = rays_through(cameras, view, pixel)
     _, ahead = project(cameras, view, origin + direction * depth.flatten()[:, None])
     assert torch.allclose(ahead, torch.full_like(ahead, 5.0))
+
+
+def test_what_does_not_fit_is_named(world: World, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no pictures"):
+        read_pictures(tmp_path)
+    with pytest.raises(DataError, match="no picture named 77"):
+        read_pictures(world.town / "images", ["77"])
+    frames = read_pictures(world.town / "images")
+    known = json.loads((world.town / "transforms.json").read_text())
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({**known, "frames": known["frames"][:4]}))
+    with pytest.raises(DataError, match="cameras for 4 of 10 frames"):
+        read_cameras(file, frames)
+    file.write_text(json.dumps({**known, "k1": 0.1}))
+    with pytest.raises(DataError, match="k1 is not 0"):
+        read_cameras(file, frames)
+    file.write_text(json.dumps({key: value for key, value in known.items() if not key.startswith("fl_")}))
+    with pytest.raises(DataError, match="no fl_x"):
+        read_cameras(file, frames)
+    cameras = read_cameras(world.town / "transforms.json", frames)
+    with pytest.raises(DataError, match=r"neither 0000\.npz nor 0000\.npy"):
+        read_depths(tmp_path, frames.names, cameras, "ray")
+    np.save(tmp_path / "0000.npy", np.zeros((3, 3)))
+    with pytest.raises(DataError, match="24 rows of 32"):
+        read_depths(tmp_path, frames.names[:1], cameras, "ray")
 
 
 def test_entries_are_found_by_place_where_no_name_agrees(world: World, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ import torch
 from tiny_world import World
 
 from fprf.datamanagers.images import load_image
+from fprf.errors import DataError
 from fprf.evaluation.evaluate import judge
 from fprf.evaluation.metrics import image_metrics
 from fprf.training.views import render_view
@@ -24,3 +25,8 @@ def test_metrics_are_those_of_the_renders(world: World) -> None:
     assert metrics["seconds_per_view"] == pytest.approx(metrics["render_seconds"] / 2)
     assert (metrics["train_steps"], metrics["train_seconds"]) == (15, trained.seconds) and metrics["lpips"] is None
     assert metrics["consistency"]["pairs"] == 1 and 0 < metrics["kept_samples_share"] <= 1
+
+
+def test_no_views_is_told(world: World) -> None:
+    with pytest.raises(DataError, match="no views"):
+        judge(world.load(), world.prepared.scene, (), lambda *of: None)

@@ -37,3 +37,10 @@ def test_bands_of_another_light_find_their_like() -> None:
     assert there[0].equal(torch.tensor([sky, wall, grass]).repeat_interleave(4)[:, None].expand(12, 6))
     assert here[0][:, 0].tolist() == [sky] * 4 + [wall] * 2 + [grass] * 6
     assert here[1][:, 0].tolist() == [sky] * 2 + [wall] * 6 + [grass] * 4
+
+
+def test_a_style_of_one_colour_has_one_region() -> None:
+    grey = torch.full((8, 8, 3), 0.5)
+    here, there = matched_regions(Halved(), [bands((4, 4, 4), DAY)], [grey, grey], regions=5, seed=0)
+    assert len(there) == 2
+    assert {int(n) for each in (*here, *there) for n in each.unique()} == {0}

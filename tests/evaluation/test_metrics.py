@@ -76,6 +76,12 @@ def test_what_is_not_finite_is_no_score(value: float) -> None:
             metric(broken, noise(12, 12))
 
 
+@pytest.mark.parametrize("shape", [(4, 5, 3), (5, 4, 4), (4, 5), (0, 5, 3)])
+def test_unlike_shapes_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(DataError, match="cannot be compared"):
+        psnr(torch.zeros(shape), torch.zeros(5, 4, 3))
+
+
 def test_what_a_mask_leaves_out_does_not_count() -> None:
     """Any change there leaves PSNR as it is, and SSIM but for windows that reach into it: those see the same in both images."""
     draw = torch.Generator().manual_seed(0)

@@ -1,6 +1,7 @@
 """`fprf bench peer` on frames that another system might have written."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -62,3 +63,15 @@ def test_what_is_missing_is_named(world: World, tmp_path: Path, capsys: pytest.C
 def test_a_run_gives_what_the_peer_did_not_write(world: World, tmp_path: Path) -> None:
     document = peer(world, world.town / "images", tmp_path / "a.json", "--run", str(world.run))
     assert document["published"]["short"]["pairs"] > 0 and "steadiness" not in document["missing"]
+
+
+def test_mistakes_are_one_line(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = ["--cameras", str(world.town / "transforms.json"), "--device", "cpu"]
+    assert cli.main(["bench", "peer", str(tmp_path), *cameras]) == 2
+    assert "no pictures" in capsys.readouterr().err
+    other = tmp_path / "other"
+    other.mkdir()
+    for path in (world.town / "images").iterdir():
+        shutil.copy(world.references[0], other / path.name)
+    assert cli.main(["bench", "peer", str(world.town / "images"), *cameras, "--plain", str(other)]) == 2
+    assert "the stylised frame 32x24; both must agree" in capsys.readouterr().err

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from fprf.errors import DataError
 from fprf.evaluation.consistency import published
 from fprf.rendering.cameras import Cameras
 
@@ -37,3 +38,11 @@ def test_the_mean_is_over_pairs_of_roots_and_of_squares() -> None:
     assert short["rmse"] == pytest.approx(2 * 0.1 / 8, rel=1e-5)
     assert short["e_warp"] == pytest.approx(2 * 0.01 / 8, rel=1e-5)
     assert isinstance(short["e_warp"], float) and math.sqrt(short["e_warp"]) > 0.025
+
+
+def test_nothing_to_compare() -> None:
+    images = [torch.zeros(12, 12, 3)] * FRAMES
+    found = published(images, [torch.zeros(12, 12)] * FRAMES, still())
+    assert found["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}
+    with pytest.raises(DataError, match="2 images, 9 depths"):
+        published(images[:2], [torch.zeros(12, 12)] * FRAMES, still())

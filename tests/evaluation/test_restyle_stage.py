@@ -1,8 +1,15 @@
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
 import torch
 from tiny_world import World, stage_of
 
+from fprf.errors import DataError, UsageError
 from fprf.evaluation.metrics import psnr
-from fprf.evaluation.town_truth import true_views
+from fprf.evaluation.town_truth import town_settings, true_views
 from fprf.town.write import read_truth
 
 
@@ -26,3 +33,17 @@ def test_smaller_views_are_the_same_views(world: World) -> None:
     small = stage_of(world.load(), views=1, frames=8, longest=16)
     assert [v.restyled().rgb.shape for v in small.shown] == [(12, 16, 3)]
     assert small.truth[0].labels.shape == (12, 16)
+
+
+def test_runs_of_other_scenes_are_refused(world: World, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(world.town, folder)
+    trained = world.load()
+    moved = replace(trained, config=replace(trained.config, data=folder))
+    assert town_settings(moved.config) == town_settings(trained.config)
+    (folder / "town.json").write_text(json.dumps({"settings": {"seed": 1}}))
+    with pytest.raises(DataError, match=r"town\.json"):
+        town_settings(moved.config)
+    (folder / "town.json").unlink()
+    with pytest.raises(UsageError, match="whose looks in other light nobody knows"):
+        town_settings(moved.config)

@@ -55,3 +55,14 @@ def test_every_method_is_in_the_table_and_numbers_repeat(
     assert "region-tone" in capsys.readouterr().out
     again = bench(world, tmp_path / "b.json")
     assert timeless(again) == timeless(document)
+
+
+def test_mistakes_are_one_line(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "restyle", str(world.run), *SMALL, "--seeds", "0", "1", "2"]) == 2
+    assert "is the town of the run itself" in capsys.readouterr().err
+    assert cli.main(["bench", "restyle", str(world.run), *SMALL, "--palettes", "noon"]) == 2
+    assert "noon" in capsys.readouterr().err
+    assert cli.main(["bench", "restyle", str(tmp_path / "nothing"), *SMALL]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert cli.main(["bench", "restyle", "--frames", "7"]) == 2
+    assert "--frames" in capsys.readouterr().err

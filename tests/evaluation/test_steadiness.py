@@ -8,7 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from fprf.evaluation.consistency import steadiness
+from fprf.errors import DataError, NumericsError
+from fprf.evaluation.consistency import sharpness, steadiness
 from fprf.evaluation.town_truth import short_path, town_view
 from fprf.rendering.cameras import Cameras
 from fprf.town.layout import build_town
@@ -120,3 +121,21 @@ def test_drift_shows_at_long_range_and_blur_in_sharpness_alone(day: list[Tensor]
     blurred = steadiness(day, blur(day, 1.0), depths, path)
     assert blurred.sharpness is not None and blurred.sharpness < 0.7
     assert blurred.score is not None and blurred.score > 0.3, "a blur agrees with itself and must not win by it"
+
+
+def test_sharpness_of_what_has_no_edges() -> None:
+    flat = [torch.full((20, 20, 3), 0.5)]
+    assert sharpness(flat, flat) is None
+    assert sharpness([], []) is None
+
+
+def test_short_paths_and_what_does_not_fit(day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
+    few = path.select(torch.arange(3))
+    found = steadiness(day[:3], flicker(day[:3], 0.05), depths[:3], few)
+    assert found.long is None and found.score is not None and found.score > 0.1
+    nothing = steadiness(day[:3], day[:3], [torch.zeros(HEIGHT, WIDTH)] * 3, few)
+    assert nothing.score is None and nothing.valid_share == 0
+    with pytest.raises(DataError, match="3 plain and 2 stylised frames"):
+        steadiness(day[:3], day[:2], depths[:3], few)
+    with pytest.raises(NumericsError, match="not finite"):
+        steadiness(day[:3], [x * float("nan") for x in day[:3]], depths[:3], few)

@@ -4,6 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import DataError
 from fprf.evaluation.metrics import luminance_ssim, ssim, structure
 
 
@@ -68,6 +69,12 @@ def test_pictures_without_structure_are_alike_and_noise_is_not() -> None:
     assert structure(flat, other) == 1.0
     noisy = flat + 0.05 * torch.randn(16, 16, 3, generator=torch.Generator().manual_seed(0))
     assert structure(flat, noisy) < 0.1
+
+
+@pytest.mark.parametrize(("a", "b"), [((16, 16, 3), (16, 17, 3)), ((10, 30, 3), (10, 30, 3)), ((16, 16), (16, 16))])
+def test_sizes_that_cannot_be_compared_are_refused(a: tuple[int, ...], b: tuple[int, ...]) -> None:
+    with pytest.raises(DataError, match="structure: pictures of shape"):
+        structure(torch.rand(a), torch.rand(b))
 
 
 def test_luminance_ssim_sees_light_but_no_hue() -> None:

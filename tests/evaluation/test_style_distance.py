@@ -123,3 +123,9 @@ def test_regions_weigh_by_their_share_and_small_ones_not_at_all() -> None:
     assert relative_distance(plain, styled, style) == pytest.approx((30 * 0.5 + 10) / 40)
     assert relative_distance(style, style, style) is None
     assert relative_distance({7: at(1.0, 30)}, styled, style) is None
+
+
+def test_layers_without_an_answer_are_left_out_of_the_mean() -> None:
+    same = noise(0)
+    rows = style_distances({"it": Pixels()}, [(same, HALVES)], {"none": [(same, HALVES)]}, [(same, HALVES)])
+    assert rows == {"none": {"it": None, "mean": None}}

@@ -1,3 +1,4 @@
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,16 @@ def test_a_run_without_images_can_be_measured_but_for_training(world: World, tmp
     assert prepared is None and f"{tmp_path / 'gone'}: no such folder" in missing
     prepared, missing = attempt(find(tmp_path / "run", replace(asked, data=world.town), tmp_path))
     assert prepared is not None and missing == ""
+
+
+def test_other_encoders_than_the_runs_are_refused(world: World, tmp_path: Path) -> None:
+    shutil.copytree(world.run, tmp_path / "run")
+    scene = tmp_path / "run" / "scene.json"
+    known = json.loads(scene.read_text())
+    known["facts"]["semantic_encoder"] = "another:1234"
+    scene.write_text(json.dumps(known))
+    _, missing = attempt(find(tmp_path / "run", SpeedConfig(references=world.references, device="cpu"), tmp_path))
+    assert missing.startswith("semantic encoder: the run was trained with another:1234")
 
 
 def test_steps_train_a_copy(world: World) -> None:
