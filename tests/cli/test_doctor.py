@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder, scene_folder
-from fprf.errors import DataError, UsageError
+from fprf.errors import ConfigError, DataError, UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 
@@ -58,6 +58,12 @@ def test_a_missing_plugin_of_a_run_is_named(trained: Path) -> None:
     finding = _by_name(run_folder(trained))["plug-ins"]
     assert finding.optional and "acme-gone 0.3" in finding.remedy and "--semantic.encoder NAME" in finding.remedy
     assert run([str(trained)]) == 0, "it renders without its encoder"
+
+
+def test_a_run_with_a_damaged_config_is_an_error(trained: Path) -> None:
+    (trained / "config.json").write_text("{")
+    with pytest.raises(ConfigError, match="is not JSON"):
+        run([str(trained)])
 
 
 def test_scene_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -54,6 +54,16 @@ def test_data_that_has_moved(run: Path, world: World, tmp_path: Path, capsys: py
     assert cli.main(["eval", str(run), "--data", str(tmp_path / "there"), "--no-images"]) == 0
 
 
+def test_other_images_than_the_runs(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(world.town, other)
+    (other / "images" / "0003.png").rename(other / "images" / "0103.png")
+    manifest = other / "transforms.json"
+    manifest.write_text(manifest.read_text().replace("images/0003.png", "images/0103.png"))
+    assert cli.main(["eval", str(run), "--data", str(other)]) == 2
+    assert "its images are not those of the run; name the folder with --data" in capsys.readouterr().err
+
+
 def test_mistakes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for args, told in (
         ([], "RUN is missing"),

@@ -100,3 +100,15 @@ def test_a_film_fades_from_plain_to_styled(world: World, styles: tuple[Path, Pat
     assert np.array_equal(keyed[0], plain[0]) and np.array_equal(keyed[3], full[3]) and np.array_equal(keyed[4], full[4])
     away = [np.abs(keyed[i] - plain[i]).mean() / np.abs(full[i] - plain[i]).mean() for i in range(4)]
     assert away == sorted(away) and 0 < away[1] < 0.5 < away[2] < 1
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["--keyframes", "absent.json"], "absent.json: cannot be read"),
+        (["--keyframes", "k.json", "--references", "a.jpg"], "--keyframes: names styles of its own"),
+    ],
+)
+def test_mistakes(world: World, tmp_path: Path, args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["render", str(world.run), *args, "--output", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

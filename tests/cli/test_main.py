@@ -39,6 +39,11 @@ def test_no_verb_is_a_mistake_that_shows_help(capsys: pytest.CaptureFixture[str]
     assert "usage: fprf VERB" in capsys.readouterr().out
 
 
+def test_an_unknown_verb_suggests_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["trian"]) == 2
+    assert capsys.readouterr().err.startswith("error: fprf trian: no such verb; did you mean 'train'? (verbs: demo,")
+
+
 def test_arguments_and_exit_code_pass_through(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[list[str]] = []
 

@@ -136,6 +136,15 @@ def test_nothing_fits_together(photos: Path, capsys: pytest.CaptureFixture[str])
     assert report(photos)["images"]["posed"] == 0, "the report is written all the same"
 
 
+def test_without_pycolmap_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("fprf.cli.process.find_spec", lambda name: None)
+    assert cli.main(["process", str(tmp_path)]) == 2
+    told = "error: fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'\n"
+    assert capsys.readouterr().err == told
+
+
 def test_an_old_pycolmap_is_refused(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "pycolmap.py").write_text("def set_random_seed(seed): pass\n")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fprf.cli.style_flags import read_flags
-from fprf.errors import DataError
+from fprf.errors import ConfigError, DataError, UsageError
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from fprf.style.files import StyleFile, write_style
@@ -82,6 +82,17 @@ def test_photographs_of_the_file_are_checked_unless_named(file: Path) -> None:
     assert read("RUN", "--style", str(file), "--references", str(photo))[1].style.references == (photo,)
 
 
+def test_what_does_not_fit_together_is_named(file: Path) -> None:
+    with pytest.raises(ConfigError, match="weights: 1 weights for 2 references"):
+        read("RUN", "--style", str(file), "--references", "x.jpg", "y.jpg")
+    with pytest.raises(ConfigError, match=r"none\.json: cannot be read"):
+        read("RUN", "--style", "none.json")
+    with pytest.raises(UsageError, match="--style"):
+        read("RUN", "--style")
+    with pytest.raises(UsageError, match="RUN is missing"):
+        read("--style", str(file))
+
+
 def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, found = read("--gentle", "RUN", "--references", "a.jpg", "--luminance", "0.9")
     assert config.luminance == found.style.luminance == 0.9 and found.style.references == (Path("a.jpg"),)
@@ -97,3 +108,8 @@ def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pyt
 def test_every_preset_is_what_its_flags_say(name: str) -> None:
     assert read("RUN", f"--{name}")[1] == read("RUN", *preset_flags(name).split())[1]
     assert with_preset(StyleConfig(), name) != StyleConfig()
+
+
+def test_an_unknown_preset_is_refused() -> None:
+    with pytest.raises(UsageError, match="'gentel': no such preset; did you mean 'gentle'"):
+        with_preset(StyleConfig(), "gentel")

@@ -171,3 +171,9 @@ def test_mistakes(run: Path, world: World, args: list[str], told: str, capsys: p
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("error: ") and err.count("\n") == 1 and told in err
     assert not (run / "styles").exists()
+
+
+def test_a_scene_without_measured_style_says_what_to_do(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "style.safetensors").unlink()
+    assert stylize(run, world) == 2
+    assert "style.safetensors: not written yet; finish training with `fprf train" in capsys.readouterr().err

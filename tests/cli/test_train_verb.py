@@ -72,6 +72,19 @@ def test_mistakes_on_the_command_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_mistakes_in_the_data(capsys: pytest.CaptureFixture[str], tmp_path: Path, world: World) -> None:
+    absent, empty = tmp_path / "absent", tmp_path / "empty"
+    empty.mkdir()
+    output = ["--output", str(tmp_path / "run")]
+    assert f"{absent}: no such folder" in mistake(capsys, "train", "fprf-lite", "--data", str(absent), *output)
+    line = mistake(capsys, "train", "fprf-lite", "--data", str(empty), *output)
+    assert f"{empty}: no transforms.json" in line and "but nothing" in line
+    assert "a folder, not a method" in mistake(capsys, "train", str(world.run))
+    assert "'tpu' is not available here" in mistake(
+        capsys, "train", "fprf-lite", *[("tpu" if a == "cpu" else a) for a in flags(world, tmp_path / "run")]
+    )
+
+
 def test_an_interrupt_is_130_and_the_run_goes_on(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
