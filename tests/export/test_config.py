@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 
 from fprf.errors import UsageError
-from fprf.export.config import KINDS, plan
+from fprf.export.config import KINDS, named_styles, plan
+from fprf.style.config import StyleConfig
+from fprf.style.files import StyleFile
 
 
 def test_a_folder_takes_all_kinds_or_those_that_are_named(tmp_path: Path) -> None:
@@ -40,3 +42,9 @@ def test_a_file_holds_what_its_ending_says(kinds: list[str], name: str, kind: st
 def test_mistakes(kinds: list[str], output: str, told: str) -> None:
     with pytest.raises(UsageError, match=told):
         plan(kinds, Path(output))
+
+
+@pytest.mark.parametrize("text", ["dusk", "=a.jpg", "dusk=", "du sk=a.jpg", "../x=a.jpg"])
+def test_other_forms_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"write NAME=PHOTO,PHOTO or NAME=STYLE\.json"):
+        named_styles([text], StyleFile(StyleConfig()))

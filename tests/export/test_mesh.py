@@ -8,6 +8,7 @@ import torch
 import trimesh
 from analytic import RADIUS, globe
 
+from fprf.errors import DataError
 from fprf.export.mesh import (
     Mesh,
     build_mesh,
@@ -51,6 +52,13 @@ def test_the_mesh_lies_on_the_sphere_with_its_normals(mesh: Mesh) -> None:
     assert float((outwards * mesh.normal).sum(1).quantile(0.05)) > 0.9
     assert torch.allclose(mesh.normal.norm(dim=1), torch.ones(len(mesh.point)), atol=1e-5)
     assert int(mesh.face.amax()) == len(mesh.point) - 1 and len(torch.unique(mesh.face)) == len(mesh.point)
+
+
+def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake() -> None:
+    maps = globe(10)
+    cloud = fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
+    with pytest.raises(DataError, match="no surface for a mesh; raise --mesh-edge"):
+        build_mesh(maps, cloud, edge=50.0)
 
 
 def test_components_of_three_balls() -> None:

@@ -5,12 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 from analytic import RADIUS, globe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import DataError
 from fprf.export.depth_maps import DepthMaps, surface_points
 from fprf.export.point_cloud import (
     LEVELS,
@@ -63,6 +65,12 @@ def test_noise_within_the_tolerance_is_averaged() -> None:
     off = (cloud.point.norm(dim=-1) - RADIUS)[cloud.point[:, 2].abs() < 0.5]
     # 0.005 of 3 metres a pixel. Voxels before and behind the surface hold few pixels, those on it dozens.
     assert float(off.abs().median()) < 0.4 * 0.015 and float(off.std()) < 0.8 * 0.015
+
+
+def test_views_that_agree_on_nothing() -> None:
+    maps = globe(2)
+    with pytest.raises(DataError, match=r"no surface that two views agree on.*--tolerance"):
+        fused(maps._replace(depth=tuple(torch.full_like(d, 1.0 + k) for k, d in enumerate(maps.depth))))
 
 
 def test_it_is_the_same_far_from_the_origin() -> None:
