@@ -16,7 +16,7 @@ from fprf.town.layout import build_town
 from fprf.town.palettes import palette
 from fprf.town.render import FIELD_OF_VIEW, render, walk
 from fprf.town.surface import SKY
-from fprf.town.write import TownSettings, read_truth, write_town
+from fprf.town.write import TownSettings, is_town, read_truth, write_town
 
 SMALL = {"seed": 2, "palette": "autumn", "views": 9, "width": 24, "height": 18}
 
@@ -110,6 +110,25 @@ def test_a_failure_leaves_nothing_behind(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_somebody_elses_folder_is_left_alone(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(DataError, match="not a town"):
+        write_town(tmp_path, **SMALL)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+    assert not is_town(tmp_path)
+
+
+def test_truth_that_is_missing_is_reported(folder, tmp_path):
+    with pytest.raises(DataError, match=r"0099\.npz"):
+        read_truth(folder, 99)
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "labels").mkdir()
+    np.savez(tmp_path / "depth/0000.npz", depth=np.zeros((2, 2)))
+    (tmp_path / "labels/0000.png").write_bytes(b"no image")
+    with pytest.raises(DataError, match="not an image"):
+        read_truth(tmp_path, 0)
+
+
 def test_parser_renders_once_into_the_cache(cache, monkeypatch):
     config = TownConfig(**TINY)
     scene = config.build().parse(Path("town"), 1)
@@ -134,3 +153,9 @@ def test_parser_reads_town_folders_and_refuses_others(cache, folder, tmp_path):
     (tmp_path / "photos").mkdir()
     with pytest.raises(DataError, match=r"no town\.json"):
         TownConfig().build().parse(tmp_path / "photos", 1)
+
+
+def test_parser_reports_an_unknown_palette(cache):
+    with pytest.raises(DataError, match="choose one of"):
+        TownConfig(palette="dusk").build().parse(Path("town"), 1)
+    assert not cache.exists()

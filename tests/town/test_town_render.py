@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import DataError
 from fprf.town.layout import build_town
 from fprf.town.palettes import PALETTES, palette
 from fprf.town.render import cast, colours, directions, geometry, render, shade, walk
@@ -73,6 +74,11 @@ def test_the_mean_of_four_samples_is_the_picture():
     fine = colours(TOWN, VIEWS[0], palette("day"), 2)
     mean = fine.reshape(36, 2, 48, 2, 3).mean((1, 3))
     np.testing.assert_allclose(render(TOWN, VIEWS[0], palette("day")).rgb / 255, mean, atol=0.51 / 255)
+
+
+def test_an_unknown_palette_names_the_known_ones():
+    with pytest.raises(DataError, match=r"dusk.*day.*sunset"):
+        palette("dusk")
 
 
 @settings(max_examples=25, deadline=None)
