@@ -76,6 +76,11 @@ def test_without_weights_for_it_no_style_is_measured(photos: str, vgg: str, tmp_
     assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
 
 
+def test_absent_style_weights_are_named(photos: str, tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
+        made(photos, tmp_path / "d.safetensors", "--style", "1", "--style-weights", "absent.safetensors")
+
+
 def test_the_report_says_what_was_done(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "deeper" / "decoder.safetensors"
     report = made(photos, output, "--steps", "4", "--seed", "3")

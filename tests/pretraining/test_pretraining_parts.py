@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from photo_folder import photo_folder
 
 from fprf.datamanagers.config import GuidedConfig
+from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.pretraining.photos import (
     filtered_at,
@@ -41,6 +42,13 @@ def test_photos_are_found_at_every_depth_in_an_order_of_their_own(folder: Path, 
     assert len(held) == 1
     assert not set(learn) & set(held)
     assert len(learn) + len(held) == 13
+
+
+def test_missing_folders_and_photographs_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="absent: no such folder"):
+        find_photos([tmp_path / "absent"])
+    with pytest.raises(DataError, match="0 photographs"):
+        find_photos([tmp_path])
 
 
 @settings(max_examples=25, deadline=None)

@@ -99,6 +99,12 @@ def test_style_statistics_and_their_distance(seed: int, shift: float, gain: floa
     assert float(style_distance([own, own], [own, own])) == 0
 
 
+def test_a_constant_filter_has_a_finite_gradient() -> None:
+    x = torch.zeros(1, 3, 4, 4, requires_grad=True)
+    style_distance(style_statistics([x]), [torch.ones(1, 6)]).backward()  # type: ignore[no-untyped-call]
+    assert x.grad is not None and bool(x.grad.isfinite().all())
+
+
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 99), channels=st.integers(1, 6))
 def test_adain_gives_the_style_its_mean_and_deviation(seed: int, channels: int) -> None:

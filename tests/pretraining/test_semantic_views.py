@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from photo_folder import photo_folder, teacher_files
 
+from fprf.errors import UsageError
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from tools.distil.config import SemanticDistilConfig
 from tools.distil.semantic import STRIDE, pretrain_semantic, relations, view
@@ -68,3 +69,9 @@ def test_a_short_run_from_photographs_and_streets(tmp_path: Path) -> None:
     assert BundledSemanticConfig(weights=tmp_path / "s.safetensors").build().channels == 26 + 25
     assert report["steps"] == 2
     assert 0 < float(report["relative_l2"]) < 20
+
+
+def test_a_size_that_splits_a_cell_is_refused(tmp_path: Path) -> None:
+    config = SemanticDistilConfig(teachers=teacher_files(tmp_path), size=60)
+    with pytest.raises(UsageError, match="multiples of 8"):
+        pretrain_semantic(config, tmp_path / "s.safetensors", lambda _: None)
