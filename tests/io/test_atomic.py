@@ -1,4 +1,5 @@
 import json
+import math
 import os
 from pathlib import Path
 
@@ -6,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import DataError
+from fprf.errors import DataError, NumericsError
 from fprf.io.atomic import atomic_path, remove_unfinished, write_bytes, write_json, write_text
 
 json_values = st.recursive(
@@ -76,12 +77,28 @@ def test_data_is_on_disk_before_the_name_moves(tmp_path: Path, monkeypatch: pyte
     assert calls == ["fsync", "replace", "fsync"]
 
 
+def test_what_is_in_the_way_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="is a file, not a folder"):
+        write_text(tmp_path / "file" / "deep" / "x", "")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(DataError, match="a folder is in the place"):
+        write_text(tmp_path / "folder", "")
+
+
 @settings(max_examples=25, deadline=None)
 @given(json_values)
 def test_json_round_trips(tmp_path_factory: pytest.TempPathFactory, value: object) -> None:
     path = tmp_path_factory.getbasetemp() / "round.json"
     write_json(path, value)
     assert json.loads(path.read_text(encoding="utf-8")) == value
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_json_refuses_what_json_lacks(tmp_path: Path, value: float) -> None:
+    with pytest.raises(NumericsError, match="must be finite"):
+        write_json(tmp_path / "m.json", {"psnr": [value]})
+    assert not list(tmp_path.iterdir())
 
 
 def test_names_from_a_locale_without_utf8_are_written_as_the_bytes_that_they_are(tmp_path: Path) -> None:

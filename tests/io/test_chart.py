@@ -48,6 +48,12 @@ def test_logarithms_space_by_factors_and_leave_out_nothing_else() -> None:
     assert points[1][1] - points[0][1] == pytest.approx(points[2][1] - points[1][1], abs=0.11)
 
 
+def test_what_has_no_points_is_no_chart() -> None:
+    assert line_chart("A", [], "", "") == line_chart("A", [Series("a", [1], [None])], "", "") == ""
+    assert line_chart("A", [Series("a", [1.0], [-1.0])], "", "", log=True) == ""
+    assert drawn(line_chart("A", [Series("a", [7.0], [3.0])], "", ""))[1][0], "a single point is one"
+
+
 HISTORY = History("", [10, 20], [1.5, 3.0], {"psnr": [12.0, None], "colour": [0.5, 0.25]}, {}, [])
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fprf.errors import DataError
 from fprf.io.gallery import Reference, Style, write_gallery
 from fprf.io.video import write_video
 
@@ -164,3 +165,19 @@ def test_an_animated_picture_plays_without_h264_and_stands_beside_upright_views(
     upright = [picture(index, 40, 30) for index in range(3)]
     page = page_of(tmp_path / "upright.html", video=flight, originals=upright, styles=[Style("dusk", upright)])
     assert page.all("figure", **{"class": "beside"}) and not page.all("section", id="flight")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"view_names": ["a"]}, "3 originals and 1 view names"),
+        ({"view_names": [], "originals": [], "styles": []}, "0 originals"),
+        ({"styles": [Style("s", [picture(0)])]}, "style s has 1 views, there are 3"),
+        ({"styles": [Style("s", [picture(0)] * 3, ["sea"])]}, "names reference sea; known are city, field"),
+        ({"styles": [Style("s", [picture(0)] * 3, ["city"], [0.5, 0.5])]}, "2 shares of 1 references"),
+    ],
+)
+def test_what_does_not_fit_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        write_gallery(tmp_path / "g.html", **content(**changes))
+    assert not list(tmp_path.iterdir())

@@ -1,7 +1,10 @@
+import math
+
 import numpy as np
 import pytest
 import torch
 
+from fprf.errors import DataError
 from fprf.io.maps import depth_image, depth_limits, match_image, match_summary, palette
 
 
@@ -16,6 +19,17 @@ def test_depth_scale_does_not_matter_and_outliers_do_not_blind() -> None:
     outlier = depth.clone()
     outlier[0, 0] = 1e-3
     assert np.abs(depth_image(outlier, solid)[1:].astype(int) - depth_image(depth, solid)[1:]).mean() < 8
+
+
+@pytest.mark.parametrize("nothing", [0.0, -1.0, math.nan, math.inf])
+def test_where_nothing_is_it_is_grey(nothing: float) -> None:
+    depth = torch.full((5, 5), 2.0)
+    depth[0] = nothing
+    picture = depth_image(depth, torch.ones(5, 5))
+    empty = depth_image(torch.full((5, 5), 2.0), torch.zeros(5, 5))
+    assert np.array_equal(picture[0], empty[0]) and np.ptp(empty[0, 0]) < 10
+    assert not np.array_equal(picture[1], empty[1])
+    assert depth_limits([depth], [torch.zeros(5, 5)]) == (0.0, 1.0)
 
 
 def test_views_share_a_scale() -> None:
@@ -71,3 +85,10 @@ def test_match_summary_in_closed_form() -> None:
     assert hidden["references"] == [{"name": "a", "share": 1.0}, {"name": "b", "share": 0.0}]
     nothing = match_summary(attention, torch.tensor([0, 1, 1]), ["a", "b"], torch.zeros(1, 2))
     assert nothing["mean_score"] == 0.0
+
+
+def test_what_does_not_fit_is_named() -> None:
+    with pytest.raises(DataError, match="does not fit 2 style codes"):
+        match_image(torch.rand(2, 2, 3), torch.tensor([0, 0]), ["a"])
+    with pytest.raises(DataError, match="name reference 1, but there are 1"):
+        match_summary(torch.rand(2, 2, 2), torch.tensor([0, 1]), ["a"])

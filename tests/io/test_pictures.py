@@ -6,10 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.io.images import data_uri, shrink, srgb_to_linear, write_exr, write_image
+from fprf.errors import DataError, NumericsError
+from fprf.io.images import data_uri, encode, shrink, srgb_to_linear, to_uint8, write_exr, write_image
 
 
 def ramp(height: int = 40, width: int = 60) -> np.ndarray:
@@ -21,11 +23,29 @@ def read(path: Path) -> np.ndarray:
     return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_what_is_not_finite_is_refused(value: float) -> None:
+    image = torch.zeros(2, 2, 3)
+    image[0, 0, 0] = value
+    with pytest.raises(NumericsError, match="not finite"):
+        to_uint8(image)
+
+
 def test_png_is_exact_and_the_others_are_close(tmp_path: Path) -> None:
     picture = ramp()
     for name, bound in (("a.png", 0), ("a.jpg", 12), ("a.JPEG", 12), ("a.webp", 14)):
         write_image(tmp_path / name, picture)
         assert np.abs(read(tmp_path / name).astype(int) - picture).max() <= bound, name
+
+
+def test_other_endings_and_other_arrays_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"'\.tiff' is no picture format; allowed are \.png"):
+        write_image(tmp_path / "a.tiff", ramp())
+    for wrong in (ramp().astype(np.float32), ramp()[..., 0], np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4, 4), np.uint8)):
+        with pytest.raises(DataError, match="uint8 of shape"):
+            encode(wrong, "png")
+    with pytest.raises(DataError, match="use png"):
+        encode(np.zeros((1, 20000, 3), np.uint8), "webp")
 
 
 def test_a_data_uri_holds_the_picture() -> None:
@@ -114,3 +134,10 @@ def test_light_is_srgb_to_linear() -> None:
     assert srgb_to_linear(np.array([0.0, 0.04045, 0.5, 1.0], np.float32)) == pytest.approx(
         [0, 0.0031308, 0.2140411, 1], abs=1e-6
     )
+
+
+def test_planes_must_be_of_one_size(tmp_path: Path) -> None:
+    for wrong in ({}, {"R": np.zeros((2, 3), np.float32), "G": np.zeros((3, 2), np.float32)}):
+        with pytest.raises(DataError, match="channels of one size"):
+            write_exr(tmp_path / "a.exr", wrong)
+    assert not list(tmp_path.iterdir())

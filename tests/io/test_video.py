@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fprf.errors import DataError
+from fprf.errors import DataError, UsageError
 from fprf.io.video import write_frames, write_video
 
 COLOURS = [(230, 40, 40), (40, 200, 60), (30, 60, 220), (240, 240, 240), (10, 10, 10)]
@@ -69,6 +69,18 @@ def test_frames_of_another_size_are_named_and_leave_nothing(tmp_path: Path, h264
     with pytest.raises(DataError, match="frame 1 is 18x16, the first was 16x16"):
         write_video(tmp_path / "x.mp4", frames, 10, h264=h264)
     assert not list(tmp_path.iterdir())
+
+
+def test_wrong_requests(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"end in \.mp4"):
+        write_video(tmp_path / "x.avi", flat(8, 8), 10)
+    for fps in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(UsageError, match="frames a second"):
+            write_video(tmp_path / "x.mp4", flat(8, 8), fps)
+    with pytest.raises(DataError, match="no frames"):
+        write_video(tmp_path / "x.mp4", [], 10)
+    with pytest.raises(DataError, match="uint8"):
+        write_video(tmp_path / "x.mp4", [np.zeros((8, 8, 3))], 10)
 
 
 def test_frames_as_pictures_are_exact_and_named(tmp_path: Path) -> None:
