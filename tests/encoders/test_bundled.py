@@ -7,7 +7,7 @@ import torch
 
 from fprf.errors import WeightsError
 from fprf.plugins.decoders.decoders import FOLDER as DECODERS
-from fprf.plugins.encoders.bundled import FOLDER
+from fprf.plugins.encoders.bundled import CONTENT_KIND, FOLDER
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig
 from fprf.plugins.weights import read_weights, write_weights
 
@@ -36,6 +36,12 @@ def test_other_files_are_refused_with_the_command_that_makes_the_right_one(
         config(weights=tmp_path / "other.safetensors").build()
     with pytest.raises(WeightsError, match="no such weights file"):
         config(weights=tmp_path / "absent.safetensors").build()
+
+
+def test_a_network_of_another_shape_is_refused(tmp_path: Path) -> None:
+    write_weights(tmp_path / "c.safetensors", {"project.weight": torch.zeros(3, 3, 1, 1)}, {"kind": CONTENT_KIND})
+    with pytest.raises(WeightsError, match="does not fit this version's network"):
+        BundledContentConfig(weights=tmp_path / "c.safetensors").build()
 
 
 @pytest.mark.parametrize("config", [BundledContentConfig(), BundledSemanticConfig()])

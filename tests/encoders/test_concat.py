@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
@@ -10,6 +11,7 @@ from network_files import deeplab_file
 from torch import Tensor
 
 from fprf.cli.parsing import parse
+from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import from_json, to_json
 from fprf.plugins.encoders.composed import ConcatEncoder
@@ -52,6 +54,11 @@ def test_the_finest_of_each_axis_counts() -> None:
     """Cells of 6 and 5 pixels on a strip: neither part decides both axes alone."""
     encoder = ConcatConfig(first=RandomConfig(stride=6), second=RandomConfig(stride=5), third=RandomConfig(stride=30)).build()
     assert encoder(torch.rand(1, 3, 31, 7)).shape[2:] == (7, 2)
+
+
+def test_a_missing_parts_weights_are_told(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
+        ConcatConfig(first=DeepLabConfig(weights=tmp_path / "absent.safetensors")).build()
 
 
 def test_nested_on_the_command_line(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from network_files import CLASSES, deeplab_file, deeplab_tensors, mobilenet_file
 from safetensors.torch import save_file
 from torch import Tensor
 
+from fprf.errors import WeightsError
 from fprf.plugins.encoders.config import DeepLabConfig, MobileNetV2Config
 
 STRIDES = (1, 2, 1, 2, 1, 1, 2, 1, 1, 1, 1, 1, 1, 2, 1, 1, 1)
@@ -103,3 +104,25 @@ def test_only_what_the_layer_needs_is_in_the_identity(tmp_path: Path) -> None:
     assert identity("backbone.8", "one") == identity("backbone.8", "two")
     assert identity("backbone.9", "one") != identity("backbone.9", "two")
     assert identity("logits", "one") != identity("logits", "two")
+
+
+def test_files_that_do_not_fit(tmp_path: Path) -> None:
+    tensors = mobilenet_tensors(folded=False)
+    short = {name: value for name, value in tensors.items() if not name.startswith("features.14")}
+    save_file(short, tmp_path / "short.safetensors")
+    assert MobileNetV2Config(weights=tmp_path / "short.safetensors").build().channels == 4
+    with pytest.raises(WeightsError, match=r"does not hold MobileNetV2 features\.14 \(14\.conv.*is missing.*--semantic\.enc"):
+        MobileNetV2Config(layer="features.14", weights=tmp_path / "short.safetensors").build()
+    save_file(tensors, tmp_path / "eps.safetensors", {"bn_eps": "small"})
+    with pytest.raises(WeightsError, match="bn_eps' is 'small'"):
+        MobileNetV2Config(weights=tmp_path / "eps.safetensors").build()
+    with pytest.raises(WeightsError, match=r"does not hold DeepLabv3 backbone\.17"):
+        DeepLabConfig(weights=tmp_path / "short.safetensors").build()
+    tensors["features.3.conv.0.0.weight"] = torch.zeros(8, 9, 1, 1)
+    save_file(tensors, tmp_path / "wide.safetensors")
+    with pytest.raises(WeightsError, match=r"does not hold MobileNetV2 features\.13"):
+        MobileNetV2Config(weights=tmp_path / "wide.safetensors").build()
+    backbone = {name: value for name, value in deeplab_tensors().items() if name.startswith("backbone")}
+    save_file(backbone, tmp_path / "headless.safetensors")
+    with pytest.raises(WeightsError, match=r"DeepLabv3 logits \(image_pooling\.weight is missing"):
+        DeepLabConfig(layer="logits", weights=tmp_path / "headless.safetensors").build()

@@ -166,6 +166,28 @@ def test_adains_files_give_adains_features(tmp_path: Path, layer: str, upto: int
     assert ":normalised:" in encoder.identity
 
 
+def test_adains_files_are_never_plain(tmp_path: Path) -> None:
+    torch.save(adain_network().state_dict(), tmp_path / "vgg_normalised.pth")
+    with pytest.raises(WeightsError, match=r"normalised VGG-19 of AdaIN, which cannot be made plain.*normalise on"):
+        Vgg19Config(weights=tmp_path / "vgg_normalised.pth", normalise=False).build()
+    with pytest.raises(WeightsError, match=r"holds no conv5_1"):
+        Vgg19Config(weights=tmp_path / "vgg_normalised.pth", layer="relu5_1").build()
+
+
+def test_a_layer_beyond_the_file_names_those_it_has(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match=r"relu1_1, relu1_2, relu2_1, relu2_2, relu3_1;.*--content\.encoder\.weights"):
+        Vgg19Config(layer="relu4_1", weights=vgg_file(tmp_path)).build()
+
+
+@pytest.mark.parametrize(("kind", "file"), [(Vgg16Config, "vgg16-397923af.pth"), (Vgg19Config, "vgg19-dcbb9e9d.pth")])
+def test_absent_weights_say_what_to_put_where(tmp_path: Path, kind: type[Vgg19Config], file: str) -> None:
+    with pytest.raises(WeightsError) as raised:
+        kind(layer="relu3_1").build()
+    for part in (f"https://download.pytorch.org/models/{file}", file[6:14], ".cache/fprf/weights", "--content.en"):
+        assert part in str(raised.value)
+    assert not list((tmp_path / "home/.cache/fprf/weights").iterdir())
+
+
 def test_a_download_of_another_hash_is_refused_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(weights.urllib.request, "urlopen", lambda *_, **__: io.BytesIO(b"not the weights"))
     with pytest.raises(WeightsError, match="promises dcbb9e9d"):

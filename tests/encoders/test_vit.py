@@ -102,3 +102,15 @@ def test_register_tokens_are_no_patches(models: dict[str, Path]) -> None:
         spot[..., 8 * row : 8 * row + 8, 8 * column : 8 * column + 8] = torch.rand(1, 3, 8, 8)
         change = (encoder(spot) - encoder(image)).square().sum(1)[0]
         assert divmod(int(change.argmax()), 6) == (row, column)
+
+
+@pytest.mark.parametrize(("family", "other"), [("dino", "dinov3"), ("dinov2", "dino"), ("dinov3", "dinov2")])
+def test_a_model_of_another_family_is_told(models: dict[str, Path], family: str, other: str) -> None:
+    with pytest.raises(WeightsError, match=rf"{family}: .* cannot be loaded \(it is of type \w+, not "):
+        KINDS[family](model=str(models[other])).build()
+
+
+def test_an_absent_model_says_where_to_put_it(tmp_path: Path) -> None:
+    pytest.importorskip("transformers", reason="the extra `encoders` is not installed")
+    with pytest.raises(WeightsError, match=r"hf download .*--semantic\.encoder\.model FOLDER"):
+        DinoConfig(model=str(tmp_path / "absent")).build()

@@ -12,7 +12,7 @@ from fprf.errors import WeightsError
 from fprf.plugins import weights
 from fprf.plugins.encoders.config import DeepLabConfig, EncoderConfig, EspNetConfig, MobileNetV2Config
 from fprf.plugins.encoders.mobilenet import DEEPLAB_SOURCE as DEEPLAB
-from fprf.plugins.weights import WeightSource, find_weights, torchvision_file
+from fprf.plugins.weights import WeightSource, find_weights, stated_triple, torchvision_file
 
 
 @pytest.fixture(autouse=True)
@@ -67,3 +67,11 @@ def test_pinned_files_alone_are_downloaded() -> None:
         find_weights(pinned, None)
     with pytest.raises(WeightsError, match=r"Net: net.pth is not in .*fprf/weights nor in .*torch.*\(somewhere\)"):
         find_weights(WeightSource("Net", "net.pth", "somewhere", "--flag"), None)
+
+
+def test_three_numbers(tmp_path: Path) -> None:
+    assert stated_triple({}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [1, 2, 3]
+    assert stated_triple({"mean": "[4,5,6]"}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [4, 5, 6]
+    for wrong in ("[1,2]", "1", "null", "grey", '["a","b","c"]'):
+        with pytest.raises(WeightsError, match="not three numbers"):
+            stated_triple({"mean": wrong}, "mean", (1.0, 2.0, 3.0), tmp_path)
