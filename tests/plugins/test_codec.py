@@ -178,6 +178,13 @@ def test_a_file_that_is_no_config_is_refused(tmp_path: Path, text: bytes, messag
     assert message in str(caught.value)
 
 
+def test_a_file_that_is_absent_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path / "none.json")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path)
+
+
 def test_a_missing_plugin_is_kept_as_data_and_fails_when_built(packages: Packages, tmp_path: Path) -> None:
     path, again = tmp_path / "config.json", tmp_path / "again.json"
     code = {"acme_gone": ENCODER.format(name="Gone")}
@@ -204,6 +211,23 @@ def test_a_broken_plugin_in_a_file_is_kept_like_a_missing_one(packages: Packages
     assert isinstance(config.semantic.encoder, Missing)
     with pytest.raises(PluginError, match="ZeroDivisionError"):
         config.semantic.encoder.build(anything=1)
+
+
+def test_a_plugin_field_called_type_is_refused(packages: Packages) -> None:
+    source = ENCODER.format(name="Typed").replace("tile: int", "type: int")
+    packages.install("acme-typed", {"fprf.encoders": {"typed": "acme_typed:TypedConfig"}}, code={"acme_typed": source})
+    chosen = registry.load("fprf.encoders", "typed", EncoderConfig)
+    with pytest.raises(ConfigError, match="has a field `type`"):
+        to_json(Leaf(encoder=chosen()))
+
+
+def test_a_class_without_entry_point_cannot_be_saved() -> None:
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Local(EncoderConfig):
+        pass
+
+    with pytest.raises(PluginError, match="has no entry point"):
+        to_json(Leaf(encoder=Local()))
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

@@ -41,6 +41,12 @@ def test_a_strangers_plugin_is_listed_without_being_imported(packages: Packages)
     assert registry.entry(GROUP, "acme").origin == "acme_a:ClipConfig from acme-clip 1"
 
 
+def test_a_missing_name_suggests_the_nearest_and_lists_all() -> None:
+    with pytest.raises(PluginError, match=r"no plug-in 'vgg_19' is installed; did you mean 'vgg19'\?") as caught:
+        registry.load(GROUP, "vgg_19", EncoderConfig)
+    assert "bundled-content" in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_two_packages_of_one_name_are_named_and_hurt_only_that_name(packages: Packages) -> None:
     for name in ("acme-one", "acme-two"):
         module = name.replace("-", "_")
@@ -93,6 +99,11 @@ def test_a_reexported_class_has_its_name(packages: Packages) -> None:
     found = registry.load(GROUP, "outer", EncoderConfig)
     assert found.__module__ == "acme_inner"
     assert registry.name_of(GROUP, found) == "outer"
+
+
+def test_a_class_without_entry_point_has_no_name() -> None:
+    with pytest.raises(PluginError, match=r"has no entry point in fprf\.encoders.*NAME ="):
+        registry.name_of(GROUP, ContentFieldConfig)
 
 
 def test_damaged_metadata_hurts_nobody_else(packages: Packages) -> None:

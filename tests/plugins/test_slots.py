@@ -66,6 +66,12 @@ def test_take_flag_both_forms_the_last_wins(flag: str) -> None:
     assert take_flag(["--other", "z"], name) == (None, ["--other", "z"])
 
 
+@pytest.mark.parametrize("args", [["--sampler"], ["--sampler", "--steps"], ["--sampler="]])
+def test_a_flag_without_a_name_is_a_mistake(args: list[str]) -> None:
+    with pytest.raises(UsageError, match="--sampler: needs the name of a plug-in"):
+        take_flag(args, "sampler")
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.sampled_from(["--steps", "5", "--sampler.samples", "--samples", "uniform", "-1"]), max_size=6), st.data())
 def test_taking_a_flag_leaves_the_rest_in_order(rest: list[str], data: Any) -> None:
@@ -106,6 +112,13 @@ def test_errors_say_which_slot() -> None:
         resolve(fprf(), ["--sampler", "unifrom"])
     with pytest.raises(PluginError, match=r"^--content.field: .*not a ContentFieldConfig"):
         resolve(fprf(), ["--content.field", "semantic-planes"])
+
+
+def test_a_config_without_defaults_is_the_strangers_fault(packages: Packages) -> None:
+    source = ENCODER.format(name="Needy").replace("tile: int = 224", "tile: int")
+    packages.install("acme-needy", {"fprf.encoders": {"needy": "acme_needy:NeedyConfig"}}, code={"acme_needy": source})
+    with pytest.raises(PluginError, match=r"'needy' \(acme_needy.*acme-needy 1\) has no defaults"):
+        resolve(fprf(), ["--semantic.encoder", "needy"])
 
 
 def test_types_that_cannot_be_resolved_are_named(packages: Packages) -> None:

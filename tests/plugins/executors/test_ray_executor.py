@@ -15,6 +15,12 @@ from fprf.plugins.executors.executors import resources
 from fprf.testing import check_executor
 
 
+def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(PluginError, match=r'pip install "fprf\[cluster\]"'):
+        RayConfig().build().map(abs, [1])
+
+
 class Refusing:
     """Ray as far as joining goes; it keeps what it was asked for."""
 

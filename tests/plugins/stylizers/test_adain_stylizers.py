@@ -5,8 +5,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import DataError
 from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, StylizerConfig
-from fprf.style.dictionary import Reference, build_dictionary
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene import SceneStyle, own_style, scene_style
 from fprf.types import Want
@@ -138,3 +139,11 @@ def test_autocast_changes_nothing() -> None:
         with torch.autocast("cpu", dtype=torch.bfloat16):
             out = stylizer(content, semantic)
         assert torch.equal(out, stylizer(content, semantic))
+
+
+def test_other_encoders_references_are_refused() -> None:
+    content, semantic = points()
+    d: StyleDictionary = build_dictionary([Reference("a", torch.randn(9, 5), torch.randn(9, 4))])
+    for config in ALL[2:]:
+        with pytest.raises(DataError, match="5 content and 4 semantic channels"):
+            config.build(dictionary=d, scene=scene_of(content, semantic))
