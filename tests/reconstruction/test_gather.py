@@ -1,3 +1,4 @@
+import json
 import struct
 import sys
 from dataclasses import asdict
@@ -11,13 +12,14 @@ from hypothesis import strategies as st
 from photo_files import HEIC
 
 from fprf.datamanagers.images import load_image
-from fprf.errors import DataError, UsageError
+from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
 from fprf.reconstruction.images import (
     Lens,
     choose_frames,
     frame_name,
+    frame_scores,
     gather_images,
     lens_of,
     natural_order,
@@ -98,6 +100,14 @@ def test_saved_frames_are_those_asked_for(video: Path, tmp_path: Path) -> None:
             assert sharpness(found) > 0
 
 
+def test_what_is_no_video_is_named(tmp_path: Path, video: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "no.mp4").write_bytes(b"nothing of the kind" * 100)
+    with pytest.raises(DataError, match=r"no\.mp4: no video that can be opened"):
+        frame_scores(tmp_path / "no.mp4", lambda *_: None)
+    with pytest.raises(DataError, match="frame 99 was there before"):
+        save_frames(video, [2, 99], tmp_path / "out", lambda *_: None)
+
+
 def tiff(order: str, model: bytes = b"Phone 9\0", focal: tuple[int, int] = (425, 100), short: int = 26) -> bytes:
     """Header, a directory with the model and the inner directory, the inner one, and the values that don't fit."""
     head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HI", 42, 8)
@@ -126,6 +136,13 @@ def test_model_and_focal_length_in_both_byte_orders(order: str, tmp_path: Path) 
     path = photo_of(tmp_path / "a.jpg", tiff(order))
     assert read_lens(path) == Lens("Phone 9", 4.25, 26)
     assert cv2.imread(str(path)).shape == (8, 8, 3), "still a photograph"
+
+
+def test_files_that_say_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    assert (
+        read_lens(tmp_path / "a.png") == read_lens(photo_of(tmp_path / "a.jpg", None)) == read_lens(tmp_path / "gone") == Lens()
+    )
 
 
 @settings(deadline=None)
@@ -207,6 +224,13 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
     assert abs(load_image(jpeg).astype(int) - load_image(source / "IMG 0.HEIC")).mean() < 3
 
 
+def test_a_folder_of_other_files_is_told_by_what_it_holds(tmp_path: Path) -> None:
+    for name in ("a.dng", "b.DNG", "c.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(DataError, match=r"0 usable images.*holds \.dng \.txt files.*convert"):
+        gathered(tmp_path, SceneFolder(tmp_path / "scene"))
+
+
 def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) -> None:
     place = SceneFolder(tmp_path / "scene")
     before = {name: (place.images / name).stat().st_mtime_ns for name in gathered(photos, place).images}
@@ -245,3 +269,28 @@ def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
     gathered(tmp_path / "clip.mp4", place, frames=4)
     assert (place.images / "frame_000004.jpg").stat().st_mtime_ns == stamp
     assert len(gathered(tmp_path / "clip.mp4", place, frames=6, blurred=0.0).images) == len(names(place)) == 6
+
+
+def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
+    place = SceneFolder(tmp_path / "scene")
+    with pytest.raises(UsageError, match="neither a folder of images nor a video"):
+        gathered(tmp_path / "absent", place)
+    with pytest.raises(UsageError, match="neither a folder of images nor a video"):
+        gathered(photos / "IMG_1.jpg", place)
+    (tmp_path / "few").mkdir()
+    photo(tmp_path / "few" / "a.jpg")
+    (tmp_path / "few" / "b.jpg").write_bytes(b"")
+    with pytest.raises(DataError, match=r"1 usable images, at least 3 are needed; b\.jpg: the file is empty"):
+        gathered(tmp_path / "few", place)
+    gathered(photos, place)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(UsageError, match=f"was begun with {photos}"):
+        gathered(tmp_path / "other", place)
+    with pytest.raises(UsageError, match="holds something else"):
+        State.load(SceneFolder(tmp_path))
+    (place.work / "state.json").write_text(json.dumps({"format": 1, "wrong": 3}))
+    with pytest.raises(DataError, match=r"state\.json: cannot be read"):
+        State.load(place)
+    for knob, value in {"frames": 2, "blurred": 1.5, "features": 5, "side": 9, "overlap": 0, "threads": 0}.items():
+        with pytest.raises(ConfigError, match=knob):
+            SfmConfig(**{knob: value})
