@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from fprf.errors import ConfigError
 from fprf.fields.planes import MAX_DEGREE, count, harmonics
 
 
@@ -60,3 +61,9 @@ def test_lower_degrees_are_a_prefix() -> None:
     for degree in range(1, MAX_DEGREE):
         assert torch.equal(harmonics(view, degree), harmonics(view, MAX_DEGREE)[:, : degree * degree])
     assert harmonics(view[:0], 3).shape == (0, 9) and harmonics(view, 2).dtype == torch.float32
+
+
+@pytest.mark.parametrize("degree", [-1, 0, 5])
+def test_other_degrees_are_refused(degree: int) -> None:
+    with pytest.raises(ConfigError, match=rf"degree: {degree} must lie in \[1, 4\]"):
+        count(degree)
