@@ -11,7 +11,7 @@ from tiny_world import World
 import fprf
 from fprf.api import TrainedScene
 from fprf.cli import main as cli
-from fprf.errors import ConfigError, UsageError
+from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
 from fprf.rendering.cameras import project
 from fprf.style.config import StyleConfig
 
@@ -135,3 +135,32 @@ def test_a_flight_is_lazy_and_as_long_as_asked(scene: TrainedScene) -> None:
     assert torch.equal(first.rgb, scene.render(cameras.select(torch.tensor([0]))).rgb)
     assert len(list(film)) == 2
     assert len(scene.path("dataset", split="test")) == 2
+
+
+def test_mistakes_are_named(scene: TrainedScene, world: World, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="no run folder"):
+        fprf.load(tmp_path)
+    with pytest.raises(UsageError, match=r"camera '00003': no such view \(did you mean '0003'|camera '00003': no such view"):
+        scene.camera("00003")
+    with pytest.raises(UsageError, match="from 0 to 9"):
+        scene.camera(10)
+    with pytest.raises(UsageError, match="10 cameras; give one"):
+        scene.render(scene.cameras)
+    with pytest.raises(UsageError, match="in no style"):
+        scene.matches(0)
+    with pytest.raises(UsageError, match="in no style"):
+        scene.save_style(tmp_path / "style.json")
+    with pytest.raises(UsageError, match="styles of one loaded scene"):
+        scene.towards(scene.stylize([world.references[0]]), 0.5)
+    with pytest.raises(UsageError, match="at least one photograph"):
+        scene.stylize([])
+    with pytest.raises(DataError, match=r"absent\.png"):
+        scene.stylize([tmp_path / "absent.png"])
+    with pytest.raises(UsageError, match="two places"):
+        scene.camera_at([0, 0, 0], [0, 0, 0])
+    with pytest.raises(ConfigError, match="fov"):
+        scene.camera_at([0, 0, 0], [1, 0, 0], fov=180)
+    with pytest.raises(UsageError, match="neither a file nor one of"):
+        scene.path("spirale")
+    with pytest.raises(DataError, match="no picture format"):
+        scene.render(0).save(tmp_path / "x.txt")
