@@ -48,8 +48,8 @@ def out_of_memory(error: BaseException) -> bool:
 
 def wanted(error: BaseException) -> int | None:
     """The bytes that could not be had, where the error tells."""
-    found = _ASKED.search(str(error))
-    return None if found is None else int(float(found[1]) * _UNITS[found[2].lower()])
+    match = _ASKED.search(str(error))
+    return None if match is None else int(float(match[1]) * _UNITS[match[2].lower()])
 
 
 def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator[_Found]:
@@ -61,7 +61,7 @@ def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator
     start = 0
     while start < count:
         try:
-            found = work(slice(start, start + size))
+            result = work(slice(start, start + size))
         except Exception as error:
             if not out_of_memory(error):
                 raise
@@ -69,7 +69,7 @@ def in_parts(count: int, size: int, work: Callable[[slice], _Found]) -> Iterator
                 raise shortage(f"{size} rays at a time", error, "close other programs") from error
             size = max(LEAST, size // 2)
         else:
-            yield found
+            yield result
             start += size
 
 

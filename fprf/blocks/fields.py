@@ -40,8 +40,8 @@ class Member(nn.Module):
 
     def proposal(self, level: int, points: Annotated[Tensor, "n 3"]) -> Annotated[Tensor, "n"]:
         """Density of a level of the sampler's own fields."""
-        found: Tensor = self.sampler.fields[level](self.chart.locate(points))
-        return found
+        density: Tensor = self.sampler.fields[level](self.chart.locate(points))
+        return density
 
 
 class Members(ABC):
@@ -97,9 +97,9 @@ class BlockedField(ContentField):
     def density(self, points: Annotated[Tensor, "N 3"]) -> FieldSample:
         """Blended density; points are those of the scene's space."""
         groups = self.router(points)
-        found = [self._group(points, group) for group in groups]
+        samples = [self._group(points, group) for group in groups]
         index = torch.cat([group.at for group in groups])
-        density, latent = (torch.cat(parts) for parts in zip(*found, strict=True))
+        density, latent = (torch.cat(parts) for parts in zip(*samples, strict=True))
         if len(groups) == 1:
             return FieldSample(density, latent)
         back = torch.empty_like(index)
@@ -114,25 +114,25 @@ class BlockedField(ContentField):
             return self.members.member(whole.members[0]).field.content(latent[:, 4:], view)
         if whole is not None:
             return self._shared(points, view, whole)
-        found, places = [], []
+        features, places = [], []
         for number in torch.unique(owner).tolist():
             index = (owner == number).nonzero()[:, 0]
             if number != _SHARED:
-                found.append(self.members.member(int(number)).field.content(latent[index, 4:], view[index]))
+                features.append(self.members.member(int(number)).field.content(latent[index, 4:], view[index]))
                 places.append(index)
                 continue
             for group in self.router(points[index]):
                 place = index[group.at]
-                found.append(self._shared(points[place], view[place], group))
+                features.append(self._shared(points[place], view[place], group))
                 places.append(place)
-        if len(found) == 1:
-            return found[0]
-        if not found:
+        if len(features) == 1:
+            return features[0]
+        if not features:
             return self.members.held[0].field.content(latent[:, 4:], view)
         order = torch.cat(places)
         back = torch.empty_like(order)
         back[order] = torch.arange(len(order), device=order.device)
-        return torch.cat(found).index_select(0, back)
+        return torch.cat(features).index_select(0, back)
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the members that are held, added up: each is regularised as if alone."""
@@ -168,7 +168,7 @@ class BlockedSemantic(SemanticField):
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
         """Blended features at points of the scene's space."""
         groups = self.router(points)
-        found = []
+        outputs = []
         for group in groups:
             here = points[group.at]
             features, densities = [], []
@@ -179,13 +179,13 @@ class BlockedSemantic(SemanticField):
                 features.append(member.semantic(at))
                 if group.weight is not None:
                     densities.append(member.field.density(at).density)
-            found.append(_mixed(features, densities, group))
-        if len(found) == 1:
-            return found[0]
+            outputs.append(_mixed(features, densities, group))
+        if len(outputs) == 1:
+            return outputs[0]
         index = torch.cat([group.at for group in groups])
         back = torch.empty_like(index)
         back[index] = torch.arange(len(index), device=index.device)
-        return torch.cat(found).index_select(0, back)
+        return torch.cat(outputs).index_select(0, back)
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the members that are held, added up."""
@@ -213,17 +213,17 @@ class _Routed(nn.Module):
 
     def forward(self, points: Tensor) -> Tensor:
         groups = self.router(points)
-        found = []
+        outputs = []
         for group in groups:
             here = points[group.at]
             values = [self.members.member(number).proposal(self.level, here) for number in group.members]
-            found.append(values[0] if group.weight is None else (torch.stack(values, -1) * group.weight).sum(-1))
-        if len(found) == 1:
-            return found[0]
+            outputs.append(values[0] if group.weight is None else (torch.stack(values, -1) * group.weight).sum(-1))
+        if len(outputs) == 1:
+            return outputs[0]
         index = torch.cat([group.at for group in groups])
         back = torch.empty_like(index)
         back[index] = torch.arange(len(index), device=index.device)
-        return torch.cat(found).index_select(0, back)
+        return torch.cat(outputs).index_select(0, back)
 
 
 class BlockedSampler(Sampler):
@@ -245,8 +245,8 @@ class BlockedSampler(Sampler):
         generator: torch.Generator | None,
     ) -> Sampled:
         """The inner sampler's edges; an open space leaves points as they are."""
-        found: Sampled = self.inner(rays, space=space, step=step, generator=generator)
-        return found
+        outputs: Sampled = self.inner(rays, space=space, step=step, generator=generator)
+        return outputs
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the samplers of the members that are held, added up."""
@@ -290,8 +290,8 @@ def relay(planes: Planes, chart: Chart, old: Chart) -> Annotated[Tensor, "rows F
             first, second = sorted((follows[a], follows[b]))
             grid = grids[AXES.index((first, second))]
             where = torch.stack([at[..., first], at[..., second]], -1)[None].to(grid)
-            found = F.grid_sample(grid.permute(2, 0, 1)[None], where, align_corners=True, padding_mode="border")
-            parts.append(found[0].permute(1, 2, 0).reshape(-1, grid.shape[2]))
+            values = F.grid_sample(grid.permute(2, 0, 1)[None], where, align_corners=True, padding_mode="border")
+            parts.append(values[0].permute(1, 2, 0).reshape(-1, grid.shape[2]))
     return torch.cat(parts)
 
 

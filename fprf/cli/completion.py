@@ -59,14 +59,14 @@ def offers() -> dict[str, Offer]:
     from .bench import NAMES
     from .main import VERBS, packaged
 
-    known, found = _WORDS | {"bench": tuple(NAMES)}, {}
+    known, described = _WORDS | {"bench": tuple(NAMES)}, {}
     summaries = {verb: about.summary for verb, about in VERBS.items()}
     for verb, summary in (summaries | {verb: f"of {package}" for verb, package in packaged().items()}).items():
         words = tuple(installed("fprf.methods")) if verb == "train" else known.get(verb, ())
         asked: Sequence[str | None] = words if verb in _FIRST or verb == "train" else (None,)
         flags = {flag for word in asked for flag in _flags(verb, word)}
-        found[verb] = Offer(summary, words, tuple(sorted({*flags, "--help"})))
-    return found
+        described[verb] = Offer(summary, words, tuple(sorted({*flags, "--help"})))
+    return described
 
 
 def script(shell: str, known: Mapping[str, Offer]) -> str:

@@ -306,9 +306,9 @@ def _weights() -> Iterator[Finding]:
     for folder, names in _SHIPPED.items():
         there = sorted(path.stem for path in (plugins / folder / "weights").glob("*.safetensors"))
         absent = [name for name in names if name not in there] or (["any"] if not there else [])
-        found = ", ".join(there) or "none"
+        listed = ", ".join(there) or "none"
         remedy = "pip install --force-reinstall --no-deps fprf" if absent else ""
-        yield Finding(folder, f"in the package: {found}" + (f"; absent: {', '.join(absent)}" if absent else ""), remedy)
+        yield Finding(folder, f"in the package: {listed}" + (f"; absent: {', '.join(absent)}" if absent else ""), remedy)
     cached = []
     for folder, pattern in _CACHES:
         cached += sorted((Path.home() / folder).glob(pattern))

@@ -56,15 +56,15 @@ class Flag(NamedTuple):
 
 def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
     """Every leaf of the tree by the flag's text."""
-    found: dict[str, Flag] = {}
+    flags: dict[str, Flag] = {}
     for field in dataclasses.fields(config):
         value, path, hint = getattr(config, field.name), f"{prefix}{field.name}", hints_of(type(config))[field.name]
         if dataclasses.is_dataclass(value):
-            found |= flags_of(value, f"{path}.")
+            flags |= flags_of(value, f"{path}.")
         elif not any(is_slot(each) for each in members(hint)):
             flag = Flag(path, hint)
-            found[flag.text] = flag
-    return found
+            flags[flag.text] = flag
+    return flags
 
 
 def spell(args: Sequence[str], flags: dict[str, Flag]) -> list[str]:

@@ -143,12 +143,12 @@ def _with_positional(config: Any, names: tuple[str, ...]) -> Any:
     return kind(**values | {name: tyro.MISSING for name in names if values[name] is not None})
 
 
-def _slot_flags(found: list[Slot]) -> Any:
+def _slot_flags(filled: list[Slot]) -> Any:
     """A dataclass that only adds the slot flags to the help text: `resolve` has taken them already."""
     import tyro
 
     rows: list[tuple[str, Any, Any]] = []
-    for slot in found:
+    for slot in filled:
         names = [name for name in registry.installed(slot.kind.group) if _may_fill(slot, name)]
         allowed = ", ".join([*names, "none"] if slot.optional else names)
         about = (slot.kind.__doc__ or "").strip().partition("\n")[0]
@@ -210,7 +210,7 @@ def describe(config: Any, *, prog: str, description: str, positional: Sequence[s
 
 def meanings(kind: type) -> dict[str, str]:
     """The docstring below each field of a dataclass, those of its bases included; of a class without source, none."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(base):
             continue
@@ -223,8 +223,8 @@ def meanings(kind: type) -> dict[str, str]:
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr):
                 said = text.value.value if isinstance(text.value, ast.Constant) else None
                 if isinstance(said, str):
-                    found[field.target.id] = " ".join(said.split())
-    return found
+                    texts[field.target.id] = " ".join(said.split())
+    return texts
 
 
 def _written(value: Any) -> str:

@@ -88,10 +88,10 @@ def _joined(args: Sequence[str], config: StyleConfig) -> list[str]:
 
 def _style_flag(args: Sequence[str]) -> Path | None:
     """The last `--style FILE`; what is wrong with it otherwise, `parse` says."""
-    found = None
+    path = None
     for at, arg in enumerate(args):
         key, equals, inline = arg.partition("=")
         value = inline if equals else "".join(args[at + 1 : at + 2])
         if key == "--style" and value and not value.startswith("-") and value != "none":
-            found = Path(value)
-    return found
+            path = Path(value)
+    return path

@@ -120,14 +120,14 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
                 write_image(output / f"{name}.png", to_uint8(picture.rgb))
             if maps or config.pixels:
                 start = time.perf_counter()
-                found = match_map(scene, styled, view)
+                matched = match_map(scene, styled, view)
                 matching += time.perf_counter() - start
-                summaries[name] = summarize(found, styled.codes)
-                pictures = match_pictures(found, styled.codes)
+                summaries[name] = summarize(matched, styled.codes)
+                pictures = match_pictures(matched, styled.codes)
                 for which in maps:
                     write_image(output / f"{name}-{which}.png", pictures[which])
                 if config.pixels:
-                    write_pixels(output / f"{name}-match.npz", found, styled.codes)
+                    write_pixels(output / f"{name}-match.npz", matched, styled.codes)
         display.count(len(views), len(views), "restyling" if shown else "matching")
     count = max(1, len(views))
     made = {"match_seconds_per_view": matching / count, "matches": summaries}
@@ -145,11 +145,11 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     from ..io.sheet import contact_sheet
     from ..training.explain import explain, region_row, region_tile
 
-    found = explain(regions, styled)
+    explained = explain(regions, styled)
     names = styled.dictionary.names if styled is not None else ()
-    _print_table([_HEAD if styled else _HEAD[:3], *(_cells(region) for region in found)])
-    write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in found]})
-    write_image(output / "explain.png", contact_sheet([region_tile(region, names) for region in found]))
+    _print_table([_HEAD if styled else _HEAD[:3], *(_cells(region) for region in explained)])
+    write_json(output / "explain.json", {"references": list(names), "regions": [region_row(region) for region in explained]})
+    write_image(output / "explain.png", contact_sheet([region_tile(region, names) for region in explained]))
     print(f"the same with pictures in {output / 'explain.png'} and explain.json")
 
 

@@ -241,10 +241,10 @@ def _say_outcome(folder: "Run", config: "TrainConfig", scene: "Scene", display: 
     from ..training.prepare import outcome
 
     quoted = shlex.quote(str(folder.root))
-    found = outcome(folder.root, config, scene)
-    short = found is not None and found.too_short
-    if found is not None:
-        display.say(found.told(folder.root, config))
+    reached = outcome(folder.root, config, scene)
+    short = reached is not None and reached.too_short
+    if reached is not None:
+        display.say(reached.told(folder.root, config))
     ended = "ended" if short else "done"
     display.say(f"{ended} after {seconds:.0f} s: fprf stylize {quoted} --references PHOTO.jpg, fprf eval {quoted}")
 

@@ -75,10 +75,10 @@ class FieldVerbs(Verbs):
         """List packages and weights that plug-ins and the decoder lack."""
         from ..training.prepare import decoder_needs, plugin_needs
 
-        found = plugin_needs(self.config)
-        if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in found):
-            found = [*found, *decoder_needs(self.config)]
-        return found
+        missing = plugin_needs(self.config)
+        if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in missing):
+            missing = [*missing, *decoder_needs(self.config)]
+        return missing
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Judge a model."""

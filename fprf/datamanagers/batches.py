@@ -279,10 +279,10 @@ class RayBatches(DataManager):
             path = masks[view] if masks else None
             return mask if path is None else mask & torch.from_numpy(load_mask(path, (width, height)))
 
-        found = PixelRuns.of(self._each(allowed))
-        if not len(found):
+        runs = PixelRuns.of(self._each(allowed))
+        if not len(runs):
             raise DataError(f"{self._scene.name}: none of {len(self._views)} training views shows what is to be learnt")
-        return found
+        return runs
 
     def _skies(self, skies: Sequence[Path | None]) -> PixelRuns:
         """The pixels that show sky."""

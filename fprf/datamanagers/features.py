@@ -239,11 +239,11 @@ class FeatureStore:
         """
         if self._packed is not None and view.device == self._numbers.device:
             return guided.apply_packed(self._packed, self._numbers[view], pixel, rgb, grey=GREY)
-        views, found = np.unique(view.detach().cpu().numpy(), return_inverse=True)
+        views, place = np.unique(view.detach().cpu().numpy(), return_inverse=True)
         missing = [v for v in views.tolist() if v not in self._slots]
         if missing:
             raise DataError(f"feature store: view {missing[0]} has no features; {len(self._entries)} training views have")
-        slot = torch.tensor([self._slots[v] for v in views.tolist()], dtype=torch.int64)[torch.from_numpy(found)]
+        slot = torch.tensor([self._slots[v] for v in views.tolist()], dtype=torch.int64)[torch.from_numpy(place)]
         positions, colours = pixel.detach().cpu().float().contiguous(), rgb.detach().cpu().float().contiguous()
         out = torch.empty(len(view), self.channels)
         (self._compiled if _COMPILED else self._plain)(slot, positions, colours, out)

@@ -105,12 +105,12 @@ def _sighted(cameras: Cameras, view: Tensor, points: Tensor) -> Sightings:
 
 def _nearest(cameras: Cameras, view: int, points: Tensor) -> Sightings:
     """The nearest layer of all points in a view."""
-    found = _sighted(cameras, torch.full((len(points),), view), points)
-    column, row = tile_of(cameras, found.view, found.pixel).unbind(1)
+    sightings = _sighted(cameras, torch.full((len(points),), view), points)
+    column, row = tile_of(cameras, sightings.view, sightings.pixel).unbind(1)
     tile = row * TILES + column
-    least = found.distance.new_full((TILES * TILES,), torch.inf).scatter_reduce(0, tile, found.distance, "amin")
-    front = found.distance <= LAYER * least[tile]
-    return Sightings(*(x[front] for x in found))
+    least = sightings.distance.new_full((TILES * TILES,), torch.inf).scatter_reduce(0, tile, sightings.distance, "amin")
+    front = sightings.distance <= LAYER * least[tile]
+    return Sightings(*(x[front] for x in sightings))
 
 
 GAMMA = 1 / 2.2

@@ -38,14 +38,14 @@ class Frames(NamedTuple):
 
 def read_pictures(folder: Path, names: Sequence[str] | None = None) -> Frames:
     """All pictures of a folder, or those with these stems, in [0, 1]. Raises DataError for none, or a missing one."""
-    found = {path.stem: path for path in sorted(folder.glob("*")) if path.suffix.lower() in IMAGE_SUFFIXES}
-    if not found:
+    files = {path.stem: path for path in sorted(folder.glob("*")) if path.suffix.lower() in IMAGE_SUFFIXES}
+    if not files:
         raise DataError(f"{folder}: no pictures ({' '.join(sorted(IMAGE_SUFFIXES))}); name the folder that the frames lie in")
-    wanted = list(found) if names is None else list(names)
-    missing = [name for name in wanted if name not in found]
+    wanted = list(files) if names is None else list(names)
+    missing = [name for name in wanted if name not in files]
     if missing:
         raise DataError(f"{folder}: no picture named {missing[0]} ({len(missing)} are missing); name them as the frames")
-    return Frames(tuple(wanted), [torch.from_numpy(load_image(found[name])).float() / 255 for name in wanted])
+    return Frames(tuple(wanted), [torch.from_numpy(load_image(files[name])).float() / 255 for name in wanted])
 
 
 def read_cameras(path: Path, frames: Frames) -> Cameras:
@@ -80,7 +80,7 @@ def read_depths(folder: Path, names: Sequence[str], cameras: Cameras, along: Alo
 
     `along` says what the files hold: distances along the ray, or along the camera's axis. Raises DataError.
     """
-    found = []
+    depths = []
     for view, name in enumerate(names):
         packed, plain = folder / f"{name}.npz", folder / f"{name}.npy"
         if packed.is_file():
@@ -97,8 +97,8 @@ def read_depths(folder: Path, names: Sequence[str], cameras: Cameras, along: Alo
             pixel = pixel_grid(cameras, view)
             _, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
             depth = depth / (-direction @ cameras.pose[view, :, 2]).view(height, width)
-        found.append(depth)
-    return found
+        depths.append(depth)
+    return depths
 
 
 def _camera(record: Record, width: int, height: int) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -199,9 +199,9 @@ def _style(config: PeerConfig, styled: Sequence[Tensor], plain: Sequence[Tensor]
     here, there = matched_regions(BundledSemanticConfig().build(), plain, references, regions=REGIONS, seed=0)
     judge = {"bundled-content": BundledContentConfig().build()}
     before, target = list(zip(plain, here, strict=True)), list(zip(references, there, strict=True))
-    found = style_distances(judge, before, {"frames": list(zip(styled, here, strict=True))}, target)
+    distances = style_distances(judge, before, {"frames": list(zip(styled, here, strict=True))}, target)
     kept = [structure(a, b) for a, b in zip(plain, styled, strict=True)]
-    return {"style_distance": found["frames"]["mean"], "structure": sum(kept) / len(kept)}
+    return {"style_distance": distances["frames"]["mean"], "structure": sum(kept) / len(kept)}
 
 
 def _reduced(image: Tensor) -> Tensor:

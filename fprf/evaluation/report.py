@@ -275,7 +275,7 @@ def provenance(device: str) -> dict[str, object]:
 def commit(folder: Path) -> str | None:
     """Short hash of the checkout that a folder lies in, with `+` where known files were changed; None outside of one."""
     try:
-        found = subprocess.run(  # nosec B607  # git as the user has it; fixed words
+        answer = subprocess.run(  # nosec B607  # git as the user has it; fixed words
             ["git", "-C", str(folder), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
             capture_output=True,
             text=True,
@@ -284,13 +284,13 @@ def commit(folder: Path) -> str | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return found.stdout.strip() or None
+    return answer.stdout.strip() or None
 
 
-def words(found: dict[str, object]) -> str:
+def words(origin: dict[str, object]) -> str:
     """A line for a page."""
-    where = f"commit {found['commit']}, " if found["commit"] else ""
-    return f"{where}fprf {found['fprf']}, torch {found['torch']}, {found['machine']}"
+    where = f"commit {origin['commit']}, " if origin["commit"] else ""
+    return f"{where}fprf {origin['fprf']}, torch {origin['torch']}, {origin['machine']}"
 
 
 def _machine(device: torch.device) -> str:

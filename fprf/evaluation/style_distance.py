@@ -105,8 +105,8 @@ def relative_distance(
     """
     regions = [
         r
-        for r, found in plain.items()
-        if r in styled and r in style and min(found.cells, styled[r].cells, style[r].cells) >= _CELLS
+        for r, before in plain.items()
+        if r in styled and r in style and min(before.cells, styled[r].cells, style[r].cells) >= _CELLS
     ]
     before = sum(plain[r].cells * gaussian_distance(plain[r], style[r], full=full) for r in regions)
     after = sum(plain[r].cells * gaussian_distance(styled[r], style[r], full=full) for r in regions)
@@ -132,8 +132,8 @@ def style_distances(
 
 
 def _described(cells: Annotated[Tensor, "N C"]) -> RegionStatistics:
-    found = moments(cells, torch.ones(len(cells)))
-    return RegionStatistics(len(cells), found.mean, covariance(found))
+    statistics = moments(cells, torch.ones(len(cells)))
+    return RegionStatistics(len(cells), statistics.mean, covariance(statistics))
 
 
 @torch.no_grad()
@@ -147,9 +147,9 @@ def matched_regions(
 ) -> tuple[list[Annotated[Tensor, "h w"]], list[Annotated[Tensor, "g f"]]]:
     """Region ids of the encoder's cells, in the contents and in the styles; at most `regions` of them."""
     here, there = ([encoder(image.permute(2, 0, 1)[None])[0].float() for image in side] for side in (contents, styles))
-    found = kmeans(_directions(there), regions, seed=seed)
-    like = _directions(here) @ torch.nn.functional.normalize(found.centres, dim=1).T
-    return _maps(like.argmax(1), here), _maps(found.label, there)
+    clusters = kmeans(_directions(there), regions, seed=seed)
+    like = _directions(here) @ torch.nn.functional.normalize(clusters.centres, dim=1).T
+    return _maps(like.argmax(1), here), _maps(clusters.label, there)
 
 
 def _directions(maps: Sequence[Annotated[Tensor, "C h w"]]) -> Annotated[Tensor, "N C"]:

@@ -191,8 +191,8 @@ def colour_gradient(model: Model, prepared: Prepared, config: TrainConfig, batch
     assert out.rgb is not None
     loss = (out.rgb - batch.rgb.to(out.rgb)).square().mean()
     parameters = [p for p in model.field.parameters() if p.requires_grad]
-    found = torch.autograd.grad(loss, parameters, allow_unused=True)
-    return torch.cat([(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, found, strict=True)])
+    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+    return torch.cat([(torch.zeros_like(p) if g is None else g).flatten() for p, g in zip(parameters, gradients, strict=True)])
 
 
 def batch_rays(model: Model, prepared: Prepared, batch: Batch) -> Rays:
@@ -278,9 +278,9 @@ def count(parts: Parts, rays: Rays, budget: float) -> Counts:
     return Counts(len(rays.near), samples, kept, empty)
 
 
-def difference(found: Tensor, truth: Tensor) -> Difference:
+def difference(image: Tensor, truth: Tensor) -> Difference:
     """Largest and root-mean-square difference."""
-    away = found.double().flatten() - truth.double().flatten()
+    away = image.double().flatten() - truth.double().flatten()
     return Difference(float(away.abs().max()), float(away.square().mean().sqrt()))
 
 

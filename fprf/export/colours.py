@@ -60,7 +60,7 @@ def best_views(
     """
     count = min(count, len(maps.depth))
     best = torch.full((len(point), count), -torch.inf, dtype=torch.float64)
-    found = torch.zeros(len(point), count, dtype=torch.int64)
+    chosen = torch.zeros(len(point), count, dtype=torch.int64)
     for view in range(len(maps.depth)):
         gap, distance = depth_gaps(maps, view, point)
         way = (maps.cameras.pose[view, :, 3] - point) / distance[:, None]
@@ -69,12 +69,12 @@ def best_views(
         missed = torch.nan_to_num(gap.abs(), nan=1e18, posinf=1e17)
         score = torch.where(missed <= 2 * near, facing / distance.square(), -missed)
         scores = torch.cat([best, score[:, None]], 1)
-        views = torch.cat([found, torch.full((len(point), 1), view)], 1)
+        views = torch.cat([chosen, torch.full((len(point), 1), view)], 1)
         best, order = scores.topk(count, 1)
-        found = views.gather(1, order)
+        chosen = views.gather(1, order)
     weight = (best / best[:, :1].clamp_min(1e-300)).clamp_min(0)
     weight[:, 0] = 1
-    return BestViews(found, weight)
+    return BestViews(chosen, weight)
 
 
 def expected_presence(
@@ -157,9 +157,9 @@ def point_colours(
         for part in torch.split((seen.weight[:, rank] > 0).nonzero()[:, 0], size):
             report(done, total)
             done += len(part)
-            found, opacity = _looked(model, facts, cameras, points[part], seen.view[part, rank], config, styles, tolerance)
+            colours, opacity = _looked(model, facts, cameras, points[part], seen.view[part, rank], config, styles, tolerance)
             weight = seen.weight[part, rank].float()
-            sums[part] += found * weight[:, None]
+            sums[part] += colours * weight[:, None]
             light[part] += opacity * weight
             share[part] += weight
     report(total, total)

@@ -87,7 +87,7 @@ def fit_lattice(
 
 def _solve(matrix: Callable[[Tensor], Tensor], right: Tensor, scale: Tensor) -> Tensor:
     """Conjugate gradients, preconditioned by a diagonal."""
-    found, residual = torch.zeros_like(right), right
+    solution, residual = torch.zeros_like(right), right
     ready = scale * residual
     way, force = ready, (residual * ready).sum()
     enough = _CLOSE**2 * force
@@ -96,11 +96,11 @@ def _solve(matrix: Callable[[Tensor], Tensor], right: Tensor, scale: Tensor) -> 
             break
         bent = matrix(way)
         step = force / (way * bent).sum()
-        found, residual = found + step * way, residual - step * bent
+        solution, residual = solution + step * way, residual - step * bent
         ready = scale * residual
         before, force = force, (residual * ready).sum()
         way = ready + force / before * way
-    return found
+    return solution
 
 
 def _stiffness(d: Tensor) -> Tensor:

@@ -108,14 +108,14 @@ def method_config(name: str) -> "RunConfig":
 
 def packages_of(config: object) -> dict[str, str]:
     """Name, package and version of what fills every slot, by dotted path."""
-    found = {}
+    packages = {}
     for slot in slots(config):
         if isinstance(slot.value, Missing):
-            found[slot.path] = f"{slot.value.name} {slot.value.package}".strip()
+            packages[slot.path] = f"{slot.value.name} {slot.value.package}".strip()
         elif slot.value is not None:
             name = registry.name_of(slot.kind.group, type(slot.value))
-            found[slot.path] = f"{name} {registry.entry(slot.kind.group, name).package}"
-    return found
+            packages[slot.path] = f"{name} {registry.entry(slot.kind.group, name).package}"
+    return packages
 
 
 def read_json(path: Path, name: str = "a config.json") -> Any:
@@ -161,12 +161,12 @@ def _check(whole: Any) -> None:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> Mapping[str, Any]:
-    found: dict[str, Any] = {}
+    members: dict[str, Any] = {}
     for key, value in pairs:
-        if key in found:
+        if key in members:
             raise ConfigError(f"the key {key!r} stands twice in one object")
-        found[key] = value
-    return found
+        members[key] = value
+    return members
 
 
 def _number(text: str) -> float:

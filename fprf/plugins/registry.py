@@ -87,14 +87,14 @@ def entry(group: str, name: str) -> Entry:
 
 def load_object(group: str, name: str) -> object:
     """Import the one plug-in of that name. Raises PluginError where it is missing, ambiguous or fails to import."""
-    found = entry(group, name)
+    plugin = entry(group, name)
     try:
-        loaded: object = found.point.load()
+        loaded: object = plugin.point.load()
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a stranger's module may even call sys.exit while it is imported
         raise PluginError(
-            f"{group}: {name!r} ({found.origin}) failed to import: {type(error).__name__}: {error}; "
+            f"{group}: {name!r} ({plugin.origin}) failed to import: {type(error).__name__}: {error}; "
             "mend or uninstall that package, or choose another plug-in"
         ) from error
     return loaded
@@ -151,15 +151,15 @@ def nearest(name: str, allowed: Mapping[str, object] | list[str]) -> str:
 def _imported(point: EntryPoint) -> object | None:
     """The object of an entry point, from the modules that are imported already: a class may be re-exported."""
     module, _, attributes = point.value.partition(":")
-    found: object | None = sys.modules.get(module.strip())
+    value: object | None = sys.modules.get(module.strip())
     for attribute in attributes.strip().split("."):
-        found = getattr(found, attribute, None)
-    return found
+        value = getattr(value, attribute, None)
+    return value
 
 
 @cache
 def _scan() -> _Scan:
-    found: dict[str, dict[str, list[Entry]]] = {}
+    entries: dict[str, dict[str, list[Entry]]] = {}
     bad: list[str] = []
     seen: set[str] = set()
     for distribution in distributions():
@@ -176,10 +176,10 @@ def _scan() -> _Scan:
         seen.add(name)
         for point in points:
             if point.group.startswith(_PREFIX):
-                found.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
+                entries.setdefault(point.group, {}).setdefault(point.name, []).append(Entry(point, package))
     groups = {
         group: MappingProxyType({name: tuple(sorted(names[name], key=lambda each: each.package)) for name in sorted(names)})
-        for group, names in found.items()
+        for group, names in entries.items()
     }
     return _Scan(MappingProxyType(groups), tuple(bad))
 

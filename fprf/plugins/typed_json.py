@@ -59,17 +59,17 @@ def to_json(config: object) -> Any:
 
 def leaves(config: object) -> dict[str, Any]:
     """Every field of a config tree as JSON by its dotted path. A plug-in's path gives its name; without one there, null."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
 
     def walk(tree: Any, path: str) -> None:
         if not isinstance(tree, dict):
-            found[path] = tree
+            values[path] = tree
             return
         for name, value in tree.items():
             walk(value, path if name == "type" else f"{path}.{name}".lstrip("."))
 
     walk(to_json(config), "")
-    return found
+    return values
 
 
 def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None) -> T:

@@ -196,8 +196,8 @@ def _check_hash(path: Path, name: str, source: WeightSource) -> None:
     if expected is None:
         return
     with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if not found.startswith(expected):
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if not digest.startswith(expected):
         raise WeightsError(
-            f"{path}: SHA-256 begins with {found[:8]}, its name promises {expected}; delete it and fetch {source.origin} again"
+            f"{path}: SHA-256 begins with {digest[:8]}, its name promises {expected}; delete it and fetch {source.origin} again"
         )

@@ -86,16 +86,16 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
 @torch.no_grad()
 def decoder_report(encoder: Encoder, decoder: Decoder, photos: Sequence[Path], device: torch.device | None = None) -> Report:
     """PSNR of decode(encode(photo)) over whole photographs: the mean of the photographs' own, and the worst."""
-    found = []
+    psnr = []
     for path in photos:
         photo = load_photo(path, LONGEST).to(device)
         content = filtered_whole(encoder, photo, GuidedConfig())
         error = float(double(decoder(content) - photo.flatten(0, 1)).square().mean())
-        found.append(-10 * math.log10(max(error, 1e-10)))
+        psnr.append(-10 * math.log10(max(error, 1e-10)))
     return {
-        "photos": len(found),
-        "psnr_db": round(sum(found) / len(found), 2),
-        "psnr_worst_db": round(min(found), 2),
+        "photos": len(psnr),
+        "psnr_db": round(sum(psnr) / len(psnr), 2),
+        "psnr_worst_db": round(min(psnr), 2),
     }
 
 
@@ -104,8 +104,8 @@ def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Rep
     """Content and style loss of every crop in the style of the next one, in the units of `network`."""
     count = len(crops.mean)
     index = torch.arange(count, device=crops.mean.device)
-    found = [restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count) for i in index]
-    content, style = (sum(float(each) for each in column) / count for column in zip(*found, strict=True))
+    losses = [restyling_losses(crops, network, decode, i[None], (i[None] + 1) % count) for i in index]
+    content, style = (sum(float(each) for each in column) / count for column in zip(*losses, strict=True))
     return {"content_loss": round(content, 4), "style_loss": round(style, 4)}
 
 

@@ -39,11 +39,11 @@ def find_photos(folders: Sequence[Path]) -> list[Path]:
     for folder in folders:
         if not folder.is_dir():
             raise DataError(f"{folder}: no such folder of photographs; name existing ones with --images DIR ...")
-    found = [path for folder in folders for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
-    if len(found) < 2:
+    photos = [path for folder in folders for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+    if len(photos) < 2:
         listed = ", ".join(str(folder) for folder in folders) or "no folder"
-        raise DataError(f"{listed}: {len(found)} photographs; at least 2 are needed: name more with --images DIR ...")
-    return sorted(found, key=lambda path: (hashlib.sha256(path.name.encode()).digest(), str(path)))
+        raise DataError(f"{listed}: {len(photos)} photographs; at least 2 are needed: name more with --images DIR ...")
+    return sorted(photos, key=lambda path: (hashlib.sha256(path.name.encode()).digest(), str(path)))
 
 
 def split(photos: Sequence[Path]) -> tuple[list[Path], list[Path]]:

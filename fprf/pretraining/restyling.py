@@ -68,23 +68,23 @@ class StyleNetwork(nn.Module):
 
     def forward(self, images: Annotated[Tensor, "B 3 H W"]) -> list[Annotated[Tensor, "B C h w"]]:
         """Activations of sRGB images in [0, 1], at every layer of `layers`."""
-        found = []
+        activations = []
         x = (images - self.get_buffer("mean")) / self.get_buffer("std")
         for name in self._names:
             if name in ("2_1", "3_1", "4_1"):
                 x = F.max_pool2d(x, 2, ceil_mode=True)
             x = F.relu(F.conv2d(reflect_pad(x), self.get_buffer(f"weight{name}"), self.get_buffer(f"bias{name}")))
             if name in self._taps:
-                found.append(x / self.get_buffer(f"unit{name}"))
-        return found
+                activations.append(x / self.get_buffer(f"unit{name}"))
+        return activations
 
     @torch.no_grad()
     def measure(self, images: Sequence[Annotated[Tensor, "3 H W"]]) -> None:
         """Take each filter's mean deviation over the images as its unit; filters that hardly fire are not blown up."""
         deviations = [[double(x[0]).std((1, 2), correction=0) for x in self(image[None])] for image in images]
-        for layer, found in zip(self.layers, zip(*deviations, strict=True), strict=True):
+        for layer, own_deviations in zip(self.layers, zip(*deviations, strict=True), strict=True):
             unit = self.get_buffer(f"unit{layer.removeprefix('relu')}")
-            own = torch.stack(found).mean(0).to(unit) * unit[:, 0, 0]
+            own = torch.stack(own_deviations).mean(0).to(unit) * unit[:, 0, 0]
             unit.copy_(own.clamp_min(0.01 * float(own.mean()))[:, None, None])
 
 
@@ -109,10 +109,10 @@ def style_statistics(activations: Sequence[Annotated[Tensor, "B C h w"]]) -> lis
 
 
 def style_distance(
-    found: Sequence[Annotated[Tensor, "B 2C"]], wanted: Sequence[Annotated[Tensor, "B 2C"]]
+    styled: Sequence[Annotated[Tensor, "B 2C"]], wanted: Sequence[Annotated[Tensor, "B 2C"]]
 ) -> Annotated[Tensor, ""]:
     """The style loss: mean squared differences, in the filters' units, summed over the layers."""
-    return torch.stack([F.mse_loss(a, b) for a, b in zip(found, wanted, strict=True)]).sum()
+    return torch.stack([F.mse_loss(a, b) for a, b in zip(styled, wanted, strict=True)]).sum()
 
 
 class Crops(NamedTuple):
@@ -187,11 +187,11 @@ def restyling_losses(
         crops.features[content].float(), (crops.mean[content], crops.std[content]), (crops.mean[style], crops.std[style])
     )
     colour = decode(features.flatten(0, 1)).view(len(content), crops.side, crops.side, 3)
-    found = network(colour.permute(0, 3, 1, 2))
+    activations = network(colour.permute(0, 3, 1, 2))
     wanted = [layer[style] for layer in crops.style]
     mean, std = (half[:, :, None, None] for half in wanted[CONTENT].chunk(2, 1))
-    structure = F.mse_loss(found[CONTENT], crops.structure[content].float() * std + mean)
-    return structure, style_distance(style_statistics(found), wanted)
+    structure = F.mse_loss(activations[CONTENT], crops.structure[content].float() * std + mean)
+    return structure, style_distance(style_statistics(activations), wanted)
 
 
 def _whitened(activation: Annotated[Tensor, "1 K h w"]) -> Annotated[Tensor, "1 K h w"]:

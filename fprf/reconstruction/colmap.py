@@ -110,8 +110,8 @@ def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) 
     np.fill_diagonal(likeness, -np.inf)
     count = min(nearest, max(0, len(vectors) - 1))
     best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
-    found = {(min(a, b), max(a, b)) for a, row in enumerate(best.tolist()) for b in row if np.isfinite(likeness[a, b])}
-    return sorted(found)
+    pairs = {(min(a, b), max(a, b)) for a, row in enumerate(best.tolist()) for b in row if np.isfinite(likeness[a, b])}
+    return sorted(pairs)
 
 
 def union_of_pairs(*parts: Sequence[Pair]) -> list[Pair]:

@@ -223,15 +223,15 @@ def _lens(tiff: bytes) -> Lens:
 
 def _entries(tiff: bytes, order: str, at: int) -> dict[int, bytes]:
     """Values of a directory by tag, of the types that are read."""
-    found = {}
+    entries = {}
     (count,) = struct.unpack_from(order + "H", tiff, at)
     for k in range(min(count, 256)):
         tag, kind, number = struct.unpack_from(order + "HHI", tiff, at + 2 + 12 * k)
         size, place = _SIZES.get(kind, 0) * number, at + 10 + 12 * k
         if 0 < size <= 4096:
             start = place if size <= 4 else struct.unpack_from(order + "I", tiff, place)[0]
-            found[tag] = tiff[start : start + size]
-    return found
+            entries[tag] = tiff[start : start + size]
+    return entries
 
 
 _FEWEST = 3
@@ -250,19 +250,19 @@ def gather_images(source: Path, place: SceneFolder, state: State, config: SfmCon
     if state.source not in ("", here):
         raise UsageError(f"--output {place.root}: was begun with {state.source}; go on with that, or name another folder")
     if source.is_dir():
-        found = _from_folder(source, place, state, progress)
+        gathered = _from_folder(source, place, state, progress)
     elif source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES:
-        found = _from_video(source, place, state, config, progress)
+        gathered = _from_video(source, place, state, config, progress)
     else:
         kinds = " ".join(sorted(VIDEO_SUFFIXES))
         raise UsageError(f"{source}: neither a folder of images nor a video ({kinds}); check the path")
-    if len(found) < _FEWEST:
+    if len(gathered) < _FEWEST:
         why = next((f"{name}: {reason}" for name, reason in state.dropped.items()), _holds(source))
-        raise DataError(f"{source}: {len(found)} usable images, at least {_FEWEST} are needed; {why}")
-    for name in set(state.images) - set(found):
+        raise DataError(f"{source}: {len(gathered)} usable images, at least {_FEWEST} are needed; {why}")
+    for name in set(state.images) - set(gathered):
         if place.images.resolve() != source.resolve():
             (place.images / name).unlink(missing_ok=True)
-    state.source, state.images = here, {name: found[name] for name in natural_order(found)}
+    state.source, state.images = here, {name: gathered[name] for name in natural_order(gathered)}
     state.save(place)
 
 
@@ -288,13 +288,13 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
     inplace = place.images.resolve() == source.resolve()
     files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
     files = [path for path in files if not any(part.startswith(".") for part in path.relative_to(source).parts)]
-    found: dict[str, dict[str, Any]] = {}
+    entries: dict[str, dict[str, Any]] = {}
     state.dropped = {}
     for i, path in enumerate(files):
         progress(i, len(files), "reading images")
         given = path.relative_to(source).as_posix()
         name = re.sub(r"\s", "_", given)
-        if name in found or (inplace and name != given):
+        if name in entries or (inplace and name != given):
             raise UsageError(f"{path}: COLMAP takes no blanks in names; rename the image, so that no other is called {name}")
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         foreign = path.suffix.lower() in _FOREIGN
@@ -313,9 +313,9 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
             if not (inplace or foreign):
                 with atomic_path(place.images / name) as temporary:
                     shutil.copyfile(path, temporary)
-        found[name] = known
+        entries[name] = known
     progress(len(files), len(files), "reading images")
-    return found
+    return entries
 
 
 def _from_video(
@@ -330,11 +330,11 @@ def _from_video(
     save_frames(source, choice.chosen, place.images, progress)
     state.dropped = {f"frame {frame}": reason for frame, reason in choice.dropped.items()}
     state.done["frames"] = key
-    found = {}
+    frames = {}
     for frame in choice.chosen:
         path = place.images / frame_name(frame)
-        found[path.name] = _described(path, hashlib.sha256(path.read_bytes()).hexdigest())
-    return found
+        frames[path.name] = _described(path, hashlib.sha256(path.read_bytes()).hexdigest())
+    return frames
 
 
 def _write_jpeg(path: Path, target: Path) -> None:

@@ -121,18 +121,18 @@ class Drop(NamedTuple):
 
 
 def dropped_images(
-    names: Sequence[str], unused: Mapping[str, str], found: Matches, models: Sequence[Mapping[str, Any]]
+    names: Sequence[str], unused: Mapping[str, str], matches: Matches, models: Sequence[Mapping[str, Any]]
 ) -> list[Drop]:
     """Every image without a pose in the first of the `models`, in the order of the steps."""
     posed = set(models[0]["images"]) if models else set()
     drops = [Drop(name, "choosing", reason) for name, reason in unused.items()]
-    lost = [_lost(name, found, models) for name in names if name not in posed]
+    lost = [_lost(name, matches, models) for name in names if name not in posed]
     order = ("features", "matching", "mapping")
     return drops + sorted(lost, key=lambda drop: order.index(drop.step))
 
 
-def _lost(name: str, found: Matches, models: Sequence[Mapping[str, Any]]) -> Drop:
-    features, partners = found.features_of(name), found.partners(name, _LEAST)
+def _lost(name: str, matches: Matches, models: Sequence[Mapping[str, Any]]) -> Drop:
+    features, partners = matches.features_of(name), matches.partners(name, _LEAST)
     if not features:
         return Drop(name, "features", "nothing with texture in it, or COLMAP cannot decode it")
     if not partners:

@@ -94,8 +94,8 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float) -> None:
     write_json(path, content)
 
 
-def _wrong(path: Path, where: str, allowed: str, found: object) -> NoReturn:
-    shown = json.dumps(found)
+def _wrong(path: Path, where: str, allowed: str, value: object) -> NoReturn:
+    shown = json.dumps(value)
     shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
     raise DataError(f"{path}: {where or 'the file'} is {shown}; must be {allowed}; export the camera path again")
 

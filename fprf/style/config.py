@@ -73,8 +73,8 @@ def parse_strength(field: str, text: str) -> tuple[str, float]:
 
 def pixel_of(text: str) -> Pixel | None:
     """`X,Y` as a pixel; None where it is something else, such as the name of a mask."""
-    found = _PIXEL.fullmatch(text)
-    return Pixel(float(found[1]), float(found[2])) if found else None
+    match = _PIXEL.fullmatch(text)
+    return Pixel(float(match[1]), float(match[2])) if match else None
 
 
 def labels(paths: Sequence[Path]) -> tuple[str, ...]:

@@ -86,8 +86,8 @@ class Restyle:
         shown = [(part, *part._alone(content, semantic)) for part in self.parts if part.share > 0]
         styled, strength, luminance = _mix([(part.share, applied) for part, applied, _ in shown])
         colour: Tensor = decoder.restyled(content, styled, strength)
-        found = (part._recoloured(colour, semantic, belongs) for part, _, belongs in shown)
-        change = [x for x in found if x is not None]
+        changes = (part._recoloured(colour, semantic, belongs) for part, _, belongs in shown)
+        change = [x for x in changes if x is not None]
         if change:
             colour = (colour + torch.stack(change).sum(0)).clamp(0, 1)
         return keep_luminance(colour, decoder(content), luminance) if luminance > 0 else colour

@@ -89,8 +89,8 @@ def scene_style(
     keys, belongs = keys[alive], belongs * double(weights)[:, None]
     mean, covariances, share = group_moments(content, belongs)
     contacts = share.new_zeros(len(share), len(share))
-    found = (whole.mean, covariance(whole), keys, mean, covariances, share, middle, contacts)
-    return SceneStyle(*(table.float().cpu() for table in found))
+    measured = (whole.mean, covariance(whole), keys, mean, covariances, share, middle, contacts)
+    return SceneStyle(*(table.float().cpu() for table in measured))
 
 
 def region_units(keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"]) -> tuple[Annotated[Tensor, "K D"], float]:

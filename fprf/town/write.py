@@ -68,10 +68,10 @@ def _files(views: int) -> list[str]:
 def _complete(folder: Path, settings: TownSettings) -> bool:
     """Whether a folder holds exactly these settings, all files present."""
     try:
-        found = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
+        record = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
-    same = isinstance(found, dict) and found.get("settings") == asdict(settings)
+    same = isinstance(record, dict) and record.get("settings") == asdict(settings)
     return same and all((folder / name).is_file() for name in _files(settings.views))
 
 

@@ -132,13 +132,13 @@ _MOVING = "moving-"
 
 def trained_tasks(root: Path) -> dict[Path, str]:
     """Folders of blocks in a run, whatever their numbers, and what each was begun as."""
-    found = {}
+    tasks = {}
     for mark in sorted((root / "blocks").glob("*/task.json")):
         try:
-            found[mark.parent] = str(json.loads(mark.read_text())["task"])
+            tasks[mark.parent] = str(json.loads(mark.read_text())["task"])
         except (OSError, ValueError, KeyError, TypeError):
             continue  # cut short while it was written: as good as not begun
-    return found
+    return tasks
 
 
 def renumber(root: Path, asked: Mapping[int, str]) -> None:

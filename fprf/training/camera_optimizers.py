@@ -70,10 +70,10 @@ class Poses(nn.Module):
 
     def going_on(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...]) -> "Poses":
         """Poses that start as these are now, and learn from other views."""
-        found = Poses(centres, held, reach=self.reach, pace=self.pace)
+        poses = Poses(centres, held, reach=self.reach, pace=self.pace)
         with torch.no_grad():
-            found.known.copy_(self.moves())
-        return found
+            poses.known.copy_(self.moves())
+        return poses
 
 
 def moved(
@@ -90,8 +90,8 @@ def rotated(x: Annotated[Tensor, "N 3"], turn: Annotated[Tensor, "N 3"]) -> Anno
     across = torch.linalg.cross(turn, x)
     # (1 - cos a) / a^2 by the half angle: 1 - cos would cancel.
     half = torch.sin(angle / 2) / (angle / 2)
-    found: Tensor = x + torch.sin(angle) / angle * across + 0.5 * half.square() * torch.linalg.cross(turn, across)
-    return found
+    turned: Tensor = x + torch.sin(angle) / angle * across + 0.5 * half.square() * torch.linalg.cross(turn, across)
+    return turned
 
 
 def moving(rays: Rays) -> Rays:
@@ -121,8 +121,8 @@ def _gauge(centres: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "6M G"]:
         return matrix
     basis, size, _ = torch.linalg.svd(matrix, full_matrices=False)
     # One view alone can be put anywhere; views in one place cannot be told to scale.
-    found: Tensor = basis[:, size > 1e-9 * size[0]]
-    return found
+    kernel: Tensor = basis[:, size > 1e-9 * size[0]]
+    return kernel
 
 
 class Tones(nn.Module):

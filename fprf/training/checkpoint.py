@@ -42,12 +42,12 @@ def _folder(root: Path, step: int) -> Path:
 
 def steps(root: Path) -> list[int]:
     """Steps of the complete checkpoints, oldest first."""
-    found = []
+    numbers = []
     for manifest in root.glob("step-*/manifest.json"):
         digits = manifest.parent.name.removeprefix("step-")
         if digits.isdecimal():
-            found.append(int(digits))
-    return sorted(found)
+            numbers.append(int(digits))
+    return sorted(numbers)
 
 
 def save(root: Path, model: Model, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> Path:
@@ -71,8 +71,8 @@ def write(root: Path, model: Mapping[str, Tensor], optimizer: Mapping[str, Tenso
     except DataError:
         tidy(root)
         raise
-    found = steps(root)
-    for old in [s for s in found if s <= step][:-KEEP] + [s for s in found if s > step]:
+    written = steps(root)
+    for old in [s for s in written if s <= step][:-KEEP] + [s for s in written if s > step]:
         (_folder(root, old) / "manifest.json").unlink()
         shutil.rmtree(_folder(root, old))
     return folder
@@ -105,12 +105,12 @@ def load(root: Path, step: int) -> Saved:
 
 def reached(root: Path) -> tuple[int, float]:
     """Step and seconds of the newest checkpoint, (0, 0) without one. Raises CheckpointError."""
-    found = steps(root)
-    if not found:
+    kept = steps(root)
+    if not kept:
         return 0, 0.0
-    manifest = _folder(root, found[-1]) / "manifest.json"
+    manifest = _folder(root, kept[-1]) / "manifest.json"
     try:
-        return found[-1], float(_read(manifest)["seconds"])
+        return kept[-1], float(_read(manifest)["seconds"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:
         raise CheckpointError(f"{manifest}: cannot be read ({e!r})") from e
 

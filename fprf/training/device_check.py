@@ -58,10 +58,10 @@ def compare(device: torch.device) -> list[Outcome]:
     """Features, gradients, a render and a restyle on a device, against plain torch on the CPU."""
     with backend.plain():
         expected = _computed(torch.device("cpu"))
-    found = _computed(device)
+    computed = _computed(device)
     outcomes = []
     for what, allowed in _ALLOWED.items():
-        away, like = double(found[what].cpu()) - double(expected[what]), double(expected[what])
+        away, like = double(computed[what].cpu()) - double(expected[what]), double(expected[what])
         error = float(away.abs().max() if what in ("render", "restyle") else away.norm() / like.norm())
         outcomes.append(Outcome(what, math.inf if math.isnan(error) else error, allowed))
     return outcomes
@@ -96,12 +96,12 @@ def _computed(device: torch.device) -> dict[str, Tensor]:
     image = _uniform(3, 48, 64).to(device)
     with torch.no_grad():
         features: Tensor = encoder(image[None])[0]
-    found = {"encoder": features, "training step": _gradients(model, cameras, image)}
+    results = {"encoder": features, "training step": _gradients(model, cameras, image)}
     model.requires_grad_(False).eval()
     look = _restyle(model, features.flatten(1).T, image)
     for name, restyle in (("render", None), ("restyle", look)):
-        found[name] = render_view(model, facts, cameras, 0, config.render, restyle).rgb
-    return found
+        results[name] = render_view(model, facts, cameras, 0, config.render, restyle).rgb
+    return results
 
 
 def _tiny(encoder: str, channels: int) -> tuple[TrainConfig, Facts]:

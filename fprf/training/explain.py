@@ -62,16 +62,16 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[Region]:
     mass = torch.stack([_mass(regions, view) for view in looked])
     best = [looked[int(mass[:, k].argmax())] for k in range(count)]
     seen = {view: _seen(regions, view) for view in sorted(set(best))}
-    found = []
+    rows = []
     for k, view in enumerate(best):
         colour, share = seen[view]
         width, height = regions.views.cameras.size[view].tolist()
         pixel = _middle(share[..., k], (width, height))
-        found.append(Region(k, float(regions.scene.share[k]), names[view], pixel, highlight(colour, share[..., k])))
+        rows.append(Region(k, float(regions.scene.share[k]), names[view], pixel, highlight(colour, share[..., k])))
     if styled is None:
-        return found
+        return rows
     attention = styled.restyle.stylizer.match(regions.scene.keys.to(regions.views.device)).cpu().double()
-    return [_matched(region, styled, attention[region.number]) for region in found]
+    return [_matched(region, styled, attention[region.number]) for region in rows]
 
 
 def region_row(region: Region) -> dict[str, Any]:

@@ -83,20 +83,20 @@ def planes(cameras: Cameras, frame: int, takes: Sequence[Take], eyes: float | No
 
     Z is the distance along the ray in world units, 0 where nothing is; normals are in world axes and absent in stereo.
     """
-    found: dict[str, NDArray[np.float32]] = {}
+    layers: dict[str, NDArray[np.float32]] = {}
     view = None
     for take in takes:
         view = shoot(take.scene(frame), cameras, frame, eyes)
         layer = "" if len(takes) == 1 else f"{take.name}."
         light = srgb_to_linear(view.rgb.numpy())
-        found |= {f"{layer}{name}": light[..., k] for k, name in enumerate("RGB")}
+        layers |= {f"{layer}{name}": light[..., k] for k, name in enumerate("RGB")}
     assert view is not None
-    found["A"] = view.opacity.numpy()
-    found["Z"] = torch.where(view.opacity > 0, view.depth, 0).nan_to_num(0.0, 0.0, 0.0).float().numpy()
+    layers["A"] = view.opacity.numpy()
+    layers["Z"] = torch.where(view.opacity > 0, view.depth, 0).nan_to_num(0.0, 0.0, 0.0).float().numpy()
     if eyes is None:
         facing = normals(cameras, frame, view.depth).numpy()
-        found |= {f"N.{name}": facing[..., k] for k, name in enumerate("XYZ")}
-    return found
+        layers |= {f"N.{name}": facing[..., k] for k, name in enumerate("XYZ")}
+    return layers
 
 
 def _eye(scene: Scene, strips: Cameras) -> View:

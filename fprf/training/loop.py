@@ -109,10 +109,10 @@ def unfit_terms(loss: Tensor, parts: Mapping[str, Tensor]) -> str | None:
 
 def unfit_gradients(parameters: Iterable[tuple[str, nn.Parameter]]) -> str | None:
     """Names of the parameters whose gradient is not finite, or too large to be squared; None where all are well."""
-    found = [(name, p.grad) for name, p in parameters if p.grad is not None]
-    if not found or bool(torch.nn.utils.get_total_norm([grad for _, grad in found]) < LARGEST):
+    gradients = [(name, p.grad) for name, p in parameters if p.grad is not None]
+    if not gradients or bool(torch.nn.utils.get_total_norm([grad for _, grad in gradients]) < LARGEST):
         return None
-    bad = [name for name, grad in found if not bool(grad.norm() < LARGEST)]
+    bad = [name for name, grad in gradients if not bool(grad.norm() < LARGEST)]
     more = f" and {len(bad) - _NAMED} more" if len(bad) > _NAMED else ""
     return f"the gradient of {', '.join(bad[:_NAMED]) or 'all parameters together'}{more}"
 
@@ -148,9 +148,9 @@ class StepStatistics:
             # Filled on the device: a term that comes every few steps must not have the host wait for a copy.
             marks = [torch.full_like(self.none, float(name in values)) for name in self.names]
             self._present[given] = torch.stack(marks).to(self.rows.dtype)
-        found = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
-        fit = torch.isfinite(found)
-        means = SMOOTHING * self.rows[:2] + (1 - SMOOTHING) * torch.stack([found, self._present[given]])
+        row = torch.stack([values.get(name, self.none) for name in self.names]).to(self.rows.dtype)
+        fit = torch.isfinite(row)
+        means = SMOOTHING * self.rows[:2] + (1 - SMOOTHING) * torch.stack([row, self._present[given]])
         bad = self.rows[2] + self._present[given] * ~fit
         self.rows = torch.cat([torch.where(fit, means, self.rows[:2]), bad[None]])
 

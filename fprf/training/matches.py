@@ -67,37 +67,37 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
         return torch.cat([taken, (taken * near).sum(1, keepdim=True), belongs(semantic)], 1)
 
     pixel = pixel_grid(cameras, view)
-    found, opacity = here.paint(cameras, view, pixel, values, semantic=belongs.divided)
+    shares, opacity = here.paint(cameras, view, pixel, values, semantic=belongs.divided)
     width, height = (int(v) for v in cameras.size[view])
-    found = found.view(height, width, -1)
-    taken = found[..., :codes]
-    score = found[..., codes] / taken.sum(-1).clamp_min(1e-10)
-    return MatchMap(taken, score.clamp(-1, 1), found[..., codes + 1 :], opacity.view(height, width))
+    shares = shares.view(height, width, -1)
+    taken = shares[..., :codes]
+    score = shares[..., codes] / taken.sum(-1).clamp_min(1e-10)
+    return MatchMap(taken, score.clamp(-1, 1), shares[..., codes + 1 :], opacity.view(height, width))
 
 
-def match_pictures(found: MatchMap, codes: Codes) -> dict[str, Picture]:
+def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
     """`match` (hue = reference, shade = code, darkness = doubt, pale = kept), `score` (0 to 1) and `entropy` (0 to log2 T)."""
     most = math.log2(max(2, len(codes.reference)))
     return {
-        "match": match_image(found.attention, codes.reference, codes.names, found.opacity, found.kept),
-        "score": scale_image(found.score, 0.0, 1.0, found.opacity * (1 - found.kept)),
-        "entropy": scale_image(found.entropy, 0.0, most, found.opacity * (1 - found.kept)),
+        "match": match_image(matched.attention, codes.reference, codes.names, matched.opacity, matched.kept),
+        "score": scale_image(matched.score, 0.0, 1.0, matched.opacity * (1 - matched.kept)),
+        "entropy": scale_image(matched.entropy, 0.0, most, matched.opacity * (1 - matched.kept)),
     }
 
 
-def summarize(found: MatchMap, codes: Codes) -> dict[str, Any]:
+def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     """How the references and their codes were used, and how surely, over the pixels of a view by their opacity."""
-    each = found.opacity.double()
+    each = matched.opacity.double()
     total = float(each.sum()) or 1.0
-    weight = each * (1 - found.kept)
+    weight = each * (1 - matched.kept)
     styled = float(weight.sum()) or 1.0
-    of_code = (found.taken.double() * each[..., None]).sum((0, 1)) / total
-    of_region = (found.region.double() * each[..., None]).sum((0, 1)) / total
+    of_code = (matched.taken.double() * each[..., None]).sum((0, 1)) / total
+    of_region = (matched.region.double() * each[..., None]).sum((0, 1)) / total
     cluster = clusters(codes)
     return {
-        **match_summary(found.attention, codes.reference, codes.names, weight),
-        "score": float((found.score * weight).sum()) / styled,
-        "kept_share": float((found.kept * each).sum()) / total,
+        **match_summary(matched.attention, codes.reference, codes.names, weight),
+        "score": float((matched.score * weight).sum()) / styled,
+        "kept_share": float((matched.kept * each).sum()) / total,
         "codes": [
             {"reference": codes.names[int(codes.reference[t])], "cluster": int(cluster[t]), "share": float(of_code[t])}
             for t in of_code.argsort(descending=True).tolist()
@@ -107,18 +107,18 @@ def summarize(found: MatchMap, codes: Codes) -> dict[str, Any]:
     }
 
 
-def write_pixels(path: Path, found: MatchMap, codes: Codes) -> None:
+def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
     """Write an .npz: reference, cluster, region (int16, -1 where nothing is), score, entropy_bits, kept, opacity, names."""
-    code = found.taken.argmax(-1)
-    some, styled = found.opacity > 0.5, found.taken.sum(-1) > 0.5
+    code = matched.taken.argmax(-1)
+    some, styled = matched.opacity > 0.5, matched.taken.sum(-1) > 0.5
     arrays = {
         "reference": torch.where(some & styled, codes.reference[code], -1).short(),
         "cluster": torch.where(some & styled, clusters(codes)[code], -1).short(),
-        "region": torch.where(some, found.region.argmax(-1), -1).short(),
-        "score": found.score,
-        "entropy_bits": found.entropy,
-        "kept": found.kept,
-        "opacity": found.opacity,
+        "region": torch.where(some, matched.region.argmax(-1), -1).short(),
+        "score": matched.score,
+        "entropy_bits": matched.entropy,
+        "kept": matched.kept,
+        "opacity": matched.opacity,
     }
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:

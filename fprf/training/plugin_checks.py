@@ -129,14 +129,14 @@ def _look(
         raise _breach(config, what, f"numbers in [{low:g}, {high:g}]", f"{float(found.min()):g} to {float(found.max()):g}")
 
 
-def _breach(config: PluginConfig, what: str, expected: str, found: str) -> PluginError:
+def _breach(config: PluginConfig, what: str, expected: str, actual: str) -> PluginError:
     try:
         name = registry.name_of(config.group, type(config))
         who = f"{config.group}: {name!r} ({registry.entry(config.group, name).origin})"
     except PluginError:  # of a test, or of a script
         who = f"{type(config).__module__}:{type(config).__qualname__}"
     return PluginError(
-        f"{who}: {what}: expected {expected}, found {found}; mend or uninstall that package, or choose another plug-in"
+        f"{who}: {what}: expected {expected}, found {actual}; mend or uninstall that package, or choose another plug-in"
     )
 
 

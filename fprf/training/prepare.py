@@ -321,14 +321,14 @@ def plugin_needs(config: TrainConfig) -> list[Need]:
 
     Raises PluginError where a plug-in cannot say what it needs.
     """
-    found = []
+    missing = []
     for slot in slots(config):
         try:
             needs = () if slot.value is None else tuple(slot.value.needs())
         except Exception as error:  # a stranger's
             raise PluginError(f"{slot.path}: cannot say what it needs ({type(error).__name__}: {error})") from error
-        found += [need._replace(what=f"{slot.path}: {need.what}") for need in needs]
-    return found
+        missing += [need._replace(what=f"{slot.path}: {need.what}") for need in needs]
+    return missing
 
 
 def decoder_needs(config: TrainConfig) -> list[Need]:

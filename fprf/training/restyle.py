@@ -235,11 +235,11 @@ class _Book:
         name = self.references[reference].name
         return name if self.names[reference] == name else str(reference)
 
-    def name(self, found: Found) -> str:
+    def name(self, region: Found) -> str:
         """What the region is called in a style file, which holds its key under that name."""
-        if found.name in self.regions.keys or not self.keys:
-            return found.name
-        key, name = key_of(self.regions, found.number), f"region{found.number}"
+        if region.name in self.regions.keys or not self.keys:
+            return region.name
+        key, name = key_of(self.regions, region.number), f"region{region.number}"
         known = [other for other, its in self.keys.items() if its == key]
         if known:
             return known[0]

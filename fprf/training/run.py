@@ -272,12 +272,12 @@ def image_hashes(scene: Scene) -> dict[str, str]:
         return dict(zip(view_names(scene.paths), pool.map(of, scene.paths), strict=True))
 
 
-def save_image_hashes(root: Path, found: Mapping[str, str]) -> None:
+def save_image_hashes(root: Path, hashes: Mapping[str, str]) -> None:
     """Write images.json."""
-    write_json(root / IMAGES, {"format": _IMAGES_FORMAT, "images": dict(found)})
+    write_json(root / IMAGES, {"format": _IMAGES_FORMAT, "images": dict(hashes)})
 
 
-def check_images(root: Path, scene: Scene, found: Mapping[str, str]) -> None:
+def check_images(root: Path, scene: Scene, hashes: Mapping[str, str]) -> None:
     """Raise UsageError where images differ from those that the run in a folder was begun with; no run, or one of before
     there was a list, has none.
     """
@@ -290,9 +290,9 @@ def check_images(root: Path, scene: Scene, found: Mapping[str, str]) -> None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: cannot be read ({error!r}); remove it, and the images are taken as they are") from error
     files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
-    changed = [f"{files[name]} is another" for name in found if name in before and before[name] != found[name]]
-    changed += [f"{files[name]} is new" for name in found if name not in before]
-    changed += [f"{name} is gone" for name in before if name not in found]
+    changed = [f"{files[name]} is another" for name in hashes if name in before and before[name] != hashes[name]]
+    changed += [f"{files[name]} is new" for name in hashes if name not in before]
+    changed += [f"{name} is gone" for name in before if name not in hashes]
     if changed:
         more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
         raise UsageError(
@@ -324,11 +324,11 @@ def read_history(run: Path) -> list[History]:
     where there is no line at all.
     """
     files = [run / "events.jsonl", *sorted((run / "blocks").glob("*/events.jsonl"))]
-    found = [_history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()]
-    found = [history for history in found if history.step or history.parts]
-    if not found:
+    histories = [_history("" if file.parent == run else file.parent.name, file) for file in files if file.is_file()]
+    histories = [history for history in histories if history.step or history.parts]
+    if not histories:
         raise CheckpointError(f"{run}: no events.jsonl with a line of training; `fprf train` writes it as it goes")
-    return found
+    return histories
 
 
 def _history(name: str, file: Path) -> History:

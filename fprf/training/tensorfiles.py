@@ -42,11 +42,11 @@ def _write(path: Path, plain: dict[str, Tensor], metadata: dict[str, str] | None
         try:
             safetensors.torch.save_file(plain, temporary, metadata)
         except SafetensorError as error:
-            found = _SYSTEM.search(str(error))
-            if found is None:
+            match = _SYSTEM.search(str(error))
+            if match is None:
                 raise
             needed = sum(t.nbytes for t in plain.values())
-            raise unwritable(path, OSError(int(found[1]), str(error)), needed) from error
+            raise unwritable(path, OSError(int(match[1]), str(error)), needed) from error
 
 
 def save(path: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:

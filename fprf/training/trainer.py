@@ -141,8 +141,8 @@ def train(
 
 def _less(run: Run) -> str:
     """What to do where there is not enough memory for a step."""
-    found = checkpoint.steps(run.checkpoints)
-    kept = f"the checkpoint of step {found[-1]} is kept" if found else "there is no checkpoint yet"
+    steps = checkpoint.steps(run.checkpoints)
+    kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
     return f"lower --datamanager.rays, or begin anew with a larger --downscale ({kept})"
 
 
@@ -324,15 +324,15 @@ class Batches:
     def __call__(self, step: int) -> Batch:
         """The batch of a step, as the manager draws it, or in pinned memory."""
         if self._next is None:
-            found = self.manager.batch(step)
-            if found.rgb.device.type != "cpu" or self.device.type == "cpu":
-                return found
+            batch = self.manager.batch(step)
+            if batch.rgb.device.type != "cpu" or self.device.type == "cpu":
+                return batch
         elif self._next[0] == step:
-            found = self._next[1].result()
+            batch = self._next[1].result()
         else:  # after going back
-            found = self._later(step).result()
+            batch = self._later(step).result()
         self._next = (step + 1, self._later(step + 1))
-        return found
+        return batch
 
     def _later(self, step: int) -> "Future[Batch]":
         if self._thread is None:

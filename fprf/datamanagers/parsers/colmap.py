@@ -286,14 +286,14 @@ def cloud_of_images(model: ColmapModel, images: Sequence[ColmapImage]) -> Cloud:
     finite = np.isfinite(model.points).all(1)
     ids = model.point_ids[finite]
     order = np.argsort(ids, kind="stable")
-    found = []
+    records = []
     for view, image in enumerate(images):
         at = np.searchsorted(ids, image.observed, sorter=order)
         inside = at < len(ids)
         point = order[at[inside]]
         point = np.unique(point[ids[point] == image.observed[inside]])
-        found.append(np.stack([np.full(len(point), view), point], 1))
-    return model.points[finite], np.concatenate(found).astype(np.int64) if found else np.zeros((0, 2), np.int64)
+        records.append(np.stack([np.full(len(point), view), point], 1))
+    return model.points[finite], np.concatenate(records).astype(np.int64) if records else np.zeros((0, 2), np.int64)
 
 
 def cloud_of_model(folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float64]]) -> Cloud | None:

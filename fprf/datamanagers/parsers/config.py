@@ -181,8 +181,8 @@ class BlockNerfConfig(DataParserConfig):
         from .blocknerf import is_record
 
         names = (path.name for depth in ("*", "*/*", "*/*/*", "*/*/*/*") for path in data.glob(f"{depth}.tfrecord*"))
-        found = next(filter(is_record, names), None)
-        return Recognised(0.3, found) if found is not None else None
+        record = next(filter(is_record, names), None)
+        return Recognised(0.3, record) if record is not None else None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -236,8 +236,8 @@ class PolycamConfig(DataParserConfig):
         """By folders of images and cameras."""
         from .polycam import keyframes
 
-        found = keyframes(data)
-        return Recognised(0.3, f"{found[1]}") if found is not None else None
+        record = keyframes(data)
+        return Recognised(0.3, f"{record[1]}") if record is not None else None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -260,8 +260,8 @@ class Record3DConfig(DataParserConfig):
         """By the metadata and the folder of images."""
         from .record3d import recording
 
-        found = recording(data)
-        return Recognised(0.3, found[0].name) if found is not None else None
+        record = recording(data)
+        return Recognised(0.3, record[0].name) if record is not None else None
 
     def build(self) -> DataParser:
         """The parser."""
@@ -281,8 +281,8 @@ class OdmConfig(DataParserConfig):
         """By the reconstruction or the report."""
         from .odm import project_file
 
-        found = project_file(data)
-        return Recognised(0.3, found.name) if found is not None else None
+        record = project_file(data)
+        return Recognised(0.3, record.name) if record is not None else None
 
     def build(self) -> DataParser:
         """The parser."""

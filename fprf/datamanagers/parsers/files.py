@@ -71,12 +71,12 @@ def read_json(path: Path) -> Json:
         return int(text)
 
     def once(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
-        found: dict[str, Json] = {}
+        members: dict[str, Json] = {}
         for key, value in pairs:
-            if key in found:
+            if key in members:
                 raise ValueError(f"the key {key!r} occurs twice in one object")
-            found[key] = value
-        return found
+            members[key] = value
+        return members
 
     data = read_bytes(path)
     try:
@@ -204,10 +204,10 @@ class Record:
             return None
         if not isinstance(value, list):
             raise DataError(f"{self.where}: {key} is {_short(value)}, not a list of strings; correct it")
-        found = [item for item in value if isinstance(item, str)]
-        if len(found) != len(value):
+        strings = [item for item in value if isinstance(item, str)]
+        if len(strings) != len(value):
             raise DataError(f"{self.where}: {key} holds something that is not a string; correct it")
-        return found
+        return strings
 
     def matrix(self, key: str) -> NDArray[np.float64]:
         """A list of 3 or 4 rows of 4 numbers."""

@@ -62,10 +62,10 @@ class PhotoTourismParser(DataParser):
             if not path.is_file():
                 raise DataError(f"{path}: no such table; name one of the folder's with parser.list")
             return path
-        found = sorted(data.glob("*.tsv"))
-        if len(found) != 1:
-            raise DataError(f"{data}: {len(found)} tables *.tsv; exactly one is needed, or its name in parser.list")
-        return found[0]
+        tables = sorted(data.glob("*.tsv"))
+        if len(tables) != 1:
+            raise DataError(f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list")
+        return tables[0]
 
 
 def read_list(path: Path) -> dict[str, str]:
@@ -75,7 +75,7 @@ def read_list(path: Path) -> dict[str, str]:
             rows = list(csv.DictReader(file, delimiter="\t"))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read ({error}); download the table again") from error
-    found = {}
+    views = {}
     for number, row in enumerate(rows, 2):
         name, split, id_ = row.get("filename"), row.get("split"), row.get("id")
         if not name or split is None or id_ is None:
@@ -84,5 +84,5 @@ def read_list(path: Path) -> dict[str, str]:
             continue
         if split not in ("train", "test"):
             raise DataError(f"{path}: line {number}: split is {split!r}; train and test are known")
-        found[name] = split
-    return found
+        views[name] = split
+    return views

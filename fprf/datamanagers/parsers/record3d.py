@@ -30,8 +30,8 @@ _MOST = 1e6
 
 def recording(data: Path) -> tuple[Path, Path] | None:
     """The metadata and the folder of images in a scene folder, or None."""
-    found = ((data / file, data / images) for file, images in _PAIRS)
-    return next(((file, images) for file, images in found if file.is_file() and images.is_dir()), None)
+    pairs = ((data / file, data / images) for file, images in _PAIRS)
+    return next(((file, images) for file, images in pairs if file.is_file() and images.is_dir()), None)
 
 
 class Record3DParser(DataParser):

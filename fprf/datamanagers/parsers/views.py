@@ -31,8 +31,8 @@ MASKS, SKY_MASKS = "masks", "sky_masks"
 def find_masks(data: Path, images: Sequence[Path], name: str) -> tuple[Path | None, ...]:
     """The mask of each image, None where there is none; nothing at all where the capture has none of that name."""
     known: dict[Path, bool] = {}
-    found = tuple(_mask(data, image, name, known) for image in images)
-    return found if any(mask is not None for mask in found) else ()
+    masks = tuple(_mask(data, image, name, known) for image in images)
+    return masks if any(mask is not None for mask in masks) else ()
 
 
 def _mask(data: Path, image: Path, name: str, known: dict[Path, bool]) -> Path | None:

@@ -248,15 +248,15 @@ def _check_transformer(layer: int, stride: int) -> None:
 
 
 def _transformer_needs(model: str) -> tuple[Need, ...]:
-    found = []
+    needs = []
     if importlib.util.find_spec("transformers") is None:
         ships = "or choose an encoder that ships: --semantic.encoder bundled-semantic"
-        found.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
+        needs.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
     hub = os.environ.get("HF_HUB_CACHE") or Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface") / "hub"
     cached = any(Path(hub).glob(f"models--{model.replace('/', '--')}/snapshots/*/config.json"))
     if not cached and not (Path(model) / "config.json").is_file():
-        found.append(Need(f"the model {model}", f"hf download {model}", downloaded=True))
-    return tuple(found)
+        needs.append(Need(f"the model {model}", f"hf download {model}", downloaded=True))
+    return tuple(needs)
 
 
 @dataclass(frozen=True, kw_only=True)

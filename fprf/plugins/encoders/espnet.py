@@ -77,19 +77,19 @@ def _pyramid_pool(tensors: FrozenTensors, x: Tensor, name: str) -> Tensor:
     """One depthwise convolution at each of several sizes, merged channel by channel."""
     x = _convolved(tensors, x, f"{name}.projection_layer.cbr")
     size = (x.shape[2], x.shape[3])
-    found = []
+    levels = []
     for index, scale in enumerate(SCALES):
         scaled = (max(SMALLEST, math.ceil(size[0] * scale)), max(SMALLEST, math.ceil(size[1] * scale)))
         stage = f"{name}.stages.{index}"
         if scale > 1:
             larger = F.interpolate(x, scaled, mode="bilinear", align_corners=True)
-            found.append(F.adaptive_avg_pool2d(convolve(tensors, larger, stage), size))
+            levels.append(F.adaptive_avg_pool2d(convolve(tensors, larger, stage), size))
         elif scale < 1:
             smaller = convolve(tensors, F.adaptive_avg_pool2d(x, scaled), stage)
-            found.append(F.interpolate(smaller, size, mode="bilinear", align_corners=True))
+            levels.append(F.interpolate(smaller, size, mode="bilinear", align_corners=True))
         else:
-            found.append(convolve(tensors, x, stage))
-    joined = normed_activation(tensors, torch.cat(found, dim=1), f"{name}.merge_layer.0.br", ("0", "1"))
+            levels.append(convolve(tensors, x, stage))
+    joined = normed_activation(tensors, torch.cat(levels, dim=1), f"{name}.merge_layer.0.br", ("0", "1"))
     # Channel by channel, all sizes of it together: what the grouped convolution after it takes.
     batch, channels = joined.shape[:2]
     joined = joined.view(batch, len(SCALES), channels // len(SCALES), *size).transpose(1, 2).flatten(1, 2)

@@ -96,12 +96,12 @@ def vgg_activations(encoder: VggEncoder, images: Annotated[Tensor, "B 3 H W"]) -
 
 def reaches(tensors: Mapping[str, Tensor], network: str) -> list[str]:
     """Layers whose convolutions, and all before them, are there."""
-    found = []
+    layers = []
     for name, place in CONVOLUTIONS[network].items():
         if f"features.{place}.weight" not in tensors or f"features.{place}.bias" not in tensors:
             break
-        found.append(f"relu{name}")
-    return found
+        layers.append(f"relu{name}")
+    return layers
 
 
 def _tensor(tensors: Mapping[str, Tensor], network: str, name: str, part: str, source: str) -> Tensor:
@@ -199,15 +199,15 @@ def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
     The 1x1 convolution at its start turns colours; it goes into the first 3x3 one, which mirrored borders leave exact.
     """
-    found = {}
+    renamed = {}
     for at, (name, place) in enumerate(CONVOLUTIONS["vgg19"].items()):
         theirs = 2 + 3 * at + int(name[0]) - 1
         for part in ("weight", "bias"):
             if f"{theirs}.{part}" in tensors:
-                found[f"features.{place}.{part}"] = tensors[f"{theirs}.{part}"]
-    if {"features.0.weight", "features.0.bias"} <= found.keys() and "0.bias" in tensors:
-        first = found["features.0.weight"].double()
+                renamed[f"features.{place}.{part}"] = tensors[f"{theirs}.{part}"]
+    if {"features.0.weight", "features.0.bias"} <= renamed.keys() and "0.bias" in tensors:
+        first = renamed["features.0.weight"].double()
         turn, shift = tensors["0.weight"][:, :, 0, 0].double(), tensors["0.bias"].double()
-        found["features.0.weight"] = torch.einsum("okyx,ki->oiyx", first, turn).float()
-        found["features.0.bias"] = (found["features.0.bias"] + torch.einsum("okyx,k->o", first, shift)).float()
-    return found
+        renamed["features.0.weight"] = torch.einsum("okyx,ki->oiyx", first, turn).float()
+        renamed["features.0.bias"] = (renamed["features.0.bias"] + torch.einsum("okyx,k->o", first, shift)).float()
+    return renamed
