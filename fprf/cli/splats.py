@@ -159,22 +159,36 @@ def _described(scene: "Scene") -> str:
 
 
 def _train_cells(config: "GaussiansConfig", folder: "Run", scene: "Scene", display: Display, start: float) -> None:
-    """Train all cells, those with the most points first, and write their union."""
-    from ..splats.cell_training import CellTask, unite, write_cells
+    """Train the whole scene coarsely, then all cells, those with the largest windows first, and write their union."""
+    from ..splats.cell_training import CellTask, train_overview, unite, write_cells
+    from .progress import EventLog
 
     assert config.data is not None
     cells = write_cells(folder.root, scene, config.cells)
-    pixels = sum(width * height for cell in cells for _, _, width, height in cell.windows.values())
+    pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
     whole = int(scene.cameras.size[scene.train].prod(1).sum())
-    display.say(f"{_described(scene)}, {len(cells)} cells, whose windows are {pixels / whole:.2f} times the photographs")
-    minutes = None
-    if config.minutes is not None:
-        minutes = max(config.minutes - (time.perf_counter() - start) / 60, 0.05 * config.minutes) / len(cells)
+    display.say(f"{_described(scene)}, {len(cells)} cells, whose windows are {sum(pixels) / whole:.2f} times the photographs")
+    log = EventLog(folder)
+
+    def report(event: "Report") -> None:
+        display.training(event, "whole scene")
+        log(event)
+
+    if not train_overview(folder.root, config, scene, report, spent=time.perf_counter() - start):
+        display.say("the whole scene is trained already")
     root, data = str(folder.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
-    order = sorted(range(len(cells)), key=lambda cell: -len(cells[cell].points))
-    tasks = [CellTask(root=root, data=data, cell=cell, minutes=minutes, quiet=display.quiet) for cell in order]
-    config.executor.on("cpu").build().map(run_cell, tasks)
-    count = unite(folder, cells)
+    order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
+    count, executor = 0, config.executor.on("cpu").build()
+    for number in range(config.rounds):
+        minutes = None
+        if config.minutes is not None:
+            left = max(config.minutes - (time.perf_counter() - start) / 60, 0.05 * config.minutes)
+            minutes = left / (config.rounds - number) / len(cells)
+        executor.map(
+            run_cell,
+            [CellTask(root=root, data=data, round=number, cell=cell, minutes=minutes, quiet=display.quiet) for cell in order],
+        )
+        count = unite(folder.root, number, cells, folder.checkpoints if number == config.rounds - 1 else None)
     display.say(f"done after {time.perf_counter() - start:.0f} s, {count} Gaussians: fprf eval {folder.root}")
 
 
@@ -184,12 +198,12 @@ def run_cell(task: "CellTask") -> None:
     from ..training.run import Run
     from .progress import EventLog
 
-    log = EventLog(Run(folder_of(Path(task.root), task.cell)))
+    log = EventLog(Run(folder_of(Path(task.root), task.round, task.cell)))
     with Display(quiet=task.quiet) as display:
 
         def report(event: "Report") -> None:
-            display.training(event, f"cell {task.cell:02d}")
+            display.training(event, f"round {task.round}, cell {task.cell:02d}")
             log(event)
 
         if not train_cell(task, report):
-            display.say(f"cell {task.cell:02d} is finished already")
+            display.say(f"round {task.round}, cell {task.cell:02d} is finished already")

@@ -1,13 +1,20 @@
 """Cells as tasks: idempotent, resumable, each in a folder of its own, so that they can run anywhere and again.
 
+The whole scene is trained first, on photographs of half the size, up to a share of the schedule. Each cell goes on from there,
+in rounds: what is seen through the Gaussians of a neighbour is explained by both, differently, until they start from the same
+union again.
+
 RUN/cells.json                               the cut: boxes, and the windows of each
-RUN/cells/NN/checkpoints/, events.jsonl      as of any run
-RUN/cells/NN/done.json                       what the finished cell was trained as
-RUN/checkpoints/                             the union of all
+RUN/overview/checkpoints/, done.json         the whole scene, which the first round starts from
+RUN/cells/R/NN/checkpoints/, events.jsonl    a cell in round R, as of any run
+RUN/cells/R/NN/done.json                     what the finished cell was trained as
+RUN/cells/R/checkpoints/                     the union of the round
+RUN/checkpoints/                             that of the last one
 """
 
 import hashlib
 import json
+import math
 import shutil
 import zlib
 from collections.abc import Callable, Sequence
@@ -29,11 +36,14 @@ from ..training.trainer import Report
 from .cells import Cell, cut
 from .config import GaussiansConfig
 from .gaussians import Gaussians
-from .training import gaussians_of, prepare, scene_of, state_of, train
+from .learner import Learner
+from .photographs import make_levels
+from .training import Prepared, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
-__all__ = ["CellTask", "folder_of", "train_cell", "unite", "write_cells"]
+__all__ = ["CellTask", "folder_of", "read_cells", "train_cell", "train_overview", "unite", "write_cells"]
 
-_FORMAT = 1
+_FORMAT = 2
+_OVERVIEW = "overview"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +54,7 @@ class CellTask:
     """Run folder."""
     data: str
     """Scene folder."""
+    round: int
     cell: int
     minutes: float | None
     """Its part of the time limit."""
@@ -51,9 +62,14 @@ class CellTask:
     """Show nothing."""
 
 
-def folder_of(root: Path, cell: int) -> Path:
+def folder_of(root: Path, round: int, cell: int) -> Path:
     """Folder of a cell in a run."""
-    return root / "cells" / f"{cell:02d}"
+    return root / "cells" / str(round) / f"{cell:02d}"
+
+
+def _start_of(root: Path, round: int) -> Path:
+    """Folder of the checkpoints that the cells of a round start from."""
+    return (root / "cells" / str(round - 1) if round else root / _OVERVIEW) / "checkpoints"
 
 
 def write_cells(root: Path, scene: Scene, count: int) -> list[Cell]:
@@ -67,9 +83,8 @@ def write_cells(root: Path, scene: Scene, count: int) -> list[Cell]:
             {
                 "low": [_bound(x) for x in cell.low.tolist()],
                 "high": [_bound(x) for x in cell.high.tolist()],
+                "border": cell.border.tolist(),
                 "windows": [[view, *window] for view, window in cell.windows.items()],
-                "points": len(cell.points),
-                "share": cell.share,
             }
             for cell in cells
         ],
@@ -80,54 +95,141 @@ def write_cells(root: Path, scene: Scene, count: int) -> list[Cell]:
     return cells
 
 
+def read_cells(root: Path) -> list[Cell]:
+    """The cells of a run. Raises CheckpointError where the file cannot be read."""
+    file = root / "cells.json"
+    try:
+        document = json.loads(file.read_text())
+        frame = torch.tensor(document["frame"], dtype=torch.float64)
+        return [
+            Cell(
+                frame=frame,
+                low=_bounds(each["low"], -math.inf),
+                high=_bounds(each["high"], math.inf),
+                border=_bounds(each["border"], 0.0),
+                windows={view: (left, top, width, height) for view, left, top, width, height in each["windows"]},
+            )
+            for each in document["cells"]
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise CheckpointError(f"{file}: cannot be read ({e!r}); train again to write it") from e
+
+
 def _bound(value: float) -> float | None:
     """JSON knows no infinity."""
-    return value if abs(value) < float("inf") else None
+    return value if abs(value) < math.inf else None
+
+
+def _bounds(values: list[float | None], infinite: float) -> Tensor:
+    return torch.tensor([infinite if value is None else value for value in values], dtype=torch.float64)
+
+
+def train_overview(
+    root: Path, config: GaussiansConfig, scene: Scene, report: Callable[[Report], None], *, spent: float
+) -> bool:
+    """Train the whole scene on photographs of half the size, up to where cells go on; False where that was done already.
+
+    What is finished stays when a run is gone on with for more steps or minutes.
+    """
+    folder = root / _OVERVIEW
+    task = _task(config, scene, scene.train.tolist())
+    done = _read_done(folder)
+    if done is not None and done["task"] == task:
+        return False
+    _begin(folder, task)
+    own = replace(
+        config,
+        downscale=2 * (config.downscale or 1),
+        coarse=config.coarse / 3,  # the levels that one piece would be trained on, of images which are half as large already
+        steps=max(1, round(config.overview * config.steps)),
+        minutes=None if config.minutes is None else config.overview * config.minutes,
+    )
+    prepared = prepare(own, scene_of(own))._replace(shares=(0.0, config.overview))
+    train(own, prepared, Run(folder), report, spent=spent)
+    write_json(folder / "done.json", {"format": _FORMAT, "task": task})
+    return True
 
 
 def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
     """Train a cell to its end, from its newest checkpoint; False where it was finished already.
 
-    Raises ConfigError where the images are not those of the run, DataError where another process trains the cell.
+    Raises ConfigError where the images are not those of the run, DataError where another process trains the cell,
+    CheckpointError where the whole scene was not trained before.
     """
     root = Path(task.root)
-    folder = folder_of(root, task.cell)
+    folder, before = folder_of(root, task.round, task.cell), _start_of(root, task.round)
     config = Run(root).load_config()[0]
     assert isinstance(config, GaussiansConfig)
     scene = scene_of(replace(config, data=Path(task.data)))
-    cells = cut(scene, config.cells)
-    cell = cells[task.cell]
+    cell = read_cells(root)[task.cell]
     with held(folder):
-        asked = _asked(config, scene, cell)
-        done = _read_done(folder)
-        if done == asked:
+        start, _ = checkpoint.load_latest(before)
+        if start is None:
+            raise CheckpointError(f"{before}: no checkpoint to start a cell from; train the run again")
+        named = _task(config, scene, list(cell.windows), cell, start)
+        asked = {"format": _FORMAT, "task": named, "steps": config.steps, "minutes": config.minutes}
+        if _read_done(folder) == asked:
             return False
-        mark = folder / "task.json"
-        known = json.loads(mark.read_text()) if mark.is_file() else None
-        if known != asked["task"]:
-            shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-            write_json(mark, asked["task"])
-        own = replace(config, minutes=task.minutes)
-        train(own, prepare(own, scene, cell), Run(folder), report, spent=0.0)
+        _begin(folder, named)
+        each = (1 - config.overview) / config.rounds
+        own = replace(config, steps=max(1, round(each * config.steps)), minutes=task.minutes)
+        first = config.overview + each * task.round
+        train(own, _prepared(own, scene, cell, start, (first, first + each)), Run(folder), report, spent=0.0)
         write_json(folder / "done.json", asked)
     return True
 
 
-def _asked(config: GaussiansConfig, scene: Scene, cell: Cell) -> dict[str, Any]:
-    """What a cell is trained as; while it stays the same, what was trained stays good."""
+def _prepared(
+    config: GaussiansConfig, scene: Scene, cell: Cell, start: checkpoint.Saved, shares: tuple[float, float]
+) -> Prepared:
+    """A cell's windows, and the Gaussians of the whole scene that they show."""
+    images, masks = load_photographs(config, scene, list(cell.windows))
+    images = {view: cell.cut(view, image) for view, image in images.items()}
+    masks = {view: cell.cut(view, mask) for view, mask in masks.items()}
+    near, whole = float(start.model["near"]), gaussians_of(start)
+    shown = cell.shown(scene, whole)
+    gaussians = whole.select(shown)
+    own = cell.scene(scene)
+    # Only what lies inside and in the border becomes more: its share of all that may be added.
+    around = int(cell.around(gaussians.means).sum())
+    cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
+    learner = Learner(replace(config, cap=cap), make_levels(own, images, masks, near), reach_of(own), cap, cell.around)
+    # As if the number had grown from the beginning of the schedule.
+    passed = min(shares[0] / config.grow, 0.99)
+    begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
+    moments = {name: start.optimizer[name][shown] for name in ("first", "second")}
+    learner.restore(gaussians, {**moments, "begun": torch.tensor(begun)})
+    return Prepared(own, learner, near, "the whole scene", start.step, shares)
+
+
+def _begin(folder: Path, task: str) -> None:
+    """Note what a folder is trained as; what it was trained as before is removed."""
+    mark = folder / "task.json"
+    if not mark.is_file() or json.loads(mark.read_text()) != task:
+        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(mark, task)
+
+
+def _task(
+    config: GaussiansConfig, scene: Scene, views: list[int], cell: Cell | None = None, start: checkpoint.Saved | None = None
+) -> str:
+    """Digest of what is asked for, steps and minutes aside; while it stays the same, what was trained stays good."""
     tree = to_json(config)
     assert isinstance(tree, dict)
-    views = list(cell.windows)
-    parts = {
-        "config": {name: value for name, value in tree.items() if name not in (*RESUMABLE, "executor")},
-        "bounds": [cell.frame.tolist(), cell.low.tolist(), cell.high.tolist(), cell.share],
-        "windows": sorted(cell.windows.items()),
+    parts: dict[str, Any] = {
+        "config": {name: value for name, value in tree.items() if name not in (*RESUMABLE, "executor", "cells")},
         "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
     }
+    if cell is not None:
+        bounds = (cell.frame, cell.low, cell.high, cell.border)
+        parts |= {"bounds": [each.tolist() for each in bounds], "windows": sorted(cell.windows.items())}
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
     for view in views:
         digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
-    return {"format": _FORMAT, "task": digest.hexdigest()[:32], "steps": config.steps, "minutes": config.minutes}
+    for tensor in () if start is None else (*start.model.values(), *start.optimizer.values()):
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()[:32]
 
 
 def _read_done(folder: Path) -> dict[str, Any] | None:
@@ -140,19 +242,27 @@ def _read_done(folder: Path) -> dict[str, Any] | None:
     return document
 
 
-def unite(run: Run, cells: Sequence[Cell]) -> int:
-    """Write the union of all finished cells as the run's checkpoint; the number of its Gaussians."""
-    parts: list[Gaussians] = []
-    steps, seconds, near = 0, 0.0, float("inf")
+def unite(root: Path, round: int, cells: Sequence[Cell], to: Path | None = None) -> int:
+    """Write the union of all cells of a round as a checkpoint, by default for the next one; the number of its Gaussians.
+
+    Raises CheckpointError where a cell is not finished.
+    """
+    start, _ = checkpoint.load_latest(_start_of(root, round))
+    assert start is not None  # the cells were trained from it
+    parts: list[tuple[Tensor, ...]] = []
+    step, seconds = start.step, start.seconds
     for number, cell in enumerate(cells):
-        folder = folder_of(run.root, number)
+        folder = folder_of(root, round, number)
         saved, _ = checkpoint.load_latest(folder / "checkpoints")
         if saved is None or _read_done(folder) is None:
-            raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {run.root / 'config.json'}`")
-        parts.append(cell.own(gaussians_of(saved)))
-        steps, seconds = steps + saved.step, seconds + saved.seconds
-        near = min(near, float(saved.model["near"]))
-    united = Gaussians(*(torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])))
-    nothing: dict[str, Tensor] = {"begun": torch.tensor(len(united))}
-    checkpoint.write(run.checkpoints, state_of(united, near), nothing, step=steps, seconds=seconds)
-    return len(united)
+            raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`")
+        own = cell.holds(saved.model["means"])
+        gaussians = gaussians_of(saved).select(own)
+        parts.append((*vars(gaussians).values(), saved.optimizer["first"][own], saved.optimizer["second"][own]))
+        step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
+    *united, first, second = (torch.cat(columns) for columns in zip(*parts, strict=True))
+    gaussians = Gaussians(*united)
+    moments = {"first": first, "second": second, "begun": torch.tensor(len(gaussians))}
+    state = state_of(gaussians, float(start.model["near"]))
+    checkpoint.write(to or _start_of(root, round + 1), state, moments, step=step, seconds=seconds)
+    return len(gaussians)

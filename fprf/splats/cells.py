@@ -2,8 +2,9 @@
 
 The space is bisected along the principal axes of the reconstruction's points, so that the points of each cell were seen about
 equally often; cells at the outside are unbounded. A cell learns from the windows of photographs that show its points and a
-border around it. Gaussians outside of the cell explain what else the windows show, and are dropped in the end. A cell's cost
-follows from its windows alone, and it can be trained on any machine, in any order (compare VastGaussian, Lin et al. 2024).
+border around it. It starts from Gaussians of the whole scene: those that its windows show explain what lies outside, and are
+dropped in the end. A cell's cost follows from its windows alone, and it can be trained on any machine, in any order (compare
+VastGaussian, Lin et al. 2024).
 """
 
 import math
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from ..datamanagers.scene import Scene, find_sightings
 from ..errors import ConfigError
+from ..rendering.cameras import project
 from .gaussians import Gaussians
 
 __all__ = ["Cell", "cut"]
@@ -31,6 +33,8 @@ _SEEN = 8
 _LEAST, _ROOM = 64, 16
 """Least width and height of a window; pixels around the points in it."""
 _OUTLIERS = 0.01
+_DEVIATIONS = 3.0
+"""A Gaussian is shown as far as so many standard deviations from its mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,21 +45,20 @@ class Cell:
     """Rows are axes, float64: coordinates are `frame @ point`."""
     low: Annotated[Tensor, "3"]
     high: Annotated[Tensor, "3"]
+    border: Annotated[Tensor, "3"]
+    """Width of what it learns around it."""
     windows: dict[int, Window]
     """What it learns from, by view."""
-    points: Annotated[Tensor, "P 3"]
-    """Points of the reconstruction that the windows show."""
-    share: float
-    """Of all Gaussians, those that are trained here: the cell's own, and those around it."""
 
     def holds(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """True for points inside."""
         local = points.double() @ self.frame.T
         return ((local >= self.low) & (local < self.high)).all(1)
 
-    def own(self, gaussians: Gaussians) -> Gaussians:
-        """The Gaussians whose centres lie inside."""
-        return gaussians.select(self.holds(gaussians.means))
+    def around(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """True for points inside and in the border."""
+        local = points.double() @ self.frame.T
+        return ((local >= self.low - self.border) & (local < self.high + self.border)).all(1)
 
     def scene(self, scene: Scene) -> Scene:
         """The scene that the cell sees: its windows are the training views."""
@@ -65,16 +68,24 @@ class Cell:
         centre[views] -= window[:, :2]
         size[views] = window[:, 2:]
         cameras = replace(scene.cameras, centre=centre, size=size)
-        return replace(scene, cameras=cameras, train=views, points=self.points, seen=None)
+        return replace(scene, cameras=cameras, train=views)
+
+    def shown(self, scene: Scene, gaussians: Gaussians) -> Annotated[Tensor, "N"]:
+        """True for Gaussians that a window may show, and for all in the cell and its border."""
+        cameras = self.scene(scene).cameras
+        found = self.around(gaussians.means)
+        radius = _DEVIATIONS * gaussians.log_scales.amax(1).double().exp()
+        for view in self.windows:
+            pixel, depth = project(cameras, torch.full((len(gaussians),), view), gaussians.means)
+            across = (radius / depth.clamp_min(1e-9))[:, None] * cameras.focal[view]
+            inside = (pixel > -across) & (pixel < cameras.size[view] + across)
+            found |= (depth > 0) & inside.all(1)
+        return found
 
     def cut(self, view: int, image: NDArray[Number]) -> NDArray[Number]:
         """The window of an image [H W ...] of a view."""
         left, top, width, height = self.windows[view]
         return image[top : top + height, left : left + width]
-
-    def share_of(self, count: int) -> int:
-        """The cell's part of a number of Gaussians."""
-        return max(1, round(self.share * count))
 
 
 def cut(scene: Scene, count: int) -> list[Cell]:
@@ -92,10 +103,9 @@ def cut(scene: Scene, count: int) -> list[Cell]:
         inside = ((local >= low) & (local < high)).all(1)
         own = local[inside]
         first, last = _extent(own)
-        span = last - first
-        near = ((local >= low - _BORDER * span) & (local < high + _BORDER * span)).all(1)
+        border = _BORDER * (last - first)
+        near = ((local >= low - border) & (local < high + border)).all(1)
         windows: dict[int, Window] = {}
-        shown = torch.zeros(len(local), dtype=torch.bool)
         for view in torch.unique(sightings.view[near]).tolist():
             of_view = sightings.view == view
             pixel = sightings.pixel[of_view & near]
@@ -106,14 +116,9 @@ def cut(scene: Scene, count: int) -> list[Cell]:
             left, wide = _interval(float(first[0]), float(last[0]), width)
             top, tall = _interval(float(first[1]), float(last[1]), height)
             windows[view] = (left, top, wide, tall)
-            x, y = sightings.pixel.unbind(1)
-            shown |= of_view & (x >= left) & (x < left + wide) & (y >= top) & (y < top + tall)
         if not windows:
             raise ConfigError(f"cells: no view shows {_SEEN} points of one of {count} cells; take fewer")
-        points = torch.unique(sightings.point[shown], dim=0)
-        others = len(points) / max(1, len(torch.unique(sightings.point[inside], dim=0)))
-        share = others * float(inside.double().mean())
-        cells.append(Cell(frame=frame, low=low, high=high, windows=windows, points=points, share=share))
+        cells.append(Cell(frame=frame, low=low, high=high, border=border, windows=windows))
     return cells
 
 

@@ -47,8 +47,12 @@ class GaussiansConfig(RunConfig):
     rate: float = 1.0
     """Factor of all learning rates."""
     cells: int = 1
-    """Parts of space that are trained apart, each for `steps` steps, with a part of the time and of the Gaussians; 1 = none.
-    More need points of a reconstruction."""
+    """Parts of space that are trained apart, each with a part of the time and of the Gaussians; 1 = none. More need points of a
+    reconstruction."""
+    overview: float = 0.4
+    """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on from there."""
+    rounds: int = 4
+    """How often cells are trained, each time from the union of all after the time before."""
     executor: ExecutorConfig = SerialConfig()
     """Where cells are trained: one after the other, or several at a time."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -59,12 +63,15 @@ class GaussiansConfig(RunConfig):
         at_least("initial", self.initial, 1)
         at_least("cap", self.cap, 1)
         at_least("cells", self.cells, 1)
+        at_least("rounds", self.rounds, 1)
         if self.degree not in range(4):
             raise ConfigError(f"degree: {self.degree}; 0, 1, 2 or 3 are possible")
         for name in ("ssim", "coarse"):
             between(name, getattr(self, name), 0.0, 1.0)
         positive("grow", self.grow)
         between("grow", self.grow, 0.0, 1.0)
+        positive("overview", self.overview)
+        between("overview", self.overview, 0.0, 0.9)
         at_least("relocate_every", self.relocate_every, 1)
         positive("rate", self.rate)
         for part in self.background:

@@ -5,7 +5,8 @@ a function of (seed, step), so parameters, moments and the step are all the stat
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -46,9 +47,20 @@ class Step(NamedTuple):
 
 
 class Learner:
-    """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate."""
+    """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
-    def __init__(self, config: GaussiansConfig, levels: list[Level], reach: float, room: int) -> None:
+    Only Gaussians whose means are `inside` are split or moved; None = all.
+    """
+
+    def __init__(
+        self,
+        config: GaussiansConfig,
+        levels: list[Level],
+        reach: float,
+        room: int,
+        inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
+    ) -> None:
+        self.inside = inside
         self.config, self.levels, self.reach = config, levels, reach
         self.bands = (config.degree + 1) ** 2
         self.room = -(-room // LANES) * LANES
@@ -123,8 +135,12 @@ class Learner:
         parts = [_rows(each, self.rows) for each in (self.blocks, self.first, self.second)]
         rows, first, second = parts
         opacity = 1 / (1 + np.exp(-rows[10, : self.count].astype(np.float64)))
-        dead = np.flatnonzero(opacity < _DEAD)
         chance = np.nan_to_num(chance * opacity)
+        transparent = opacity < _DEAD
+        if self.inside is not None:
+            inside = self.inside(torch.from_numpy(rows[:3, : self.count].T)).numpy()
+            chance, transparent = chance * inside, transparent & inside
+        dead = np.flatnonzero(transparent)
         chance[dead] = 0
         cap = max(self.config.cap, self.begun)
         wanted = int(self.begun * (cap / self.begun) ** min(1.0, share / self.config.grow))

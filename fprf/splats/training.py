@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..config import StatisticsConfig
 from ..datamanagers.bounds import find_space
-from ..datamanagers.images import load_images, load_mask
+from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, NumericsError, UsageError
@@ -27,7 +28,6 @@ from ..training.model import Facts
 from ..training.quality import PRESETS, QualityConfig
 from ..training.run import Known, Run
 from ..training.trainer import REPORT_SECONDS, Report
-from .cells import Cell
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points
@@ -39,8 +39,10 @@ __all__ = [
     "Prepared",
     "facts_of",
     "gaussians_of",
+    "load_photographs",
     "open_gaussians",
     "prepare",
+    "reach_of",
     "scene_of",
     "state_of",
     "train",
@@ -68,6 +70,10 @@ class Prepared(NamedTuple):
     near: float
     origin: str
     """Where the first Gaussians are from."""
+    before: int = 0
+    """Steps that the Gaussians were trained for elsewhere."""
+    shares: tuple[float, float] = (0.0, 1.0)
+    """The part of the schedule that is trained here."""
 
 
 def scene_of(config: GaussiansConfig) -> Scene:
@@ -85,29 +91,35 @@ def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
     return replace(config, downscale=max(1, math.ceil(math.sqrt(pixels / _PIXELS))))
 
 
-def prepare(config: GaussiansConfig, scene: Scene, cell: Cell | None = None) -> Prepared:
-    """Load photographs and find the first points, of the whole scene or of what a cell learns from."""
-    views = scene.train.tolist() if cell is None else list(cell.windows)
+def prepare(config: GaussiansConfig, scene: Scene) -> Prepared:
+    """Load photographs and find the first points."""
+    images, masks = load_photographs(config, scene, scene.train.tolist())
+    draw = np.random.default_rng((config.seed, 0))
+    points, origin = initial_points(scene, images, config.initial, draw)
+    near = _near(scene, points)
+    levels = make_levels(scene, images, masks, near)
+    learner = Learner(config, levels, reach_of(scene), max(config.cap, len(points.position)))
+    learner.begin(points, draw)
+    return Prepared(scene, learner, near, origin)
+
+
+def load_photographs(
+    config: GaussiansConfig, scene: Scene, views: list[int]
+) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]]]:
+    """Images of views, and the masks of those that have one."""
     images = dict(zip(views, load_images(scene, config.background, views), strict=True))
     masks = {}
     for view in views:
         path = scene.masks[view] if config.masks and scene.masks else None
         if path is not None:
             masks[view] = load_mask(path, (images[view].shape[1], images[view].shape[0]))
-    if cell is not None:
-        scene = cell.scene(scene)
-        images = {view: cell.cut(view, image) for view, image in images.items()}
-        masks = {view: cell.cut(view, mask) for view, mask in masks.items()}
-        config = replace(config, initial=cell.share_of(config.initial), cap=cell.share_of(config.cap))
-    draw = np.random.default_rng((config.seed, 0))
-    points, origin = initial_points(scene, images, config.initial, draw)
-    near = _near(scene, points)
-    levels = make_levels(scene, images, masks, near)
+    return images, masks
+
+
+def reach_of(scene: Scene) -> float:
+    """Radius of the training cameras' positions, the unit of the means' learning rate."""
     centre = scene.cameras.pose[scene.train][:, :, 3]
-    reach = 1.1 * float((centre - centre.mean(0)).norm(dim=1).max())
-    learner = Learner(config, levels, reach or 1.0, max(config.cap, len(points.position)))
-    learner.begin(points, draw)
-    return Prepared(scene, learner, near, origin)
+    return 1.1 * float((centre - centre.mean(0)).norm(dim=1).max()) or 1.0
 
 
 def facts_of(config: GaussiansConfig, scene: Scene) -> Facts:
@@ -130,7 +142,7 @@ def train(config: GaussiansConfig, prepared: Prepared, run: Run, report: Callabl
     An interrupt saves first, then goes on upwards. A step whose loss is not finite changes nothing; raises NumericsError
     after several in a row.
     """
-    learner = prepared.learner
+    learner, (first, last) = prepared.learner, prepared.shares
     checkpoint.tidy(run.checkpoints)
     saved, damaged = checkpoint.load_latest(run.checkpoints)
     for line in damaged:
@@ -150,7 +162,7 @@ def train(config: GaussiansConfig, prepared: Prepared, run: Run, report: Callabl
         try:
             while (share := progress(config, step, clock)) < 1:
                 stop.obey()
-                found = learner.step(step, share)
+                found = learner.step(prepared.before + step, first + (last - first) * share)
                 step += 1
                 meter.add(found)
                 if found is None:

@@ -13,6 +13,7 @@ from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene, find_sightings
 from fprf.errors import ConfigError
+from fprf.splats.cell_training import read_cells
 from fprf.splats.cells import Cell, cut
 from fprf.splats.files import read_capture
 from fprf.town.write import write_town
@@ -56,7 +57,7 @@ def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: li
     for cell in cells:
         assert not {*cell.windows} - {*scene.train.tolist()}
         own = cell.scene(scene)
-        found = find_sightings(replace(own, points=cell.points, seen=None))
+        found = find_sightings(replace(own, seen=None))
         assert found is not None and {*found.view.tolist()} == {*cell.windows}
         mine = cell.holds(sightings.point)
         inside = torch.zeros_like(mine)
@@ -73,8 +74,8 @@ def test_too_few_points_are_refused(scene: Scene) -> None:
 
 def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Scene, cells: list[Cell], tmp_path: Path) -> None:
     run = tmp_path / "run"
-    command = ["train", "fprf-splats", "--data", str(town), "--downscale", "1", "--steps", "25", "--cells", str(COUNT)]
-    command += ["--initial", "300", "--cap", "600", "--output", str(run)]
+    command = ["train", "fprf-splats", "--data", str(town), "--downscale", "1", "--steps", "40", "--cells", str(COUNT)]
+    command += ["--rounds", "2", "--initial", "300", "--cap", "600", "--output", str(run)]
     assert main(command) == 0
 
     def exported(name: str) -> bytes:
@@ -82,12 +83,14 @@ def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Sce
         return (tmp_path / name).read_bytes()
 
     first = exported("a.ply")
-    stamps = {path: path.stat().st_mtime_ns for path in run.glob("cells/*/done.json")}
-    assert len(stamps) == COUNT
-    shutil.rmtree(run / "cells" / "01")
+    stamps = {path: path.stat().st_mtime_ns for path in run.glob("**/done.json")}
+    assert len(stamps) == 1 + 2 * COUNT
+    shutil.rmtree(run / "cells" / "0" / "01")
     assert main(command) == 0
     assert exported("b.ply") == first
-    assert [path.parent.name for path, stamp in stamps.items() if path.stat().st_mtime_ns != stamp] == ["01"]
+    changed = [path.parent.relative_to(run) for path, stamp in stamps.items() if path.stat().st_mtime_ns != stamp]
+    assert changed == [Path("cells/0/01")]
+    assert [*map(repr, read_cells(run))] == [*map(repr, cells)]
     gaussians = read_capture(tmp_path / "a.ply").gaussians
     assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cells]).sum(0).eq(1).all()
     document = json.loads((run / "cells.json").read_text())
