@@ -18,7 +18,7 @@ from ..style.matching import scores, unit
 from ..style.regional import RegionWeight
 from ..style.scene import SceneStyle
 
-__all__ = ["ALIKE", "Found", "Regions", "find_regions", "key_of", "membership_view", "memberships"]
+__all__ = ["ALIKE", "RegionMatch", "Regions", "find_regions", "key_of", "membership_view", "memberships"]
 
 ALIKE = 0.5
 """Least cosine of a region with a key from elsewhere: below, the scene has no such region.
@@ -46,7 +46,7 @@ class Regions(NamedTuple):
     """Identity of the encoder that the keys are of, if the file tells."""
 
 
-class Found(NamedTuple):
+class RegionMatch(NamedTuple):
     """One region that somebody meant."""
 
     number: int
@@ -63,7 +63,7 @@ def key_of(regions: Regions, number: int) -> Key:
     return tuple(float(f"{x:.6g}") for x in regions.basis.lift(regions.scene.keys[number]).tolist())
 
 
-def find_regions(regions: Regions, text: str) -> list[Found]:
+def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
     """The regions that a text means: one, those that a mask covers, or those like a region of the style file, if there are.
 
     Raises UsageError for what names nothing on this scene, DataError for an unreadable mask.
@@ -72,7 +72,7 @@ def find_regions(regions: Regions, text: str) -> list[Found]:
     if text.isascii() and text.isdigit():
         if int(text) >= count:
             raise UsageError(f"region {text}: regions go from 0 to {count - 1}; --explain lists them")
-        return [Found(int(text), text)]
+        return [RegionMatch(int(text), text)]
     if text in regions.keys:
         return _like(regions, text)
     for view in sorted(range(len(names)), key=lambda v: -len(names[v])):
@@ -80,7 +80,7 @@ def find_regions(regions: Regions, text: str) -> list[Found]:
             rest = text[len(names[view]) + 1 :]
             pixel = pixel_of(rest)
             numbers = _covered(regions, view, Path(rest)) if pixel is None else _at(regions, view, pixel)
-            return [Found(k, str(k)) for k in numbers]
+            return [RegionMatch(k, str(k)) for k in numbers]
     named = f", a name in the style file ({', '.join(regions.keys)})" if regions.keys else ""
     raise UsageError(
         f"region {text!r}: neither a number{named}, nor VIEW:X,Y or VIEW:MASK.png with a view of the run "
@@ -110,7 +110,7 @@ def shrunk(cameras: Cameras, view: int, size: int) -> Cameras:
     return one.scaled(max(1.0, float(one.size.amax()) / size))
 
 
-def _like(regions: Regions, name: str) -> list[Found]:
+def _like(regions: Regions, name: str) -> list[RegionMatch]:
     """The regions that, of all that the style file knows, are most like the one of that name, and really like it."""
     encoder, scene, lengths = regions.views.semantic_encoder, regions.scene, {*map(len, regions.keys.values())}
     if regions.basis is None or lengths != {len(regions.basis.mean)} or regions.encoder not in ("", encoder):
@@ -119,11 +119,11 @@ def _like(regions: Regions, name: str) -> list[Found]:
             f"{encoder or 'none'}; name the region by its number or a pixel of a view instead"
         )
     if len(scene.share) == 1:
-        return [Found(0, name)]
+        return [RegionMatch(0, name)]
     there = regions.basis.project(torch.tensor(list(regions.keys.values())))
     alike, nearest = scores(unit(scene.keys, scene.semantic_mean), unit(there, scene.semantic_mean)).max(1)
     mine = (nearest == list(regions.keys).index(name)) & (alike >= ALIKE)
-    return [Found(k, name, float(alike[k])) for k in mine.nonzero().flatten().tolist()]
+    return [RegionMatch(k, name, float(alike[k])) for k in mine.nonzero().flatten().tolist()]
 
 
 def _at(regions: Regions, view: int, pixel: Pixel) -> list[int]:

@@ -21,7 +21,7 @@ from ..style.references import Encoders, encode_photograph
 from ..style.regional import RegionWeight, regional
 from ..style.scene import SceneStyle
 from .plugin_checks import check_stylizer
-from .regions import Found, Regions, find_regions, key_of
+from .regions import RegionMatch, Regions, find_regions, key_of
 
 __all__ = ["Codes", "RegionControls", "Styled", "apply_style", "dress", "mixed", "region_controls", "region_scores", "restyle"]
 
@@ -216,7 +216,7 @@ class _Book:
         self.keys = dict(regions.keys) if regions.keys else every
         self.notes: list[str] = []
 
-    def find(self, text: str) -> list[Found]:
+    def find(self, text: str) -> list[RegionMatch]:
         found = find_regions(self.regions, text)
         if not found:
             self.notes.append(f"region {text!r} of the style: no region here is most like it, so it is left out")
@@ -225,7 +225,7 @@ class _Book:
                 self.notes.append(f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})")
         return found
 
-    def pairs(self, field: str, texts: Sequence[str]) -> list[tuple[Found, int]]:
+    def pairs(self, field: str, texts: Sequence[str]) -> list[tuple[RegionMatch, int]]:
         """Regions and references of REGION=REFERENCE; a mask may mean several regions."""
         wishes = [parse_region_value(field, text) for text in texts]
         return [(found, find_reference(w.value, self.references)) for w in wishes for found in self.find(w.region)]
@@ -235,7 +235,7 @@ class _Book:
         name = self.references[reference].name
         return name if self.names[reference] == name else str(reference)
 
-    def name(self, region: Found) -> str:
+    def name(self, region: RegionMatch) -> str:
         """What the region is called in a style file, which holds its key under that name."""
         if region.name in self.regions.keys or not self.keys:
             return region.name

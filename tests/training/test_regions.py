@@ -11,7 +11,7 @@ from tiny_world import World
 from fprf.errors import DataError, UsageError
 from fprf.style.files import Key
 from fprf.training.loading import Trained, load_style
-from fprf.training.regions import ALIKE, Found, Regions, find_regions, key_of, membership_view
+from fprf.training.regions import ALIKE, RegionMatch, Regions, find_regions, key_of, membership_view
 
 
 def regions_of(world: World, keys: dict[str, Key] | None = None) -> Regions:
@@ -27,7 +27,7 @@ def trained_of(regions: Regions) -> Trained:
 def test_numbers_are_the_scenes(world: World) -> None:
     regions = regions_of(world)
     count = len(regions.scene.share)
-    assert find_regions(regions, "1") == [Found(1, "1")] and count >= 2
+    assert find_regions(regions, "1") == [RegionMatch(1, "1")] and count >= 2
     with pytest.raises(UsageError, match=f"region 17: regions go from 0 to {count - 1}; --explain lists them"):
         find_regions(regions, "17")
 
