@@ -15,7 +15,7 @@ from .style_flags import read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
-    from ..training.explain import Region
+    from ..training.matches import Region
     from ..training.regions import Regions
     from ..training.restyle import Styled
     from ..training.run import Known
@@ -143,7 +143,7 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     from ..io.atomic import write_json
     from ..io.images import write_image
     from ..io.sheet import contact_sheet
-    from ..training.explain import explain, region_row, region_tile
+    from ..training.matches import explain, region_row, region_tile
 
     explained = explain(regions, styled)
     names = styled.dictionary.names if styled is not None else ()

@@ -9,8 +9,8 @@ from tiny_world import World
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
-from fprf.training.explain import explain, region_row, region_tile
 from fprf.training.loading import load_style
+from fprf.training.matches import explain, region_row, region_tile
 from fprf.training.regions import Regions, find_regions, membership_view
 from fprf.training.restyle import apply_style
 
