@@ -50,7 +50,7 @@ class Shot:
     depth: Annotated[Tensor, "H W"]
     """Distance along the unit ray, in the capture's units."""
     opacity: Annotated[Tensor, "H W"]
-    """How much of the ray is met, in [0, 1]."""
+    """Opacity of the ray, in [0, 1]."""
 
     @property
     def pixels(self) -> Picture:
@@ -203,13 +203,13 @@ class TrainedScene:
             yield Shot(made.rgb, made.depth, made.opacity)
 
     def matches(self, camera: Cameras | int | str) -> MatchMap:
-        """Which style codes each pixel of a view takes; `styled.codes` names them. Raises UsageError without a style."""
+        """Style codes that each pixel of a view takes; `styled.codes` names them. Raises UsageError without a style."""
         styled, one = self._style("matches"), self._single("matches", camera)
         return match_map(self.trained.scene, styled, 0, one)
 
     @property
     def restyle(self) -> Restyle | None:
-        """What the renderer is given; None = nothing."""
+        """The look that is rendered; None = as captured."""
         return None if self.styled is None else self.styled.restyle
 
     def _style(self, what: str) -> Styled:

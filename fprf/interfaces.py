@@ -54,7 +54,7 @@ class Encoder(nn.Module, ABC):
     @property
     @abstractmethod
     def identity(self) -> str:
-        """What makes two encoders the same: name, layer, settings and a hash of the weights. Keys caches and decoders."""
+        """Identity of an encoder: name, layer, settings and a hash of the weights. Keys caches and decoders."""
 
     @property
     @abstractmethod
@@ -264,7 +264,7 @@ class Scene(ABC):
 
     @abstractmethod
     def encoders(self) -> "Encoders":
-        """What brings photographs into the terms of `measured`. Raises WeightsError where the encoders at hand are others."""
+        """Encoders for references, in the terms of `measured`. Raises WeightsError where those at hand are others."""
 
     @abstractmethod
     def colour_maps(
@@ -275,7 +275,7 @@ class Scene(ABC):
         config: "StylizerConfig",
         allowed: Annotated[Tensor, "K references"],
     ) -> "ColourMaps | None":
-        """What a stylizer does to colours behind its change of features; None where that is nothing.
+        """Change of colours behind a stylizer's change of features; None = no change.
 
         `allowed` says which references each region may take from, bool.
         """
@@ -290,7 +290,7 @@ class LossTerm(ABC):
     @property
     @abstractmethod
     def needs(self) -> Want:
-        """What must be rendered for it; `Want.DENSITY` where weights and sample edges are enough."""
+        """Outputs of the renderer that it needs; `Want.DENSITY` where weights and sample edges are enough."""
 
     @abstractmethod
     def __call__(
@@ -305,7 +305,7 @@ class LossTerm(ABC):
 
 
 class BlockLayout(ABC):
-    """How a scene is cut into blocks: geometry only, no parameters."""
+    """Division of a scene into blocks: geometry only, no parameters."""
 
     @abstractmethod
     def cut(self, site: Site) -> Boxes:

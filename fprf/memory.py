@@ -1,4 +1,4 @@
-"""What to do when there is not enough memory: take less at once where that gives the same, else say what was needed.
+"""Recovery from too little memory: take less at once where that gives the same, else say what was needed.
 
 Every library says it differently: Python and NumPy raise MemoryError, torch a RuntimeError on the CPU and one of its own on a
 GPU, OpenCV its error -4. None of them is imported here.
@@ -36,7 +36,7 @@ _Found = TypeVar("_Found")
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory could not be had."""
+    """True for an error of memory that could not be allocated."""
     if isinstance(error, MemoryError):
         return True
     if getattr(error, "code", None) == _OPENCV_NO_MEMORY and type(error).__module__ == "cv2":
@@ -119,7 +119,7 @@ def peak() -> int | None:
 
 
 def _limits() -> str:
-    """What is free, and what the process may have, as far as the system tells."""
+    """Free memory and the process's limit, as far as the system tells."""
     parts = []
     try:
         available = re.search(r"MemAvailable:\s+(\d+)", Path("/proc/meminfo").read_text())

@@ -1,4 +1,4 @@
-"""What flows between the parts. Letters, used in every signature:
+"""Data that flows between the parts. Letters, used in every signature:
 
 R rays · S samples of a ray · E = S+1 edges · N points · C content channels · D semantic channels of the field ·
 L latent channels · T style codes · K scene regions · V views · H W pixels · B images · Z blocks · P sparse points.
@@ -17,7 +17,7 @@ __all__ = ["Batch", "Boxes", "FieldSample", "Level", "Rays", "Rendered", "Sample
 
 
 class Want(Flag):
-    """What is asked of a field or a render: nothing else is computed."""
+    """Outputs that are asked of a field or a render: nothing else is computed."""
 
     DENSITY = auto()
     COLOUR = auto()
@@ -45,7 +45,7 @@ class Level(NamedTuple):
 
 
 class Site(NamedTuple):
-    """What a block layout looks at: training cameras and sparse points in the scene's space, float64.
+    """Inputs of a block layout: training cameras and sparse points in the scene's space, float64.
 
     Axis 0 runs along the capture, axis 2 upwards; one unit is the distance that views commonly see.
     """
@@ -60,7 +60,7 @@ class Site(NamedTuple):
 
 
 class Boxes(NamedTuple):
-    """Where a scene is cut: Z cells in the scene's space, float64. Neighbours share faces; what no cell holds is surroundings.
+    """Z cells of a scene's blocks, in the scene's space, float64. Neighbours share faces; what no cell holds is surroundings.
 
     Point x lies in a cell where low <= turn x <= high.
     """
@@ -70,7 +70,7 @@ class Boxes(NamedTuple):
     turn: Annotated[Tensor, "Z 3 3"]
     """Rows: the axes of each cell; orthonormal."""
     margin: float
-    """How far each block reaches beyond its cell; there it blends with its neighbours."""
+    """Margin of each block beyond its cell; there it blends with its neighbours."""
 
 
 class Sampled(NamedTuple):
@@ -102,7 +102,7 @@ class Batch(NamedTuple):
     distance: Annotated[Tensor, "R"] | None = None
     """World distance along the rays that go through points of the reconstruction, NaN for the others."""
     sky: Annotated[Tensor, "R"] | None = None
-    """Whether a mask of the capture says that the pixel shows sky; None where there is none."""
+    """True where a mask of the capture shows sky; None where there is none."""
 
 
 class Rendered(NamedTuple):
@@ -117,7 +117,7 @@ class Rendered(NamedTuple):
     weights: Annotated[Tensor, "R S"] | None = None
     sampled: Sampled | None = None
     counts: Mapping[str, int] = {}
-    """How many samples were placed, kept, decoded: what was skipped can be read off."""
+    """Numbers of rays, samples, and kept samples."""
     frozen_rgb: Annotated[Tensor, "R 3"] | None = None
     """In training: the colour without the decoder's parameters that are the scene's own, if it has any."""
 

@@ -211,7 +211,7 @@ class Plan:
 
     @property
     def cut(self) -> bool:
-        """Whether there is more than one block."""
+        """True for more than one block."""
         return len(self.boxes.low) > 1
 
     @property

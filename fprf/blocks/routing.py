@@ -1,4 +1,4 @@
-"""Which blocks a point belongs to. Points are handed out in groups: all points of a group have the same members.
+"""Routing of points to their blocks. Points are handed out in groups: all points of a group have the same members.
 
 `Everywhere` sends all points to one member. `Inset` is for training a block: inside its reach the block, outside of it the
 surroundings. `Blend` is for rendering: weights of `windows`, whose smooth change from block to block leaves no seam. It looks
@@ -97,7 +97,7 @@ class Chart:
         return contract(y) if self.contracted else y
 
     def inside(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
-        """Whether points lie in the box."""
+        """Mask of the points in the box."""
         there = self._placed(points)
         x = local(points, there.turn)
         return ((x >= there.low) & (x <= there.high)).all(-1)
@@ -232,7 +232,7 @@ class Blend(Router):
         return groups
 
     def _kinds(self, points: Tensor) -> Annotated[Tensor, "N"]:
-        """Which set of blocks the table names at each point; set 0 is none."""
+        """Set of blocks that the table names at each point; set 0 is none."""
         at = (points[:, :2] - self.low.to(points)) / self.step
         inside = ((at >= 0) & (at < at.new_tensor([self.columns, self.rows]))).all(1)
         # NaN and far points must not become an index.

@@ -1,4 +1,4 @@
-"""What `fprf train` does with a scene of several blocks: plan it, train each one as a task, measure the style of the whole."""
+"""`fprf train` on a scene of several blocks: plan it, train each one as a task, measure the style of the whole."""
 
 import time
 from pathlib import Path

@@ -10,7 +10,7 @@ __all__ = ["ClusterConfig", "run"]
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterConfig:
-    """What goes into the lines."""
+    """Addresses and limits of the printed lines."""
 
     head: str = "HEAD"
     """Address of the first machine, as the others reach it."""

@@ -36,7 +36,7 @@ _FIRST = ("pretrain", "bench")
 
 
 class Offer(NamedTuple):
-    """What can follow a verb."""
+    """Words and flags that can follow a verb."""
 
     summary: str
     words: tuple[str, ...]
@@ -132,4 +132,4 @@ def _quoted(text: str) -> str:
 
 
 SHELLS: dict[str, Callable[[Mapping[str, Offer]], str]] = {"bash": _bash, "zsh": _zsh, "fish": _fish}
-"""What can be written, by the name of the shell."""
+"""Writers of scripts by the name of the shell."""

@@ -45,7 +45,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorConfig:
-    """What to look over."""
+    """Settings of `fprf doctor`."""
 
     target: Path | None = None
     """A run, a scene folder or a method; none = this machine."""
@@ -132,7 +132,7 @@ def self_test(name: str) -> Iterator[Finding]:
 
 
 def speed(environment: Mapping[str, str]) -> Iterator[Finding]:
-    """What makes this machine slower than it could be: fewer threads than cores, other programs, a GPU that torch misses."""
+    """Causes of a slow machine: fewer threads than cores, other programs, a GPU that torch misses."""
     cores = _cores()
     for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         threads = environment.get(name, "")
@@ -250,7 +250,7 @@ def run_folder(folder: Path) -> Iterator[Finding]:
 
 
 def _trouble(folder: Path) -> Iterator[Finding]:
-    """What training noted on the way: skipped steps, damaged checkpoints."""
+    """Notes of the training: skipped steps, damaged checkpoints."""
     from ..training.run import read_history
 
     if not (folder / "events.jsonl").is_file():
@@ -265,7 +265,7 @@ def _trouble(folder: Path) -> Iterator[Finding]:
 
 
 def _packages() -> Iterator[Finding]:
-    """What pyproject.toml asks for, without importing it."""
+    """Packages that pyproject.toml requires, without importing them."""
     for requirement in requires("fprf") or ():
         name = requirement.split(";")[0].split("<")[0].split(">")[0].split("=")[0].strip()
         extra = requirement.partition("extra == ")[2].strip("\"'")

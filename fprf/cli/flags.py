@@ -50,7 +50,7 @@ class Flag(NamedTuple):
 
     @property
     def takes(self) -> str:
-        """What it takes, in words."""
+        """Its values in words."""
         return " or ".join("none" if hint is type(None) else _words(hint) for hint in _none_last(members(self.hint)))
 
 

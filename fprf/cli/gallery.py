@@ -183,7 +183,7 @@ def _views(known: "Known", config: GalleryConfig) -> list[int]:
 
 
 def _metrics(run: Path) -> dict[str, Any]:
-    """What `fprf eval` has measured of the run, without the single views; nothing where it has not."""
+    """Metrics of `fprf eval` without the single views; empty where it has not run."""
     from ..plugins.codec import read_json
 
     path = run / "metrics.json"

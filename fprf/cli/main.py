@@ -25,7 +25,7 @@ __all__ = ["VERBS", "Verb", "main", "packaged", "run_verb"]
 _GROUP = "fprf.commands"
 
 _PIPE_CLOSED = 141
-"""What a shell reports for a program that SIGPIPE ended."""
+"""Exit status of a program that SIGPIPE ended."""
 
 
 class Verb(NamedTuple):

@@ -54,7 +54,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class PluginsConfig:
-    """What to do with the installed plug-ins."""
+    """Settings of `fprf plugins`."""
 
     check: bool = False
     """Import each one and report what fails; exit code 1 if anything does."""

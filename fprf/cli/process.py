@@ -27,7 +27,7 @@ Needs the extra `sfm` (pip install 'fprf[sfm]') and no other program. Run again,
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessConfig(SfmConfig):
-    """What to process."""
+    """Settings of `fprf process`."""
 
     source: Path = Path()
     """A folder of images, or a video."""

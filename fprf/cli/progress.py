@@ -1,4 +1,4 @@
-"""What a long command shows: a live line on a terminal, one JSON line every few seconds elsewhere."""
+"""Progress of a long command: a live line on a terminal, one JSON line every few seconds elsewhere."""
 
 import json
 import sys
@@ -67,7 +67,7 @@ class Display:
         self.count(done, total, what)
 
     def training(self, report: "Report", what: str = "training") -> None:
-        """How training goes."""
+        """Progress of training."""
         left = report.seconds * (1 - report.share) / max(report.share, 1e-3)
         detail = f"step {report.step}  {report.psnr:.2f} dB  {report.rays_per_second:,.0f} rays/s  {_clock(left)} left"
         self._bar(what, report.share, detail)

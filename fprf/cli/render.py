@@ -35,7 +35,7 @@ _NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv"
 
 @dataclass(frozen=True, kw_only=True)
 class RenderVerbConfig(StyleConfig, QualityConfig):
-    """What to film, and how."""
+    """Settings of `fprf render`."""
 
     run: Path = Path()
     """Run folder."""

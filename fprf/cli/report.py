@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 __all__ = ["ReportConfig", "run"]
 
 _PLAIN = {"psnr": "PSNR", "rays_per_second": "rays a second", "kept": "samples kept", "skipped_steps": "skipped steps"}
-"""What is no loss, with its name for people."""
+"""Labels of figures that are no losses."""
 _UNITS = {"psnr": "dB", "kept": "share"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig:
-    """Which run, and where to."""
+    """Settings of `fprf report`."""
 
     run: Path = Path()
     """Run folder; one in training will do."""

@@ -1,4 +1,4 @@
-"""What the command line asks of each kind of scene."""
+"""Functions of the command line for each kind of scene."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path

@@ -39,7 +39,7 @@ class Basis(NamedTuple):
         return -(self.mean @ self.matrix)
 
     def tensors(self) -> dict[str, Tensor]:
-        """What `from_tensors` takes: for a tensor file."""
+        """Tensors by name for a tensor file, as `from_tensors` takes them."""
         return {
             "mean": self.mean,
             "matrix": self.matrix.contiguous(),

@@ -90,7 +90,7 @@ class PixelRuns:
         return PixelRuns(start, end - start)
 
     def __len__(self) -> int:
-        """How many numbers there are."""
+        """Count of the numbers."""
         return self._count
 
     def to(self, device: torch.device) -> "PixelRuns":
@@ -105,7 +105,7 @@ class PixelRuns:
         return self._start[run] + rank - self._before[run]
 
     def holds(self, number: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R"]:
-        """Which numbers are in the set."""
+        """Mask of the numbers that are in the set."""
         if not len(self._start):
             return torch.zeros_like(number, dtype=torch.bool)
         run = (torch.searchsorted(self._start, number, right=True) - 1).clamp_min(0)
@@ -301,7 +301,7 @@ class RayBatches(DataManager):
             yield int(self._ends[slot]) - width * height, mask(view, width, height).reshape(-1)
 
     def _marked(self) -> _Marks | None:
-        """Where sparse points are seen in the training views, among the pixels that are learnt from.
+        """Sightings of sparse points in the training views, among the pixels that are learnt from.
 
         Of a reconstruction that says who saw what, points count that two of these views saw: one alone says nothing of depth.
         """

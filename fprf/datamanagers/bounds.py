@@ -59,7 +59,7 @@ def find_space(scene: Scene) -> Space:
 
 
 def find_kind(scene: Scene) -> Kind:
-    """Which of the three fits."""
+    """Choose the one of the three that fits."""
     if scene.alpha:
         return "box"
     cameras = scene.cameras
@@ -174,7 +174,7 @@ def _ndc(scene: Scene) -> Space:
 
 
 def _span(space: Space, cameras: Cameras) -> tuple[list[float], list[float]]:
-    """What all image corners span in NDC x and y, from the near plane to infinity, a little widened."""
+    """Range of all image corners in NDC x and y, from the near plane to infinity, a little widened."""
     ends = []
     for view in range(len(cameras)):
         w, h = (float(v) for v in cameras.size[view])

@@ -115,7 +115,7 @@ def write_tensors(folder: Path, key: str, tensors: Mapping[str, Tensor]) -> None
 
 
 def read_tensors(folder: Path, key: str) -> dict[str, Tensor] | None:
-    """What `write_tensors` wrote under the key; None where it is absent, damaged or of another key."""
+    """Read what `write_tensors` wrote under the key; None where it is absent, damaged or of another key."""
     path = folder / f"{key}.safetensors"
     try:
         with safetensors.safe_open(path, framework="pt") as file:
@@ -176,7 +176,7 @@ BASIS_CELLS = 32_768
 REMEMBER_BYTES = 1 << 28
 MOMENT_PIXELS = 2048
 CACHED_BYTES = 1 << 30
-"""What the files in a folder may take together; those of the views at hand stay whatever they take."""
+"""Most bytes of the files in a folder; those of the views at hand stay whatever they take."""
 # A and b move within a window's fifth: measured on photographs, a coarser grid costs more than 1.5 % of the features' spread.
 CELLS_PER_WINDOW = 5
 _COMPILED = importlib.util.find_spec("numba") is not None
@@ -189,7 +189,7 @@ class FeatureStore:
         if not entries:
             raise DataError("feature store: no views; a scene needs at least one training view")
         self.basis = basis
-        """What the encoder's features were projected on; None = kept raw."""
+        """Basis that the encoder's features were projected on; None = kept raw."""
         self._entries = dict(entries)
         first = next(iter(self._entries.values()))
         self.channels = len(first.scale)
@@ -335,7 +335,7 @@ def _fingerprint(pixels: Annotated[Tensor, "H W 3"]) -> str:
 
 
 def _device(encoder: Encoder) -> torch.device:
-    """Where its parameters are; the CPU where it has none."""
+    """Device of its parameters; the CPU where it has none."""
     weight = next(chain(encoder.parameters(), encoder.buffers()), None)
     return torch.device("cpu") if weight is None else weight.device
 
@@ -398,7 +398,7 @@ def _basis(
 
 
 def _table(entries: Sequence[Entry]) -> "ViewTable":
-    """What the kernel takes of the views."""
+    """The views as the kernel takes them."""
     from ..ops.guided_kernels import ViewArrays, ViewTable
 
     views = []

@@ -39,7 +39,7 @@ __all__ = [
 
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"})
-"""What is taken for an image when a folder is listed, in lower case."""
+"""Suffixes of images in a folder's list, in lower case."""
 
 _HEAD = 1 << 18
 """Bytes read at first: more than any camera's EXIF block with its thumbnail."""
@@ -53,7 +53,7 @@ _ALPHA = (b"auxiliary:alpha", b"hevc:2015:auxid:1")
 
 
 class ImageHeader(NamedTuple):
-    """What a file says of its image, as stored: EXIF orientation is not applied.
+    """Header of an image file, as stored: EXIF orientation is not applied.
 
     HEIC and AVIF store rotation in the image itself (`irot`), which decoders apply: width and height are those after it.
     """
@@ -365,7 +365,7 @@ def _decode_heic(path: Path, data: bytes) -> NDArray[np.generic]:
 
 
 def _damage(data: bytes, header: ImageHeader) -> str:
-    """What is wrong with the file, as far as its structure tells; decoders fill what is missing with grey, silently."""
+    """Damage of a file, as far as its structure tells; decoders fill what is missing with grey, silently."""
     if header_of(data) != header:
         return "the file changed while it was read"
     if header.kind == "jpeg":
@@ -377,7 +377,7 @@ def _damage(data: bytes, header: ImageHeader) -> str:
 
 
 def _first_scan(data: bytes) -> int:
-    """Where the first scan starts: an end marker before it belongs to a thumbnail."""
+    """Offset of the first scan: an end marker before it belongs to a thumbnail."""
     at = 2
     while at + 4 <= len(data) and data[at + 1] != 0xDA:
         stuffed = data[at + 1] == 0xFF

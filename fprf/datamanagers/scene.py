@@ -126,7 +126,7 @@ DARK, BRIGHT = 0.03, 0.97
 
 
 def exposures_differ(exposure: Annotated[Tensor, "V"] | None) -> bool:
-    """Whether views were taken so differently that each needs a factor of its own; not where nothing is known."""
+    """True where views were taken so differently that each needs a factor of its own; not where nothing is known."""
     return exposure is not None and len(exposure) > 1 and GAMMA * float(exposure.log().std()) > DIFFERENT
 
 

@@ -101,7 +101,7 @@ def judge_views(
 
 @dataclass(frozen=True, kw_only=True)
 class AlignmentConfig:
-    """How a pose is fitted."""
+    """Settings of the pose fit."""
 
     steps: int = 120
     """Steps of Adam."""

@@ -169,7 +169,7 @@ _TO_XYZ = (
 """Linear sRGB to CIE XYZ (IEC 61966-2-1)."""
 _POLE = 25.0**7
 _EDGE = 6 / 29
-"""Where Lab's cube root turns into a line."""
+"""Value below which Lab's cube root is a line."""
 
 
 def delta_e(a: Annotated[Tensor, "... 3"], b: Annotated[Tensor, "... 3"]) -> Annotated[Tensor, "..."]:

@@ -126,7 +126,7 @@ Progress = Callable[[int, int, str], None]
 
 
 class _Known(NamedTuple):
-    """What frames are judged by, as far as it is there."""
+    """Data that frames are judged by, as far as it is there."""
 
     plain: list[Tensor] | None
     depths: list[Tensor] | None

@@ -76,7 +76,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 class Watch(NamedTuple):
-    """How times are taken."""
+    """Clock and rounds of a timing."""
 
     rounds: int
     device: torch.device
@@ -121,12 +121,12 @@ class Watch(NamedTuple):
 
 
 def ratio(slow: Sequence[float], fast: Sequence[float]) -> Spread:
-    """How many times faster, round by round: load that both met in a round cancels."""
+    """Speed-up, round by round: load that both met in a round cancels."""
     return spread([a / max(b, 1e-12) for a, b in zip(slow, fast, strict=True)])
 
 
 class Outcome(NamedTuple):
-    """What a benchmark found."""
+    """Result of a benchmark."""
 
     document: dict[str, Any]
     """For JSON."""
@@ -146,17 +146,17 @@ class Row:
     high: float | None = None
     """Third quartile."""
     goal: float | None = None
-    """What is aimed at; None where nothing is."""
+    """Target of the figure; None = none."""
     more_is_better: bool = False
-    """Whether the figure should be at least the goal, or at most."""
+    """True where the figure should be at least the goal, else at most."""
     peer: float | None = None
     """The same figure of what it is compared with."""
     ratio: Spread | None = None
-    """How many times faster than the peer, round by round."""
+    """Speed-up against the peer, round by round."""
     ratio_goal: float | None = None
-    """How many times faster it should be at least."""
+    """Least speed-up that is aimed at."""
     error: float | None = None
-    """What the speed costs; see `error_kind`."""
+    """Error at that speed; see `error_kind`."""
     error_kind: str = ""
     peer_error: float | None = None
     """The same error of the peer."""
@@ -164,14 +164,14 @@ class Row:
 
     @property
     def met(self) -> bool:
-        """Whether the goals, if any, are met."""
+        """True where the goals, if any, are met."""
         fast = self.ratio_goal is None or (self.ratio is not None and self.ratio.median >= self.ratio_goal)
         if self.goal is None:
             return fast
         return fast and (self.figure >= self.goal if self.more_is_better else self.figure <= self.goal)
 
     def json(self) -> dict[str, object]:
-        """What is known of it, rounded to the digits that mean something."""
+        """Fields as JSON, rounded to significant digits."""
         known: dict[str, object] = {"name": self.name, "figure": _rounded(self.figure), "unit": self.unit}
         for key in ("low", "high", "goal", "peer", "ratio_goal", "error", "peer_error"):
             value = getattr(self, key)
@@ -185,7 +185,7 @@ class Row:
 
 
 def machine(device: torch.device) -> dict[str, object]:
-    """What ran it: kind of machine, cores, threads, torch, load."""
+    """Machine that ran it: kind of machine, cores, threads, torch, load."""
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None  # Windows has none
     return {
@@ -263,7 +263,7 @@ def _rounded(value: float) -> float:
 
 
 def provenance(device: str) -> dict[str, object]:
-    """What a report carries besides its settings; nothing in it depends on the time. `device` as configs name it."""
+    """Origin of a report: versions, commit, machine; nothing in it depends on the time. `device` as configs name it."""
     return {
         "commit": commit(Path(__file__).parent),
         "fprf": __version__,

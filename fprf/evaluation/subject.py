@@ -1,4 +1,4 @@
-"""What a benchmark measures: a trained run, its images where they are at hand, references; single training steps and views.
+"""Subject of a benchmark: a trained run, its images where they are at hand, references; single training steps and views.
 
 The exact result of a view is the run's own image, sampled as it was trained, in float64 with nothing skipped.
 """
@@ -65,7 +65,7 @@ class Subject(NamedTuple):
     trained: Trained
     references: tuple[Path, ...]
     data: Path
-    """Where its images should lie."""
+    """Folder of its images."""
     prepare: Callable[[TrainConfig], Prepared]
     """Images and features for the run's config, or one that differs in its batches. Raises FprfError where they are not
     at hand."""
@@ -90,7 +90,7 @@ def find(root: Path, config: BenchConfig, folder: Path) -> Subject:
 
 
 def attempt(subject: Subject) -> tuple[Prepared | None, str]:
-    """What training needs; or why it is not at hand: rendering can be measured without."""
+    """Data of training, or the reason why it is not at hand: rendering can be measured without."""
     try:
         return subject.prepare(subject.trained.config), ""
     except FprfError as error:
@@ -105,12 +105,12 @@ def fresh_model(trained: Trained) -> Model:
 
 
 def watch_of(config: BenchConfig, trained: Trained) -> Watch:
-    """How times of this run are taken."""
+    """Timing of this run."""
     return Watch(config.repeats, trained.model.device, config.clock)
 
 
 def settings(config: BenchConfig, trained: Trained, missing: str) -> dict[str, object]:
-    """What figures depend on; `missing` says why some are absent."""
+    """Settings that figures depend on; `missing` says why some are absent."""
     return {
         "method": trained.method,
         "scene": trained.known.name,
@@ -154,7 +154,7 @@ def town_references(folder: Path, *, width: int = 160, height: int = 120) -> tup
 
 
 SHARE = 0.5
-"""Where in the learning-rate schedule a step is taken: halfway."""
+"""Place in the learning-rate schedule at which a step is taken."""
 
 
 def loop_of(config: TrainConfig, prepared: Prepared, model: Model) -> Loop:
@@ -206,7 +206,7 @@ CHUNK = 4096
 
 
 class Counts(NamedTuple):
-    """What a view was spared."""
+    """Rays and samples of a view: all, kept, and empty rays."""
 
     rays: int
     samples: int
@@ -269,7 +269,7 @@ def plainly(
 
 @torch.inference_mode()
 def count(parts: Parts, rays: Rays, budget: float) -> Counts:
-    """What a budget spares."""
+    """Count samples that a budget keeps."""
     samples = kept = empty = 0
     for part in _chunks(rays):
         marched = march(part, parts, budget=budget)

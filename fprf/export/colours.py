@@ -80,7 +80,7 @@ def best_views(
 def expected_presence(
     maps: DepthMaps, point: Annotated[Tensor, "N 3"], seen: BestViews, tolerance: float
 ) -> Annotated[Tensor, "N"]:
-    """How much light comes from within `tolerance` of a point's distance where it lies in a surface as thick as its views see.
+    """Share of light from within `tolerance` of a point's distance where it lies in a surface as thick as its views see.
 
     1 for sharp surfaces. A surface that training has left thick, as far ones in forward-facing captures are, has only a part of
     its light there; between two surfaces, where nothing is, less light comes than from either. In (0, 1], float32.
@@ -104,7 +104,7 @@ def expected_presence(
 _CLOSE = UniformSampler(UniformConfig(samples=8))
 """Steps along the piece of a ray that is close to a point."""
 _LOST = 1e-3
-"""Where less light than this comes from a point, the colour of the whole ray is taken."""
+"""Least light from a point: below, the colour of the whole ray is taken."""
 
 
 class Coloured(NamedTuple):
@@ -113,7 +113,7 @@ class Coloured(NamedTuple):
     colours: list[Annotated[Tensor, "N 3"]]
     """sRGB in [0, 1], one set a look."""
     presence: Annotated[Tensor, "N"]
-    """How much light comes from close to a point, in [0, 1]: low where it floats before or behind the field's own surface,
+    """Share of light from close to a point, in [0, 1]: low where it floats before or behind the field's own surface,
     and where that is thick (see `witness.expected_presence`)."""
 
 

@@ -1,4 +1,4 @@
-"""What to export, how finely, in which looks (as it is, and each style with its name), and the names of the files. No torch."""
+"""Settings of `fprf export`: kinds, resolution, looks (as it is, and each style with its name), names of files. No torch."""
 
 import re
 import warnings
@@ -86,7 +86,7 @@ KINDS = {
     "cameras": "transforms.json of Nerfstudio",
     "lut": "3D lookup tables of each style, for video editors",
 }
-"""What can be exported."""
+"""Kinds of export."""
 _ALSO = {"points": "ply", "splats": "splat", "gaussians": "splat", "mesh": "glb", "transforms": "cameras", "luts": "lut"}
 """Other words for the kinds."""
 
@@ -95,7 +95,7 @@ _ENDINGS = {".ply": ("ply", "splat", "glb"), ".splat": ("splat",), ".glb": ("glb
 
 
 class Plan(NamedTuple):
-    """What is to be written where."""
+    """Outputs and their files."""
 
     kinds: tuple[str, ...]
     folder: Path

@@ -37,7 +37,7 @@ __all__ = [
 _TORN = 1.25
 """Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground falls away fast."""
 _BENT = 3.0
-"""Where the steps to a pixel's two neighbours differ by more than this factor, an edge runs on the longer one's side."""
+"""Factor between the steps to a pixel's two neighbours beyond which an edge runs on the longer one's side."""
 
 
 class DepthMaps(NamedTuple):
@@ -47,7 +47,7 @@ class DepthMaps(NamedTuple):
     depth: tuple[Annotated[Tensor, "H W"], ...]
     """float32."""
     thickness: tuple[Annotated[Tensor, "H W"], ...] = ()
-    """How deep the surface is that each pixel sees, as a share of its depth, float32: its ray meets 80 % of its light
+    """Thickness of the surface that each pixel sees, as a share of its depth, float32: its ray meets 80 % of its light
     over that distance. Empty where surfaces are sharp."""
 
 
@@ -105,7 +105,7 @@ def _directed(maps: DepthMaps, view: int) -> tuple[Tensor, Tensor, Tensor]:
 def _step(
     point: Annotated[Tensor, "H W 3"], depth: Annotated[Tensor, "H W"], axis: int, flat: Annotated[Tensor, "H W 3"]
 ) -> Annotated[Tensor, "H W 3"]:
-    """How far the surface moves from one pixel to the next along an axis; `flat` where neither neighbour belongs to it."""
+    """Displacement of the surface from one pixel to the next along an axis; `flat` where neither neighbour belongs to it."""
     before, after = point - point.roll(1, axis), point.roll(-1, axis) - point
     joined = []
     for shift in (1, -1):
@@ -161,13 +161,13 @@ _THICKEST = 2.0
 """Surfaces are taken for no thicker than so many times their distance."""
 
 _REACH = 20.0
-"""What is farther than so many inner radii of a contraction is sky, unless the user says otherwise."""
+"""Distance of the sky in inner radii of a contraction, unless the user says otherwise."""
 _REACH_AHEAD = 50.0
 """The same for captures that look one way, in distances of the nearest thing."""
 
 
 def default_reach(space: Space) -> float:
-    """How far surfaces are looked for, in world units: a bounded box is looked at as a whole."""
+    """Distance up to which surfaces are looked for, in world units: a bounded box is looked at as a whole."""
     return math.inf if space.kind == "box" else _REACH_AHEAD * space.near if space.kind == "ndc" else _REACH / space.scale
 
 

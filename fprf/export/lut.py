@@ -148,7 +148,7 @@ class ColourPairs(NamedTuple):
     plain: Annotated[Tensor, "R 3"]
     styled: Annotated[Tensor, "S R 3"]
     share: Annotated[Tensor, "R K"]
-    """How much of each pixel's light comes from each region of the scene; rows sum to the pixel's opacity."""
+    """Share of each pixel's light from each region of the scene; rows sum to the pixel's opacity."""
 
 
 @torch.inference_mode()

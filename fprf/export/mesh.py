@@ -35,7 +35,7 @@ _BLOCK = 4
 _STEEP = 0.1
 """Smallest cosine that distances are multiplied with: below, a depth map knows little of the surface's place."""
 _CLEAR = 0.3
-"""How much a view that looks past a lattice point counts, against one that sees a surface there head-on."""
+"""Weight of a view that looks past a lattice point, against one that sees a surface there head-on."""
 _CHUNK = 1 << 18
 
 
@@ -130,21 +130,21 @@ def surface_nets(
 
 
 def _corners(key: Annotated[Tensor, "M"], cell: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 8"]:
-    """Where in the sorted keys the 8 lattice points of each cell are; -1 = not there."""
+    """Index in the sorted keys of the 8 lattice points of each cell; -1 = absent."""
     return torch.stack([_find(key, keys(cell + torch.tensor(shift))) for shift in _CORNERS], 1)
 
 
 def _mixed(
     key: Annotated[Tensor, "M"], inside: Annotated[Tensor, "M"], cell: Annotated[Tensor, "N 3"]
 ) -> Annotated[Tensor, "N"]:
-    """Which cells have all corners, and both signs among them."""
+    """Mask of the cells with all corners, and both signs among them."""
     corner = _corners(key, cell)
     signs = inside[corner.clamp_min(0)]
     return (corner >= 0).all(1) & signs.any(1) & ~signs.all(1)
 
 
 def _find(key: Annotated[Tensor, "M"], wanted: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
-    """Where in the sorted keys the wanted ones are; -1 = not there."""
+    """Index in the sorted keys of the wanted ones; -1 = absent."""
     if len(key) == 0:
         return torch.full_like(wanted, -1)
     index = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)

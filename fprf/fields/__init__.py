@@ -1,1 +1,1 @@
-"""What a scene is made of: planes, content, semantics, blocks."""
+"""Fields of a scene: planes, content, semantics, layouts of blocks."""

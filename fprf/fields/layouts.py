@@ -23,7 +23,7 @@ class LayoutConfig(PluginConfig):
 
     group: ClassVar[str] = "fprf.layouts"
     cuts: ClassVar[bool] = True
-    """Whether it may give more than one block."""
+    """True where it may give more than one block."""
 
     def build(self) -> BlockLayout:
         """The layout."""

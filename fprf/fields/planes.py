@@ -67,7 +67,7 @@ MAX_DEGREE = 4
 
 
 def count(degree: int) -> int:
-    """How many functions a degree has: its square. Raises ConfigError outside 1..4."""
+    """Number of functions of a degree: its square. Raises ConfigError outside 1..4."""
     if not 1 <= degree <= MAX_DEGREE:
         raise ConfigError(f"degree: {degree} must lie in [1, {MAX_DEGREE}]")
     return degree * degree

@@ -20,7 +20,7 @@ _UNFINISHED = re.compile(r"\..{1,40}\.[0-9a-f]{8}(\.\w+)?|\.tmp\w{6}")
 
 
 def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataError:
-    """What to say where the system refuses to write at `path`; `needed` are the bytes of the file, where they are known."""
+    """Error for a system that refuses to write at `path`; `needed` are the bytes of the file, where they are known."""
     reason = os.strerror(error.errno) if error.errno else str(error)
     try:
         folder = next(p for p in (path.absolute(), *path.absolute().parents) if p.is_dir())

@@ -15,10 +15,10 @@ from .images import Picture, to_uint8
 __all__ = ["depth_image", "depth_limits", "match_image", "match_summary", "palette", "scale_image"]
 
 _EMPTY = (0.50, 0.51, 0.53)
-"""Where nothing was hit: a grey that neither map uses."""
+"""Colour of pixels that hit nothing: a grey that neither map uses."""
 
 _KEPT = (0.86, 0.87, 0.88)
-"""Where a style leaves the scene as it is: paler than anything that takes part."""
+"""Colour of pixels that a style leaves as they are: paler than anything that takes part."""
 
 _COLOURS = (
     (0.902, 0.624, 0.000),  # orange
@@ -85,7 +85,7 @@ def match_image(
     opacity: Annotated[Tensor, "H W"] | None = None,
     kept: Annotated[Tensor, "H W"] | None = None,
 ) -> Picture:
-    """Which reference each pixel took its style from: its hue (`palette`), the code of it as a shade, doubt as darkness.
+    """Picture of the reference of each pixel: its hue (`palette`), the code of it as a shade, doubt as darkness.
 
     `attention` as `Stylizer.match` gives it (rows sum to 1); `reference` is the dictionary's; `kept` is how much of each
     pixel takes no style at all, shown pale. Raises DataError for numbers that do not fit together.
@@ -118,7 +118,7 @@ def match_summary(
     names: Sequence[str],
     opacity: Annotated[Tensor, "H W"] | None = None,
 ) -> dict[str, object]:
-    """How the references were used: their `share` of the attention (sums to 1), the mean of the best code's attention
+    """Use of the references: their `share` of the attention (sums to 1), the mean of the best code's attention
     (`mean_score`, 1 = certain) and the mean `entropy` in bits (0 = certain). Pixels count by their opacity.
     """
     _fitting(attention, reference, names)

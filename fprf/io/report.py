@@ -1,4 +1,4 @@
-"""How training went: charts as SVG text in the colours of the page, the page of a run's report, TensorBoard's event files."""
+"""Report of training: charts as SVG text in the colours of the page, the page of a run's report, TensorBoard's event files."""
 
 import math
 import shutil

@@ -110,7 +110,7 @@ def side_by_side(pictures: Sequence[Picture]) -> Picture:
 
 
 def seam_positions(count: int, at: float) -> list[float]:
-    """Where `count` strips meet, as shares of the width; over `at` in [0, 1] each seam swings by half a strip and back."""
+    """Seams of `count` strips, as shares of the width; over `at` in [0, 1] each seam swings by half a strip and back."""
     swing = math.sin(2 * math.pi * at) / (2 * count)
     return [k / count + swing for k in range(1, count)]
 

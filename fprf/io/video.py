@@ -152,7 +152,7 @@ _RECORD = ".render.json"
 
 
 def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
-    """Which of the frames are not there yet; all, where the folder was rendered from something else than `key` says.
+    """Frames that are not there yet; all, where the folder was rendered from something else than `key` says.
 
     The key is written down at once, so that what is rendered from now on counts. Frames are whole or absent.
     """

@@ -1,4 +1,4 @@
-"""Which form of an operation runs: a compiled kernel where one applies, or the plain torch form, the reference, everywhere."""
+"""Choice of an operation's form: a compiled kernel where one applies, or the plain torch form, the reference, everywhere."""
 
 import importlib.util
 from collections.abc import Iterator
@@ -12,12 +12,12 @@ _PLAIN: ContextVar[bool] = ContextVar("fprf.ops.plain", default=False)
 
 
 def compiled() -> bool:
-    """Whether kernels for the CPU may run: numba is installed, and nobody asked for the plain forms."""
+    """True where kernels for the CPU may run: numba is installed, and nobody asked for the plain forms."""
     return _AVAILABLE and not _PLAIN.get()
 
 
 def asked_plain() -> bool:
-    """Whether somebody asked for the plain forms."""
+    """True within `plain()`."""
     return _PLAIN.get()
 
 

@@ -20,7 +20,7 @@ __all__ = ["Gathered", "Warp", "Weighed", "composite", "distances", "gather", "p
 
 
 Warp = Annotated[Tensor, "7"]
-"""How a space maps to the unit cube, as the kernels take it."""
+"""Map of a space to the unit cube, as the kernels take it."""
 
 
 class Weighed(NamedTuple):
@@ -33,7 +33,7 @@ class Weighed(NamedTuple):
     """Of the whole ray."""
     keep: Annotated[Tensor, "R S"]
     start: Annotated[Tensor, "R+1"]
-    """Where the kept samples of each ray begin, int64; at last where they end."""
+    """Offsets of the kept samples of each ray, int64; the last is their count."""
 
 
 class Gathered(NamedTuple):
@@ -82,7 +82,7 @@ def propose(
     count: int,
     shift: Annotated[Tensor, "R 1"],
 ) -> Annotated[Tensor, "R count+1"]:
-    """Where a plane field of one scale, of density exp(feature . weight - 1), wants the next level's edges.
+    """Edges of the next level for a plane field of one scale, of density exp(feature . weight - 1).
 
     F is a multiple of 8. Behind an optical depth of 20 nothing is looked up.
     """

@@ -27,7 +27,7 @@ forward and 102 backward, nothing spilled and no barrier; twice as many cost bar
 
 
 def interpreted() -> bool:
-    """Whether Triton was told to interpret its code on the CPU."""
+    """True where Triton interprets its code on the CPU."""
     if not _AVAILABLE:
         return False
     import triton
@@ -48,7 +48,7 @@ def usable(points: Tensor, table: Tensor) -> bool:
 
 @cache
 def _launches(device: torch.device) -> bool:
-    """Whether a kernel can be compiled and launched there: tried once, and told where it cannot."""
+    """True where a kernel can be compiled and launched: tried once, and told where it cannot."""
     try:
         forward(torch.zeros(1, 3, device=device), torch.zeros(12, 1, device=device), (2,))
     except torch.OutOfMemoryError:

@@ -11,7 +11,7 @@ class Need(NamedTuple):
     """Something that a plug-in lacks on this machine."""
 
     what: str
-    """What is missing, for example `the package transformers`."""
+    """Name of what is missing, for example `the package transformers`."""
     remedy: str
     """The command that installs it, or what else to do."""
     downloaded: bool = False

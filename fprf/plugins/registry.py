@@ -137,7 +137,7 @@ def name_of(group: str, cls: type) -> str:
 
 
 def peek(group: str, name: str) -> object | None:
-    """What the name stands for if its module happens to be imported already, else None. Imports nothing."""
+    """Object of that name if its module is imported already, else None. Imports nothing."""
     entries = installed(group).get(name, ())
     return _imported(entries[0].point) if len(entries) == 1 else None
 
@@ -192,7 +192,7 @@ def _package(distribution: Distribution) -> str:
 
 
 def _complaint(distribution: Distribution, error: Exception) -> list[str]:
-    """What is wrong with a package whose metadata cannot be read, if it has plug-ins of ours at all."""
+    """Fault of a package whose metadata cannot be read, if it has plug-ins of ours at all."""
     try:
         text = distribution.read_text("entry_points.txt") or ""
     except Exception:  # the file itself is the damaged one: it may be about us

@@ -36,7 +36,7 @@ def members(hint: Any) -> tuple[Any, ...]:
 
 
 def is_slot(hint: Any) -> bool:
-    """Whether a type is an abstract plug-in config: one that sets `group` itself."""
+    """True for an abstract plug-in config: one that sets `group` itself."""
     return isinstance(hint, type) and issubclass(hint, PluginConfig) and "group" in hint.__dict__
 
 

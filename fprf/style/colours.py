@@ -66,7 +66,7 @@ class ColourMaps(nn.Module):
         semantic: Annotated[Tensor, "N D"] | None,
         belongs: Annotated[Tensor, "N K"] | None = None,
     ) -> Annotated[Tensor, "N 3"]:
-        """What is to be added to colours in [0, 1] so that they lie in the style and in [0, 1].
+        """Change to add to colours in [0, 1] so that they lie in the style and in [0, 1].
 
         `belongs` is the points' membership, where somebody has it.
         """

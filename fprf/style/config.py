@@ -39,7 +39,7 @@ _PIXEL = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
 
 
 class RegionValue(NamedTuple):
-    """What is wanted of a region."""
+    """A value for a region."""
 
     region: str
     value: str
@@ -88,7 +88,7 @@ def labels(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def find_reference(text: str, paths: Sequence[Path]) -> int:
-    """Which reference is meant: by label, else path or name, else number from 0, else stem. Raises UsageError."""
+    """Index of a reference: by label, else path or name, else number from 0, else stem. Raises UsageError."""
     names = labels(paths)
     for matches in (
         [i for i, name in enumerate(names) if text == name],
@@ -185,7 +185,7 @@ def with_preset(config: C, name: str) -> C:
 
 
 def preset_flags(name: str) -> str:
-    """What a preset sets, as flags."""
+    """Flags that a preset sets."""
     return " ".join(f"--{path.replace('_', '-')} {value:g}" for path, value in PRESETS[name].items())
 
 

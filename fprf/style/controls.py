@@ -1,4 +1,4 @@
-"""What a user turns, as mathematics: how strong a style is, where, from which reference, and how light its colours are.
+"""Controls of a style as mathematics: strength, regions, references, and luminance.
 
 Strengths are one number or one a point. Luminance is Rec. 709 luma of sRGB. It is kept on the colour of each point, not of
 each pixel: luma is linear, so both would agree but for what leaves the range of colours, and on points that is mended where
@@ -66,7 +66,7 @@ def allowed_references(
     pin: Mapping[int, Set[int]] | None = None,
     forbid: Sequence[tuple[int, int]] = (),
 ) -> Annotated[Tensor, "regions references"]:
-    """Which references each region may take codes from, bool: all, but for what the user excludes.
+    """References that each region may take codes from, bool: all, but for what the user excludes.
 
     `pin` maps a region to the only references that it may take from; `forbid` holds (region, reference) pairs that may not
     meet. Raises UsageError for numbers out of range or a region that is left with nothing.

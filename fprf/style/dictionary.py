@@ -51,7 +51,7 @@ class Reference(NamedTuple):
     semantic: Annotated[Tensor, "N D"]
     """In the scene's semantic basis; D = 0 where the scene has no semantics."""
     weight: float = 1.0
-    """How much it counts beside the others; above 0."""
+    """Weight beside the others; above 0."""
     colour: Annotated[Tensor, "N 3"] | None = None
     """The samples' own colours, sRGB in [0, 1]; None where nobody will ask."""
 

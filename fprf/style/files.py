@@ -32,7 +32,7 @@ S = TypeVar("S", bound=StyleConfig)
 
 
 class StyleFile(NamedTuple):
-    """What a style file says; paths as they are found from here."""
+    """Content of a style file; paths relative to the working directory."""
 
     style: StyleConfig
     regions: Mapping[str, Key] = {}

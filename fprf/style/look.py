@@ -1,4 +1,4 @@
-"""What a renderer needs to show a scene in a style: features to styled features, strengths and colours, point by point.
+"""The look of a scene in a style: features to styled features, strengths and colours, point by point.
 
 A look is one stylizer with its strengths, or a mix of several: features, strengths and luminances are mixed linearly at every
 point, so that a style fades into another without either's edges showing.
@@ -32,11 +32,11 @@ class Restyle:
     regions: RegionWeight | None = None
     """Strength of each region, times `strength`; None = all 1."""
     features: float = 1.0
-    """How much of the stylizer's change of features counts at full strength."""
+    """Share of the stylizer's change of features at full strength."""
     colours: ColourMaps | None = None
-    """What is done to colours behind the decoder at full strength; None = nothing."""
+    """Change of colours behind the decoder at full strength; None = none."""
     luminance: float = 0.0
-    """How much of the scene's own luminance is kept."""
+    """Share of the scene's own luminance that is kept."""
     share: float = 1.0
     """Its part of the mix; those of all parts sum to 1."""
     others: tuple["Restyle", ...] = ()
@@ -54,7 +54,7 @@ class Restyle:
 
     @property
     def needs(self) -> Want:
-        """What it reads of points."""
+        """Features of points that it reads."""
         needs = Want.CONTENT
         for part in self.parts:
             if part.share > 0 and part.strength > 0:
@@ -97,7 +97,7 @@ class Restyle:
         return _mix([(part.share, part._alone(content, semantic)[0]) for part in self.parts if part.share > 0])
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
-        """How much each point takes of each style code, those of all parts one after the other; rows sum to 1 at most.
+        """Share that each point takes of each style code, those of all parts one after the other; rows sum to 1 at most.
 
         What is missing to 1 is what regions keep; the overall strength does not count.
         """
@@ -108,7 +108,7 @@ class Restyle:
         return torch.cat(taken, 1)
 
     def _alone(self, content: Tensor, semantic: Tensor | None) -> tuple[Applied, Annotated[Tensor, "N K"] | None]:
-        """What this part makes of points, and which regions they belong to, if the stylizer has found that."""
+        """Points in this part's style, and their regions, if the stylizer has computed them."""
         if self.strength == 0:
             return (content, 0.0, self.luminance), None
         styled, belongs = self.stylizer.shared(content, semantic)
@@ -127,7 +127,7 @@ class Restyle:
     def _recoloured(
         self, colour: Annotated[Tensor, "N 3"], semantic: Tensor | None, belongs: Tensor | None
     ) -> Annotated[Tensor, "N 3"] | None:
-        """What this part adds to colours; None where that is nothing."""
+        """Change of colours by this part; None = none."""
         if self.colours is None or self.share == 0 or self.strength == 0:
             return None
         change: Tensor = self.colours(colour, semantic, belongs)

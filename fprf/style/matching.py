@@ -84,7 +84,7 @@ def scores(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) ->
 
 
 def score_spread(queries: Annotated[Tensor, "N D"], keys: Annotated[Tensor, "T D"]) -> float:
-    """What temperature 1 means: how much the scores of a query differ between keys (rms); 1 where they never do.
+    """Unit of the temperature: spread of the scores of a query between keys (rms); 1 where they never do.
 
     The unit cancels the encoder's scale and its contrast between things, both of which differ between encoders.
     """
@@ -139,7 +139,7 @@ _RIDGE = 0.1
 
 
 class Matching(NamedTuple):
-    """How regions and codes are matched."""
+    """Settings of the match between regions and codes."""
 
     temperature: float
     """Relative to the spread of the scores; above 0."""
@@ -192,7 +192,7 @@ def match_keys(
 
 
 def whitener(side: Keys, whitening: float) -> Annotated[Tensor, "D D"]:
-    """What partly whitens semantics of a side, float64 and symmetric; the identity where they do not vary, or for 0."""
+    """Matrix that partly whitens semantics of a side, float64 and symmetric; the identity where they do not vary, or for 0."""
     away = double(side.keys) - share_mean(double(side.keys), double(side.share))
     scatter = (away * (double(side.share) / double(side.share).sum())[:, None]).T @ away
     unity, size = torch.eye(len(scatter)).to(scatter), scatter.diagonal().mean()

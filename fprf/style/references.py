@@ -47,7 +47,7 @@ _ROWS = 4096
 
 
 class Encoders(NamedTuple):
-    """What brings references into a scene's terms: loaded once for any number of styles."""
+    """Encoders and basis for references of a scene: loaded once for any number of styles."""
 
     content: Encoder
     semantic: Encoder | None
@@ -156,7 +156,7 @@ def _inside(mask: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "N 2"]:
 
 
 def _mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
-    """What a mask selects at that size (width, height), bool: at least half covered, else whatever is covered at all."""
+    """A mask at that size (width, height), bool: at least half covered, else whatever is covered at all."""
     picture = load_image(path, upright=True)
     (height, width), (own_height, own_width) = picture.shape[:2], photo.shape[:2]
     if abs(width * own_height - height * own_width) > 0.5 * (width + height + own_width + own_height):

@@ -1,4 +1,4 @@
-"""What a trained scene knows of its own style: one set of content statistics and its semantic regions."""
+"""Style of a trained scene: one set of content statistics and its semantic regions."""
 
 from collections.abc import Mapping
 from typing import Annotated, NamedTuple
@@ -57,7 +57,7 @@ class SceneStyle(NamedTuple):
     semantic_mean: Annotated[Tensor, "D"]
     """Mean semantic feature of the scene: the centre for cosine matching."""
     contacts: Annotated[Tensor, "K K"]
-    """How much each two regions meet without an edge of colour between them (`region_contacts`); 0 where not measured."""
+    """Contact of each two regions without an edge of colour between them (`region_contacts`); 0 where not measured."""
 
 
 def scene_style(
@@ -102,7 +102,7 @@ def region_units(keys: Annotated[Tensor, "K D"], centre: Annotated[Tensor, "D"])
 def membership(
     semantic: Annotated[Tensor, "N D"], centre: Annotated[Tensor, "D"], units: Annotated[Tensor, "K D"], temperature: float
 ) -> Annotated[Tensor, "N K"]:
-    """How much each point belongs to each region: attention without the faintest shares; rows sum to 1."""
+    """Membership of each point in each region: attention without the faintest shares; rows sum to 1."""
     if len(units) == 1:
         return semantic.new_ones(len(semantic), 1)
     return point_shares(semantic, units, temperature, centre=centre, faint=_FAINT)
@@ -111,7 +111,7 @@ def membership(
 def region_contacts(
     scene: SceneStyle, semantic: Annotated[Tensor, "P 2 D"], colour: Annotated[Tensor, "P 2 3"]
 ) -> Annotated[Tensor, "K K"]:
-    """How much membership passes from one region to another between P pairs of neighbouring pixels without an edge of colour.
+    """Membership that passes from one region to another between P pairs of neighbouring pixels without an edge of colour.
 
     Mean over the pairs of -d_k d_l, with d the difference of both ends' memberships, where that is above 0; pairs whose colours
     differ count less. Symmetric, at least 0, with 0 on the diagonal.
@@ -129,7 +129,7 @@ def region_contacts(
 def region_smoothing(
     scene: SceneStyle, smoothness: float, allowed: Annotated[Tensor, "K references"] | None = None
 ) -> Annotated[Tensor, "K K"]:
-    """What makes regions alike that meet without an edge of colour: H, float64, rows sum to 1; the identity for 0.
+    """Matrix that makes regions alike that meet without an edge of colour: H, float64, rows sum to 1; the identity for 0.
 
     For values v of the regions, x = H v minimises sum_k s_k |x_k - v_k|^2 + smoothness sum_(k<l) c_kl |x_k - x_l|^2, with
     shares s and contacts c: the second sum is what x changes by between neighbouring pixels of one colour. The mean over the
@@ -197,7 +197,7 @@ def from_tensors(tensors: Mapping[str, Tensor]) -> SceneStyle:
 
 
 def _regions(semantic: Tensor, keys: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Which keys some point belongs to, and memberships among those alone: no region has statistics of nothing.
+    """Keys that some point belongs to, and memberships among those alone: no region has statistics of nothing.
 
     K-means compares distances and membership compares directions, so a cluster may win no point. Memberships are taken
     again without it, as the stylizers will.

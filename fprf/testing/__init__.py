@@ -1,4 +1,4 @@
-"""What every plug-in must keep to, for the tests of a plug-in's own package: `from fprf.testing import check_encoder`."""
+"""Contract tests for a plug-in's own package: `from fprf.testing import check_encoder`."""
 
 from .contracts import (
     check_config,

@@ -55,7 +55,7 @@ def pointwise(function: Callable[[Tensor], Tensor], points: Tensor, name: str) -
 
 
 def follows(call: Callable[[], Tensor], like: Tensor, name: str) -> None:
-    """What a call gives, and makes on the way, takes device and dtype from its inputs, which are of the kind of `like`.
+    """The result of a call, and tensors that it makes, take device and dtype from its inputs, which are of the kind of `like`.
 
     Called with float64 on the CPU, while new tensors that name no device are put elsewhere: those cannot be computed with.
     """

@@ -1,4 +1,4 @@
-"""What every plug-in must keep to, as functions that a plug-in's own tests call: `check_encoder(MyConfig())`.
+"""Contracts of plug-ins, as functions that a plug-in's own tests call: `check_encoder(MyConfig())`.
 
 Each builds the plug-in from its config, as the program does, and raises AssertionError with one sentence on the first
 breach. They take a second or so on a CPU and need no data but what is passed to them.

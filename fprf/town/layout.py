@@ -18,9 +18,9 @@ __all__ = ["CROSSING", "END", "KERB", "ROAD_HALF", "SQUARE_HALF", "START", "WALK
 ROAD_HALF, WALK_HALF, KERB = 3.4, 5.4, 0.22
 """Half widths of the road and of road plus sidewalks, and the width of the kerb, in metres."""
 START, END, SQUARE_HALF = -8.0, 41.0, 9.0
-"""Where the houses begin (in the shortest town), where the road meets the square, and half the square's width."""
+"""Start of the houses (in the shortest town), end of the road at the square, and half the square's width."""
 CROSSING = 13.0
-"""Where the zebra crossing begins."""
+"""Start of the zebra crossing."""
 
 
 class FaceTable(NamedTuple):
@@ -80,7 +80,7 @@ def _row(side: int, start: float, rng: np.random.Generator) -> list[Shape]:
 
 
 def _gap(x: float, gap: float, front: float, side: int, rng: np.random.Generator) -> list[Shape]:
-    """What fills the space between two houses: a tree behind a hedge, or a car on a driveway before one."""
+    """Objects between two houses: a tree behind a hedge, or a car on a driveway before one."""
     middle = x + gap / 2
     parked = gap > 2.6 and rng.random() < 0.6
     at = front + (5.4 if parked else 1.0)

@@ -1,4 +1,4 @@
-"""What a palette is: colours of every material, the light, the sky. Geometry and labels know nothing of it.
+"""Palettes: colours of every material, the light, the sky. Geometry and labels know nothing of it.
 
 Colours are sRGB in [0, 1] as (r, g, b); intensities of light are linear.
 """
@@ -46,7 +46,7 @@ class Palette:
     """Share of the lawn under fallen leaves."""
     snow: Colour = (0.93, 0.95, 0.99)
     snowing: float = 0.0
-    """How much snow lies, 0 to 1."""
+    """Share of snow, 0 to 1."""
     asphalt: Colour = (0.37, 0.37, 0.39)
     marking: Colour = (0.93, 0.92, 0.88)
     slabs: Colour = (0.66, 0.63, 0.58)

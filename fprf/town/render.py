@@ -157,7 +157,7 @@ def cast(town: Town, view: View, d: tuple[Array, Array, Array], samples: int) ->
 
 
 def shadowed(town: Town, points: Array, sun: Array, foliage: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ...]:
-    """Whether something solid, and whether foliage, stands between points [N 3] and the sun (a unit vector towards it).
+    """Masks: something solid, and foliage, stands between points [N 3] and the sun (a unit vector towards it).
 
     `foliage` says of each solid whether it lets some light through.
     """
@@ -193,7 +193,7 @@ _EVERY = 8
 
 
 def is_test(view: int) -> bool:
-    """Whether a view is held out: every 8th, the first one included."""
+    """True for held-out views: every 8th, the first one included."""
     return view % _EVERY == 0
 
 

@@ -45,19 +45,19 @@ _FLAT: Array = np.zeros(3)
 
 
 class Material(IntEnum):
-    """How a face is painted (finer than its class)."""
+    """Material of a face (finer than its class)."""
 
     GROUND, FACADE, ROOF, TRIM, FOLIAGE, TRUNK, POST, LANTERN, PAINT, GLASS, TYRE = range(11)
 
 
 class Finish(NamedTuple):
-    """What a face is made of. Whole numbers that painters read; their meaning depends on the material."""
+    """Parameters of a face. Whole numbers that painters read; their meaning depends on the material."""
 
     material: Material
     style: int = 0
     """Facade: 0 brick, 1 plaster, 2 clapboard, 3 timber, 4 stone. Roof: 0 tiles, 1 flat."""
     tint: int = 0
-    """Which of the palette's colours for this material."""
+    """Index of the palette's colour for this material."""
     columns: int = 0
     """Facade: windows side by side; 0 = a blank wall."""
     storeys: int = 0
@@ -208,7 +208,7 @@ _HIDDEN = Finish(Material.TRIM)
 
 
 class Lot(NamedTuple):
-    """Where a house stands: x from start to stop, its front at |y| = front on one side (-1 or 1) of the street."""
+    """Place of a house: x from start to stop, its front at |y| = front on one side (-1 or 1) of the street."""
 
     start: float
     stop: float

@@ -80,7 +80,7 @@ _CLASS = {
 
 
 class Parts(NamedTuple):
-    """Where on a facade N points lie."""
+    """Places of N points on a facade."""
 
     window: Mask
     """Frame included."""

@@ -37,7 +37,7 @@ _RECORD = "town.json"
 
 @dataclass(frozen=True, kw_only=True)
 class TownSettings:
-    """What a folder holds."""
+    """Settings of a folder."""
 
     seed: int
     palette: str
@@ -66,7 +66,7 @@ def _files(views: int) -> list[str]:
 
 
 def _complete(folder: Path, settings: TownSettings) -> bool:
-    """Whether a folder holds exactly these settings, all files present."""
+    """True where a folder holds exactly these settings, all files present."""
     try:
         record = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -120,7 +120,7 @@ def write_down(run: Run, config: TrainConfig, method: str, laid: Laid) -> None:
 
 
 def _rays_of(plan: Plan, block: int) -> dict[str, Tensor]:
-    """What a block learns from: `views` [M] and their tiles `seen` [M TILES TILES]; the surroundings from everything."""
+    """Training data of a block: `views` [M] and their tiles `seen` [M TILES TILES]; the surroundings from everything."""
     views = plan.views if block == SURROUNDINGS else plan.views_of(block)
     at = torch.isin(plan.views, views)
     seen = torch.ones_like(plan.seen[:, 0]) if block == SURROUNDINGS else plan.seen[:, block]

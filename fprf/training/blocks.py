@@ -86,7 +86,7 @@ class Built(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """What done.json says of a block."""
+    """Content of a block's done.json."""
 
     step: int
     seconds: float
@@ -94,7 +94,7 @@ class Finished(NamedTuple):
 
 
 def folder_of(root: Path, block: int) -> Path:
-    """Where a block lies in a run."""
+    """Folder of a block in a run."""
     return root / "blocks" / ("surroundings" if block == SURROUNDINGS else f"{block:02d}")
 
 
@@ -210,7 +210,7 @@ def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
 
 
 def load_boxes(root: Path) -> Boxes:
-    """How a run is cut. Raises CheckpointError."""
+    """Read the boxes of a run's blocks. Raises CheckpointError."""
     path = root / "blocks.json"
     try:
         document: dict[str, Any] = json.loads(path.read_text())
@@ -224,7 +224,7 @@ def load_boxes(root: Path) -> Boxes:
 def asked_of(
     config: TrainConfig, facts: Facts, scene: Scene, boxes: Boxes, block: int, rays: dict[str, Tensor]
 ) -> dict[str, Any]:
-    """What a block is trained as; while it stays the same, what was trained stays good. `rays` is its rays.safetensors.
+    """Settings and data of a block's training; while they stay the same, the block stays valid. `rays` is its rays.safetensors.
 
     A block is decided by its bounds and rays, its images, and the config but for what may change, not by its surroundings:
     they are only its frame.
@@ -255,7 +255,7 @@ WARM_UP = 20
 
 @dataclass(frozen=True, kw_only=True)
 class BlockTask:
-    """What a worker is told; the rest lies in the run folder. Small, so that it can be sent to other machines."""
+    """Message to a worker; the rest lies in the run folder. Small, so that it can be sent to other machines."""
 
     root: str
     """Run folder."""

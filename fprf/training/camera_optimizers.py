@@ -1,4 +1,4 @@
-"""Where each view was taken from, a little off what the capture says: a turn and a shift a view, learnt with the scene.
+"""Corrections of the captured poses: a turn and a shift a view, learnt with the scene.
 
 Conventions. A move is [turn, shift]: a rotation vector in world axes about the camera's own centre (radians), and the centre's
 shift in units of `reach`, the distance that views commonly see. So one step of the optimiser moves a pixel about as far by

@@ -27,7 +27,7 @@ KEEP = 2
 
 
 class Saved(NamedTuple):
-    """What a checkpoint holds."""
+    """Content of a checkpoint."""
 
     step: int
     seconds: float

@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
 
     @property
     def right(self) -> bool:
-        """Whether the error is within the tolerance."""
+        """True where the error is within the tolerance."""
         return self.error <= self.allowed
 
 

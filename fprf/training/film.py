@@ -31,7 +31,7 @@ class Take(NamedTuple):
     scene: Callable[[int], Scene]
     """In its look of each frame."""
     styled: Styled | None = None
-    """Where it is one style throughout: what match maps speak of."""
+    """The style where it is one throughout, for match maps."""
 
 
 def shoot(scene: Scene, cameras: Cameras, frame: int, eyes: float | None = None) -> View:
@@ -60,7 +60,7 @@ def panels(
     limits: tuple[float, float] | None = None,
     eyes: float | None = None,
 ) -> list[Picture]:
-    """What is to be shown, in its order: colour and match maps once for each take, geometry once for all."""
+    """Panels in their order: colour and match maps once for each take, geometry once for all."""
     views = [shoot(take.scene(frame), cameras, frame, eyes) for take in takes] if "colour" in show else []
     geometry = views[0] if views else shoot(scene, cameras, frame, eyes)
     shown: list[Picture] = []

@@ -118,7 +118,7 @@ class Trained(Scene):
     damaged: tuple[str, ...] = ()
     """A line for each newer checkpoint that could not be used."""
     look: Restyle | None = None
-    """What it is rendered in; None = as it was captured."""
+    """Look that it is rendered in; None = as it was captured."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -171,7 +171,7 @@ class Trained(Scene):
         return self.model.decoder
 
     def measured(self) -> tuple[SceneStyle, Basis | None]:
-        """What training measured."""
+        """Style and basis that training measured."""
         return load_style(self.run)
 
     @torch.inference_mode()
@@ -272,7 +272,7 @@ def _load_blocks(
 
 
 def _where_refined(known: Known, model: Model) -> Known:
-    """What is known of the scene, its cameras where training has put them."""
+    """Facts of the scene, its cameras as refined by training."""
     return known if model.poses is None else replace(known, cameras=model.poses.refined(known.cameras))
 
 

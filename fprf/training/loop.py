@@ -1,4 +1,4 @@
-"""What a training loop heeds: its schedule, interrupts, and numbers that are not finite."""
+"""Parts of a training loop: schedule, interrupts, and numbers that are not finite."""
 
 import math
 import signal
@@ -48,7 +48,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """What was asked for since."""
+    """Requests to stop."""
 
     def __init__(self) -> None:
         self.asked = False

@@ -50,7 +50,7 @@ def check_penalties(config: LossConfig, model: Model) -> None:
 
 
 def wanted(config: LossConfig, batch: Batch, extra: LossTerm | None = None) -> Want:
-    """What must be rendered for the terms that count."""
+    """Outputs of the renderer that terms of weight above 0 need."""
     want = Want.DENSITY if extra is None else Want.DENSITY | extra.needs
     if config.rgb > 0:
         want |= Want.COLOUR
@@ -115,7 +115,7 @@ def terms(
 def ending(
     t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], ends: Annotated[Tensor, "R"], *, ndc: bool = False
 ) -> Tensor | None:
-    """How far rays are from ending at their known ray parameters (NaN = unknown); None where none is known.
+    """Distance of rays from ending at their known ray parameters (NaN = unknown); None where none is known.
 
     (1 - weight within NEARBY of the distance)^2 + (weight before)^2, the mean over those rays: both within [0, 1]. On an
     accelerator it is 0 where none is known: the host would have to wait to find out.
@@ -142,7 +142,7 @@ def _missed(t: Tensor, weights: Tensor, ends: Tensor, *, ndc: bool) -> Annotated
 def emptiness(
     t: Annotated[Tensor, "R E"], weights: Annotated[Tensor, "R S"], sky: Annotated[Tensor, "R"], *, within: float
 ) -> Tensor | None:
-    """How much rays into the sky meet before `within` (space units); None where there are none.
+    """Opacity that rays into the sky meet before `within` (space units); None where there are none.
 
     Mean over those rays of (weight before)^2, in [0, 1]: the sky itself is learnt beyond the shell. On an accelerator
     it is 0 where there are none.

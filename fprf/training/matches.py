@@ -103,7 +103,7 @@ def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
 
 
 def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
-    """How the references and their codes were used, and how surely, over the pixels of a view by their opacity."""
+    """Use of the references and their codes, and its certainty, over the pixels of a view by their opacity."""
     each = matched.opacity.double()
     total = float(each.sum()) or 1.0
     weight = each * (1 - matched.kept)
@@ -162,7 +162,7 @@ _COARSE, _FINE = 32, 160
 
 
 class Taken(NamedTuple):
-    """What a region takes from one reference."""
+    """Share of a region that comes from one reference."""
 
     name: str
     share: float
@@ -178,7 +178,7 @@ class Region(NamedTuple):
     share: float
     """Of the scene's weight."""
     view: str
-    """Where it is largest."""
+    """View in which it is largest."""
     pixel: tuple[int, int]
     """A place in that view, in the middle of it: what to point at to mean it."""
     picture: Picture

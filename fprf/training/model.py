@@ -33,7 +33,7 @@ def build_decoder(config: TrainConfig, *, encoder: str, channels: int) -> Decode
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What training found out about a scene: enough to rebuild its model without images or encoders."""
+    """Facts of a trained scene: enough to rebuild its model without images or encoders."""
 
     space: Space
     channels: int

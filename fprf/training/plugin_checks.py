@@ -1,4 +1,4 @@
-"""What a plug-in answers, looked at once when it is built: a breach is told with its name, not met later as a strange image.
+"""Checks of a plug-in's first outputs: a breach is told with its name, not met later as a strange image.
 
 A handful of points cost milliseconds, and nothing afterwards. `fprf.testing` has whole contracts, for a plug-in's own tests.
 """

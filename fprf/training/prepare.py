@@ -64,7 +64,7 @@ class Prepared(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """Where features and embedded scenes are kept between runs: $XDG_CACHE_HOME/fprf or ~/.cache/fprf."""
+    """Folder of features and embedded scenes between runs: $XDG_CACHE_HOME/fprf or ~/.cache/fprf."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fprf"
 
 
@@ -159,7 +159,7 @@ def facts_of(
     content_store: FeatureStore | None,
     semantic_store: FeatureStore | None,
 ) -> Facts:
-    """What was found out about a scene."""
+    """Facts of a scene."""
     return Facts(
         space=space,
         channels=content.channels,
@@ -202,7 +202,7 @@ def behind(config: TrainConfig, scene: Scene) -> tuple[float, float, float] | No
 
 
 class _Pace(NamedTuple):
-    """What a kind of device does, within a factor of two."""
+    """Speed of a kind of device, within a factor of two."""
 
     rays: float
     """Rays trained in a second by `fprf-lite`."""
@@ -273,7 +273,7 @@ class Forecast:
 
 
 class Outcome(NamedTuple):
-    """What a training came to."""
+    """Outcome of a training."""
 
     steps: int
     """Of the block that was trained least, where there are several."""
@@ -284,7 +284,7 @@ class Outcome(NamedTuple):
 
     @property
     def too_short(self) -> bool:
-        """Whether there is nothing to be judged by yet."""
+        """True where training was too short to be judged."""
         return self.steps < _FEW_STEPS
 
     def told(self, root: Path, config: TrainConfig) -> str:
@@ -301,7 +301,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(root: Path, config: TrainConfig, scene: Scene) -> Outcome | None:
-    """What a run's events.jsonl says of its training, or those of its blocks; None where no step was made."""
+    """Outcome by a run's events.jsonl, or those of its blocks; None where no step was made."""
     try:
         trained = [history for history in read_history(root) if history.step and history.values["psnr"][-1] is not None]
     except CheckpointError:

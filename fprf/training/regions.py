@@ -1,4 +1,4 @@
-"""Which regions of a scene are meant: by number, by name in a style file, by a pixel of a view, by a mask over one."""
+"""Choice of a scene's regions: by number, by name in a style file, by a pixel of a view, by a mask over one."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -91,13 +91,13 @@ def find_regions(regions: Regions, text: str) -> list[RegionMatch]:
 def memberships(
     scene: Scene, style: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
 ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
-    """How much of what pixels (centres) see belongs to each region of a scene's style, and their opacity."""
+    """Share of what pixels (centres) see that belongs to each region of a scene's style, and their opacity."""
     weight = RegionWeight(style, torch.eye(len(style.share))).to(scene.device)
     return scene.paint(cameras, view, pixel, weight, semantic=weight.divided)
 
 
 def membership_view(regions: Regions, view: int, size: int) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:
-    """How much of each pixel belongs to each region, and its opacity, with the longest side at most `size` pixels."""
+    """Share of each pixel that belongs to each region, and its opacity, with the longest side at most `size` pixels."""
     cameras = shrunk(regions.views.cameras, view, size)
     share, opacity = memberships(regions.views, regions.scene, cameras, 0, pixel_grid(cameras, 0))
     width, height = (int(v) for v in cameras.size[0])

@@ -145,12 +145,12 @@ def mixed(a: Styled, b: Styled, at: float) -> Styled:
 
 
 class RegionControls(NamedTuple):
-    """What holds for each of K regions."""
+    """Controls of each of K regions."""
 
     allowed: Annotated[Tensor, "K references"]
-    """Which references it may take from, bool, in the order of the dictionary."""
+    """References that it may take from, bool, in the order of the dictionary."""
     strength: Annotated[Tensor, "K"]
-    """How strongly it is restyled; 0 = kept."""
+    """Strength of the style; 0 = kept."""
     score: Annotated[Tensor, "K T"]
     """Cosine of the region with each style code, both from the scene's mean; 0 without semantics."""
     saved: StyleFile
@@ -236,7 +236,7 @@ class _Book:
         return name if self.names[reference] == name else str(reference)
 
     def name(self, region: RegionMatch) -> str:
-        """What the region is called in a style file, which holds its key under that name."""
+        """Name of the region in a style file, which holds its key under that name."""
         if region.name in self.regions.keys or not self.keys:
             return region.name
         key, name = key_of(self.regions, region.number), f"region{region.number}"

@@ -67,7 +67,7 @@ class Known:
 
     name: str
     data: str
-    """Where the images lay when it was trained: a hint for `eval`, not a need."""
+    """Folder of the images when it was trained: a hint for `eval`, not a need."""
     names: tuple[str, ...]
     """Of each view: the stem of its image (see `view_names`)."""
     cameras: Cameras
@@ -95,7 +95,7 @@ class Run:
 
     @property
     def exists(self) -> bool:
-        """Whether a run was begun here."""
+        """True where a run was begun."""
         return (self.root / "config.json").is_file()
 
     def save_config(self, config: RunConfig, method: str) -> None:
@@ -150,7 +150,7 @@ class Run:
             raise CheckpointError(f"{path}: cannot be read ({e!r}); train the scene again") from e
 
     def saved_facts(self) -> Facts | None:
-        """What a run found out about its scene; None before it wrote scene.json. Raises CheckpointError."""
+        """Facts of the run's scene; None before it wrote scene.json. Raises CheckpointError."""
         return self.load_known().facts if (self.root / "scene.json").is_file() else None
 
     def save_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
@@ -314,7 +314,7 @@ class History(NamedTuple):
     parts: dict[str, float]
     """Seconds of each part of training by its name, all resumes together."""
     notes: list[str]
-    """What went wrong: skipped steps, damaged checkpoints, returns to an earlier one."""
+    """Faults of the training: skipped steps, damaged checkpoints, returns to an earlier one."""
 
 
 def read_history(run: Path) -> list[History]:

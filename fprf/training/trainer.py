@@ -48,7 +48,7 @@ REPORT_SECONDS = 0.5
 
 
 class Report(NamedTuple):
-    """How training goes."""
+    """Progress of training."""
 
     step: int
     share: float
@@ -140,7 +140,7 @@ def train(
 
 
 def _less(run: Run) -> str:
-    """What to do where there is not enough memory for a step."""
+    """Advice where there is not enough memory for a step."""
     steps = checkpoint.steps(run.checkpoints)
     kept = f"the checkpoint of step {steps[-1]} is kept" if steps else "there is no checkpoint yet"
     return f"lower --datamanager.rays, or begin anew with a larger --downscale ({kept})"
@@ -180,7 +180,7 @@ class Loop:
         self.config, self.model, self.optimizer, self.device = config, model, optimizer, device
         self.facts: Facts = prepared.facts
         self.deferred = device.type == "cuda"
-        """Whether the host reads faults only with the reports."""
+        """True where the host reads faults only with the reports."""
         self.tf32 = config.precision == "tf32" and device.type == "cuda"
         self.half = config.precision == "bfloat16" and device.type != "cpu"
         check_penalties(config.loss, model)
@@ -197,7 +197,7 @@ class Loop:
         self.statistics = StepStatistics(device)
         self.steps = self.skipped = self.failed = 0
         self.fault: str | None = None
-        """What was not finite in the last step, or since faults were last read; None where all was well."""
+        """Names of what was not finite in the last step, or since faults were last read; None where all was well."""
         self.rays = 0
         self.begun = time.perf_counter()
 

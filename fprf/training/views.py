@@ -149,9 +149,9 @@ class Part:
     opacity: Annotated[Tensor, "R"]
     """On the CPU."""
     samples: int
-    """How many there were before the light ones were dropped."""
+    """Number of samples before the light ones were dropped."""
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """What colours are multiplied by at last."""
+    """Factor of the final colours."""
 
     @property
     def bytes(self) -> int:
@@ -167,7 +167,7 @@ class Part:
 
     @torch.inference_mode()
     def mean(self, values: Annotated[Tensor, "M X"]) -> Annotated[Tensor, "R X"]:
-        """What each pixel sees of values at the samples, scaled to what it sees at all; 0 where that is nothing."""
+        """Mean of values over the samples that each pixel sees; 0 where it sees nothing."""
         return composite_mean(self.kept, values, self.rays).cpu()
 
 
@@ -187,7 +187,7 @@ class CachedView(SceneView):
 
     @property
     def opacity(self) -> Annotated[Tensor, "H W"]:
-        """How much of each ray is met, in [0, 1]."""
+        """Opacity of each ray, in [0, 1]."""
         return torch.cat([part.opacity for part in self.parts]).view(self.size)
 
     @property

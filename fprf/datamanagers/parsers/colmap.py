@@ -341,7 +341,7 @@ _Lens: TypeAlias = tuple[tuple[float, float], tuple[float, float], tuple[float, 
 
 
 def model_folder(data: Path) -> Path | None:
-    """Where the folder's sparse model lies, or None."""
+    """Folder of the sparse model, or None."""
     for folder in (data / "sparse" / "0", data / "sparse", data):
         if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
             return folder

@@ -45,7 +45,7 @@ class _Shot(NamedTuple):
 
 
 def project_file(data: Path) -> Path | None:
-    """What says where a project's images were taken, or None."""
+    """File with the poses of a project's images, or None."""
     return next((data / file for file in (_RECONSTRUCTION, _SHOTS) if (data / file).is_file()), None)
 
 

@@ -45,6 +45,6 @@ class TownParser(DataParser):
 
 
 def cache_folder() -> Path:
-    """Where the project keeps what it can make again."""
+    """Folder for generated scenes."""
     named = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(named) if named else Path.home() / ".cache") / "fprf"

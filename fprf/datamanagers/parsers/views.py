@@ -89,7 +89,7 @@ class View:
     lens: int = 0
     depths: tuple[float, float] | None = None
     mask: Path | None = None
-    """Where the capture names it; else it is looked for beside the image."""
+    """File that the capture names; else one beside the image."""
     sky_mask: Path | None = None
 
 

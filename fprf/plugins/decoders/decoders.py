@@ -101,7 +101,7 @@ def _loaded(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str], *,
 def residual_share(
     change: Annotated[Tensor, "N 3"], strength: float | Annotated[Tensor, "N 1"], fade: float
 ) -> Annotated[Tensor, "N 1"]:
-    """How much of the residual a restyled colour keeps: 1 - strength (1 - g), with g = exp(-mean(change^2) / fade^2).
+    """Share of the residual that a restyled colour keeps: 1 - strength (1 - g), with g = exp(-mean(change^2) / fade^2).
 
     1 without a change or at strength 0, exactly; at full strength 1/e where the decoded logits change by `fade` (root mean
     square over the channels), and soon nothing.

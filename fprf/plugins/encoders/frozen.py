@@ -1,4 +1,4 @@
-"""What frozen encoders share: padding that any size survives, tensors that no optimiser sees, pictures to measure them on."""
+"""Parts of frozen encoders: padding that any size survives, tensors that no optimiser sees, pictures to measure them on."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

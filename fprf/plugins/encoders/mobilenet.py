@@ -40,7 +40,7 @@ SOURCE = torchvision_file("MobileNetV2", "mobilenet_v2-b0353104.pth", FLAG)
 
 
 class Layout(NamedTuple):
-    """What differs between the classifier and DeepLab's backbone."""
+    """Differences between the classifier and DeepLab's backbone."""
 
     strides: tuple[int, ...]
     """Of blocks 1 to 17."""

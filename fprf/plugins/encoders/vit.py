@@ -25,7 +25,7 @@ TYPES: Mapping[str, tuple[str, ...]] = {
     "dinov2": ("dinov2", "dinov2_with_registers"),
     "dinov3": ("dinov3_vit",),
 }
-"""What transformers calls the models of each family."""
+"""Model types of each family in transformers."""
 
 
 class VitEncoder(FrozenEncoder):

@@ -85,7 +85,7 @@ class LocalAdainStylizer(Stylizer):
 
     content_mean: Annotated[Tensor, "C"]
     centre: Annotated[Tensor, "D"] | None
-    """What directions are taken from; None for dot products."""
+    """Origin of directions; None for dot products."""
     origin: Annotated[Tensor, "D"] | None
     """The encoder's zero, for dot products of features as it gives them."""
     keys: Annotated[Tensor, "T D"]

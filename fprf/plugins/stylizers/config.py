@@ -51,7 +51,7 @@ class StylizerConfig(PluginConfig):
     def smoothing(
         self, scene: SceneStyle, allowed: Annotated[Tensor, "K references"] | None = None
     ) -> Annotated[Tensor, "K K"] | None:
-        """What its stylizers smooth the matches of regions by (`style.scene.region_smoothing`); None = nothing."""
+        """Matrix that smooths the matches of regions (`style.scene.region_smoothing`); None = not smoothed."""
         return None
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
@@ -115,7 +115,7 @@ class LocalAdainConfig(StylizerConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class _RegionConfig(StylizerConfig):
-    """What all two-sided stylizers have: points belong to scene regions, regions match style codes."""
+    """Common fields of two-sided stylizers: points belong to scene regions, regions match style codes."""
 
     handles_allowed_references: ClassVar[bool] = True
     transport: ClassVar[bool] = False
