@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from ..datamanagers.config import GuidedConfig
 from ..interfaces import Decoder, Encoder
+from ..ops.precision import double
 from ..plugins.decoders.decoders import DECODER_KIND, MlpDecoder, load_decoder
 from ..plugins.weights import write_weights
-from ..style.statistics import deviation, double
+from ..style.statistics import deviation
 from ..training.prepare import device_of
 from .config import PretrainDecoderConfig
 from .loop import generator_of, sheet, train

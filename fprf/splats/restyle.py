@@ -15,13 +15,13 @@ from torch import Tensor
 
 from ..fields.planes import harmonics as harmonic_functions
 from ..interfaces import Encoder, Stylizer
+from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import ColourMaps, carried_colours
 from ..style.controls import luma
 from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.scene import SceneStyle, membership, own_style
-from ..style.statistics import double
 from .gaussians import HARMONIC
 
 __all__ = ["Colours", "as_drawn", "region_maps", "restyled_harmonics"]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..errors import NumericsError
-from .statistics import double
+from ..ops.precision import double
 
 __all__ = ["Clusters", "kmeans"]
 

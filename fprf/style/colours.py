@@ -18,11 +18,12 @@ from torch import Tensor, nn
 
 from ..interfaces import Decoder, Stylizer
 from ..ops import mixture
+from ..ops.precision import double
 from ..types import Want
 from .controls import blend_strength
 from .dictionary import StyleDictionary, blend_codes
 from .scene import SceneStyle, membership, region_units
-from .statistics import double, mix, monge, symmetric_root
+from .statistics import mix, monge, symmetric_root
 
 __all__ = ["ColourMaps", "carried_colours", "colour_maps", "decoded_colours"]
 

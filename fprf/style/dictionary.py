@@ -14,8 +14,9 @@ from torch import Tensor
 from ..checks import at_least, between
 from ..errors import CheckpointError, DataError
 from ..io.atomic import write_bytes
+from ..ops.precision import double
 from .clusters import kmeans
-from .statistics import covariance, double, group_moments, mix, moments
+from .statistics import covariance, group_moments, mix, moments
 
 __all__ = [
     "BLEND",

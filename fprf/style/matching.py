@@ -23,8 +23,7 @@ from torch import Tensor
 from ..errors import ConfigError
 from ..ops import mixture
 from ..ops.dense import usable
-from ..ops.precision import full_precision
-from .statistics import double
+from ..ops.precision import double, full_precision
 
 __all__ = [
     "Keys",

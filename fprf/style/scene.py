@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from ..errors import CheckpointError, DataError
+from ..ops.precision import double
 from .clusters import kmeans
 from .dictionary import BLEND, StyleDictionary, blend_codes
 from .matching import point_shares, score_spread, unit
-from .statistics import Moments, covariance, double, group_moments
+from .statistics import Moments, covariance, group_moments
 from .statistics import moments as moments_of
 
 __all__ = [

@@ -23,7 +23,6 @@ __all__ = [
     "covariance",
     "dead_channels",
     "deviation",
-    "double",
     "empty",
     "group_moments",
     "limit_gain",

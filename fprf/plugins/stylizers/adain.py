@@ -13,11 +13,11 @@ from torch import Tensor
 
 from ...interfaces import Stylizer
 from ...ops import mixture
-from ...ops.precision import full_precision
+from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
 from ...style.matching import Similarity, compared, point_shares, score_spread, share_mean
 from ...style.scene import SceneStyle, check_fit
-from ...style.statistics import deviation, double
+from ...style.statistics import deviation
 from ...types import Want
 
 __all__ = ["AdainStylizer", "IdentityStylizer", "LocalAdainStylizer"]

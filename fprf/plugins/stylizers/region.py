@@ -16,11 +16,11 @@ from torch import Tensor, nn
 
 from ...interfaces import Stylizer
 from ...ops import mixture
-from ...ops.precision import full_precision
+from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import Keys, Matching, match_keys
 from ...style.scene import SceneStyle, check_fit, membership, own_style, region_units
-from ...style.statistics import deviation, double, monge
+from ...style.statistics import deviation, monge
 from ...types import Want
 
 __all__ = ["ChannelMaps", "MatrixMaps", "RegionMaps", "RegionPlan", "TwoSidedStylizer", "plan_regions", "region_table"]
