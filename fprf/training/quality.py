@@ -1,4 +1,4 @@
-"""Presets of rendering time: presets of what can be changed without training again. Imports no torch at first.
+"""Presets of rendering time: settings that change without training again. Imports no torch at first.
 
 A preset sets samples along rays, error budget and resolution; whoever gives one of them himself keeps it. Trained
 parameters stay as they are. `python -m benchmarks pareto` shows each preset beside every single knob.
