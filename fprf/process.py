@@ -1,4 +1,4 @@
-"""What the command line asks of the process that it runs in, before anything heavy is imported.
+"""Configuration of the command line's process, before anything heavy is imported.
 
 Threads that wait for others give way soon. By default OpenMP's spin for milliseconds, and where another program uses the
 cores they spin instead of those that they wait for: with 20 busy programs on two cores a training step took 2304 ms,

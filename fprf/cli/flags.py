@@ -109,7 +109,7 @@ def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Seque
 
 
 def _unknown(key: str, config: Any, flags: dict[str, Flag], prog: str) -> str:
-    """Where the flag lies below a slot, what fills the slot decides which fields there are."""
+    """Message for an unknown flag. Below a slot, its plug-in decides which fields there are."""
     lists = f"; `{prog} --help` lists all"
     within = [slot for slot in slots(config) if _dashed(key).startswith(f"--{slot.path.replace('_', '-')}.")]
     if within:

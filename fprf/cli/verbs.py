@@ -46,7 +46,7 @@ class Verbs(ABC):
 
 
 def verbs_of(run: Path) -> Verbs:
-    """What is done with the run in a folder. Raises CheckpointError where there is none."""
+    """Functions for the run in a folder. Raises CheckpointError where there is none."""
     from ..training.run import Run
 
     return Run(run).load_config()[0].verbs()

@@ -37,7 +37,7 @@ class Missing(PluginConfig):
     package: str
     """The package that provided it when the file was written, as the file says; may be empty."""
     reason: str
-    """Why it cannot be loaded."""
+    """Reason why it cannot be loaded."""
 
     def needs(self) -> tuple[Need, ...]:
         """The package that provides it."""

@@ -80,9 +80,9 @@ class WeightSource(NamedTuple):
     file: str
     """Name that the caches are searched for."""
     origin: str
-    """Where the file is to be had: its URL if `pinned`."""
+    """Origin of the file: its URL if `pinned`."""
     flag: str
-    """What names another file on the command line."""
+    """Flag that names another file."""
     pinned: bool = False
     """The file's name carries its hash, so that it may be downloaded."""
 
@@ -93,7 +93,7 @@ def torchvision_file(network: str, file: str, flag: str) -> WeightSource:
 
 
 def weights_needed(source: WeightSource, path: Path | None) -> tuple[Need, ...]:
-    """What `find_weights` would not find without a network."""
+    """Weights that `find_weights` would have to download."""
     if path is not None or _cached(source) is not None:
         return absent_file(path)
     target = _cache_folder() / source.file

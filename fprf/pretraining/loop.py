@@ -36,12 +36,12 @@ GAP = 4
 
 
 def report_path(output: Path) -> Path:
-    """Where the report of these weights lies."""
+    """Path of the report of these weights."""
     return output.with_name(output.stem + ".report.json")
 
 
 def samples_folder(output: Path) -> Path:
-    """Where the sample pictures of these weights lie."""
+    """Folder of the sample pictures of these weights."""
     return output.with_name(output.stem + ".samples")
 
 
@@ -77,7 +77,7 @@ class _Progress:
     seconds: float = 0.0
 
     def done(self, config: PretrainConfig) -> float:
-        """How much of the run is over, 0 to 1."""
+        """Finished share of the run, 0 to 1."""
         if config.steps is not None:
             return min(1.0, self.step / config.steps)
         return min(1.0, self.seconds / (60 * config.minutes))
@@ -89,7 +89,7 @@ def generator_of(seed: int, step: int) -> torch.Generator:
 
 
 def checkpoint_path(output: Path) -> Path:
-    """Where the state of an unfinished run lies."""
+    """Path of the state of an unfinished run."""
     return output.with_name(output.name + ".checkpoint")
 
 

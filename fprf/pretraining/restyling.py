@@ -41,7 +41,7 @@ NAMES = ("1_1", "1_2", "2_1", "2_2", "3_1", "3_2", "3_3", "3_4", "4_1")
 LAST = ("relu4_1", "relu3_4")
 """The deepest layer of the style, the first of these that the weights reach."""
 CONTENT = 1
-"""Which of the activations the content loss compares: relu2_1, the paper's layer."""
+"""Index of the activations that the content loss compares: relu2_1, the paper's layer."""
 EPS = 1e-4
 """Added to variances, which are in units of the filters' own: keeps the root's gradient finite where a filter is constant."""
 

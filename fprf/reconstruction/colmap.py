@@ -37,7 +37,7 @@ _MAX_IMAGES = 2147483647
 
 
 class MatchTables:
-    """What a database says of images, by their names. Raises sqlite3.Error for what is no database of COLMAP's."""
+    """Features and matches in a database, by image. Raises sqlite3.Error for what is no database of COLMAP's."""
 
     def __init__(self, path: Path) -> None:
         with _reading(path) as base:
@@ -278,7 +278,7 @@ def _similar_images(place: SceneFolder, names: Sequence[str], config: SfmConfig)
 
 
 class _Watch(NamedTuple):
-    """How a step is seen from outside."""
+    """Progress of a step for the parent process."""
 
     seen: Callable[[], int]
     total: int

@@ -77,7 +77,7 @@ def choose_frames(scores: Sequence[float], count: int, least: float) -> Choice:
 
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
-"""What is taken for a video, in lower case."""
+"""Suffixes of videos, in lower case."""
 
 _QUALITY = 95
 
@@ -348,7 +348,7 @@ def _write_jpeg(path: Path, target: Path) -> None:
 
 
 def _holds(source: Path) -> str:
-    """What a folder holds instead of images."""
+    """Description of a folder without images."""
     if not source.is_dir():
         return "the video holds no more"
     endings = sorted({path.suffix.lower() for path in source.rglob("*") if path.is_file() and path.suffix})

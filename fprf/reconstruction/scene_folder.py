@@ -57,10 +57,10 @@ class SceneFolder:
 
 @dataclass
 class State:
-    """What was done, with the keys of what it was done from. Saved after every step."""
+    """Finished steps and the keys of their inputs. Saved after every step."""
 
     source: str = ""
-    """What the images were taken from."""
+    """Source of the images."""
     images: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Of each used image by its name: sha256, width, height, lens."""
     dropped: dict[str, str] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class State:
     done: dict[str, str] = field(default_factory=dict)
     """Key of each finished step by its name."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """What each step took when it was done."""
+    """Time of each finished step."""
 
     @classmethod
     def load(cls, place: SceneFolder) -> "State":
@@ -102,7 +102,7 @@ _LEAST = 15
 
 
 class Matches(Protocol):
-    """What is known of matches (`database.Tables`)."""
+    """Features and matches of the images."""
 
     def features_of(self, name: str) -> int:
         """Features found in an image."""

@@ -23,11 +23,11 @@ from .lens import PINHOLE
 __all__ = ["read_camera_path", "write_camera_path"]
 
 _FPS = 24.0
-"""What Nerfstudio assumes where a file does not say."""
+"""Nerfstudio's value where a file has none."""
 _FAR = 1e30
 """Numbers of a pose lie below: an integer of JSON may be larger than any float."""
 _STRAY = 1e-3
-"""How far a rotation may be from orthonormal: viewers round to a few digits."""
+"""Tolerance of a rotation's orthonormality: viewers round to a few digits."""
 
 
 def read_camera_path(path: Path) -> tuple[Cameras, float]:

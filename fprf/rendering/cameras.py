@@ -42,7 +42,7 @@ class Cameras:
 
     @cached_property
     def reach(self) -> Annotated[Tensor, "V"]:
-        """How far out each lens maps one to one: radius at depth 1, or a fisheye's angle; infinite for a pinhole."""
+        """Limit up to which each lens maps one to one: radius at depth 1, or a fisheye's angle; infinite for a pinhole."""
         return lens_reach(self.distortion, self.lens)
 
     def select(self, index: Annotated[Tensor, "M"]) -> "Cameras":

@@ -1,4 +1,4 @@
-"""How well the training cameras of a capture cover what a view shows: the choice of views that are worth showing.
+"""Coverage of views by the training cameras of a capture: the choice of views that are worth showing.
 
 A view is worth showing where several training cameras have seen the same from about the same direction.
 """
@@ -36,7 +36,7 @@ def well_covered(cameras: Cameras, train: Sequence[int], space: Space, most: int
 
 
 def coverage(cameras: Cameras, train: Sequence[int], space: Space) -> Annotated[Tensor, "V"]:
-    """How well training cameras see what each view shows, from about its direction: n / (n + 4) for n cameras, in [0, 1).
+    """Coverage of each view: n / (n + 4) for n training cameras that see the same from about its direction, in [0, 1).
 
     What a view shows is not known from cameras alone: it is looked at half as far, as far and twice as far as the scene
     commonly lies. Of more than 256 views the others have the score 0.

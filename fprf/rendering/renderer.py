@@ -34,7 +34,7 @@ _NEAR_CAMERA = 4.0
 
 
 class Parts(NamedTuple):
-    """What a scene is rendered with."""
+    """Modules that a scene is rendered with."""
 
     space: Space
     sampler: Sampler
@@ -56,9 +56,9 @@ class Kept(NamedTuple):
     gradient_scale: Annotated[Tensor, "M"] | None = None
     """Factor of the gradients of their features in training; None = 1."""
     start: Annotated[Tensor, "R+1"] | None = None
-    """Where the samples of each ray begin, and at last where they end; None = unknown."""
+    """Offsets of the samples of each ray, and their count at last; None = unknown."""
     whole: bool = False
-    """Whether every sample of every ray is here, M = R S."""
+    """True where every sample of every ray is kept, M = R S."""
 
 
 class March(NamedTuple):

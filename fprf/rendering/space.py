@@ -166,7 +166,7 @@ class Space:
         return first, way
 
     def _slab(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Where rays enter and leave the box; a ray that misses it gets an empty interval."""
+        """Ray parameters at which rays enter and leave the box; a ray that misses it gets an empty interval."""
         low, high = self._constant("low", o), self._constant("high", o)
         safe = torch.where(d.abs() < 1e-12, torch.full_like(d, 1e-12), d)
         a, b = (low - o) / safe, (high - o) / safe

@@ -82,7 +82,7 @@ def midpoints(t: Annotated[Tensor, "R E"]) -> Annotated[Tensor, "R S"]:
 
 
 def shifts(s: Annotated[Tensor, "R E"], generator: torch.Generator | None) -> Annotated[Tensor, "R 1"]:
-    """How far new edges are shifted, as a share of a step: one draw a ray, one half without a generator."""
+    """Shift of new edges, as a share of a step: one draw a ray, one half without a generator."""
     if generator is None:
         return torch.full((len(s), 1), 0.5, dtype=s.dtype, device=s.device)
     return torch.rand((len(s), 1), generator=generator, dtype=s.dtype, device=s.device)

@@ -49,7 +49,7 @@ class Side(NamedTuple):
 
 
 class RegionPlan(NamedTuple):
-    """What each region has and what it gets."""
+    """Statistics of each region, its own and its style's."""
 
     table: Annotated[Tensor, "K T"]
     scene: Side
