@@ -294,10 +294,10 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
     An image in a folder that cannot be read is left out, and `report` is given the reason. Raises DataError for a folder
     without a readable image.
     """
-    found: dict[Path, None] = {}
+    listed: dict[Path, None] = {}
     for path in paths:
-        found |= dict.fromkeys(_readable(path, report) if path.is_dir() else [path])
-    return list(found)
+        listed |= dict.fromkeys(_readable(path, report) if path.is_dir() else [path])
+    return list(listed)
 
 
 def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:

@@ -71,9 +71,9 @@ def region_statistics(encoder: Encoder, pictures: Labelled) -> dict[int, RegionS
     """
     features, labels = [], []
     for image, regions in pictures:
-        found: Tensor = encoder(image.permute(2, 0, 1)[None])[0]
-        features.append(found.flatten(1).T)
-        labels.append(whole_cells(regions, (found.shape[1], found.shape[2])).flatten())
+        maps: Tensor = encoder(image.permute(2, 0, 1)[None])[0]
+        features.append(maps.flatten(1).T)
+        labels.append(whole_cells(regions, (maps.shape[1], maps.shape[2])).flatten())
     cells, label = torch.cat(features), torch.cat(labels)
     kinds = sorted(set(label.tolist()) - {MIXED})
     if not kinds:

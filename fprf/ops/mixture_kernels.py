@@ -117,10 +117,10 @@ def attention(x, centre, least, keys, width, sharpness, odds, faint, none, out):
 
 @numba.njit(inline="always", cache=True)
 def _any(share, at, step, rows):
-    found = False
+    some = False
     for r in range(rows):
-        found |= share[at + r * step] != _0
-    return found
+        some |= share[at + r * step] != _0
+    return some
 
 
 @numba.njit(inline="always", cache=True)

@@ -37,10 +37,10 @@ def _across(source, at):
 
 
 def _weighted(values):
-    found = None
+    summed = None
     for weight, each in zip(_WEIGHTS, values, strict=True):
-        found = each * weight if found is None else found + each * weight
-    return found
+        summed = each * weight if summed is None else summed + each * weight
+    return summed
 
 
 @traced
@@ -169,11 +169,11 @@ def _loss(counters, image, target, target_blurred, width, height, share, rooms, 
                 for x in range(0, width, LANES):
                     _down_both(image, target, at + x, padded, line, x, room)
                 for x in range(0, across, LANES):
-                    found = _similarity(
+                    similarity = _similarity(
                         line, x, room, target_blurred, at + x, 3 * area + 64, across, scale, moves, d + x + WINDOW - 1, layer
                     )
                     if y >= first:
-                        alike += total(found)
+                        alike += total(similarity)
         for y in range(first, last):
             at = unit // strips * area + y * padded
             if similar:

@@ -136,8 +136,8 @@ def build_vocabulary(read: Reader, count: int, number: int, seed: int = 0) -> Wo
     each = max(1, _SAMPLE // max(1, count))
     parts = []
     for image in range(count):
-        found = read(image)
-        parts.append(found[rng.permutation(len(found))[:each]])
+        features = read(image)
+        parts.append(features[rng.permutation(len(features))[:each]])
     sample = np.concatenate(parts).astype(np.float32) if parts else np.zeros((0, 128), np.float32)
     if len(sample) <= number:
         return sample
@@ -153,17 +153,17 @@ def vlad_vectors(read: Reader, count: int, vocabulary: Words) -> Annotated[NDArr
     """A unit vector an image; 0 for an image without descriptors."""
     result = np.zeros((count, vocabulary.size), np.float32)
     for image in range(count):
-        found = read(image)
-        some = found[:: -(-len(found) // _MOST) or 1].astype(np.float32)
+        features = read(image)
+        some = features[:: -(-len(features) // _MOST) or 1].astype(np.float32)
         if len(some) and len(vocabulary):
             result[image] = _vlad(some, vocabulary)
     return result
 
 
-def _vlad(found: NDArray[np.float32], vocabulary: NDArray[np.float32]) -> NDArray[np.float32]:
-    nearest = np.argmin(_distances(found, vocabulary), axis=1)
+def _vlad(features: NDArray[np.float32], vocabulary: NDArray[np.float32]) -> NDArray[np.float32]:
+    nearest = np.argmin(_distances(features, vocabulary), axis=1)
     sums = np.zeros_like(vocabulary)
-    np.add.at(sums, nearest, found - vocabulary[nearest])
+    np.add.at(sums, nearest, features - vocabulary[nearest])
     sums = np.sign(sums) * np.sqrt(np.abs(sums))
     sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
     flat: NDArray[np.float32] = sums.reshape(-1)

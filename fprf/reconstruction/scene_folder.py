@@ -145,11 +145,11 @@ def _lost(name: str, matches: Matches, models: Sequence[Mapping[str, Any]]) -> D
 
 
 def report(
-    state: Mapping[str, Any], matching: str, found: Matches, models: Sequence[Mapping[str, Any]], version: str
+    state: Mapping[str, Any], matching: str, matches: Matches, models: Sequence[Mapping[str, Any]], version: str
 ) -> dict[str, Any]:
     """The content of process.json. `state` is that of `place.State`, as a mapping."""
     images = state["images"]
-    drops = dropped_images(list(images), state["dropped"], found, models)
+    drops = dropped_images(list(images), state["dropped"], matches, models)
     main = models[0] if models else {"images": [], "points": 0, "error_pixels": None, "track_length": None}
     return {
         "format": 1,

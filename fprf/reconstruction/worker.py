@@ -95,10 +95,10 @@ def _mapping(pycolmap: Any, job: dict[str, Any]) -> int:
 
     out = Path(job["models"])
     out.mkdir(parents=True, exist_ok=True)
-    found = pycolmap.incremental_mapping(
+    mapped = pycolmap.incremental_mapping(
         job["database"], job["images"], str(out), options, initial_image_pair_callback=count, next_image_callback=count
     )
-    models = sorted(found.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+    models = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     described = [
         {
             "images": sorted(model.image(id_).name for id_ in model.reg_image_ids()),

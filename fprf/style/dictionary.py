@@ -239,8 +239,8 @@ def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: in
 def _cluster(semantic: Tensor, clusters: int, seed: int) -> tuple[Tensor, Tensor]:
     if semantic.shape[1] == 0:
         return semantic.new_zeros(len(semantic), dtype=torch.int64), semantic[:1].float()
-    found = kmeans(semantic, clusters, seed=seed)
-    return found.label, found.centres
+    result = kmeans(semantic, clusters, seed=seed)
+    return result.label, result.centres
 
 
 def _content_hash(r: Reference) -> str:

@@ -42,10 +42,10 @@ class Record3DParser(DataParser):
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of its images: at most `frames` of them, evenly through the recording."""
-        found = recording(data)
-        if found is None:
+        files = recording(data)
+        if files is None:
             raise DataError(f"{data}: no metadata.json with rgb/; export from Record3D as EXR and JPG, or unpack its .r3d")
-        file, folder = found
+        file, folder = files
         record = as_record(file, read_json(file))
         poses = _table(file, "poses", record.get("poses"), 7)
         numbered = sorted((int(Path(name).stem), name) for name in image_names(folder) if _numbered(name))

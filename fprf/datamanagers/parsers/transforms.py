@@ -93,8 +93,8 @@ def _cloud(data: Path, views: list[View]) -> tuple[NDArray[np.float64] | None, N
     cloud, model = data / "points.npz", data / "sparse" / "0"
     points, seen = read_cloud(cloud, len(views)) if cloud.is_file() else (None, None)
     if seen is None and ((model / "cameras.bin").is_file() or (model / "cameras.txt").is_file()):
-        found = cloud_of_model(model, [view.name for view in views], [view.pose for view in views])
-        return (points, None) if found is None else found
+        sparse = cloud_of_model(model, [view.name for view in views], [view.pose for view in views])
+        return (points, None) if sparse is None else sparse
     return points, seen
 
 
