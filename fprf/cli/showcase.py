@@ -24,7 +24,7 @@ class Shown(NamedTuple):
     styled: "Styled"
     views: "list[View]"
     maps: "list[Picture]"
-    """Match maps."""
+    """Match maps, where it has several photographs."""
     sources: list[Path]
     """Its photographs, in the order of its match maps' colours."""
     shares: list[float]
@@ -39,7 +39,7 @@ class Shown(NamedTuple):
 def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display) -> list[Shown]:
     """Each style on the views, with match maps and how well the views agree with each other."""
     from ..style.config import labels
-    from ..training.matches import match_map, match_pictures, summarize
+    from ..training.matches import match_map, match_picture, summarize
     from ..training.restyle import apply_style
 
     encoders, shown = scene.encoders(), []
@@ -59,7 +59,7 @@ def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: S
                 name,
                 styled,
                 pictures,
-                [match_pictures(each, styled.codes)["match"] for each in found],
+                [match_picture(each, styled.codes) for each in found] if len(styled.codes.names) > 1 else [],
                 [called[label] for label in styled.codes.names],
                 [_mean([row["references"][k]["share"] for row in summaries]) for k in range(len(styled.codes.names))],
                 built - start,

@@ -13,7 +13,7 @@ from ..io.maps import depth_image, depth_limits
 from ..rendering.cameras import Cameras, normals
 from ..rendering.paths import eye_strips
 from ..types import View
-from .matches import match_map, match_pictures
+from .matches import match_map, match_picture
 from .restyle import Styled
 
 __all__ = ["Channel", "Take", "limits_of", "panels", "planes", "shoot"]
@@ -74,7 +74,7 @@ def panels(
         else:
             for take in takes:
                 if take.styled is not None:
-                    shown.append(match_pictures(match_map(scene, take.styled, frame, cameras), take.styled.codes)["match"])
+                    shown.append(match_picture(match_map(scene, take.styled, frame, cameras), take.styled.codes))
     return shown
 
 

@@ -31,6 +31,7 @@ __all__ = [
     "Taken",
     "explain",
     "match_map",
+    "match_picture",
     "match_pictures",
     "region_row",
     "region_tile",
@@ -92,11 +93,16 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
     return MatchMap(taken, score.clamp(-1, 1), shares[..., codes + 1 :], opacity.view(height, width))
 
 
+def match_picture(matched: MatchMap, codes: Codes) -> Picture:
+    """Matches of a view: hue = reference, shade = code, darkness = doubt, pale = kept."""
+    return match_image(matched.attention, codes.reference, codes.names, matched.opacity, matched.kept)
+
+
 def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
-    """`match` (hue = reference, shade = code, darkness = doubt, pale = kept), `score` (0 to 1) and `entropy` (0 to log2 T)."""
+    """`match` (see `match_picture`), `score` (0 to 1) and `entropy` (0 to log2 T)."""
     most = math.log2(max(2, len(codes.reference)))
     return {
-        "match": match_image(matched.attention, codes.reference, codes.names, matched.opacity, matched.kept),
+        "match": match_picture(matched, codes),
         "score": scale_image(matched.score, 0.0, 1.0, matched.opacity * (1 - matched.kept)),
         "entropy": scale_image(matched.entropy, 0.0, most, matched.opacity * (1 - matched.kept)),
     }
@@ -104,9 +110,9 @@ def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
 
 def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     """Use of the references and their codes, and its certainty, over the pixels of a view by their opacity."""
-    each = matched.opacity.double()
+    each, kept = matched.opacity.double(), matched.kept
     total = float(each.sum()) or 1.0
-    weight = each * (1 - matched.kept)
+    weight = each * (1 - kept)
     styled = float(weight.sum()) or 1.0
     of_code = (matched.taken.double() * each[..., None]).sum((0, 1)) / total
     of_region = (matched.region.double() * each[..., None]).sum((0, 1)) / total
@@ -114,7 +120,7 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     return {
         **match_summary(matched.attention, codes.reference, codes.names, weight),
         "score": float((matched.score * weight).sum()) / styled,
-        "kept_share": float((matched.kept * each).sum()) / total,
+        "kept_share": float((kept * each).sum()) / total,
         "codes": [
             {"reference": codes.names[int(codes.reference[t])], "cluster": int(cluster[t]), "share": float(of_code[t])}
             for t in of_code.argsort(descending=True).tolist()
