@@ -59,23 +59,6 @@ def test_eval_takes_it(world: World, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--quality great: it takes draft or standard or best" in capsys.readouterr().err
 
 
-def test_render_and_stylize_take_it(world: World, tmp_path: Path) -> None:
-    import cv2
-
-    shutil.copytree(world.run, tmp_path / "run")
-    run, split = str(tmp_path / "run"), ["--split", "test"]
-    style = ["--references", str(world.references[0]), "--no-matches"]
-    pictures = {}
-    for name in PRESETS:
-        quality = ["--quality", name]
-        assert cli.main(["render", run, "--path", "dataset", *split, "--output", str(tmp_path / f"r-{name}"), *quality]) == 0
-        assert cli.main(["stylize", run, *style, *split, "--output", str(tmp_path / f"s-{name}"), *quality]) == 0
-        pictures[name] = [cv2.imread(str(tmp_path / f"{kind}-{name}" / "0000.png")) for kind in "rs"]
-    for first, second in (("draft", "standard"), ("standard", "best")):
-        for a, b in zip(pictures[first], pictures[second], strict=True):
-            assert a.shape == b.shape and (a != b).any()
-
-
 def test_a_reduced_view_is_the_small_oneenlarged(world: World) -> None:
     trained = world.load()
     known, render = trained.known, trained.config.render

@@ -64,7 +64,7 @@ def paint(path: Path, pixels: np.ndarray) -> Path:
 
 @pytest.mark.parametrize(
     ("height", "width", "colour"),
-    [(1, 1, (255, 255, 255)), (1, 1, (3, 200, 90)), (90, 120, (0, 0, 0)), (64, 64, (255, 0, 255)), (2, 300, None)],
+    [(1, 1, (3, 200, 90)), (90, 120, (0, 0, 0)), (2, 300, None)],
 )
 def test_degenerate_photographs_give_finite_pictures(
     world: World, tmp_path: Path, height: int, width: int, colour: tuple[int, int, int] | None

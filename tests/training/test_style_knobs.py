@@ -34,7 +34,7 @@ SECOND: dict[str, object] = {
 }
 """Those of `references`, `masks`, `between` and `at` need files: see below."""
 
-STYLIZERS = [AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig()]
+STYLIZERS = [LocalAdainConfig(), RegionOtConfig()]
 
 
 class Bench:
