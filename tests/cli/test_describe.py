@@ -41,7 +41,7 @@ def test_a_config_in_words() -> None:
 
 @pytest.mark.parametrize("verb", sorted(VERBS.keys() - {"completion"}))
 def test_every_verb_describes_itself_and_every_flag_has_a_meaning(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    word = {"train": ["fprf-lite"], "bench": ["speed"], "pretrain": ["semantic"]}.get(verb, [])
+    word = {"train": ["fprf-lite"], "bench": ["speed"], "pretrain": ["decoder"]}.get(verb, [])
     assert cli.main([verb, *word, "--describe"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["prog"].startswith(f"fprf {verb}") and found["description"]
