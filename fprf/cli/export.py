@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from ..export.colours import BestViews, Coloured
     from ..export.depth_maps import DepthMaps
     from ..export.point_cloud import Cloud
+    from ..interfaces import Scene
+    from ..splats.initial import Points
     from ..style.files import StyleFile
     from ..training.loading import Trained
+    from ..training.run import Known
 
-__all__ = ["export_fields", "run"]
+__all__ = ["export_cameras", "export_fields", "run"]
 
 _FEW = 0.5
 """A smaller share of what there was is worth a warning."""
@@ -61,7 +64,7 @@ def export_fields(config: ExportConfig, file: "StyleFile") -> None:
     with Display() as display:
         made |= _geometry(trained, config, what, looks, display)
         if "cameras" in what.kinds:
-            made |= _cameras(trained, config, what, looks, display)
+            made |= export_cameras(trained, trained.known, config, what, looks, display)
         if "lut" in what.kinds and styles:
             made |= _tables(trained, config, what, looks)
     made["seconds"] = time.perf_counter() - start
@@ -175,6 +178,7 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     from ..export.colours import best_views, expected_presence, single_view
     from ..export.point_cloud import Cloud, concatenate, sky_dome, write_points
     from ..export.splats import surface_discs, write_gaussians, write_splat
+    from ..splats.initial import Points
 
     kinds = place.what.kinds
     seen = best_views(place.maps, cloud.point, cloud.normal, cloud.edge, config.witnesses)
@@ -187,18 +191,43 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     whole = cloud if above is None else concatenate(cloud, above)
     beyond = None if above is None else place.colours(above.point, single_view(above.view), None).colours
     splats = surface_discs(whole)
+    made = {"points": len(cloud.point), "floating": int((~solid).sum()), "splats": len(whole.point)}
+    if "splat" in kinds and config.fit > 0:
+        first = colours[0] if beyond is None else torch.cat([colours[0], beyond[0]])
+        made["splats"] = _fitted(place, Points(whole.point.numpy(), first.float().numpy()), config)
     for number, look in enumerate(place.looks):
         colour = colours[number]
         every = colour if beyond is None else torch.cat([colour, beyond[number]])
         if "ply" in kinds:
             for path in place.paths("points", look, ".ply"):
                 write_points(path, cloud, colour, place.origin)
-        if "splat" in kinds:
+        if "splat" in kinds and config.fit == 0:
             for path in place.paths("splats", look, ".ply"):
                 write_gaussians(path, splats, every, place.origin)
             for path in place.paths("splats", look, ".splat"):
                 write_splat(path, splats, every, place.origin)
-    return {"points": len(cloud.point), "floating": int((~solid).sum()), "splats": len(whole.point)}
+    return made
+
+
+def _fitted(place: _Place, points: "Points", config: ExportConfig) -> int:
+    """Write splats that are trained against the field's renders; the number of them."""
+    from ..export.depth_maps import spread_views
+    from ..export.fit import fit_gaussians
+    from ..splats.files import write_gaussians
+
+    views = spread_views(place.trained.known.train, config.views)
+    looks = [look.restyle for look in place.looks]
+    fitted = fit_gaussians(
+        place.trained, points, views, looks,
+        minutes=config.fit, cap=config.fit_cap, origin=place.origin, report=place.display.count,
+    )  # fmt: skip
+    count = 0
+    for look, gaussians in zip(place.looks, fitted, strict=True):
+        for ending in (".ply", ".splat"):
+            for path in place.paths("splats", look, ending):
+                write_gaussians(path, gaussians, antialiased=True)
+        count = len(gaussians)
+    return count
 
 
 def _mesh(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
@@ -221,20 +250,20 @@ def _mesh(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]
     return {"vertices": len(mesh.point), "triangles": len(mesh.face), "mesh_edge": mesh.edge}
 
 
-def _cameras(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequence[Look], display: Display) -> dict[str, Any]:
-    """transforms.json, and the pictures that it names if they are wanted."""
+def export_cameras(
+    scene: "Scene", known: "Known", config: ExportConfig, what: Plan, looks: Sequence[Look], display: Display
+) -> dict[str, Any]:
+    """Write transforms.json, and the pictures that it names if they are wanted."""
     from ..export.transforms import transforms
     from ..io.atomic import write_json
     from ..io.images import to_uint8, write_image
-    from ..training.views import render_view
 
-    known, folder = trained.known, what.folder
+    folder, shown = what.folder, scene.restyled(looks[-1].restyle)
     files = [f"images/{name}.png" for name in known.names]
     if config.images:
         for view, file in enumerate(files):
             display.count(view, len(files), "rendering views")
-            picture = render_view(trained.model, known.facts, known.cameras, view, trained.config.render, looks[-1].restyle)
-            write_image(folder / file, to_uint8(picture.rgb))
+            write_image(folder / file, to_uint8(shown.render(known.cameras, view).rgb))
         display.count(len(files), len(files), "rendering views")
     cloud = look_file("points", looks[-1].name, ".ply") if "ply" in what.kinds and what.single is None else None
     document = transforms(known.cameras, files, train=known.train, test=known.test, cloud=cloud)

@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from ..style.files import StyleFile
     from ..training.run import Run
     from ..training.trainer import Report
+    from ..types import View
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
 __all__ = ["SplatVerbs"]
 
-_KINDS = ("ply", "splat")
-"""Kinds of `fprf export`."""
+_KINDS = ("ply", "splat", "cameras")
+"""Kinds of `fprf export`; the last one not unless it is asked for."""
 
 
 class SplatVerbs(Verbs):
@@ -49,8 +50,10 @@ class SplatVerbs(Verbs):
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         """Judge renders, lenses included, as those of fields are judged."""
+        import torch
+
         from ..evaluation.evaluate import judge_views
-        from ..splats.training import open_gaussians, scene_of
+        from ..splats.training import load_tones, open_gaussians, scene_of
         from ..training.run import view_names
         from .eval import store
 
@@ -64,38 +67,62 @@ class SplatVerbs(Verbs):
         views = known.split(config.split)
         if not views:
             raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
-        shown = opened.scene
+        shown, tones = opened.scene, load_tones(opened.run)
+
+        def draw(view: int) -> "View":
+            if tones is None:
+                return shown.render(known.cameras, view)
+            # Of a view that was held out, what its exposure says.
+            red, green, blue = tones(torch.tensor([view]))[0].tolist()
+            return replace(shown, tone=(red, green, blue)).render(known.cameras, view)
+
         with Display() as display:
-            found, renders = judge_views(
-                known, scene, views, lambda view: shown.render(known.cameras, view), display.count, masks=self.config.masks
-            )
+            found, renders = judge_views(known, scene, views, draw, display.count, masks=self.config.masks)
         found |= {"train_seconds": opened.seconds, "train_steps": opened.step, "gaussians": len(shown.gaussians)}
         return store(config, known, opened.method, views, found, renders)
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
-        """Write files of Gaussians, as they are and in every style."""
-        from ..export.config import look_file, make_looks, styles_of
+        """Write files of Gaussians, as they are and in every style, and the cameras."""
+        from ..export.config import Plan, look_file, make_looks, styles_of
         from ..splats.files import ENDINGS, write_gaussians
         from ..splats.training import open_gaussians
         from ..training.quality import QualityConfig
+        from .export import export_cameras
         from .style_flags import say
 
         for kind in config.kinds:
             if kind not in _KINDS:
-                raise UsageError(f"fprf export: of Gaussians there are {' and '.join(_KINDS)}, not {kind}")
+                raise UsageError(
+                    f"fprf export: of Gaussians there are {', '.join(_KINDS)}, not {kind}; a run of fields has all kinds, or "
+                    "`export RUN cameras --images` makes a scene folder that other programs reconstruct"
+                )
+        if config.fit:
+            raise UsageError("--fit: the run is of Gaussians already; leave it out")
         output = config.output or config.run / "exports"
-        single = output.name.lower().endswith(ENDINGS) and not output.is_dir()
+        kinds, gaussians = tuple(dict.fromkeys(config.kinds or _KINDS[:2])), output.name.lower().endswith(ENDINGS)
+        table = output.suffix.lower() == ".json" and not gaussians
+        single = (gaussians or table) and not output.is_dir()
+        if single and config.kinds and table != ("cameras" in kinds):
+            raise UsageError(f"--output {output}: cameras are written to a .json file, Gaussians to others; name a folder")
         styles = styles_of(config, file, say)
         if single and len(styles) > 1:
             raise UsageError(f"--output {output}: one file holds one style, {len(styles)} are asked for; name a folder")
-        scene = open_gaussians(config.run, self.config, QualityConfig()).scene
-        paths = []
-        for look in make_looks(scene, styles)[-1 if single else 0 :]:
+        opened = open_gaussians(config.run, self.config, QualityConfig())
+        scene, paths = opened.scene, []
+        looks = make_looks(scene, styles)[-1 if single else 0 :]
+        if table or "cameras" in kinds:
+            what = Plan(("cameras",), output.parent if single else output, output if single else None)
+            with Display() as display:
+                export_cameras(scene, opened.known, config, what, looks, display)
+            print(f"cameras in {what.single or what.folder / 'transforms.json'}")
+        kinds = () if table else tuple(kind for kind in kinds if kind != "cameras")
+        for look in looks if kinds else ():
             shown = scene.restyled(look.restyle).shown
-            for kind in dict.fromkeys(config.kinds or _KINDS):
+            for kind in kinds:
                 paths.append(output if single else output / look_file("splats", look.name, f".{kind}"))
                 write_gaussians(paths[-1], shown, antialiased=True)
-        print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}")
+        if paths:
+            print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}")
 
 
 def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) -> Path:
@@ -124,17 +151,19 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
         marks = image_hashes(scene)
         if folder.exists and not others:
             check_images(output, scene, marks)
-        prepared = prepare(config, scene) if config.cells == 1 else None
+        saved = folder.load_known().facts if folder.checkpoints.is_dir() else None
+        prepared = prepare(config, scene, saved=saved) if config.cells == 1 else None
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
         save_image_hashes(output, marks)
-        folder.save_known(scene, config.data, facts_of(config, scene))
+        folder.save_known(scene, config.data, (prepared and prepared.facts) or facts_of(config, scene))
         if prepared is None:
             for process in compiling:
                 process.wait()
             _train_cells(config, folder, scene, display, start)
             return output
-        display.say(f"{_described(scene)}, {prepared.learner.count} Gaussians at {prepared.origin}")
+        light = ", tones" if prepared.learner.tones is not None else ""
+        display.say(f"{_described(scene)}, {prepared.learner.count} Gaussians at {prepared.origin}{light}")
         log = EventLog(folder)
         spent = time.perf_counter() - start
         folder.log({"part": "preparing", "seconds": round(spent, 3)})

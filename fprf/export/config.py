@@ -54,6 +54,11 @@ class ExportConfig(StyleConfig):
     """What is farther from its view, in world units, is sky; none = 20 times the scene's inner radius."""
     sky: bool = True
     """Put a dome round splats where views see nothing within reach."""
+    fit: float = 0.0
+    """Minutes of training splats against the field's own renders, and a third of it again for each style; 0 = flat discs on its
+    surfaces, without training. For runs of fields."""
+    fit_cap: int = 60_000
+    """Splats that are trained, at most."""
     mesh_edge: float | None = None
     """Edge of the mesh's lattice in world units, above 0; none = twice the finest voxel's."""
     lut_size: int = 33
@@ -73,6 +78,8 @@ class ExportConfig(StyleConfig):
         at_least("witnesses", self.witnesses, 1)
         between("presence", self.presence, 0.0, 1.0)
         between("lut_size", self.lut_size, 2, 129)
+        at_least("fit", self.fit, 0.0)
+        at_least("fit_cap", self.fit_cap, 1)
         for name in ("edge", "reach", "mesh_edge"):
             value = getattr(self, name)
             if value is not None:
@@ -164,7 +171,7 @@ def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], 
     Folders stand for the images in them, and `report` is told which of these cannot be read. Raises UsageError for another
     form or a name that comes twice, and what reading a style file raises.
     """
-    styles = []
+    found = []
     for text in texts:
         name, equals, what = text.partition("=")
         if not (equals and name and what) or name != _tidy(name):
@@ -176,8 +183,8 @@ def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], 
             check_photographs(Path(what), file)
         else:
             file = StyleFile(with_folders(_with(base.style, tuple(Path(part) for part in what.split(","))), report))
-        styles.append(Named(name, file))
-    return styles
+        found.append(Named(name, file))
+    return found
 
 
 def styles_of(config: ExportConfig, base: StyleFile, report: Callable[[str], None] = warnings.warn) -> list[Named]:

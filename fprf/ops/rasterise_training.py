@@ -43,7 +43,9 @@ class Learnt(NamedTuple):
     l1: float
     ssim: float
     image: Floats
-    """Planes like those of the target."""
+    """Planes like those of the target, times the factors."""
+    pull: Annotated[Floats, "3"]
+    """Gradient of the loss by the logarithms of the factors."""
 
 
 def learn(
@@ -58,33 +60,47 @@ def learn(
     ssim: float,
     rates: Floats,
     step: int,
+    factors: Annotated[Floats, "3"] | None = None,
 ) -> Learnt:
     """Render `count` Gaussians, compare, and move them by a step of Adam, the first one being 0. Where the loss is not finite
-    nothing is changed. `splats` is room for SLOTS numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss.
+    nothing is changed. `splats` is room for SLOTS numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss; renders are
+    multiplied by `factors`, one a channel, before they are compared.
     """
     width, height, camera, planes, blurred, valid = target
     entries, out, left = _render(blocks, count, bands, splats, target, background)
-    l1, similar, slope = photometric.loss(out, planes, blurred, width, height, ssim)
+    shown, pull = _exposed(out, target, factors), np.zeros(3, np.float32)
+    l1, similar, slope = photometric.loss(shown, planes, blurred, width, height, ssim)
     if not np.isfinite(l1 + similar):
-        return Learnt(l1, similar, out)
+        return Learnt(l1, similar, shown, pull)
     if valid is not None:
         slope *= valid
+    if factors is not None:
+        area = _area(target)
+        channels = slope[: 3 * area].reshape(3, area)
+        pull[:] = np.einsum("ca,ca->c", channels, shown[: 3 * area].reshape(3, area))
+        channels *= factors[:, None]
     found = rasterise_gradient_kernels.composite_back(
         3, entries, splats, splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
     )
     rasterise_gradient_kernels.adam(
         blocks, *moments, count, bands, camera, found, entries.first_slot, rates, step
     )  # fmt: skip
-    return Learnt(l1, similar, out)
+    return Learnt(l1, similar, shown, pull)
 
 
 def errors(
-    blocks: Floats, count: int, bands: int, splats: Floats, target: Target, background: tuple[float, float, float]
+    blocks: Floats,
+    count: int,
+    bands: int,
+    splats: Floats,
+    target: Target,
+    background: tuple[float, float, float],
+    factors: Annotated[Floats, "3"] | None = None,
 ) -> Annotated[Floats, "count"]:
     """What each Gaussian has to do with the errors of a view: the sum over pixels of its weight times |render - photograph|."""
     entries, out, _ = _render(blocks, count, bands, splats, target, background)
-    area = -(-target.width // SIDE) * SIDE * -(-target.height // SIDE) * SIDE
-    apart = np.abs(out - target.planes)[: 3 * area]
+    area = _area(target)
+    apart = np.abs(_exposed(out, target, factors) - target.planes)[: 3 * area]
     if target.valid is not None:
         apart *= target.valid[: 3 * area]
     pixels, found = np.zeros(8 * area, np.float32), np.empty((count, 8), np.float32)
@@ -92,6 +108,20 @@ def errors(
     summed = rasterise_gradient_kernels.lift(entries, splats, target.width, target.height, pixels)
     rasterise_gradient_kernels.lift_values(summed, entries.first_slot, count, found.reshape(-1), 8, 0, 8)
     return found[:, 0]
+
+
+def _area(target: Target) -> int:
+    """Padded pixels of a plane."""
+    return -(-target.width // SIDE) * SIDE * -(-target.height // SIDE) * SIDE
+
+
+def _exposed(image: Floats, target: Target, factors: Annotated[Floats, "3"] | None) -> Floats:
+    """A render times the factors of its channels, a copy; itself where there are none."""
+    if factors is None:
+        return image
+    area, shown = _area(target), image.copy()
+    shown[: 3 * area].reshape(3, area)[:] *= factors[:, None]
+    return shown
 
 
 def _render(

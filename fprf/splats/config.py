@@ -30,6 +30,9 @@ class GaussiansConfig(RunConfig):
     """Format of the scene folder; none = recognised from what lies in it."""
     masks: bool = True
     """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or `mask_path`)."""
+    tones: bool | None = None
+    """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what they have in common.
+    none = where exposures differ, as the capture says or as its sparse points show. Not in cells."""
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
     cap: int = 60_000

@@ -17,6 +17,7 @@ from ..ops.rasterise_kernels import FIXED, SLOTS
 from ..ops.rasterise_training import errors, learn
 from ..ops.simd import LANES, aligned
 from ..rendering.splines import rotations
+from ..training.camera_optimizers import Tones
 from .config import GaussiansConfig
 from .gaussians import HARMONIC, Gaussians
 from .initial import Points, spacing, spatial_order
@@ -33,6 +34,8 @@ _JUDGES = 8
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE = 0.3, 0.7
+_TONES = 2e-3
+"""Learning rate of the logarithms of factors. It falls to a tenth."""
 
 
 class Step(NamedTuple):
@@ -50,6 +53,7 @@ class Learner:
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
     Only Gaussians whose means are `inside` are split or moved; None = all.
+    With `tones` each view's factors are learnt as well; with `colours_only` nothing but harmonics is.
     """
 
     def __init__(
@@ -59,6 +63,9 @@ class Learner:
         reach: float,
         room: int,
         inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
+        *,
+        tones: Tones | None = None,
+        colours_only: bool = False,
     ) -> None:
         self.inside = inside
         self.config, self.levels, self.reach = config, levels, reach
@@ -67,6 +74,8 @@ class Learner:
         self.count = self.begun = 0
         self.blocks, self.first, self.second = (_blocks(np.zeros((self.rows, self.room), np.float32)) for _ in range(3))
         self.splats = aligned(self.room * SLOTS)
+        self.tones, self.colours_only = tones, colours_only
+        self.adam = None if tones is None else torch.optim.Adam(tones.parameters(), lr=_TONES)
 
     @property
     def rows(self) -> int:
@@ -99,10 +108,17 @@ class Learner:
         found = learn(
             self.blocks, (self.first, self.second), self.count, self.bands, self.splats, target,
             background=self.config.background, ssim=self.config.ssim, rates=self._rates(share), step=step,
+            factors=self._factors(view),
         )  # fmt: skip
         if not math.isfinite(found.l1 + found.ssim):
             return None
-        if (step + 1) % self.config.relocate_every == 0 and step >= _SETTLE and share < max(self.config.grow, _LAST):
+        if self.tones is not None and self.adam is not None:
+            self.adam.zero_grad()
+            self.tones(torch.tensor([view]))[0].log().backward(torch.from_numpy(found.pull))
+            self.adam.param_groups[0]["lr"] = self.config.rate * _TONES * 0.1**share
+            self.adam.step()
+        moved = (step + 1) % self.config.relocate_every == 0 and not self.colours_only
+        if moved and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, level, share)
         height, width = target.height, target.width
         tall, wide = -(-height // LANES) * LANES, -(-width // LANES) * LANES
@@ -117,7 +133,16 @@ class Learner:
             [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.04), np.full(4, 0.008), [0.4], np.full(3, 0.28), rest]
         )
         falls = np.where(np.arange(len(rates)) < 3, 0.02**share, 0.1**share)
+        if self.colours_only:
+            rates[:FIXED] = 0
         found: Floats = (self.config.rate * rates * falls).astype(np.float32)
+        return found
+
+    def _factors(self, view: int) -> Floats | None:
+        """What renders of a view are multiplied by."""
+        if self.tones is None:
+            return None
+        found: Floats = self.tones(torch.tensor([view]))[0].detach().numpy()
         return found
 
     def _relocate(self, step: int, level: Level, share: float) -> None:
@@ -131,7 +156,7 @@ class Learner:
         chance = np.zeros(self.count)
         for view in views:
             target, background = level[view], self.config.background
-            chance += errors(self.blocks, self.count, self.bands, self.splats, target, background)
+            chance += errors(self.blocks, self.count, self.bands, self.splats, target, background, self._factors(view))
         parts = [_rows(each, self.rows) for each in (self.blocks, self.first, self.second)]
         rows, first, second = parts
         opacity = 1 / (1 + np.exp(-rows[10, : self.count].astype(np.float64)))
@@ -176,20 +201,35 @@ class Learner:
     def moments(self) -> dict[str, Tensor]:
         """What else a checkpoint holds: Adam's moments, and how many Gaussians training began with."""
         first, second = (torch.from_numpy(_rows(x, self.rows)[:, : self.count].T.copy()) for x in (self.first, self.second))
-        return {"first": first, "second": second, "begun": torch.tensor(self.begun)}
+        found = {"first": first, "second": second, "begun": torch.tensor(self.begun)}
+        if self.tones is not None and self.adam is not None:
+            for name, parameter in self.tones.named_parameters():
+                kept = {"value": parameter.detach(), **self.adam.state[parameter]}
+                found |= {f"tones.{name}.{key}": each.clone() for key, each in kept.items()}
+        return found
 
-    def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint holds."""
-        self.count, self.begun = len(gaussians), int(moments["begun"])
+    def start_from(self, gaussians: Gaussians) -> None:
+        """Begin with Gaussians, of the config's degree, as they are."""
+        self.count = self.begun = len(gaussians)
         parts = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.logits[:, None])
         rows = np.zeros((self.rows, self.room), np.float32)
         rows[6], rows[10] = 1, -20
         rows[:, : self.count] = torch.cat([*parts, gaussians.harmonics.flatten(1)], 1).T.numpy()
         self.blocks = _blocks(rows)
+
+    def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
+        """Go on from what a checkpoint holds."""
+        self.start_from(gaussians)
+        self.begun = int(moments["begun"])
         for name in ("first", "second"):
             rows = np.zeros((self.rows, self.room), np.float32)
             rows[:, : self.count] = moments[name].T.numpy()
             setattr(self, name, _blocks(rows))
+        if self.tones is not None and self.adam is not None:
+            for name, parameter in self.tones.named_parameters():
+                kept = {key.rpartition(".")[2]: each for key, each in moments.items() if key.startswith(f"tones.{name}.")}
+                parameter.data.copy_(kept.pop("value"))
+                self.adam.state[parameter] = kept
 
 
 def _rows(blocks: Floats, rows: int) -> Floats:

@@ -98,6 +98,8 @@ class SplatScene(Scene):
     """Share of a view's width and height that is rendered."""
     harmonics: Annotated[Tensor, "N K 3"] | None = None
     """Those of a look; None = as captured."""
+    tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """What rendered colours are multiplied by at last."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -136,7 +138,7 @@ class SplatScene(Scene):
         layers = torch.cat([drawn.image, (drawn.depth * _ray_lengths(camera))[..., None], drawn.opacity[..., None]], -1)
         if place is not None:
             layers = torch.cat([distorted(layers[..., :3], place), distorted(layers[..., 3:].contiguous(), place)], -1)
-        return View(layers[..., :3].clamp(0, 1), layers[..., 3], layers[..., 4], 1.0)
+        return View((layers[..., :3] * torch.tensor(self.tone)).clamp(0, 1), layers[..., 3], layers[..., 4], 1.0)
 
     @torch.inference_mode()
     def paint(

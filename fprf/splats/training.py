@@ -22,10 +22,12 @@ from ..errors import CheckpointError, NumericsError, UsageError
 from ..plugins.encoders.config import BundledSemanticConfig
 from ..rendering.cameras import project
 from ..training import checkpoint
+from ..training.camera_optimizers import Tones
 from ..training.loading import LoadedRun
 from ..training.loop import held_back, progress
-from ..training.model import Facts
-from ..training.quality import PRESETS, QualityConfig
+from ..training.model import Facts, tones_of
+from ..training.prepare import exposure_of
+from ..training.quality import PRESETS, QualityConfig, mixed_tone
 from ..training.run import Known, Run
 from ..training.trainer import REPORT_SECONDS, Report
 from .config import GaussiansConfig
@@ -38,8 +40,10 @@ from .scene import Semantics, SplatScene, find_semantics, load_semantics, semant
 __all__ = [
     "Prepared",
     "facts_of",
+    "find_near",
     "gaussians_of",
     "load_photographs",
+    "load_tones",
     "open_gaussians",
     "prepare",
     "reach_of",
@@ -74,6 +78,8 @@ class Prepared(NamedTuple):
     """Steps that the Gaussians were trained for elsewhere."""
     shares: tuple[float, float] = (0.0, 1.0)
     """The part of the schedule that is trained here."""
+    facts: Facts | None = None
+    """What is known of the scene, where it is whole."""
 
 
 def scene_of(config: GaussiansConfig) -> Scene:
@@ -91,16 +97,24 @@ def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
     return replace(config, downscale=max(1, math.ceil(math.sqrt(pixels / _PIXELS))))
 
 
-def prepare(config: GaussiansConfig, scene: Scene) -> Prepared:
-    """Load photographs and find the first points."""
+def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -> Prepared:
+    """Load photographs and find the first points.
+
+    `saved` are the facts of a run that goes on: its exposures are not measured again.
+    """
     images, masks = load_photographs(config, scene, scene.train.tolist())
+    tones = config.tones if config.cells == 1 else False
+    exposure = exposure_of(tones, scene, lambda view: torch.from_numpy(images[view]).float() / 255, saved)
+    held = set(range(len(scene.paths))) - set(scene.train.tolist()) if exposure else ()
+    facts = replace(facts_of(config, scene), exposure=exposure, held=tuple(sorted(held)))
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
-    near = _near(scene, points)
+    near = find_near(scene, points)
     levels = make_levels(scene, images, masks, near)
-    learner = Learner(config, levels, reach_of(scene), max(config.cap, len(points.position)))
+    room = max(config.cap, len(points.position))
+    learner = Learner(config, levels, reach_of(scene), room, tones=tones_of(facts))
     learner.begin(points, draw)
-    return Prepared(scene, learner, near, origin)
+    return Prepared(scene, learner, near, origin, facts=facts)
 
 
 def load_photographs(
@@ -239,7 +253,7 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
 
     Raises CheckpointError with what is missing, UsageError for qualities other than a resolution.
     """
-    for name in ("samples", "budget", "chunk", "tone", "max_memory"):
+    for name in ("samples", "budget", "chunk", "max_memory"):
         if getattr(quality, name):
             raise UsageError(f"--{name.replace('_', '-')}: is for runs of fields; leave it out")
     run = Run(root)
@@ -259,8 +273,25 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         near,
         config.background,
         preset if quality.resolution is None else quality.resolution,
+        tone=mixed_tone(_tones(saved, known.facts), known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
+
+
+def load_tones(run: Run) -> Tones | None:
+    """How each view of a run was taken; None where that was not learnt."""
+    saved, _ = checkpoint.load_latest(run.checkpoints)
+    return None if saved is None else _tones(saved, run.load_known().facts)
+
+
+def _tones(saved: checkpoint.Saved, facts: Facts) -> Tones | None:
+    tones = tones_of(facts)
+    if tones is not None:
+        tones.load_state_dict(
+            {name: saved.optimizer[f"tones.{name}.value"] for name, _ in tones.named_parameters()}, strict=False
+        )
+        tones.requires_grad_(False)
+    return tones
 
 
 def _semantics(run: Run, step: int, known: Known, gaussians: Gaussians, near: float) -> Semantics:
@@ -280,8 +311,8 @@ def _semantics(run: Run, step: int, known: Known, gaussians: Gaussians, near: fl
     return found
 
 
-def _near(scene: Scene, points: Points) -> float:
-    """How near to a camera something is drawn."""
+def find_near(scene: Scene, points: Points) -> float:
+    """Distance from cameras, along z, from which on things are drawn."""
     some = -(-len(points.position) // _SOME)
     positions, depths = torch.from_numpy(points.position[::some]), []
     for view in scene.train.tolist():

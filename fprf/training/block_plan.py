@@ -86,7 +86,7 @@ def lay_out(
     if semantic is not None:
         dim = config.semantic.dim
         semantic_store = extract(cache / "semantic", views, image, semantic, guided, dim=dim, progress=progress)
-    exposure = exposure_of(config, scene, lambda view: image(view).float() / 255, saved)
+    exposure = exposure_of(config.tones, scene, lambda view: image(view).float() / 255, saved)
     facts = facts_of(config, scene, plan.space, exposure, content, semantic, content_store, semantic_store)
     return Laid(scene, plan, facts, semantic_store.basis if semantic_store is not None else None)
 

@@ -122,7 +122,7 @@ def prepare(
         background=behind(config, scene),
     )
     semantic_store = manager.semantic_store
-    exposure = exposure_of(config, scene, manager.image, saved)
+    exposure = exposure_of(config.tones, scene, manager.image, saved)
     facts = facts_of(config, scene, find_space(scene), exposure, content, semantic, manager.content_store, semantic_store)
     return Prepared(scene, manager, facts, semantic_store.basis if semantic_store is not None else None)
 
@@ -177,15 +177,18 @@ def facts_of(
 
 
 def exposure_of(
-    config: TrainConfig, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
+    tones: bool | None, scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"]], saved: Facts | None = None
 ) -> tuple[float, ...]:
-    """`relative` exposure of the views; empty where tones are not learnt. `image(view)` is a training view, in [0, 1]."""
+    """`relative` exposure of the views; empty where tones are not learnt: None = where exposures differ.
+
+    `image(view)` is a training view, in [0, 1].
+    """
     if saved is not None:
         return saved.exposure
-    if config.tones is False:
+    if tones is False:
         return ()
     exposure = with_exposure(scene, image).exposure
-    return relative(exposure, len(scene.paths)) if config.tones or exposures_differ(exposure) else ()
+    return relative(exposure, len(scene.paths)) if tones or exposures_differ(exposure) else ()
 
 
 def reach_of(scene: Scene, space: Space) -> float:

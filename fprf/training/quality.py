@@ -12,9 +12,11 @@ from ..checks import at_least, between, positive
 from ..errors import PluginError, UsageError
 
 if TYPE_CHECKING:
+    from .camera_optimizers import Tones
     from .loading import Trained
+    from .run import Known
 
-__all__ = ["PRESETS", "Preset", "QualityConfig", "at_quality"]
+__all__ = ["PRESETS", "Preset", "QualityConfig", "at_quality", "mixed_tone"]
 
 Name: TypeAlias = Literal["draft", "standard", "best"]
 
@@ -86,16 +88,15 @@ def at_quality(trained: "Trained", quality: QualityConfig) -> "Trained":
     given = {name: value for name in ("budget", "resolution", "chunk") if (value := getattr(quality, name)) is not None}
     render = replace(render, **given)
     if quality.tone:
-        render = replace(render, tone=_tone(trained, quality.tone))
+        render = replace(render, tone=mixed_tone(trained.model.tones, trained.known, quality.tone))
     config = replace(trained.config, render=render)
     if samples == 1:
         return replace(trained, config=config)
     return _resampled(replace(trained, config=config), samples)
 
 
-def _tone(trained: "Trained", texts: tuple[str, ...]) -> tuple[float, float, float]:
-    """Factors of some training views, weighted; as they are, VIEW alone counts 1."""
-    tones, known = trained.model.tones, trained.known
+def mixed_tone(tones: "Tones | None", known: "Known", texts: tuple[str, ...]) -> tuple[float, float, float]:
+    """Factors of some training views, weighted; as they are, VIEW alone counts 1. Raises UsageError for none and for others."""
     if tones is None:
         raise UsageError("tone: this run has learnt no tones; train it with --tones true, or leave --tone out")
     views, weights = [], []

@@ -4,12 +4,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 import trimesh
 from tiny_world import World
 
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
+from fprf.evaluation.metrics import psnr
+from fprf.export.config import ExportConfig
 from fprf.export.depth_maps import render_depth_maps
+from fprf.splats.files import read_capture
+from fprf.splats.views import camera_of, draw
 
 LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0"]
 """The tiny model has barely begun to agree with itself."""
@@ -50,6 +55,13 @@ def test_everything_in_two_styles(world: World, tmp_path: Path, capsys: pytest.C
     assert "ply, splat" in told and f"points: {made['points']} of" in told and f"({share:.0%})" in told
     assert f"mesh: {made['vertices']} vertices" in told
     assert f"{made['pixels']['agreed'] / made['pixels']['seen']:.0%} of these" in told
+
+
+def test_points_of_thick_surfaces_stay(world: World, tmp_path: Path) -> None:
+    """Of a field that is trained too little to be sharp, a narrow piece of each ray holds but a part of the light."""
+    assert export(world, "points", *LOOSE[:4], "--output", str(tmp_path)) == 0
+    made = json.loads((tmp_path / "export.json").read_text())
+    assert made["points"] > made["floating"]
 
 
 def test_kinds_are_words_behind_the_run_or_a_flag(world: World, tmp_path: Path) -> None:
@@ -110,14 +122,29 @@ def test_bounds_and_options_reach_the_files(world: World, tmp_path: Path) -> Non
     assert bare["splats"] == bare["points"] == near["points"]
 
 
+def test_one_table_of_another_size(world: World, tmp_path: Path) -> None:
+    style = ["--references", str(world.references[0])]
+    assert export(world, "lut", *style, "--lut-size", "5", "--output", str(tmp_path / "dusk.cube")) == 0
+    lines = (tmp_path / "dusk.cube").read_text().splitlines()
+    assert names(tmp_path) == {"dusk.cube"} and len(lines) == 4 + 5**3 and lines[1] == "LUT_3D_SIZE 5"
+
+
 @pytest.mark.parametrize(
     ("args", "told"),
     [
         (["plx"], "'plx' is nothing to export"),
+        (["--witnesses", "0"], "--witnesses: 0 must be at least 1"),
+        (["--presence", "1.5"], "--presence: 1.5 must lie in [0.0, 1.0]"),
+        (["--points", "0"], "--points: 0 must be at least 1"),
+        (["--views", "1"], "--views: 1 must be at least 2"),
+        (["--edge", "0"], "--edge: 0.0 must be above 0"),
+        (["--tolerance", "2"], "--tolerance: 2.0 must lie in"),
         (["--styles", "A"], "write NAME=PHOTO,PHOTO or NAME=STYLE.json"),
+        (["--styles", "a=absent.png"], "absent.png"),
         (["--styles", "a=x.png", "b=x.png", "--output", "OUT/one.ply"], "one file holds one style, 2 are asked for"),
         (["cameras", "--output", "OUT/one.splat"], "holds splat, not cameras"),
         (["lut"], "a lut is the way into a style; name one with --references"),
+        (["--lut-size", "1"], "--lut-size: 1 must lie in [2, 129]"),
         (["ply", *LOOSE, "--presence", "1"], "no point is as present as 1 in the field; lower --presence"),
         (["ply", "--tolerance", "1e-6"], "no surface that two views agree on"),
     ],
@@ -130,3 +157,27 @@ def test_mistakes(world: World, args: list[str], told: str, capsys: pytest.Captu
     lines = [line for line in err.splitlines() if not line.startswith("{")]
     assert out == "" and len(lines) == 1 and lines[0].startswith("error: ") and told in lines[0]
     assert names(tmp_path) == set()
+
+
+def test_by_default_it_lies_in_the_run() -> None:
+    assert ExportConfig().output is None and ExportConfig(run=Path("r")).kinds == ()
+
+
+def test_splats_are_fitted_to_the_field(world: World, tmp_path: Path) -> None:
+    """Trained ones come nearer to the field's own render than discs do; a style has the same ones in other colours."""
+    more = ["--references", str(world.references[1])]
+    assert export(world, "splat", *LOOSE, "--output", str(tmp_path / "discs")) == 0
+    assert export(world, "splat", *LOOSE, *more, "--fit", "0.04", "--fit-cap", "500", "--output", str(tmp_path)) == 0
+    trained = world.load()
+    cameras, view = trained.known.cameras, trained.known.test[0]
+    shown = trained.render(cameras, view).rgb
+
+    def quality(path: Path) -> float:
+        capture = read_capture(path)
+        return psnr(draw(capture.gaussians, camera_of(cameras, view), antialiased=capture.antialiased).image.clamp(0, 1), shown)
+
+    assert quality(tmp_path / "splats.ply") > quality(tmp_path / "discs" / "splats.ply")
+    plain, snow = (read_capture(tmp_path / f"splats{look}.ply").gaussians for look in ("", ".snow"))
+    assert len(plain) <= 500 and torch.equal(plain.means, snow.means) and torch.equal(plain.logits, snow.logits)
+    assert float((plain.colours - snow.colours).abs().mean()) > 0.02
+    assert len(read_capture(tmp_path / "splats.snow.splat").gaussians) == len(snow)

@@ -84,7 +84,7 @@ def test_it_goes_on_bit_for_bit(config: GaussiansConfig, scene: Scene, trained: 
 
 SECOND: dict[str, Any] = {
     "initial": 200, "cap": 500, "degree": 2, "ssim": 0.0, "coarse": 0.0, "grow": 0.9, "relocate_every": 30, "rate": 0.5,
-    "background": (1.0, 0.0, 0.0), "seed": 1, "masks": False,
+    "background": (1.0, 0.0, 0.0), "seed": 1, "masks": False, "tones": True,
 }  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tm
         width, height = scene.cameras.size[0].tolist()
         write_image(tmp_path / "mask.png", np.zeros((height, width, 3), np.uint8))
         scene = replace(scene, masks=(tmp_path / "mask.png",) * len(scene.paths))
-    end = 3 if name in ("initial", "degree", "ssim", "coarse", "rate", "background", "seed", "masks") else STEPS
+    end = 3 if name in ("initial", "degree", "ssim", "coarse", "rate", "background", "seed", "masks", "tones") else STEPS
     first, second = (learnt(each, scene, 0, end) for each in (config, replace(config, **{name: SECOND[name]})))
     assert not equal(first.gaussians(), second.gaussians())
 
@@ -105,6 +105,36 @@ def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: 
     for photograph in learner.levels[1].values():
         photograph.planes[:] = np.nan
     assert learner.step(0, 0.0) is None and equal(learner.gaussians(), before)
+
+
+def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) -> None:
+    """Photographs that were taken darker or warmer: factors are found up to their mean, and training goes on bit for bit."""
+    asked = replace(config, tones=True, ssim=0.0)  # what SSIM keeps of the targets would be that of the others
+    learners = []
+    for break_ in (False, True):
+        learner = prepare(asked, scene).learner
+        wanted = torch.linspace(-0.3, 0.3, len(scene.paths))[:, None] * torch.tensor([1.0, 0.5, -0.5])
+        for level in learner.levels:
+            for view, target in level.items():
+                planes = target.planes[: len(target.planes) // 3 * 3]
+                area = -(-target.width // 16) * 16 * -(-target.height // 16) * 16
+                planes[: 3 * area].reshape(3, area)[:] *= wanted[view].exp().numpy()[:, None]
+        for step in range(STEPS):
+            if break_ and step == 100:
+                other = prepare(asked, scene).learner
+                other.levels = learner.levels
+                other.restore(learner.gaussians(), learner.moments())
+                learner = other
+            assert learner.step(step, step / STEPS) is not None
+        learners.append(learner)
+    first, second = learners
+    assert equal(first.gaussians(), second.gaussians())
+    assert first.tones is not None and second.tones is not None
+    train = scene.train
+    found, other_ = (each.tones(train).log().detach() for each in learners if each.tones is not None)
+    assert torch.equal(found, other_) and float(found.mean(0).abs().max()) < 1e-5
+    true = wanted[train] - wanted[train].mean(0)
+    assert float((found - true).square().mean()) < 0.75 * float(true.square().mean())
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +156,10 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     capture = read_capture(run / "exports" / "splats.ply")
     assert len(capture.gaussians) == metrics["gaussians"] and capture.antialiased
     assert main(["export", str(run), "--output", str(tmp_path / "x.spz")]) == 0
+    assert main(["export", str(run), "cameras", "ply", "--images", "--output", str(tmp_path / "files")]) == 0
+    again = parse_scene(tmp_path / "files", 1, None)
+    assert torch.allclose(again.cameras.pose, fprf.load(run).cameras.pose) and (tmp_path / "files" / "splats.ply").is_file()
+    assert main(["export", str(run), "--output", str(tmp_path / "cameras.json")]) == 0
     # A run that is done goes on doing nothing.
     before = (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes()
     assert main(["train", str(run / "config.json")]) == 0
@@ -171,6 +205,9 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     "line",
     [
         "export RUN glb",
+        "export RUN splat --fit 1",
+        "export RUN cameras --output x.ply",
+        "render RUN --tone 1",
         "render RUN --lens panorama",
         "stylize RUN --references a.png --samples 2",
         "train fprf-splats --plan",

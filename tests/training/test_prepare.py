@@ -44,10 +44,10 @@ def test_tones_are_learnt_where_exposures_differ(world: World) -> None:
     unevenly = replace(scene, exposure=torch.linspace(1.0, 4.0, len(scene.paths), dtype=torch.float64))
 
     def learnt(tones: bool | None, scene: Scene) -> bool:
-        return bool(exposure_of(replace(world.config, tones=tones), scene, image))
+        return bool(exposure_of(tones, scene, image))
 
     assert [learnt(None, each) for each in (scene, evenly, unevenly)] == [False, False, True]
     assert [learnt(own, each) for own in (True, False) for each in (evenly, unevenly)] == [True, True, False, False]
     saved = replace(world.prepared.facts, exposure=(0.0,) * len(scene.paths))
     for facts in (saved, world.prepared.facts):
-        assert exposure_of(world.config, unevenly, image, facts) == facts.exposure
+        assert exposure_of(world.config.tones, unevenly, image, facts) == facts.exposure
