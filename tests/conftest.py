@@ -1,5 +1,6 @@
 """Fixtures for every test."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,3 +57,9 @@ def world(_world: "World", monkeypatch: pytest.MonkeyPatch) -> "World":
     """The tiny trained scene, its features in a cache of its own; read it, don't write to it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(_world.folder / "cache"))
     return _world
+
+
+@pytest.fixture
+def run(world: "World", tmp_path: Path) -> Path:
+    """A copy of the trained run, to write to."""
+    return shutil.copytree(world.run, tmp_path / "run")

@@ -14,12 +14,6 @@ KEYS = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def run(world: World, tmp_path: Path) -> Path:
-    shutil.copytree(world.run, tmp_path / "run")
-    return tmp_path / "run"
-
-
 def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["eval", str(run)]) == 0
     metrics = json.loads((run / "metrics.json").read_text())

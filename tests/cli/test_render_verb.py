@@ -1,5 +1,4 @@
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -10,12 +9,6 @@ from tiny_world import World
 from fprf.cli import main as cli
 from fprf.cli.progress import Display
 from fprf.cli.render import RenderVerbConfig, camera_path, frames_of
-
-
-@pytest.fixture
-def run(world: World, tmp_path: Path) -> Path:
-    shutil.copytree(world.run, tmp_path / "run")
-    return tmp_path / "run"
 
 
 def pictures(folder: Path) -> dict[str, np.ndarray]:

@@ -1,19 +1,11 @@
 import json
 import re
-import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from tiny_world import World
 
 from fprf.cli import main as cli
-
-
-@pytest.fixture
-def run(world: World, tmp_path: Path) -> Path:
-    shutil.copytree(world.run, tmp_path / "run")
-    return tmp_path / "run"
 
 
 def test_a_trained_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

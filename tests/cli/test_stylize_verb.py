@@ -14,12 +14,6 @@ from fprf.style.dictionary import load_dictionary
 MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "dead_channels", "matches"}
 
 
-@pytest.fixture
-def run(world: World, tmp_path: Path) -> Path:
-    shutil.copytree(world.run, tmp_path / "run")
-    return tmp_path / "run"
-
-
 def stylize(run: Path, world: World, *args: str) -> int:
     return cli.main(["stylize", str(run), "--split", "test", "--references", *map(str, world.references), *args])
 
