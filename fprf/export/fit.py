@@ -6,7 +6,7 @@ Gaussians in the same order.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +17,7 @@ from torch import Tensor
 from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene
 from ..io.images import to_uint8
+from ..rendering.cameras import Cameras
 from ..splats.config import GaussiansConfig
 from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
@@ -28,6 +29,8 @@ from ..training.loading import Trained
 
 __all__ = ["fit_gaussians"]
 
+_ALIKE = 0.7
+"""Cosine between the axes of views that have a view between them."""
 _COLOURS = 0.3
 """Time for the colours of a further look, as a share of that for the geometry."""
 
@@ -43,15 +46,17 @@ def fit_gaussians(
     origin: Annotated[Tensor, "3"],
     report: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> Iterator[Gaussians]:
-    """Gaussians of each look, their positions relative to `origin`, float32; trained for `minutes` after rendering `views`.
+    """Gaussians of each look, their positions relative to `origin`, float32; trained for `minutes` after rendering.
 
-    `points` are where they begin; at most `cap` of them are taken, and there are at most `cap` Gaussians in the end.
+    What is rendered are `views` and as many between them. `points` are where Gaussians begin; at most 0.7 `cap` of them are
+    taken, and there are at most `cap` Gaussians in the end.
     """
-    cameras, facts = trained.known.cameras.select(torch.tensor(views)), trained.known.facts
+    seen, facts = _with_midpoints(trained.known.cameras.select(torch.tensor(views))), trained.known.facts
+    cameras = seen
     pose = cameras.pose.clone()
     pose[:, :, 3] -= origin
     cameras = replace(cameras, pose=pose)
-    count, every = len(views), torch.arange(len(views))
+    count, every = len(cameras), torch.arange(len(cameras))
     paths = (Path("field"),) * count
     scene = Scene(name="field", paths=paths, cameras=cameras, train=every, test=every[:0])
     draw = np.random.default_rng(trained.config.seed)
@@ -62,7 +67,7 @@ def fit_gaussians(
     reach = 1.1 * float((pose[:, :, 3] - pose[:, :, 3].mean(0)).norm(dim=1).max()) or 1.0
     learner = None
     for number, look in enumerate(looks):
-        images = _renders(trained, views, look, report)
+        images = _renders(trained, seen, look, report)
         levels = make_levels(scene, images, {}, near)
         if learner is None:
             learner = Learner(config, levels, reach, cap)
@@ -83,10 +88,25 @@ def fit_gaussians(
 
 
 def _renders(
-    trained: Trained, views: Sequence[int], look: Restyle | None, report: Callable[[int, int, str], None]
+    trained: Trained, cameras: Cameras, look: Restyle | None, report: Callable[[int, int, str], None]
 ) -> dict[int, Image]:
     shown, images = trained.restyled(look), {}
-    for number, view in enumerate(views):
-        report(number, len(views), "rendering views")
-        images[number] = to_uint8(shown.render(trained.known.cameras, view).rgb)
+    for view in range(len(cameras)):
+        report(view, len(cameras), "rendering views")
+        images[view] = to_uint8(shown.render(cameras, view).rgb)
     return images
+
+
+def _with_midpoints(cameras: Cameras) -> Cameras:
+    """The views, and one half-way from each to its nearest neighbour that looks about the same way: a field shows any view."""
+    pose = cameras.pose
+    centre, turns = pose[:, :, 3], pose[:, :, :3]
+    alike = torch.einsum("va,wa->vw", turns[:, :, 2], turns[:, :, 2])
+    apart = torch.cdist(centre, centre).masked_fill(alike < _ALIKE, torch.inf).fill_diagonal_(torch.inf)
+    distance, other = apart.min(1)
+    mean = (turns + turns[other]) / 2
+    left, _, right = torch.linalg.svd(mean)  # the rotation nearest to the mean
+    between = torch.cat([left @ right, ((centre + centre[other]) / 2)[:, :, None]], 2)
+    chosen = (distance < torch.inf).nonzero()[:, 0]
+    added = replace(cameras, pose=between).select(chosen)
+    return Cameras(*(torch.cat([getattr(part, field.name) for part in (cameras, added)]) for field in fields(Cameras)))
