@@ -26,10 +26,12 @@ __all__ = ["Cell", "cut"]
 Number = TypeVar("Number", bound=np.generic)
 Window = tuple[int, int, int, int]
 """Left, top, width, height in pixels."""
-_BORDER = 0.1
+_BORDER = 0.05
 """Of the cell's width to each side, from which it learns as well."""
 _SEEN = 8
 """Points of a cell that a view shows, at least, where the cell learns from it."""
+_OWN = 0.15
+"""Share of the points in a window that are the cell's own, at least."""
 _LEAST, _ROOM = 64, 16
 """Least width and height of a window; pixels around the points in it."""
 _OUTLIERS = 0.01
@@ -115,7 +117,10 @@ def cut(scene: Scene, count: int) -> list[Cell]:
             first, last = _extent(pixel)
             left, wide = _interval(float(first[0]), float(last[0]), width)
             top, tall = _interval(float(first[1]), float(last[1]), height)
-            windows[view] = (left, top, wide, tall)
+            x, y = sightings.pixel.unbind(1)
+            shown = of_view & (x >= left) & (x < left + wide) & (y >= top) & (y < top + tall)
+            if int((inside & shown).sum()) >= _OWN * int(shown.sum()):
+                windows[view] = (left, top, wide, tall)
         if not windows:
             raise ConfigError(f"cells: no view shows {_SEEN} points of one of {count} cells; take fewer")
         cells.append(Cell(frame=frame, low=low, high=high, border=border, windows=windows))

@@ -52,9 +52,9 @@ class GaussiansConfig(RunConfig):
     cells: int = 1
     """Parts of space that are trained apart, each with a part of the time and of the Gaussians; 1 = none. More need points of a
     reconstruction."""
-    overview: float = 0.4
+    overview: float = 0.6
     """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on from there."""
-    rounds: int = 4
+    rounds: int = 2
     """How often cells are trained, each time from the union of all after the time before."""
     executor: ExecutorConfig = SerialConfig()
     """Where cells are trained: one after the other, or several at a time."""
