@@ -9,7 +9,7 @@ themselves have less contrast (deviation 0.13 against 0.17 on a plant), since wh
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, NamedTuple
 
 import torch
@@ -34,6 +34,7 @@ from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
 from ..types import View
 from .gaussians import Gaussians
+from .levels import Levels, make_levels_of_detail
 from .look_config import LookConfig
 from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
@@ -100,6 +101,8 @@ class SplatScene(Scene):
     """Those of a look; None = as captured."""
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """What rendered colours are multiplied by at last."""
+    merged: float | None = None
+    """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are drawn."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,6 +129,11 @@ class SplatScene(Scene):
         """The Gaussians in the scene's look."""
         return self.gaussians if self.harmonics is None else self.gaussians.recoloured(self.harmonics)
 
+    @cached_property
+    def levels(self) -> Levels:
+        """Levels of detail in the scene's look."""
+        return make_levels_of_detail(self.shown)
+
     @torch.inference_mode()
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
         """Draw a view, its lens included. Raises DataError for a panorama."""
@@ -134,7 +142,8 @@ class SplatScene(Scene):
             small = cameras.select(torch.tensor([view])).scaled(1 / share)
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
         camera, place = cover(cameras, view, self.near)
-        drawn = draw(self.shown, camera, antialiased=self.antialiased, background=self.background)
+        shown = self.shown if self.merged is None else self.levels.select(camera, self.merged)
+        drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
         layers = torch.cat([drawn.image, (drawn.depth * _ray_lengths(camera))[..., None], drawn.opacity[..., None]], -1)
         if place is not None:
             layers = torch.cat([distorted(layers[..., :3], place), distorted(layers[..., 3:].contiguous(), place)], -1)

@@ -262,7 +262,8 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
     known, gaussians = run.load_known(), gaussians_of(saved)
     near = float(saved.model.get("near", torch.tensor(0.01)))
-    preset = PRESETS[quality.quality].resolution if quality.quality is not None else 1.0
+    preset = None if quality.quality is None else PRESETS[quality.quality]
+    resolution = preset.resolution if preset is not None else 1.0
     scene = SplatScene(
         gaussians,
         True,
@@ -272,8 +273,9 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         min(_SEEN, int(known.cameras.size.amax())),
         near,
         config.background,
-        preset if quality.resolution is None else quality.resolution,
+        resolution if quality.resolution is None else quality.resolution,
         tone=mixed_tone(_tones(saved, known.facts), known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
+        merged=None if preset is None else preset.merged,
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
 

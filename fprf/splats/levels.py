@@ -1,0 +1,170 @@
+"""Levels of detail: chunks of Gaussians that are near to each other, each also as fewer and larger ones.
+
+A chunk is a box of a k-d tree. Its level k has a Gaussian for each 4^k along a Morton curve, with the mean, the covariance
+and the colour of their mixture by weight (opacity times area), and as much opacity times area as they have together (compare
+Kerbl et al. 2024, a hierarchical 3D Gaussian representation). A view takes of each chunk in its frustum the coarsest level in
+which what was merged lies within a given number of pixels; the others cost it nothing.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..ops.rasterise import Pinhole
+from ..rendering.splines import rotations
+from .gaussians import Gaussians
+from .initial import spatial_order
+
+__all__ = ["Levels", "make_levels_of_detail"]
+
+_CHUNK, _GROUP, _LEVELS = 512, 4, 4
+"""Gaussians of a chunk; those merged into one of the next level; levels, the finest included."""
+_DEVIATIONS = 3.0
+"""How far a Gaussian reaches, in standard deviations."""
+_OPAQUE = 0.995
+_TAIL = 0.02
+"""Share of the means at either end that does not say how long a chunk is."""
+_SPREAD = 0.9
+"""Quantile that says how wide a chunk is, and how far apart is what a level merges."""
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """B chunks in L levels, the rows of a chunk and level side by side in memory."""
+
+    rows: Annotated[NDArray[np.float32], "R 11+3K"]
+    """Mean, quaternion, logarithms of scales, logit, harmonics."""
+    begin: Annotated[NDArray[np.int64], "B L+1"]
+    """First row of each level of a chunk; then the end of the last one."""
+    spread: Annotated[NDArray[np.float64], "B L"]
+    """Distances over which a level merges, in world units; 0 in the finest."""
+    centre: Annotated[NDArray[np.float64], "B 3"]
+    radius: Annotated[NDArray[np.float64], "B"]
+    """Of a ball around all that a chunk shows."""
+    core: Annotated[NDArray[np.float64], "B"]
+    """Of a ball around nearly all means of a chunk."""
+
+    def select(self, camera: Pinhole, pixels: float) -> Gaussians:
+        """What a camera sees, merged where that lies within `pixels`; 0 = nothing is merged."""
+        pose = camera.world_to_camera.double().numpy()
+        fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        local = self.centre @ pose[:3, :3].T + pose[:3, 3]
+        x, y, z = local.T
+        seen = z + self.radius > camera.near
+        # Distance from the planes through the camera and the image's sides; normals point outwards.
+        for along, slope in ((-x, cx / fx), (x, (camera.width - cx) / fx), (-y, cy / fy), (y, (camera.height - cy) / fy)):
+            seen &= (along - slope * z) / math.hypot(1, slope) < self.radius
+        distance = np.maximum(np.linalg.norm(local, axis=1) - self.core, camera.near)
+        fine = self.spread * max(fx, fy) <= pixels * distance[:, None]
+        level = np.minimum.accumulate(fine, axis=1).sum(1) - 1
+        chunks = np.flatnonzero(seen)
+        first, last = self.begin[chunks, level[chunks]], self.begin[chunks, level[chunks] + 1]
+        parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
+        return _gaussians(torch.from_numpy(np.concatenate(parts)))
+
+
+def make_levels_of_detail(gaussians: Gaussians) -> Levels:
+    """Sort Gaussians into chunks and merge them; all must be finite."""
+    position = gaussians.means.double().numpy()
+    order = torch.from_numpy(np.concatenate(_chunks(position, np.arange(len(position)))))
+    levels = [gaussians.select(order)]
+    sizes = [np.full(len(order), 0.0)]
+    for _ in range(_LEVELS - 1):
+        merged, apart = _merged(levels[-1])
+        before = sizes[-1]
+        # What lies apart in a level was apart already in the one before.
+        fill = np.pad(before, (0, -len(before) % _GROUP)).reshape(-1, _GROUP).max(1)
+        levels.append(merged)
+        sizes.append(np.hypot(apart, fill))
+    count = -(-len(order) // _CHUNK)
+    width = [_CHUNK // _GROUP**k for k in range(_LEVELS)]
+    tables = [_rows(level).numpy() for level in levels]
+    parts, begin, spread = [], np.zeros((count, _LEVELS + 1), np.int64), np.zeros((count, _LEVELS))
+    centre, radius, core, at = np.zeros((count, 3)), np.zeros(count), np.zeros(count), 0
+    reach = _DEVIATIONS * np.exp(levels[0].log_scales.double().amax(1).numpy())
+    means = levels[0].means.double().numpy()
+    for chunk in range(count):
+        for k, (table, each) in enumerate(zip(tables, width, strict=True)):
+            part = slice(chunk * each, (chunk + 1) * each)
+            begin[chunk, k] = at
+            parts.append(table[part])
+            at += len(table[part])
+            spread[chunk, k] = np.quantile(sizes[k][part], _SPREAD)
+        begin[chunk, -1] = at
+        own = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
+        centre[chunk] = np.median(means[own], axis=0)
+        away = np.linalg.norm(means[own] - centre[chunk], axis=1)
+        radius[chunk], core[chunk] = (away + reach[own]).max(), np.quantile(away, _SPREAD)
+    return Levels(np.concatenate(parts), begin, spread, centre, radius, core)
+
+
+def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Indices in chunks, all but the last one full: halved across the longest side, then along a Morton curve."""
+    if len(index) <= _CHUNK:
+        return [index[spatial_order(position[index])]] if len(index) else []
+    own = position[index]
+    axis = int((np.quantile(own, 1 - _TAIL, axis=0) - np.quantile(own, _TAIL, axis=0)).argmax())
+    half = max(1, len(index) // (2 * _CHUNK)) * _CHUNK
+    order = np.argpartition(own[:, axis], half)
+    return _chunks(position, index[order[:half]]) + _chunks(position, index[order[half:]])
+
+
+def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
+    """Each `_GROUP` neighbours as one, and the standard deviation of their means along its longest axis."""
+    missing = -len(gaussians) % _GROUP
+    index = torch.arange(len(gaussians) + missing).clamp_max(len(gaussians) - 1)
+    scales = gaussians.log_scales.double().exp()
+    weight = (gaussians.opacities.double() * scales.topk(2, dim=1).values.prod(1))[index].clamp_min(1e-30)
+    if missing:
+        weight[-missing:] = 0
+    weight = weight.view(-1, _GROUP, 1)
+    share = weight / weight.sum(1, keepdim=True)
+    means = gaussians.means.double()[index].view(-1, _GROUP, 3)
+    mean = (share * means).sum(1)
+    axes = rotations(gaussians.quaternions.double()) * scales[:, None]
+    covariance = (axes @ axes.mT)[index].view(-1, _GROUP, 3, 3)
+    away = means - mean[:, None]
+    between = (share[..., None] * away[..., :, None] * away[..., None, :]).sum(1)
+    values, vectors = torch.linalg.eigh((share[..., None] * covariance).sum(1) + between)
+    vectors = vectors * torch.linalg.det(vectors).sign()[:, None, None]
+    values = values.clamp_min(1e-20)
+    area = values[:, 1:].prod(1).sqrt()
+    opacity = (weight.sum((1, 2)) / area).clamp(1e-6, _OPAQUE)
+    harmonics = (share[..., None] * gaussians.harmonics.double()[index].view(len(mean), _GROUP, -1, 3)).sum(1)
+    found = (mean, _quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
+    apart = torch.linalg.eigvalsh(between)[:, -1].clamp_min(0).sqrt()
+    return Gaussians(*(part.float() for part in found)), apart.numpy()
+
+
+def _quaternions(turns: Annotated[Tensor, "N 3 3"]) -> Annotated[Tensor, "N 4"]:
+    """wxyz, by the largest of the four components (Shepperd 1978)."""
+    a, b, c = turns.diagonal(dim1=1, dim2=2).unbind(1)
+    squares = torch.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], 1)
+    x, y, z = turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]
+    p, q, r = turns[:, 1, 0] + turns[:, 0, 1], turns[:, 0, 2] + turns[:, 2, 0], turns[:, 2, 1] + turns[:, 1, 2]
+    rows = torch.stack(
+        [
+            torch.stack([squares[:, 0], x, y, z], 1),
+            torch.stack([x, squares[:, 1], p, q], 1),
+            torch.stack([y, p, squares[:, 2], r], 1),
+            torch.stack([z, q, r, squares[:, 3]], 1),
+        ],
+        1,
+    )
+    found = rows[torch.arange(len(turns)), squares.argmax(1)]
+    return torch.nn.functional.normalize(found, dim=1)
+
+
+def _rows(gaussians: Gaussians) -> Annotated[Tensor, "N 11+3K"]:
+    parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits[:, None])
+    return torch.cat([*parts, gaussians.harmonics.flatten(1)], 1)
+
+
+def _gaussians(rows: Annotated[Tensor, "N 11+3K"]) -> Gaussians:
+    parts = (rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10], rows[:, 11:].reshape(len(rows), -1, 3))
+    return Gaussians(*(part.contiguous() for part in parts))

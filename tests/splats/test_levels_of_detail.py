@@ -1,0 +1,52 @@
+"""Levels of detail: nothing that is seen is left out, moments are kept, and what is merged does not show."""
+
+from dataclasses import replace
+
+import torch
+from splat_ball import ball
+
+from fprf.ops.rasterise import Pinhole
+from fprf.splats.gaussians import Gaussians
+from fprf.splats.levels import make_levels_of_detail
+from fprf.splats.views import draw
+
+
+def _scattered(count: int) -> Gaussians:
+    """Small Gaussians in a ball of radius 10."""
+    found = ball(count)
+    return replace(found, means=10 * found.means, log_scales=found.log_scales - 1)
+
+
+def _camera(distance: float, focal: float) -> Pinhole:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = distance
+    intrinsics = torch.tensor([[focal, 0, 48], [0, focal, 32], [0, 0, 1]], dtype=torch.float64)
+    return Pinhole(intrinsics, pose, 96, 64, 0.01)
+
+
+def _squared(gaussians: Gaussians, camera: Pinhole, pixels: float) -> tuple[float, int]:
+    shown = make_levels_of_detail(gaussians).select(camera, pixels)
+    apart = draw(gaussians, camera, antialiased=True).image - draw(shown, camera, antialiased=True).image
+    return float(apart.square().mean()), len(shown)
+
+
+def test_culling_changes_nothing() -> None:
+    gaussians = _scattered(20_000)
+    for distance, focal in ((0.0, 100.0), (5.0, 300.0), (-5.0, 100.0)):
+        error, count = _squared(gaussians, _camera(distance, focal), 0.0)
+        assert error < 1e-10 and count < len(gaussians)
+
+
+def test_merging_within_a_pixel_does_not_show_and_saves() -> None:
+    gaussians = _scattered(20_000)
+    error, count = _squared(gaussians, _camera(300.0, 300.0), 1.0)
+    assert error**0.5 < 2 / 255 and count < 0.75 * len(gaussians)
+
+
+def test_equal_gaussians_merge_into_one_of_them() -> None:
+    one = ball(1)
+    many = one.select(torch.zeros(64, dtype=torch.int64))
+    found = make_levels_of_detail(many).select(_camera(10.0, 100.0), 0.5)
+    assert len(found) == 1
+    assert torch.allclose(found.means, one.means, atol=1e-5) and torch.allclose(found.harmonics, one.harmonics, atol=1e-5)
+    assert torch.allclose(found.log_scales.sort().values, one.log_scales.sort().values, atol=1e-4)
