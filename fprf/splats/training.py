@@ -58,7 +58,7 @@ _PATIENCE = 3
 _SMOOTHING = 0.95
 _VIEWS, _SEEN = 32, 400
 """Training views that semantics are found in, at most, and their longest side in pixels."""
-_PIXELS = 200_000
+_PIXELS = 640 * 360
 """Of an image, where nobody says how far to reduce them."""
 _SOME = 4000
 """Points whose depths say how near to a camera things are."""
@@ -90,7 +90,7 @@ def scene_of(config: GaussiansConfig) -> Scene:
 
 
 def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
-    """The config with the size of its images decided: the smallest factor at which none has more than 200 000 pixels."""
+    """The config with the size of its images decided: the smallest factor at which none has more pixels than 640 x 360."""
     if config.downscale is not None:
         return config
     pixels = int(scene_of(config).cameras.size.prod(1).max())
