@@ -24,8 +24,9 @@ from fprf.plugins.encoders.config import (
 from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionAdainConfig, RegionOtConfig, RegionToneConfig
-from fprf.pretraining.config import DistilConfig, PretrainDecoderConfig
+from fprf.pretraining.config import PretrainDecoderConfig
 from fprf.training.quality import QualityConfig
+from tools.distil.config import DistilConfig
 
 PLANES: dict[str, list[Any]] = {"resolutions": [(), (64, 1)], "channels": [0], "hidden": [0], "layers": [-1]}
 OUTSIDE: dict[type, dict[str, list[Any]]] = {
