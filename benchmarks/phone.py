@@ -109,7 +109,7 @@ def main(argv: list[str]) -> None:
     train, stylize = (shlex.split(line)[1:] for line in done["process"]["printed"])
     execute(train, work, done)
     execute(["eval", stylize[1]], work, done)
-    execute([*stylize[:-1], "autumn.jpg", "night.jpg"], work, done)
+    execute([*stylize[:-1], "autumn.jpg", "night.jpg", "--split", "test"], work, done)
     figures: dict[str, Any] = {"poses": poses(work), "lines": done}
     run = work / stylize[1]
     metrics = json.loads((run / "metrics.json").read_text())
