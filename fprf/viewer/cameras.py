@@ -59,6 +59,11 @@ class CameraState(NamedTuple):
     aspect: float
     """Width / height."""
 
+    def for_aspect(self, aspect: float) -> "CameraState":
+        """Narrow the angle on a wider page by half, in the logarithm, of what its sides would show beyond the photograph."""
+        tangent = math.tan(self.fov / 2) * math.sqrt(min(1.0, self.aspect / aspect))
+        return self._replace(fov=2 * math.atan(tangent), aspect=aspect)
+
 
 class PageTransform(NamedTuple):
     """The map from the capture's world to the page's."""

@@ -116,8 +116,9 @@ class ViserFrontend(Frontend):
                 self._session.move_camera(client.client_id, self._camera_of(client))
 
         client.camera.on_update(moved)
-        self._move_camera(client, self._home)
-        self._session.move_camera(client.client_id, self._home._replace(aspect=self._camera_of(client).aspect))
+        home = self._home.for_aspect(self._camera_of(client).aspect)
+        self._move_camera(client, home)
+        self._session.move_camera(client.client_id, home)
 
     async def _disconnected(self, client: viser.ClientHandle) -> None:
         self._session.disconnect(client.client_id)

@@ -168,3 +168,10 @@ def test_pyramids_behind_their_cameras_are_not_seen_from_there(world: World) -> 
     assert ahead.shape == behind.shape
     axis = cameras.pose[:, :, 2].repeat_interleave(10, 0).numpy()
     assert np.allclose(behind - ahead, 0.1 * axis[:, None], atol=1e-6)
+
+
+@pytest.mark.parametrize(("aspect", "height"), [(0.5, 1.0), (2.0, 0.5), (0.25, 1.0)])
+def test_a_page_wider_than_a_photograph_is_cut_above_as_much_as_it_shows_beside(aspect: float, height: float) -> None:
+    photograph = CameraState((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), math.radians(90), 0.5)
+    shown = photograph.for_aspect(aspect)
+    assert math.tan(shown.fov / 2) == pytest.approx(height) and shown.aspect == aspect
