@@ -79,17 +79,14 @@ def test_what_is_no_photograph_is_told_on_the_page(opened: tuple[Front, int], tm
 
 def test_many_moves_and_drops_leave_no_memory_behind(opened: tuple[Front, int], world: World) -> None:
     found, pid = opened
-    for i in range(14):  # the shelf is full then
-        found.drop(world.references[i % 2])
-    found.turn(20)
-    found.rest()
-    before = memory(pid)
-    found.turn(200)
-    found.rest()
-    for i in range(50):
-        found.drop(world.references[i % 2])
-    found.rest()
-    assert memory(pid) <= 1.05 * before
+    held = []
+    for _ in range(2):  # the shelf is full after fourteen, allocators have what they keep after the first round
+        found.turn(150)
+        for i in range(40):
+            found.drop(world.references[i % 2])
+        found.rest()
+        held.append(memory(pid))
+    assert held[1] <= 1.03 * held[0]
     assert len(found.state()["shelf"]) == 12
 
 
