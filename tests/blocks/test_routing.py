@@ -1,4 +1,4 @@
-"""Routers: every point in one group, weights as windows say, no block named that no point needs."""
+"""Routers and weights of blocks: a partition of unity, continuous, local; every point in one group."""
 
 import math
 
@@ -6,8 +6,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
+from torch import Tensor
 
-from fprf.blocks.routing import Blend, Chart, Everywhere, Group, Inset, chart_of, shares, surroundings_of
+from fprf.blocks.routing import Blend, Group, chart_of, local, shares, surroundings_of, window
 from fprf.types import Boxes
 
 
@@ -74,22 +76,6 @@ def test_blocks_that_no_point_needs_are_not_named() -> None:
     assert [g.members for g in far] == [(5,)] and len(far[0].at) == 3
 
 
-def test_no_points_are_no_trouble() -> None:
-    assert all(not len(g.at) for g in Blend(row(2))(torch.zeros(0, 3)))
-    assert not Inset(chart_of(row(2), 0))(torch.zeros(0, 3))
-
-
-def test_insets_and_everywhere() -> None:
-    boxes = row(3)
-    points = spread(boxes, 300, 0)
-    chart = chart_of(boxes, 1)
-    groups = {g.members: g for g in Inset(chart)(points)}
-    inside = chart.inside(points)
-    assert torch.equal(groups[(0,)].at, inside.nonzero()[:, 0]) and torch.equal(groups[(1,)].at, (~inside).nonzero()[:, 0])
-    only = Everywhere()(points)
-    assert len(only) == 1 and only[0].members == (0,) and only[0].weight is None and len(only[0].at) == 300
-
-
 def test_a_chart_fills_the_cube_with_the_cell_and_its_margin() -> None:
     boxes = ring(5)
     for block in range(5):
@@ -111,9 +97,53 @@ def test_surroundings_hold_everything_and_blocks_fill_their_inner_half() -> None
     assert bool((far.abs() <= 1).all()) and float(far[0, 0]) == pytest.approx(1.0, abs=1e-5)
 
 
-def test_charts_keep_float32_precision_in_a_wide_scene() -> None:
-    low = torch.tensor([500.0, 20.0, 0.0], dtype=torch.float64)
-    chart = Chart(low, low + 2, torch.eye(3, dtype=torch.float64))
-    points = low + 2 * torch.rand(100, 3, dtype=torch.float64)
-    error = (chart.locate(points.float()).double() - chart.locate(points)).abs().max()
-    assert float(error) < 6.2e-5, "the rounding of the coordinate itself: half a step of float32 at 500"
+def grid(columns: int, rows: int, margin: float = 0.2, side: float = 1.0) -> Boxes:
+    low = torch.tensor([[side * i, side * j, 0.0] for i in range(columns) for j in range(rows)], dtype=torch.float64)
+    return Boxes(low, low + side, torch.eye(3, dtype=torch.float64).expand(len(low), 3, 3), margin)
+
+
+def turned(angle: float) -> Tensor:
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def bend() -> Boxes:
+    """Two segments that meet at 60 degrees and overlap on the inner side."""
+    low, high = torch.tensor([[-2.0, -1.0, 0.0], [0.0, -1.0, 0.0]]).double(), torch.tensor([[0.0, 1, 2], [2.0, 1, 2]]).double()
+    return Boxes(low, high, torch.stack([turned(0.0), turned(math.pi / 3)]), 0.3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 3), st.integers(1, 3), st.floats(0.01, 0.5), st.integers(0, 2**31 - 1))
+def test_weights_sum_to_one_and_need_no_scaling_in_a_grid(columns: int, rows: int, margin: float, seed: int) -> None:
+    boxes = grid(columns, rows, margin)
+    draw = torch.Generator().manual_seed(seed)
+    points = torch.rand(200, 3, dtype=torch.float64, generator=draw) * torch.tensor([columns + 2.0, rows + 2.0, 3.0]) - 1
+    weight = shares(points, boxes)
+    assert weight.shape == (200, columns * rows + 1) and bool((weight >= 0).all())
+    assert torch.allclose(weight.sum(1), torch.ones(200, dtype=torch.float64), atol=1e-12)
+    bare = torch.stack([window(points, boxes, z) for z in range(columns * rows)], 1).sum(1)
+    assert bool((bare <= 1 + 1e-12).all()), "windows of cells that share faces never sum to more than 1"
+    inside = (points > 2 * margin).all(1) & (points < torch.tensor([columns, rows, 1.0]) - 2 * margin).all(1)
+    assert torch.allclose(bare[inside], torch.ones(int(inside.sum())).double(), atol=1e-12), "no surroundings inside"
+
+
+@pytest.mark.parametrize("boxes", [grid(3, 2), bend()], ids=["grid", "bend"])
+def test_weights_change_no_faster_than_the_margins_allow(boxes: Boxes) -> None:
+    """Steepest slope of a smoothstep over two margins is 3 / (4 m) an axis; scaling at most doubles it."""
+    draw = torch.Generator().manual_seed(3)
+    start = torch.rand(4000, 3, dtype=torch.float64, generator=draw) * 6 - 2.5
+    step = torch.nn.functional.normalize(torch.randn(4000, 3, dtype=torch.float64, generator=draw), dim=1) * 1e-3
+    jump = (shares(start + step, boxes) - shares(start, boxes)).abs().amax(1)
+    assert float(jump.max()) <= 1e-3 * math.sqrt(3) * 2 * 0.75 / boxes.margin + 1e-12
+    assert float(jump.max()) > 0, "the test crosses a border"
+
+
+def test_on_cuda_places_are_no_products_of_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which TF32 would round."""
+    points, turn = torch.randn(50, 3), turned(0.3)
+    expected = local(points, turn)
+    monkeypatch.setattr(torch.Tensor, "__matmul__", None, raising=False)
+    with pretend_cuda():
+        found = local(points.to(CUDA), turn.to(CUDA)).cpu()
+    assert (found - expected).abs().max() <= 1e-6

@@ -1,13 +1,23 @@
-import math
-from dataclasses import replace
+"""Frames against each other: what is consistent scores nothing, faults score by their size."""
 
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import cv2
 import pytest
 import torch
+from torch import Tensor
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.consistency import consistency, path_pairs, warp
+from fprf.evaluation.consistency import consistency, path_pairs, published, steadiness, warp
+from fprf.evaluation.town_truth import short_path, town_view
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.paths import look_at
+from fprf.town.layout import build_town
+from fprf.town.palettes import palette
+from fprf.town.render import geometry, render, walk
 
 WIDTH, HEIGHT = 48, 36
 
@@ -47,14 +57,6 @@ def seen(cameras: Cameras, view: int, *, plate: bool = False) -> tuple[torch.Ten
     return colour.reshape(HEIGHT, WIDTH, 3).float(), distance.reshape(HEIGHT, WIDTH).float()
 
 
-def test_a_view_warped_onto_itself_is_itself() -> None:
-    cameras = row_of_cameras(1)
-    image, depth = seen(cameras, 0)
-    found = warp(image, depth, depth, cameras, 0, 0)
-    assert bool(found.valid.all())
-    torch.testing.assert_close(found.image, image, atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("lens", [0, 1, 2])
 def test_a_plane_warps_exactly_to_interpolation(lens: int) -> None:
     cameras = row_of_cameras(2, step=0.6)
@@ -83,29 +85,6 @@ def test_what_is_hidden_or_outside_is_not_compared() -> None:
     plane = seen(cameras, 1)[1]
     fooled = warp(image_b, seen(cameras, 0)[1], plane, cameras, 0, 1)
     assert float((fooled.image - seen(cameras, 0)[0])[fooled.valid].abs().max()) > 0.2
-
-
-def test_pixels_without_depth_are_not_compared() -> None:
-    cameras = row_of_cameras(2)
-    (image, depth_a), (_, depth_b) = seen(cameras, 0), seen(cameras, 1)
-    for nothing in (0.0, -1.0, math.inf, math.nan):
-        holed = depth_a.clone()
-        holed[10:20, 10:20] = nothing
-        found = warp(image, holed, depth_b, cameras, 0, 1)
-        assert not bool(found.valid[10:20, 10:20].any()) and bool(found.valid[22:30, 22:30].all())
-        back = warp(image, depth_a, holed, cameras, 0, 0)
-        assert not bool(back.valid[12:18, 12:18].any()) and bool(torch.isfinite(back.image).all())
-
-
-def test_views_that_look_away_share_nothing() -> None:
-    cameras = row_of_cameras(2)
-    pose = cameras.pose.clone()
-    pose[1, :, :3] = pose[1, :, :3] @ torch.diag(torch.tensor([-1.0, 1, -1], dtype=torch.float64))
-    image, depth = seen(cameras, 0)
-    found = warp(image, depth, depth, replace(cameras, pose=pose), 0, 1)
-    assert not bool(found.valid.any())
-    row = consistency([image, image], [depth, depth], replace(cameras, pose=pose), [(0, 1)])
-    assert row == {"rmse": None, "relative": None, "valid_share": 0.0, "pairs": 1}
 
 
 def test_a_consistent_path_scores_zero_and_flicker_its_own_size() -> None:
@@ -153,3 +132,127 @@ def test_what_does_not_fit_is_named() -> None:
         warp(image, depth.T, depth, cameras, 0, 1)
     with pytest.raises(NumericsError, match="not finite"):
         consistency([image * math.nan] * 2, [depth] * 2, cameras, [(0, 0)])
+
+
+STILL_FRAMES = 9
+
+
+def still() -> Cameras:
+    pose = torch.eye(4, dtype=torch.float64)[None, :3].repeat(STILL_FRAMES, 1, 1)
+    return Cameras(
+        pose=pose,
+        focal=torch.full((STILL_FRAMES, 2), 12.0, dtype=torch.float64),
+        centre=torch.full((STILL_FRAMES, 2), 6.0, dtype=torch.float64),
+        size=torch.full((STILL_FRAMES, 2), 12),
+        distortion=torch.zeros(STILL_FRAMES, 6, dtype=torch.float64),
+        lens=torch.zeros(STILL_FRAMES, dtype=torch.int64),
+    )
+
+
+def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
+    """Brighter by 0.01 with every frame: neighbours differ by that, frames 7 apart by seven times as much."""
+    images = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(STILL_FRAMES)]
+    found = published(images, [torch.full((12, 12), 2.0)] * STILL_FRAMES, still())
+    assert found["short"]["rmse"] == pytest.approx(0.01, rel=1e-4) and found["short"]["pairs"] == 8
+    assert found["short"]["e_warp"] == pytest.approx(1e-4, rel=1e-4)
+    assert found["long"]["rmse"] == pytest.approx(0.07, rel=1e-4) and found["long"]["pairs"] == 2
+    assert found["short"]["lpips"] is None
+
+
+def test_nothing_to_compare() -> None:
+    images = [torch.zeros(12, 12, 3)] * STILL_FRAMES
+    found = published(images, [torch.zeros(12, 12)] * STILL_FRAMES, still())
+    assert found["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}
+    with pytest.raises(DataError, match="2 images, 9 depths"):
+        published(images[:2], [torch.zeros(12, 12)] * STILL_FRAMES, still())
+
+
+FILM_WIDTH, FILM_HEIGHT, FILM_FRAMES = 96, 72, 8
+
+
+@pytest.fixture(scope="module")
+def path() -> Cameras:
+    view = walk(seed=0, views=10, width=FILM_WIDTH, height=FILM_HEIGHT)[3]
+    start = Cameras(
+        pose=torch.from_numpy(view.pose)[None],
+        focal=torch.full((1, 2), view.focal, dtype=torch.float64),
+        centre=torch.tensor([[FILM_WIDTH / 2, FILM_HEIGHT / 2]], dtype=torch.float64),
+        size=torch.tensor([[FILM_WIDTH, FILM_HEIGHT]]),
+        distortion=torch.zeros(1, 6, dtype=torch.float64),
+        lens=torch.zeros(1, dtype=torch.int64),
+    )
+    return short_path(start, FILM_FRAMES)
+
+
+@pytest.fixture(scope="module")
+def depths(path: Cameras) -> list[Tensor]:
+    town = build_town(0)
+    return [torch.from_numpy(geometry(town, town_view(path, i))[0]) for i in range(FILM_FRAMES)]
+
+
+def film(path: Cameras, light: str) -> list[Tensor]:
+    town, look = build_town(0), palette(light)
+    return [torch.from_numpy(render(town, town_view(path, i), look).rgb).float() / 255 for i in range(FILM_FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def day(path: Cameras) -> list[Tensor]:
+    return film(path, "day")
+
+
+def flicker(frames: list[Tensor], size: float) -> list[Tensor]:
+    draw = torch.Generator().manual_seed(0)
+    return [frame + size * torch.randn(3, generator=draw) for frame in frames]
+
+
+def drift(frames: list[Tensor], size: float) -> list[Tensor]:
+    return [frame + size * k / 7 * torch.tensor([1.0, 0.0, -1.0]) for k, frame in enumerate(frames)]
+
+
+def blur(frames: list[Tensor], size: float) -> list[Tensor]:
+    return [torch.from_numpy(cv2.GaussianBlur(frame.numpy(), (0, 0), size)) for frame in frames]
+
+
+def noise(frames: list[Tensor], size: float) -> list[Tensor]:
+    draw = torch.Generator().manual_seed(0)
+    return [frame + size * torch.randn(frame.shape, generator=draw) for frame in frames]
+
+
+def score(plain: list[Tensor], styled: list[Tensor], depths: list[Tensor], path: Cameras) -> float:
+    found = steadiness(plain, styled, depths, path).score
+    assert found is not None
+    return found
+
+
+def test_the_render_itself_scores_zero(day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
+    found = steadiness(day, day, depths, path)
+    assert found.score == 0 and found.sharpness == 1
+    assert found.short == found.plain_short and found.long == found.plain_long
+    assert found.plain_short is not None and found.plain_short < 0.05, "true depth warps a true picture onto the next"
+    assert found.valid_share > 0.4
+
+
+def test_dull_and_inverted_colours_score_zero(day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
+    for recoloured in ([0.4 * x + 0.3 for x in day], [1 - x for x in day]):
+        assert score(day, recoloured, depths, path) < 1e-3
+
+
+@pytest.mark.parametrize("light", ["night"])
+def test_a_consistent_recolouring_scores_zero(light: str, day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
+    """Another palette is a new colour for every point of the town, the same from every view."""
+    assert score(day, film(path, light), depths, path) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("fault", "sizes"),
+    [(flicker, (0.01, 0.03, 0.09)), (drift, (0.02, 0.06, 0.15)), (blur, (0.5, 1.0, 2.0)), (noise, (0.02, 0.05, 0.1))],
+)
+def test_faults_rank_by_their_size(
+    fault: Callable[[list[Tensor], float], list[Tensor]],
+    sizes: tuple[float, ...],
+    day: list[Tensor],
+    depths: list[Tensor],
+    path: Cameras,
+) -> None:
+    found = [0.0, *(score(day, fault(day, size), depths, path) for size in sizes)]
+    assert all(after > 1.3 * before + 0.01 for before, after in pairwise(found)), found

@@ -7,14 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.errors import DataError
-from fprf.evaluation.style_distance import (
-    RegionStatistics,
-    gaussian_distance,
-    region_statistics,
-    relative_distance,
-    style_distances,
-)
+from fprf.evaluation.style_distance import RegionStatistics, gaussian_distance, relative_distance, style_distances
 from fprf.interfaces import Encoder
 
 
@@ -62,26 +55,6 @@ def test_the_full_distance_is_frechets(seed: int, channels: int) -> None:
     assert gaussian_distance(a, a, full=True) < 1e-5
 
 
-def test_statistics_are_those_of_the_regions_of_all_pictures() -> None:
-    one, two = noise(0), noise(1)
-    found = region_statistics(Pixels(), [(one, HALVES), (two, HALVES)])
-    right = torch.cat([one[:, 8:].reshape(-1, 3), two[:, 8:].reshape(-1, 3)]).double()
-    assert sorted(found) == [0, 1]
-    assert found[1].cells == 2 * 12 * 8
-    assert torch.allclose(found[1].mean, right.mean(0))
-    assert torch.allclose(found[1].covariance, torch.cov(right.T, correction=0))
-
-
-def test_coarse_labels_leave_their_borders_out() -> None:
-    coarse = torch.tensor([[0, 1]])
-    found = region_statistics(Pixels(), [(noise(0), coarse)])
-    assert found[0].cells == found[1].cells == 96
-    odd = torch.tensor([[0, 1, 1]])  # 16 columns over 3 cells: columns 5 lies in two of them
-    assert region_statistics(Pixels(), [(noise(0), odd)])[0].cells == 12 * 5
-    with pytest.raises(DataError, match="wholly in one region"):
-        region_statistics(Pixels(), [(noise(0), torch.arange(24 * 32).reshape(24, 32))])
-
-
 def test_no_change_is_one_and_the_reference_itself_is_zero() -> None:
     plain, style = noise(0), noise(1, mean=0.2, spread=0.2)
     halfway = (plain + style.mean(dim=(0, 1))) / 2
@@ -123,9 +96,3 @@ def test_regions_weigh_by_their_share_and_small_ones_not_at_all() -> None:
     assert relative_distance(plain, styled, style) == pytest.approx((30 * 0.5 + 10) / 40)
     assert relative_distance(style, style, style) is None
     assert relative_distance({7: at(1.0, 30)}, styled, style) is None
-
-
-def test_layers_without_an_answer_are_left_out_of_the_mean() -> None:
-    same = noise(0)
-    rows = style_distances({"it": Pixels()}, [(same, HALVES)], {"none": [(same, HALVES)]}, [(same, HALVES)])
-    assert rows == {"none": {"it": None, "mean": None}}

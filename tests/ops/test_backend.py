@@ -1,10 +1,12 @@
-"""The switch between compiled kernels and their plain forms."""
+"""Switches for a block of code: plain forms in place of compiled kernels, TF32."""
 
 import threading
 
+import pytest
 import torch
 
 from fprf.ops import backend, dense, march, triplane_numba
+from fprf.ops.precision import tf32
 
 
 def test_plain_forms_alone_within_the_block() -> None:
@@ -28,9 +30,9 @@ def test_other_threads_go_on() -> None:
     assert found == [True] and backend.compiled()
 
 
-def test_the_block_ends_with_an_error() -> None:
-    try:
-        with backend.plain():
-            raise ValueError
-    except ValueError:
-        assert backend.compiled()
+@pytest.mark.parametrize("enabled", [True, False])
+def test_tf32_is_put_back_after_an_error(enabled: bool) -> None:
+    with pytest.raises(KeyError), tf32(enabled):
+        assert torch.get_float32_matmul_precision() == ("high" if enabled else "highest")
+        raise KeyError
+    assert torch.get_float32_matmul_precision() == "highest"

@@ -17,9 +17,15 @@ from fprf.rendering.stepfun import keep_heaviest, midpoints, resample, shifts, t
 from fprf.types import Rays
 
 QUICK = settings(max_examples=25, deadline=None)
+
+
 U = 2.0**-24
 """Unit round-off of float32."""
+
+
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
 KINDS: tuple[Kind, ...] = ("contraction", "box", "ndc")
 
 
@@ -65,30 +71,6 @@ def test_distances_and_places_are_those_of_the_space(kind: Kind, count: int) -> 
     assert ((point - located).abs() <= 8 * U * (1 + slope)).all()
 
 
-@torch.no_grad()
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_plain_forms_say_the_same(kind: Kind) -> None:
-    """Where somebody wants the gradient of edges the space computes in torch: the compiled form differs by rounding alone."""
-    space, rays, s = space_of(kind), rays_of(kind, 40), edges(40, 30)
-    compiled = space.distance(s, rays.near, rays.far)
-    with torch.enable_grad():
-        plain = space.distance(s.clone().requires_grad_(True), rays.near, rays.far)
-    assert plain.requires_grad and not compiled.requires_grad
-    assert torch.allclose(compiled, plain, rtol=1e-6, atol=1e-6) and compiled.shape == plain.shape
-
-
-@torch.no_grad()
-def test_far_ends_and_empty_intervals() -> None:
-    space = space_of("contraction")
-    s = torch.linspace(0, 1, 65).repeat(4, 1)
-    near, far = torch.tensor([0.05, 1.0, 3.0, 2.0]), torch.tensor([1e30, 1e6, 3.0, 0.5])
-    t = march.distances(s, near, far, space.warp)
-    assert t.isfinite().all() and (t[:3].diff(dim=-1) >= 0).all()
-    assert torch.allclose(t[:, 0], near) and torch.allclose(t[:, -1], far)
-    rays = Rays(torch.zeros(4, 3), torch.eye(3)[[0, 1, 2, 0]], torch.eye(3)[[0, 1, 2, 0]], near, far)
-    assert (march.place(rays, t, space.warp).abs() <= 1).all()
-
-
 def check_weights(density: Tensor, t: Tensor, found: march.Weighed) -> None:
     tau = density.double() * t.double().diff(dim=-1)
     before = torch.nn.functional.pad(tau[:, :-1], (1, 0)).cumsum(-1)
@@ -105,8 +87,8 @@ def check_weights(density: Tensor, t: Tensor, found: march.Weighed) -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("samples", [1, 10, 16, 48, 100])
-@pytest.mark.parametrize("thickness", [1e-9, 1e-3, 1.0, 50.0, 1e8])
+@pytest.mark.parametrize("samples", [1, 16, 100])
+@pytest.mark.parametrize("thickness", [1e-9, 1.0, 1e8])
 def test_weights_are_those_of_fp64(samples: int, thickness: float) -> None:
     draw = torch.Generator().manual_seed(samples)
     density = torch.rand(37, samples, generator=draw) * thickness
@@ -139,28 +121,6 @@ def test_a_nan_is_kept_to_be_seen() -> None:
     density[0, 3] = float("nan")
     found = march.weigh(density, torch.arange(6.0).repeat(2, 1), 0.3)
     assert found.weights[0, 3:].isnan().all() and found.keep[0, 3:].all() and found.weights[1].isfinite().all()
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("latents", [0, 3, 64])
-def test_what_is_kept_is_gathered_in_order(latents: int) -> None:
-    draw = torch.Generator().manual_seed(0)
-    density, t = torch.rand(29, 8, generator=draw), torch.arange(9.0).repeat(29, 1)
-    weighed = march.weigh(density, t, 0.1)
-    point, latent = torch.rand(29, 8, 3, generator=draw), torch.rand(29 * 8, latents, generator=draw)
-    view = torch.rand(29, 3, generator=draw)
-    found = march.gather(weighed, point, latent, view)
-    index = weighed.keep.view(-1).nonzero()[:, 0]
-    assert torch.equal(found.ray, index // 8) and torch.equal(found.weight, weighed.weights.view(-1)[index])
-    assert torch.equal(found.point, point.view(-1, 3)[index]) and torch.equal(found.latent, latent[index])
-    assert torch.equal(found.view, view[index // 8])
-
-
-@torch.no_grad()
-def test_nothing_is_kept_where_nothing_is() -> None:
-    weighed = march.weigh(torch.zeros(3, 4), torch.arange(5.0).repeat(3, 1), 0.0)
-    assert not weighed.keep.any() and not weighed.opacity.any() and (weighed.transmittance == 1).all()
-    assert len(march.gather(weighed, torch.zeros(3, 4, 3), torch.zeros(12, 3), torch.zeros(3, 3)).ray) == 0
 
 
 @torch.no_grad()
@@ -212,8 +172,7 @@ def plain_proposal(
 
 @torch.no_grad()
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("samples", [5, 16, 48, 50])
-@pytest.mark.parametrize("thickness", [1.0, 4.0, 7.0])
+@pytest.mark.parametrize(("samples", "thickness"), [(5, 1.0), (16, 4.0), (50, 7.0)])
 def test_proposals_are_those_of_the_plain_form(kind: Kind, samples: int, thickness: float) -> None:
     """A cumulative weight errs by some units of the densities' rounding, an edge by that times its step's slope."""
     space, rays, field = space_of(kind), rays_of(kind, 50), proposal(thickness=thickness)

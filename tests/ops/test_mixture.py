@@ -3,14 +3,11 @@
 import numba
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.ops.lanes import BLOCK
 from fprf.ops.mixture import affine, affine_reference, attention, scaled, scaled_reference
 
-QUICK = settings(max_examples=25, deadline=None)
 U = 2.0**-24
 """Unit round-off of float32."""
 
@@ -35,8 +32,8 @@ def affine_oracle(x: Tensor, share: Tensor, matrix: Tensor, bias: Tensor, centre
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 3), (5, 4), (16, 1), (16, 2), (33, 20), (72, 3), (100, 2)])
-@pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
+@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 3), (5, 4), (16, 1), (33, 20)])
+@pytest.mark.parametrize("count", [1, 3 * BLOCK + 5])
 def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: int) -> None:
     x, centre = draw(count, channels) + 3, draw(channels, seed=1) + 3
     matrix, bias, share = draw(regions, channels, channels, seed=2), draw(regions, channels, seed=3), shares(count, regions)
@@ -44,26 +41,6 @@ def test_affine_maps_stay_within_the_bound(channels: int, regions: int, count: i
     for form in (affine, affine_reference):
         found = form(x, share, matrix, bias, centre=centre)
         assert found.shape == x.shape and ((found.double() - value).abs() <= bound).all()
-
-
-@QUICK
-@given(st.integers(1, 140), st.integers(1, 5), st.integers(1, 40), st.integers(0, 99))
-def test_any_affine_maps(channels: int, regions: int, count: int, seed: int) -> None:
-    x, centre, bias = draw(count, channels, seed=seed), draw(channels, seed=seed + 1), draw(regions, channels, seed=seed + 2)
-    matrix, share = draw(regions, channels, channels, seed=seed + 3), shares(count, regions, seed)
-    value, bound = affine_oracle(x, share, matrix, bias, centre)
-    with torch.no_grad():
-        assert ((affine(x, share, matrix, bias, centre=centre).double() - value).abs() <= bound).all()
-
-
-@torch.no_grad()
-def test_nothing_of_a_region_without_a_share_is_seen() -> None:
-    x, share = draw(100, 16), shares(100, 3)
-    share[:, 1] = 0
-    matrix, bias = draw(3, 16, 16), draw(3, 16)
-    clean = affine(x, share, matrix, bias, centre=x[0])
-    matrix[1], bias[1] = float("nan"), float("inf")
-    assert torch.equal(affine(x, share, matrix, bias, centre=x[0]), clean)
 
 
 @torch.no_grad()
@@ -79,8 +56,8 @@ def test_other_types_and_no_points_take_the_plain_form() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (128, 10), (5, 4), (16, 1), (72, 3)])
-@pytest.mark.parametrize("count", [1, BLOCK, 3 * BLOCK + 5])
+@pytest.mark.parametrize(("channels", "regions"), [(48, 8), (5, 4), (16, 1)])
+@pytest.mark.parametrize("count", [1, 3 * BLOCK + 5])
 def test_gains_and_biases_stay_within_the_bound(channels: int, regions: int, count: int) -> None:
     x, centre, share = draw(count, channels) + 3, draw(channels, seed=1) + 3, shares(count, regions)
     gain, bias = draw(regions, channels, seed=2), draw(regions, channels, seed=3)
@@ -100,8 +77,8 @@ def attention_oracle(x: Tensor, keys: Tensor, temperature: float, centre: Tensor
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("depth", "count"), [(32, 8), (64, 10), (3, 1), (7, 20), (384, 17)])
-@pytest.mark.parametrize("points", [1, BLOCK, 2 * BLOCK + 7])
+@pytest.mark.parametrize(("depth", "count"), [(32, 8), (3, 1), (7, 20), (384, 17)])
+@pytest.mark.parametrize("points", [1, 2 * BLOCK + 7])
 @pytest.mark.parametrize("directed", [False, True])
 def test_attention_is_the_softmax_of_the_scores(depth: int, count: int, points: int, directed: bool) -> None:
     """A score errs by (D + 4) u of its magnitudes, a share by twice that over the temperature."""
@@ -138,27 +115,6 @@ def test_a_point_at_the_centre_matches_everything_alike() -> None:
     assert torch.allclose(close, far, atol=1e-5), "nothing is flat unless it is said"
     at_zero = attention(torch.zeros(1, 16), keys, 0.1, centre=torch.zeros(16))
     assert torch.allclose(at_zero, torch.full((1, 4), 0.25))
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("temperature", [1e-30, 1e-45, 1e6, 3e38])
-def test_extreme_temperatures_stay_finite(temperature: float) -> None:
-    x, keys = draw(50, 16) * 1e4, draw(6, 16, seed=1) * 1e4
-    found = attention(x, keys, temperature)
-    assert found.isfinite().all() and torch.allclose(found.sum(1), torch.ones(50), atol=1e-6)
-    if temperature < 1:
-        assert torch.equal(found.argmax(1), (x.double() @ keys.double().T).argmax(1))
-
-
-@torch.no_grad()
-def test_a_nan_stays_in_its_row() -> None:
-    x, keys = draw(60, 16), draw(6, 16, seed=1)
-    clean = attention(x, keys, 1.0, centre=keys[0], faint=0.01)
-    x[7, 3] = float("nan")
-    found = attention(x, keys, 1.0, centre=keys[0], faint=0.01)
-    assert found[7].isnan().all()
-    others = torch.arange(60) != 7
-    assert torch.equal(found[others], clean[others])
 
 
 @torch.no_grad()

@@ -76,12 +76,11 @@ NETWORKS = ("dense.network", "dense.network_reference")
 """What somebody who asks for autocast wants to be lowered."""
 
 
-@pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("case", [pytest.param(case, id=case.name) for case in CASES if case.name not in NETWORKS])
-def test_autocast_does_not_lower_the_precision(case: Case, half: torch.dtype) -> None:
+def test_autocast_does_not_lower_the_precision(case: Case) -> None:
     given = cast(list(case.make(37)), torch.float32)
     usual = outputs(case.call(*given))
-    with torch.autocast("cpu", dtype=half):
+    with torch.autocast("cpu", dtype=torch.bfloat16):
         found = outputs(case.call(*given))
     exact = outputs(case.call(*cast(given, torch.float64)))
     for one, plain, other in zip(found, usual, exact, strict=True):

@@ -8,17 +8,9 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-KERNELS = (
-    "dense",
-    "exponential",
-    "guided",
-    "march",
-    "mixture",
-    "point_slopes",
-    "rasterise",
-    "triplane",
-    "variation",
-)
+
+
+KERNELS = ("dense", "guided", "march", "mixture", "rasterise", "triplane")
 
 
 @pytest.mark.slow

@@ -89,16 +89,6 @@ def test_a_decoder_learns_and_its_report_is_honest(photos: str, tmp_path: Path, 
     assert found[1] > found[0] + 5
 
 
-def test_content_and_decoder_repeat_exactly(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = [tmp_path / name for name in ("a.safetensors", "b.safetensors")]
-    for file in files:
-        args = ["--images", photos, "--output", str(file), "--encoder", "random", "--pixels", "30"]
-        assert run(["decoder", *args, *QUICK]) == 0
-    first, second = (read_weights(file) for file in files)
-    assert first[1] == second[1]
-    assert all(torch.equal(value, second[0][name]) for name, value in first[0].items())
-
-
 @pytest.mark.parametrize(
     ("args", "message"),
     [
@@ -113,12 +103,6 @@ def test_content_and_decoder_repeat_exactly(photos: str, tmp_path: Path, capsys:
 def test_mistakes(args: list[str], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         run(args)
-
-
-@pytest.mark.parametrize("kind", ["content", "semantic"])
-def test_distilling_needs_teachers(kind: str, photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([kind, "--images", photos, "--output", str(tmp_path / "w.safetensors")]) == 2
-    assert "--teachers" in capsys.readouterr().err
 
 
 def quadratic(network: nn.Linear, broken_at: int | None = None) -> Callable[[torch.Generator], Tensor]:
@@ -152,14 +136,3 @@ def test_a_resumed_run_ends_where_an_unbroken_one_does(tmp_path: Path, monkeypat
     assert said[0] == "resumed at step 5"
     assert torch.equal(resumed.weight, whole.weight)
     assert not checkpoint_path(output).exists()
-
-
-def test_a_checkpoint_of_another_config_is_not_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fprf.pretraining.loop.EVERY_SECONDS", -1.0)
-    output, net = tmp_path / "w.safetensors", network()
-    with pytest.raises(KeyboardInterrupt):
-        train(net, quadratic(net, broken_at=3), PretrainConfig(steps=9), output, lambda _: None)
-    assert checkpoint_path(output).exists()
-    said: list[str] = []
-    train(network(), quadratic(net), PretrainConfig(steps=1, seed=1), output, said.append)
-    assert not said[0].startswith("resumed")

@@ -21,6 +21,8 @@ from fprf.pretraining.loop import report_path, samples_folder
 from fprf.training.model import build_decoder
 
 ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
+
+
 QUICK = ["--pixels", "60", "--batch", "64", "--size", "24", "--pairs", "1"]
 
 
@@ -58,15 +60,6 @@ def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: P
     assert styled["psnr_db"] < plain["psnr_db"] - 3, "what the style gains, the identity pays"
 
 
-def test_runs_with_a_style_repeat_exactly(photos: str, vgg: str, tmp_path: Path) -> None:
-    for name in "ab":
-        made(
-            photos, tmp_path / f"{name}.safetensors", "--steps", "5", "--samples", "0", "--style", "0.1", "--style-weights", vgg
-        )
-    first, second = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
-    assert all(torch.equal(first[name], second[name]) for name in first)
-
-
 def test_without_weights_for_it_no_style_is_measured(photos: str, vgg: str, tmp_path: Path) -> None:
     steps = ["--steps", "3", "--samples", "0"]
     assert "style_loss" not in made(photos, tmp_path / "a.safetensors", *steps)
@@ -74,23 +67,6 @@ def test_without_weights_for_it_no_style_is_measured(photos: str, vgg: str, tmp_
     assert measured["style_loss"] > 0
     first, second = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in "ab")
     assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
-
-
-def test_absent_style_weights_are_named(photos: str, tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
-        made(photos, tmp_path / "d.safetensors", "--style", "1", "--style-weights", "absent.safetensors")
-
-
-def test_the_report_says_what_was_done(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "deeper" / "decoder.safetensors"
-    report = made(photos, output, "--steps", "4", "--seed", "3")
-    shown = json.loads(capsys.readouterr().out)
-    assert shown | {"weights": "decoder.safetensors", "kind": "decoder"} == report
-    assert report_path(output) == output.parent / "decoder.report.json"
-    assert (report["steps"], report["seed"], report["learned_photos"], report["photos"]) == (4, 3, 4, 1)
-    assert report["psnr_worst_db"] <= report["psnr_db"]
-    assert report["seconds"] >= 0
-    assert str(tmp_path) not in report_path(output).read_text()
 
 
 def test_samples_are_pictures_of_photo_decoded_and_restyled(photos: str, tmp_path: Path) -> None:

@@ -9,16 +9,8 @@ from hypothesis import strategies as st
 from photo_folder import photo_folder
 
 from fprf.datamanagers.config import GuidedConfig
-from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.pretraining.photos import (
-    filtered_at,
-    filtered_whole,
-    find_photos,
-    load_photo,
-    random_pixels,
-    split,
-)
+from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
 from tools.distil.config import DistilConfig
 from tools.distil.content import fit_basis
 from tools.distil.examples import crop, nightfall, prepared, prepared_path, toned
@@ -42,13 +34,6 @@ def test_photos_are_found_at_every_depth_in_an_order_of_their_own(folder: Path, 
     assert len(held) == 1
     assert not set(learn) & set(held)
     assert len(learn) + len(held) == 13
-
-
-def test_missing_folders_and_photographs_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="absent: no such folder"):
-        find_photos([tmp_path / "absent"])
-    with pytest.raises(DataError, match="0 photographs"):
-        find_photos([tmp_path])
 
 
 @settings(max_examples=25, deadline=None)
@@ -90,14 +75,6 @@ def test_a_basis_is_orthonormal_and_keeps_what_it_says(features: int, seed: int)
     energy = (samples - samples.mean(0)).double().square().sum()
     assert float(projected.square().sum() * basis.scale**2 / energy) == pytest.approx(basis.kept, rel=1e-3)
     assert basis.kept >= 0.8 or channels == features
-
-
-def test_a_whole_basis_keeps_distances() -> None:
-    samples = torch.randn(50, 5) * torch.tensor([3.0, 2.0, 1.0, 0.5, 0.1])
-    basis = fit_basis(samples, (5,), 1.0)
-    projected = basis.project(samples.T[None, :, :, None])[0, :, :, 0].T
-    found, wanted = (torch.pdist(x.double()) for x in (projected * basis.scale, samples))
-    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
 
 
 def test_filtered_pixels_are_those_of_the_whole_image(folder: Path) -> None:

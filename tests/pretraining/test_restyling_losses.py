@@ -20,7 +20,6 @@ from fprf.pretraining.restyling import (
     load_style_network,
     prepare_crops,
     restyling_losses,
-    style_distance,
     style_statistics,
 )
 
@@ -69,42 +68,6 @@ def test_activations_are_the_convolutions_in_float64() -> None:
         torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
 
 
-def test_units_are_the_filters_own_deviations() -> None:
-    net = network()
-    images = [torch.rand(3, 20, 24) for _ in range(4)]
-    plain = [net(image[None]) for image in images]
-    net.measure(images)
-    again = [net(image[None]) for image in images]
-    for layer in range(4):
-        deviation = torch.stack([each[layer][0].double().std((1, 2), correction=0) for each in plain]).mean(0)
-        unit = deviation.clamp_min(0.01 * float(deviation.mean()))
-        torch.testing.assert_close(again[0][layer][0].double(), plain[0][layer][0].double() / unit[:, None, None])
-    before = {name: value.clone() for name, value in net.named_buffers()}
-    net.measure(images)
-    for name, value in net.named_buffers():
-        torch.testing.assert_close(value, before[name], msg=f"{name}: measuring again must change nothing")
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 99), shift=st.floats(-2, 2), gain=st.floats(0.2, 4))
-def test_style_statistics_and_their_distance(seed: int, shift: float, gain: float) -> None:
-    draw = torch.Generator().manual_seed(seed)
-    x = torch.randn(2, 5, 6, 7, generator=draw)
-    (own,), (moved,) = style_statistics([x]), style_statistics([gain * x + shift])
-    flat = x.double().flatten(2)
-    torch.testing.assert_close(own[:, :5].double(), flat.mean(2), rtol=0, atol=1e-5)
-    torch.testing.assert_close(own[:, 5:].double(), (flat.var(2, correction=0) + 1e-4).sqrt(), rtol=1e-5, atol=0)
-    expected = float((moved - own).double().square().mean())
-    assert float(style_distance([own], [moved])) == pytest.approx(expected, rel=1e-5, abs=1e-12)
-    assert float(style_distance([own, own], [own, own])) == 0
-
-
-def test_a_constant_filter_has_a_finite_gradient() -> None:
-    x = torch.zeros(1, 3, 4, 4, requires_grad=True)
-    style_distance(style_statistics([x]), [torch.ones(1, 6)]).backward()  # type: ignore[no-untyped-call]
-    assert x.grad is not None and bool(x.grad.isfinite().all())
-
-
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 99), channels=st.integers(1, 6))
 def test_adain_gives_the_style_its_mean_and_deviation(seed: int, channels: int) -> None:
@@ -144,18 +107,6 @@ def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: list[Path]) -> 
     assert float(style) > 1e-4
     upside_down, _ = restyling_losses(crops, net, lambda f: f.flip(0), same, other)
     assert float(upside_down) > float(content), "the content loss sees where things are"
-
-
-def test_crops_are_a_function_of_the_seed_and_no_larger_than_the_photographs(photos: list[Path]) -> None:
-    encoder, net = RandomConfig(channels=3, stride=2).build(), network()
-    first, again, other = (
-        prepare_crops(encoder, net, photos, side=24, longest=96, seed=seed, measure=False) for seed in (0, 0, 1)
-    )
-    assert torch.equal(first.features, again.features)
-    assert not torch.equal(first.features, other.features)
-    assert first.features.shape == (4, 24 * 24, 3)
-    whole = prepare_crops(encoder, net, photos, side=500, longest=96, seed=0, measure=False)
-    assert whole.side == min(min(load_photo(path, 96).shape[:2]) for path in photos)
 
 
 def test_gradients_reach_the_decoder_alone(photos: list[Path]) -> None:

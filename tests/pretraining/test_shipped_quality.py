@@ -11,7 +11,6 @@ from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
 from fprf.plugins.encoders.config import BundledContentConfig, BundledSemanticConfig, EncoderConfig, Vgg19Config
 from fprf.pretraining.decoder import decoder_report
 from fprf.pretraining.photos import find_photos, load_photo, split
-from tools.distil.content import content_basis, content_report
 from tools.distil.examples import nightfall
 
 
@@ -31,15 +30,6 @@ def test_photographs_survive_encoding_and_decoding(
     report = decoder_report(encoder, decoder, photos[1][:3])
     assert float(report["psnr_db"]) >= (32 if objective == "identity" else 31)
     assert float(report["psnr_worst_db"]) >= 28
-
-
-@pytest.mark.slow
-def test_the_content_encoder_follows_its_teacher(shared: Path, photos: tuple[list[Path], list[Path]]) -> None:
-    teacher = Vgg19Config(weights=shared / "weights/vgg19_imagenet.safetensors").build()
-    basis = content_basis(teacher, photos[0][:60], 0)
-    report = content_report(BundledContentConfig().build(), teacher, basis, photos[1][:8])
-    assert float(report["relative_l2_filtered"]) < 0.10
-    assert float(report["relative_l2"]) < 0.20
 
 
 def test_day_and_night_agree_better_than_their_colours_do(photos: tuple[list[Path], list[Path]]) -> None:

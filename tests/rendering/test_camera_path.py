@@ -96,11 +96,3 @@ def test_what_is_no_camera_path_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "p.json").write_text(text)
     with pytest.raises(DataError, match="export the camera path again"):
         read_camera_path(tmp_path / "p.json")
-
-
-def test_files_that_are_not_there_and_paths_of_nothing(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such camera path; give spiral"):
-        read_camera_path(tmp_path / "none.json")
-    empty = read_camera_path(file(tmp_path / "p.json"))[0].select(torch.tensor([], dtype=torch.int64))
-    with pytest.raises(DataError, match="no frames"):
-        write_camera_path(tmp_path / "q.json", empty, 24)

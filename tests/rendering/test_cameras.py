@@ -1,6 +1,7 @@
-"""Rays and projections: against OpenCV's own lenses, and against each other."""
+"""Rays and projections: against OpenCV's own lenses, and against each other; tables, panoramas, normals."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,10 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.rendering.cameras import Cameras, project, rays_through, sees
-from fprf.rendering.lens import FISHEYE, OPENCV, PINHOLE, lens_reach
+from fprf.rendering.cameras import LIMIT, Cameras, PixelRays, grid_rays, normals, pixel_grid, project, rays_through, sees
+from fprf.rendering.lens import FISHEYE, OPENCV, PANORAMA, PINHOLE, lens_reach
+from fprf.rendering.paths import eye_strips, look_at, panoramas, pinhole
 
 QUICK = settings(max_examples=25, deadline=None)
+
+
 K = {
     PINHOLE: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     OPENCV: (0.0578421, -0.0805099, 0.01, -0.002, -0.000980296, 0.00015575),
@@ -121,35 +125,6 @@ def _opencv_pose(scene: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return cv2.Rodrigues(rotation)[0], -rotation @ pose[:, 3], matrix
 
 
-def test_a_fisheye_sees_behind_its_image_plane() -> None:
-    scene = cameras([FISHEYE], [(0.0,) * 6])
-    angle = 2.0
-    pixel = scene.centre + torch.tensor([[angle, 0.0]]) * scene.focal
-    view = torch.zeros(1, dtype=torch.int64)
-    origin, direction = rays_through(scene, view, pixel)
-    again, depth = project(scene, view, origin + direction)
-    assert torch.allclose(again, pixel, atol=1e-10)
-    assert depth.item() == pytest.approx(math.cos(angle))
-
-
-def test_barrel_distortion_leaves_corners_that_see_nothing() -> None:
-    # k1 = -0.3: r (1 - 0.3 r²) turns at r = 1.054 and never exceeds 0.703 focal lengths.
-    scene = cameras([OPENCV], [(-0.3, 0.0, 0.0, 0.0, 0.0, 0.0)])
-    reach = math.sqrt(1 / 0.9)
-    assert scene.reach.item() == pytest.approx(reach, rel=1e-12)
-    rim = reach * (1 - 0.3 * reach**2)
-    view = torch.zeros(2, dtype=torch.int64)
-    pixel = scene.centre + torch.tensor([[rim * 0.999, 0.0], [rim * 1.01, 0.0]]) * scene.focal
-    assert sees(scene, view, pixel).tolist() == [True, False]
-    # A millionth of a pixel decides, in pixels of this view.
-    beyond = torch.tensor([[0.0], [0.9e-6], [1.5e-6], [1e-4]], dtype=torch.float64)
-    at_rim = scene.centre + torch.tensor([[rim, 0.0]], dtype=torch.float64) * scene.focal + beyond * torch.tensor([1.0, 0.0])
-    assert sees(scene, torch.zeros(4, dtype=torch.int64), at_rim).tolist() == [True, True, False, False]
-    _, direction = rays_through(scene, view, pixel)
-    forward = -(direction @ scene.pose[0, :, 2])
-    assert forward[1].item() == pytest.approx(1 / math.hypot(1, reach), rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("lens", "k", "reach"),
     [
@@ -165,14 +140,6 @@ def test_the_reach_is_where_the_radius_turns(lens: int, k: tuple[float, ...], re
     assert found.item() == pytest.approx(reach, rel=1e-9)
 
 
-def test_points_behind_a_camera_have_no_pixel() -> None:
-    scene = cameras([PINHOLE, OPENCV])
-    view, pixel = pixels(scene, 8)
-    origin, direction = rays_through(scene, view, pixel)
-    behind, depth = project(scene, view, origin - direction)
-    assert behind.isnan().all() and (depth < 0).all()
-
-
 @QUICK
 @given(st.integers(1, 9), st.integers(0, 99))
 def test_scaling_commutes_with_rays(factor: int, seed: int) -> None:
@@ -185,26 +152,160 @@ def test_scaling_commutes_with_rays(factor: int, seed: int) -> None:
         assert torch.allclose(one, other, atol=1e-12)
 
 
-def test_something_is_left_of_the_smallest_image() -> None:
-    scene = cameras([PINHOLE, OPENCV])
-    assert torch.equal(scene.scaled(1e4).size, torch.ones(2, 2, dtype=torch.int64))
+LENSES = {PINHOLE: [0.0] * 6, OPENCV: [0.05, -0.08, 0.01, 0.0, -0.001, 0.0002], FISHEYE: [0.05, -0.01, 0.002, 0.0, 0.0, 0.0]}
 
 
-def test_select_takes_views_in_order() -> None:
-    scene = cameras([PINHOLE, OPENCV, FISHEYE])
-    some = scene.select(torch.tensor([2, 0]))
-    assert some.lens.tolist() == [FISHEYE, PINHOLE] and len(some) == 2
-    view, pixel = pixels(scene, 16)
-    keep = (view == 2) | (view == 0)
-    renumbered = torch.where(view[keep] == 2, 0, 1)
-    whole = rays_through(scene, view[keep], pixel[keep])
-    part = rays_through(some, renumbered, pixel[keep])
-    assert all(torch.equal(a, b) for a, b in zip(whole, part, strict=True))
+def rig(lenses: list[int], sizes: list[tuple[int, int]], offset: float = 0.0) -> Cameras:
+    count, draw = len(lenses), torch.Generator().manual_seed(0)
+    turn, _ = torch.linalg.qr(torch.randn(count, 3, 3, dtype=torch.float64, generator=draw))
+    turn = turn * torch.linalg.det(turn)[:, None, None]
+    place = torch.randn(count, 3, 1, dtype=torch.float64, generator=draw) + offset
+    size = torch.tensor(sizes)
+    return Cameras(
+        pose=torch.cat([turn, place], -1),
+        focal=torch.full((count, 2), 20.0, dtype=torch.float64),
+        centre=size.double() / 2,
+        size=size,
+        distortion=torch.tensor([LENSES[lens] for lens in lenses], dtype=torch.float64),
+        lens=torch.tensor(lenses),
+    )
 
 
-def test_no_rays_are_no_rays() -> None:
-    scene = cameras([OPENCV, FISHEYE])
-    none = torch.zeros(0, dtype=torch.int64)
-    origin, direction = rays_through(scene, none, torch.zeros(0, 2))
-    assert origin.shape == direction.shape == (0, 3)
-    assert project(scene, none, origin)[0].shape == (0, 2)
+def every_pixel(cameras: Cameras) -> tuple[Tensor, Tensor]:
+    grids = [pixel_grid(cameras, v) for v in range(len(cameras))]
+    return torch.cat([torch.full((len(g),), v) for v, g in enumerate(grids)]), torch.cat(grids)
+
+
+MIXED = ([PINHOLE, OPENCV, FISHEYE, OPENCV, PINHOLE], [(9, 6), (12, 5), (7, 7), (12, 5), (6, 9)])
+
+
+@pytest.mark.parametrize("offset", [0.0, 4.5e6])
+@pytest.mark.parametrize("limit", [LIMIT, 0])
+def test_every_pixel_of_mixed_cameras(offset: float, limit: int) -> None:
+    cameras = rig(*MIXED, offset=offset)
+    rays = PixelRays(cameras, limit=limit)
+    view, pixel = every_pixel(cameras)
+    origin, direction = rays(view, pixel)
+    wanted_origin, wanted = rays_through(cameras, view, pixel)
+    assert origin.dtype == direction.dtype == torch.float64
+    assert torch.equal(origin, wanted_origin)
+    assert (direction - wanted).abs().max() <= 1e-14
+    assert (direction.norm(dim=-1) - 1).abs().max() <= 1e-14
+
+
+def test_a_lens_that_differs_in_anything_is_another() -> None:
+    base = rig([OPENCV], [(12, 5)])
+    changed = [
+        replace(base, focal=base.focal * 1.01),
+        replace(base, centre=base.centre + 0.5),
+        replace(base, distortion=base.distortion * 0.5),
+        replace(base, lens=torch.tensor([FISHEYE])),
+        base.resized(torch.tensor([[24, 10]])),
+    ]
+    _, known = grid_rays(base, 0)
+    for other in changed:
+        pixel = pixel_grid(other, 0)
+        _, found = grid_rays(other, 0)
+        assert (found - rays_through(other, torch.zeros(len(pixel), dtype=torch.int64), pixel)[1]).abs().max() <= 1e-14
+        assert found.shape != known.shape or (found - known).abs().max() > 1e-4
+
+
+UP = torch.tensor([0.0, 0, 2], dtype=torch.float64)
+
+
+def looking(*target: float) -> Cameras:
+    place = torch.tensor([[1.0, 2, 3]], dtype=torch.float64)
+    aim = place + torch.tensor([target], dtype=torch.float64)
+    return pinhole(look_at(place, aim, UP), width=40, height=30, fov=50)
+
+
+def view_rays(cameras: Cameras, view: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    pixel = pixel_grid(cameras, view)
+    return rays_through(cameras, torch.full((len(pixel),), view), pixel)
+
+
+def test_pixels_are_angles() -> None:
+    camera = panoramas(looking(1, 0, 0.4), 64, UP)
+    assert camera.lens.tolist() == [PANORAMA] and camera.size.tolist() == [[64, 32]]
+    _, direction = view_rays(camera)
+    direction = direction.view(32, 64, 3)
+    longitude = ((torch.arange(64) + 0.5) / 64 - 0.5) * 2 * math.pi
+    latitude = (0.5 - (torch.arange(32) + 0.5) / 32) * math.pi
+    # It looks along +x, level; right is -y, up is +z.
+    expected = torch.stack(
+        [
+            latitude.cos()[:, None] * longitude.cos(),
+            -latitude.cos()[:, None] * longitude.sin(),
+            latitude.sin()[:, None].expand(32, 64),
+        ],
+        -1,
+    )
+    assert torch.allclose(direction, expected.double(), atol=1e-6)
+
+
+def test_all_directions_come_back_to_their_pixels() -> None:
+    camera = panoramas(looking(0.3, 1, -0.2), 48, UP)
+    pixel, view = pixel_grid(camera, 0), torch.zeros(48 * 24, dtype=torch.int64)
+    origin, direction = rays_through(camera, view, pixel)
+    back, _ = project(camera, view, origin + 7 * direction)
+    assert torch.allclose(back, pixel, atol=1e-9) and bool(sees(camera, view, pixel).all())
+    assert torch.allclose(direction.norm(dim=-1), torch.ones(len(pixel), dtype=torch.float64))
+    # Every part of the sphere is covered alike, per solid angle.
+    weight = torch.cos((pixel[:, 1] / 24 - 0.5) * math.pi)
+    assert (weight[:, None] * direction).sum(0).norm() / weight.sum() < 1e-9
+
+
+def test_eyes_look_where_the_panorama_does_from_a_circle() -> None:
+    camera = panoramas(looking(1, 0, 0), 30, UP)
+    _, whole = view_rays(camera)
+    for offset in (-0.03, 0.03):
+        strips = eye_strips(camera, offset)
+        assert strips.size[:, 0].sum() == 30 and set(strips.size[:, 1].tolist()) == {15}
+        columns, places = [], []
+        for k in range(len(strips)):
+            origin, direction = view_rays(strips, k)
+            columns.append(direction.view(15, -1, 3))
+            places.append(origin[0])
+        assert torch.allclose(torch.cat(columns, 1).reshape(-1, 3), whole, atol=1e-12)
+        for place, column in zip(places, columns, strict=True):
+            away = place - camera.pose[0, :, 3]
+            ahead = torch.nn.functional.normalize(column[7].mean(0) * torch.tensor([1.0, 1, 0]), dim=0)
+            assert float(away.norm()) == pytest.approx(0.03)
+            right = torch.linalg.cross(ahead, torch.tensor([0.0, 0, 1], dtype=torch.float64))
+            assert torch.allclose(away, offset * right, atol=1e-9), "the eye is beside where it looks"
+
+
+def camera(width: int = 40, height: int = 30) -> Cameras:
+    place, aim = (torch.tensor([p], dtype=torch.float64) for p in ((0.0, 0, 2), (5.0, 1, 1)))
+    return pinhole(look_at(place, aim, torch.tensor([0.0, 0, 1]).double()), width=width, height=height, fov=60)
+
+
+def plane_depth(cameras: Cameras, normal: torch.Tensor, offset: float) -> torch.Tensor:
+    """Distance along each ray to the plane normal . x = offset; infinite where it is missed."""
+    pixel = pixel_grid(cameras, 0)
+    origin, direction = rays_through(cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
+    depth = (offset - origin @ normal) / (direction @ normal)
+    width, height = cameras.size[0].tolist()
+    return torch.where(depth > 0, depth, torch.inf).view(height, width)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (-1.0, 0.2, 0.1), (-0.6, 0.0, 0.8)])
+def test_a_plane_has_its_normal_everywhere(normal: tuple[float, float, float]) -> None:
+    unit = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    for cameras in (camera(), panoramas(camera(), 48, torch.tensor([0.0, 0, 1]).double())):
+        depth = plane_depth(cameras, unit, float(unit @ torch.tensor([5.0, 0, 0], dtype=torch.float64)))
+        found = normals(cameras, 0, depth)
+        seen = found.norm(dim=-1) > 0
+        assert int(seen.sum()) >= 0.9 * int(torch.isfinite(depth).sum())
+        assert torch.allclose(found[seen], unit.float().expand_as(found[seen]), atol=1e-4)
+        assert not found[~torch.isfinite(depth)].any()
+
+
+@pytest.mark.parametrize("around", [False, True])
+def test_whatever_the_depths_normals_face_the_camera(around: bool) -> None:
+    cameras = panoramas(camera(), 48, torch.tensor([0.0, 0, 1]).double()) if around else camera()
+    width, height = cameras.size[0].tolist()
+    found = normals(cameras, 0, torch.rand(height, width, generator=torch.Generator().manual_seed(0)) * 3 + 0.1)
+    pixel = pixel_grid(cameras, 0)
+    _, direction = rays_through(cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
+    assert ((found.view(-1, 3).double() * direction).sum(-1) < 1e-6).all() and (found.norm(dim=-1) > 0.99).all()

@@ -6,21 +6,28 @@ from typing import Any
 
 import pytest
 import torch
+import toy_parts as toys
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor, nn
 from toy_parts import Never, Ones, Shift, Squash, Uniform, parts_of, rays_of, space_of
 
+from fprf.interfaces import ContentField, Decoder
 from fprf.plugins.samplers.config import UniformConfig
-from fprf.rendering.renderer import Parts, render_rays
-from fprf.rendering.space import Kind
+from fprf.rendering.renderer import Parts, march, render_rays
+from fprf.rendering.space import Kind, Space
+from fprf.rendering.stepfun import midpoints
 from fprf.style.look import Restyle
-from fprf.types import Rays, Rendered, Want
+from fprf.types import FieldSample, Rays, Rendered, Want
 
 pytestmark = pytest.mark.usefixtures("form")
+
+
 QUICK = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 """The form that is rendered by stays the same throughout a test."""
+
+
 ALL = Want.DENSITY | Want.COLOUR | Want.CONTENT | Want.SEMANTIC
 
 
@@ -53,9 +60,10 @@ def composite_oracle(rays: Rays, parts: Parts, rendered: Rendered, restyle: Rest
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("kind", ["contraction", "box", "ndc"])
-@pytest.mark.parametrize("proposal", [False, True])
-@pytest.mark.parametrize("restyle", [None, Restyle(Shift(), 1.0), Restyle(Shift(reads=True), 0.4)])
+@pytest.mark.parametrize(
+    ("kind", "proposal", "restyle"),
+    [("contraction", True, Restyle(Shift(reads=True), 0.4)), ("box", False, None), ("ndc", False, Restyle(Shift(), 1.0))],
+)
 def test_a_render_is_the_loop_over_rays_and_samples(kind: Kind, proposal: bool, restyle: Restyle | None) -> None:
     parts, rays, background = parts_of(kind, proposal=proposal), rays_of(kind, 5), torch.tensor([0.9, 0.1, 0.4])
     found = render_rays(rays, parts, want=ALL, budget=0.0, restyle=restyle, background=background)
@@ -113,18 +121,6 @@ def test_a_step_on_a_device_is_the_same_without_waiting(budget: float) -> None:
                 torch.testing.assert_close(one.cpu(), other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))
 
 
-@pytest.mark.parametrize("budget", [0.0, 0.01])
-@torch.no_grad()
-def test_strength_zero_is_the_plain_render_bit_for_bit(budget: float) -> None:
-    parts, rays = parts_of(), rays_of("contraction", 16)
-    background = torch.ones(3)
-    plain = render_rays(rays, parts, want=ALL, budget=budget, background=background)
-    restyle = Restyle(Never(), 0.0)  # type: ignore[arg-type]
-    faded = render_rays(rays, parts, want=ALL, budget=budget, background=background, restyle=restyle)
-    for name in ("rgb", "content", "semantic", "depth", "opacity"):
-        assert torch.equal(getattr(plain, name), getattr(faded, name))
-
-
 @torch.no_grad()
 def test_style_changes_colour_alone_and_sees_only_what_is_kept() -> None:
     parts, rays, stylizer = parts_of(), rays_of("contraction", 16), Shift(reads=True)
@@ -161,7 +157,7 @@ def test_content_moves_density_only_where_it_may(moves: bool) -> None:
     assert all(g is not None and g.any() for g in gradients(found.rgb.square().sum(), parts.field))
 
 
-@pytest.mark.parametrize("density", [0.0, 1e-6, 0.1, 2.0, 1e4])
+@pytest.mark.parametrize("density", [0.0, 0.1, 1e4])
 def test_a_background_is_seen_through_and_density_learns_from_it(density: float) -> None:
     """Colour c (1 - e^-x) + b e^-x over a length L, x = density L; its derivative is L (c - b) e^-x."""
     parts = Parts(space_of("box"), UniformConfig(samples=8).build(seed=0), Uniform(density, 0.3), None, Squash())
@@ -185,8 +181,7 @@ def test_a_background_is_seen_through_and_density_learns_from_it(density: float)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("samples", [None, 1, 3, 99])
-@pytest.mark.parametrize("count", [None, 0, 5])
+@pytest.mark.parametrize(("samples", "count"), [(None, None), (1, 5), (3, 0), (99, None)])
 def test_semantics_of_some_rays_and_samples_keep_the_opacity(samples: int | None, count: int | None) -> None:
     parts = parts_of()._replace(semantic=Ones())
     rays = rays_of("contraction", 9)
@@ -212,17 +207,99 @@ def test_nothing_is_computed_that_nobody_wants() -> None:
     assert found.rgb is not None
 
 
-def test_a_training_step_draws_and_learns_its_proposals() -> None:
-    parts, rays = parts_of(proposal=True), rays_of("contraction", 7)
+EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-    def render(seed: int) -> Rendered:
-        return render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, generator=torch.Generator().manual_seed(seed))
 
-    one, again, other = render(1), render(1), render(2)
-    assert one.rgb is not None and again.rgb is not None and other.rgb is not None and one.sampled is not None
-    assert torch.equal(one.rgb, again.rgb) and not torch.equal(one.rgb, other.rgb)
-    assert len(one.sampled.levels) == 1 and one.sampled.levels[0].weights.requires_grad
-    assert all(g is None for g in gradients(one.rgb.sum(), parts.sampler))
-    with torch.no_grad():
-        plain = render_rays(rays, parts, want=Want.COLOUR, budget=0.0)
-    assert plain.sampled is not None and plain.sampled.levels == ()
+NEAR = 0.1
+
+
+class Told(ContentField):
+    """The densities that it was given, sample by sample."""
+
+    def __init__(self, values: Tensor) -> None:
+        super().__init__()
+        self.values = nn.Parameter(values)
+
+    def density(self, points: Tensor) -> FieldSample:
+        return FieldSample(self.values[: len(points)], points)
+
+    def content(self, latent: Tensor, view: Tensor) -> Tensor:
+        return latent
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {}
+
+
+class Plain(Decoder):
+    def forward(self, content: Tensor) -> Tensor:
+        return content.sigmoid()
+
+    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
+        return self(styled)
+
+    def frozen_colour(self, content: Tensor) -> None:
+        return None
+
+
+def told_parts(kind: Kind, samples: int) -> Parts:
+    values = torch.rand(4 * samples, generator=torch.Generator().manual_seed(0))
+    space = Space(kind, (0.0, 0.0, 0.0), EYE, 1.0, NEAR, 1e3)
+    return Parts(space, UniformConfig(samples=samples).build(seed=0), Told(values), None, Plain())
+
+
+def told_rays(parts: Parts, count: int) -> Rays:
+    origin = torch.zeros(count, 3, dtype=torch.float64)
+    direction = torch.tensor([[0.0, 0.6, 0.8]], dtype=torch.float64).expand(count, 3)
+    return parts.space.rays(origin, direction)
+
+
+@pytest.mark.parametrize("kind", ["contraction", "box"])
+def test_near_densities_learn_by_the_square_of_their_distance(kind: Kind) -> None:
+    parts = told_parts(kind, 64)
+    rays = told_rays(parts, 4)
+    assert isinstance(parts.field, Told)
+
+    def gradient(step: int | None) -> Tensor:
+        marched = march(rays, parts, budget=0.0, step=step)
+        assert isinstance(parts.field, Told)
+        (grad,) = torch.autograd.grad(marched.weights.square().sum(), parts.field.values)
+        return grad.view(4, -1)
+
+    plain, training = gradient(None), gradient(0)
+    middle = midpoints(march(rays, parts, budget=0.0).sampled.t)
+    share = (middle / (4 * rays.near[:, None])).square().clamp(max=1) if kind == "contraction" else torch.ones(4, 64)
+    assert bool((share < 0.5).any()) == (kind == "contraction")
+    torch.testing.assert_close(training, plain * share, rtol=1e-5, atol=1e-9)
+
+
+def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
+    """Rays that want gradients are rendered as the same rays without, and where samples lie moves nothing."""
+    parts = toys.parts_of(proposal=True)
+    still = toys.rays_of("contraction", 6)
+    moved = still._replace(origin=still.origin.clone().requires_grad_(True))
+    want = Want.CONTENT | Want.COLOUR | Want.SEMANTIC
+    one, other = (render_rays(rays, parts, want=want, budget=0.0) for rays in (still, moved))
+    for name in ("rgb", "content", "semantic", "depth"):
+        assert torch.allclose(getattr(one, name), getattr(other, name), atol=2e-6), name
+    assert other.content is not None and other.semantic is not None and other.sampled is not None
+    (gradient,) = torch.autograd.grad(other.content.square().sum(), moved.origin, retain_graph=True)
+    assert gradient.isfinite().all() and (gradient.norm(dim=1) > 0).all()
+    assert torch.autograd.grad(other.semantic.sum(), moved.origin, allow_unused=True, retain_graph=True) == (None,)
+    assert not other.sampled.t.requires_grad
+
+
+class Aided(toys.Squash):
+    """A decoder with a part that helps it: alone it answers half."""
+
+    def frozen_colour(self, content: Tensor) -> Tensor:  # type: ignore[override]
+        return self(content) / 2
+
+
+def test_training_also_renders_what_the_decoder_says_alone() -> None:
+    parts, rays = toys.parts_of()._replace(decoder=Aided()), toys.rays_of("contraction", 4)
+    behind = torch.tensor([0.2, 0.4, 0.6])
+    found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, background=behind)
+    transmittance = 1 - found.opacity[:, None]
+    assert found.rgb is not None and found.frozen_rgb is not None
+    assert torch.allclose(found.frozen_rgb - transmittance * behind, (found.rgb - transmittance * behind) / 2, atol=1e-5)
+    assert render_rays(rays, parts, want=Want.COLOUR, budget=0.0).frozen_rgb is None

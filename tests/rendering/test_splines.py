@@ -38,12 +38,6 @@ def test_slerp_is_the_part_of_the_turn(seed: int, angle: float, u: float, flip: 
     torch.testing.assert_close(rotations(found)[0], start @ turn(axis(seed), u * angle), atol=1e-9, rtol=0)
 
 
-def test_slerp_half_a_turn_stays_a_rotation() -> None:
-    ends = quaternions(torch.stack([torch.eye(3), torch.diag(torch.tensor([1.0, -1, -1]))]).double())
-    middle = rotations(slerp(ends[:1], ends[1:], torch.tensor([0.5], dtype=torch.float64)))[0]
-    torch.testing.assert_close(middle @ middle.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.integers(2, 6), st.integers(0, 1000))
 def test_catmull_rom_passes_through_keys_with_one_velocity(count: int, seed: int) -> None:
@@ -66,20 +60,3 @@ def test_catmull_rom_never_turns_back_on_a_line(distances: list[float]) -> None:
     u = torch.linspace(0, 1, 40, dtype=torch.float64).repeat(len(distances))
     gaps = torch.arange(len(distances)).repeat_interleave(40)
     assert float(catmull_rom(keys, gaps, u)[:, 0].diff().min()) > -1e-12
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.integers(2, 6), st.integers(0, 1000), st.floats(0, 1))
-def test_catmull_rom_moves_with_its_keys(count: int, seed: int, u: float) -> None:
-    draw = torch.Generator().manual_seed(seed)
-    keys = torch.randn(count, 3, dtype=torch.float64, generator=draw)
-    gaps, place = torch.arange(count - 1), torch.full((count - 1,), u, dtype=torch.float64)
-    turned, shift = turn(axis(seed), 2.0), torch.randn(3, dtype=torch.float64, generator=draw)
-    expected = catmull_rom(keys, gaps, place) @ turned.T + shift
-    torch.testing.assert_close(catmull_rom(keys @ turned.T + shift, gaps, place), expected, atol=1e-10, rtol=0)
-
-
-def test_catmull_rom_of_one_place_stays() -> None:
-    keys = torch.ones(3, 3, dtype=torch.float64)
-    assert torch.equal(catmull_rom(keys, torch.tensor([0, 1]), torch.tensor([0.2, 0.7]).double()).round(decimals=12), keys[:2])
-    assert torch.equal(catmull_rom(keys[:1], torch.tensor([0]), torch.tensor([0.0]).double()), keys[:1])

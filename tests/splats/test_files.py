@@ -1,11 +1,10 @@
 """Files of Gaussians: byte for byte back where nothing changed, within each format's steps where it is written anew."""
 
 import gzip
-import io
 import json
 import struct
 import zipfile
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +18,11 @@ from fprf.splats.files.base import spatial_order
 from fprf.splats.gaussians import Gaussians
 
 SHAPE = ("means", "quaternions", "log_scales", "logits")
+
+
 COUNT = 600
+
+
 STEP = {  # half a step of positions (of their range), ln-scales (of theirs), opacities, mean colours and harmonics
     ".ply": (0.0, 0.0, 1e-7, 0.0, 0.0),
     ".compressed.ply": (0.5 / 1023, 0.5 / 1023, 0.5 / 255, 0.5 / 255, 0.5 * 8 / 256),
@@ -211,30 +214,6 @@ def test_sog_of_version_1(tmp_path: Path) -> None:
     write_capture(tmp_path / "there" / "meta.json", capture, new)
     again = read_capture(tmp_path / "there").gaussians
     assert (again.harmonics - new).abs().max() < 2 / 255 and torch.equal(again.logits, capture.gaussians.logits)
-
-
-def test_a_palette_takes_the_mean_of_what_its_gaussians_became(tmp_path: Path) -> None:
-    first = cloud(1, 50)
-    harmonics = torch.cat([first.harmonics, first.harmonics])
-    twice = Gaussians(*(torch.cat([getattr(first, f.name)] * 2) for f in fields(first)))
-    write_gaussians(tmp_path / "x.sog", replace(twice, harmonics=harmonics))
-    capture = read_capture(tmp_path / "x.sog")
-    parts = {}
-    with zipfile.ZipFile(io.BytesIO(capture.data)) as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
-    labels = cv2.imdecode(np.frombuffer(parts["shN_labels.webp"], np.uint8), cv2.IMREAD_UNCHANGED)
-    labels[...] = 0  # all take the first entry
-    parts["shN_labels.webp"] = cv2.imencode(".webp", labels, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
-    with zipfile.ZipFile(tmp_path / "y.sog", "w") as archive:
-        for name, content in parts.items():
-            archive.writestr(name, content)
-    capture = read_capture(tmp_path / "y.sog")
-    new = capture.gaussians.harmonics.clone()
-    new[:30, 1:] = 0.3
-    new[30:, 1:] = -0.2
-    write_capture(tmp_path / "z.sog", capture, new)
-    rest = read_capture(tmp_path / "z.sog").gaussians.harmonics[:, 1:]
-    assert torch.allclose(rest, torch.tensor(0.3 * 0.3 - 0.7 * 0.2).expand_as(rest), atol=1e-3)
 
 
 def test_gaussians_that_are_not_finite_are_read_and_told(tmp_path: Path) -> None:

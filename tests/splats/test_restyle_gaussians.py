@@ -24,10 +24,11 @@ from fprf.splats.views import camera_of, draw, find_views
 from fprf.style.config import StyleConfig
 from fprf.style.controls import luma
 from fprf.style.files import StyleFile, write_style
-from fprf.training.regions import memberships
 from fprf.training.restyle import apply_style
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
+
+
 TONE = RegionToneConfig(centred=False)
 
 
@@ -97,16 +98,6 @@ def test_pinned_regions_take_one_photograph_alone(scene: SplatScene, photographs
     assert (styled(scene, *photographs) - alone).abs().max() > 0.01
     with pytest.raises(UsageError, match="region 9"):
         styled(scene, photographs[0], keep=("9",))
-
-
-def test_a_pixel_names_the_region_that_is_seen_there(scene: SplatScene, photographs: list[Path]) -> None:
-    drawn = draw(scene.gaussians, camera_of(scene.cameras, 2))
-    y, x = divmod(int(drawn.opacity.argmax()), drawn.opacity.shape[1])
-    share, opacity = memberships(scene, scene.measured()[0], scene.cameras, 2, torch.tensor([[x + 0.5, y + 0.5]]))
-    assert opacity[0] > 0.9 and float(share.sum()) == pytest.approx(1, abs=1e-4)
-    number = str(int(share[0].argmax()))
-    by_pixel, by_number = (styled(scene, photographs[0], keep=(text,)) for text in (f"02:{x},{y}", number))
-    assert torch.equal(by_pixel, by_number)
 
 
 def test_luminance_is_kept_and_styles_mix(scene: SplatScene, photographs: list[Path], tmp_path: Path) -> None:
@@ -218,22 +209,3 @@ def test_the_verb_writes_capture_sheet_page_and_style(
     kept = next((tmp_path / "cache").iterdir())
     kept.write_bytes(kept.read_bytes()[:-9])
     assert cli.main([*words, *same]) == 0, "what is damaged is made again"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--references", "x.jpg"], "name what to write"),
-        (["--output", "out.ply"], "at least one photograph"),
-        (["--references", "x.jpg", "--output", "out.obj"], "known endings"),
-        (["--references", "x.jpg", "--page", "out.png"], "html"),
-        (["--references", "x.jpg", "--output", "out.ply", "--up", "0", "0", "0"], "no direction"),
-    ],
-)
-def test_mistakes_are_told_in_one_line(words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_gaussians(tmp_path / "in.ply", ball(20))
-    cv2.imwrite(str(tmp_path / "x.jpg"), np.full((64, 64, 3), 90, np.uint8))
-    words = [str(tmp_path / word) if word == "x.jpg" else word for word in words]
-    assert cli.main(["restyle", str(tmp_path / "in.ply"), "--cache", str(tmp_path), *words]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1

@@ -12,7 +12,6 @@ import torch
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene, find_sightings
-from fprf.errors import ConfigError
 from fprf.splats.cell_training import read_cells
 from fprf.splats.cells import Cell, cut
 from fprf.splats.files import read_capture
@@ -65,11 +64,6 @@ def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: li
             x, y = sightings.pixel.unbind(1)
             inside |= (sightings.view == view) & (x >= left) & (x < left + width) & (y >= top) & (y < top + height)
         assert inside[mine].double().mean() > 0.9  # outliers and views with few points are left out
-
-
-def test_too_few_points_are_refused(scene: Scene) -> None:
-    with pytest.raises(ConfigError, match="cells"):
-        cut(replace(scene, points=None, seen=None), 2)
 
 
 def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Scene, cells: list[Cell], tmp_path: Path) -> None:

@@ -253,13 +253,6 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
     assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
 
 
-def test_points_begin_where_there_are_none(scene: Scene) -> None:
-    bare = replace(scene, points=None, seen=None)
-    found, origin = initial.initial_points(bare, dict(enumerate(load_images(bare))), 500, np.random.default_rng(0))
-    assert origin == "random points" and len(found.position) == 500 and np.isfinite(found.position).all()
-    assert found.colour.min() >= 0 and found.colour.max() <= 1
-
-
 def test_matches_between_views_give_points_on_the_surface() -> None:
     """Views of a textured plane z = 0: what is triangulated lies in it."""
     from fprf.rendering.cameras import Cameras

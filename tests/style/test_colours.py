@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.errors import CheckpointError, DataError
 from fprf.interfaces import Decoder
-from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, RegionToneConfig
-from fprf.style.colours import ColourMaps, colour_maps, decoded_colours
+from fprf.plugins.stylizers.config import IdentityConfig, RegionToneConfig
+from fprf.style.colours import ColourMaps, colour_maps
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, load_dictionary, save_dictionary
 from fprf.style.look import Restyle
 from fprf.style.regional import RegionWeight
@@ -76,47 +75,6 @@ def test_colours_get_mean_and_covariance_of_their_match() -> None:
         assert torch.allclose(torch.cov(own.T), d.colour_covariance[taken].double(), atol=0.2 * float(own.var(0).max()))
 
 
-@pytest.mark.parametrize("kinds", [2, 3])
-def test_each_region_goes_its_own_way(kinds: int) -> None:
-    content, semantic, _ = points(0)
-    scene = scene_style(content, semantic, torch.ones(COUNT), None, kinds, 0)
-    d = build_dictionary([reference(1)], clusters=KINDS, blend=0.0)
-    sharp = RegionToneConfig(temperature=1e-3, features=0.0).build(dictionary=d, scene=scene)
-    maps = colour_maps(sharp, d, scene, Straight(), features=0.0)
-    assert maps is not None and d.colour_mean is not None
-    moved = scene.region_mean[:, :3] + torch.einsum("kc,kcd->kd", scene.region_mean[:, :3], maps.matrix) + maps.bias
-    assert torch.allclose(moved, d.colour_mean[sharp.match(scene.keys).argmax(1)].float(), atol=2e-3)
-    assert len(sharp.match(scene.keys).argmax(1).unique()) > 1, "or nothing was told apart"
-
-
-def test_what_has_the_colours_already_is_left_alone() -> None:
-    content, semantic, _, scene, _ = setting()
-    stylizer = RegionToneConfig(temperature=1e-3).build(dictionary=own_style(scene, 0.0), scene=scene)
-    mean, spread = decoded_colours(stylizer, scene, Straight())
-    same = own_style(scene, 0.0)._replace(colour_mean=mean.float(), colour_covariance=spread.float())
-    maps = colour_maps(stylizer, same, scene, Straight())
-    assert float((carried(maps, content[:, :3], semantic) - content[:, :3]).abs().max()) < 2e-3
-
-
-def test_draws_meet_the_mean_of_the_features() -> None:
-    *_, scene, d = setting()
-    stylizer = IdentityConfig().build(dictionary=d, scene=scene)
-    mean, spread = decoded_colours(stylizer, scene, Straight())
-    assert torch.allclose(mean, scene.region_mean[:, :3].double(), atol=1e-6), "drawn in pairs"
-    wanted = scene.region_covariance[:, :3, :3].double()
-    assert float((spread - wanted).norm() / wanted.norm()) < 0.15
-    again = decoded_colours(stylizer, scene, Straight())
-    assert torch.equal(mean, again[0]) and torch.equal(spread, again[1]), "no chance in it"
-
-
-@pytest.mark.parametrize("config", [AdainConfig(), LocalAdainConfig(), RegionToneConfig(), IdentityConfig()])
-def test_any_stylizer_can_be_followed(config: AdainConfig | LocalAdainConfig | RegionToneConfig | IdentityConfig) -> None:
-    content, semantic, _, scene, d = setting(1, 2, blend=0.3)
-    stylizer = config.build(dictionary=d, scene=scene)
-    found = carried(colour_maps(stylizer, d, scene, Straight()), content[:, :3], semantic)
-    assert bool(found.isfinite().all()) and float(found.min()) >= -1e-6 and float(found.max()) <= 1 + 1e-6
-
-
 def test_nothing_asked_nothing_made() -> None:
     *_, scene, d = setting()
     stylizer = RegionToneConfig().build(dictionary=d, scene=scene)
@@ -124,17 +82,6 @@ def test_nothing_asked_nothing_made() -> None:
     bare = build_dictionary([reference(1), reference(2, coloured=False)], clusters=2)
     assert bare.colour_mean is None and colour_maps(stylizer, bare, scene, Straight()) is None
     assert colour_maps(stylizer, own_style(scene), scene, Straight()) is None
-
-
-def test_one_region_needs_no_semantics() -> None:
-    content, _, _ = points(0)
-    scene = scene_style(content, None, torch.ones(COUNT), None, 1, 0)
-    d = build_dictionary([Reference("r", points(1)[0], torch.zeros(COUNT, 0), colour=points(7)[0][:, :3])])
-    stylizer = IdentityConfig().build(dictionary=d, scene=scene)
-    maps = colour_maps(stylizer, d, scene, Straight())
-    assert maps is not None and maps.needs == Want.CONTENT
-    found = carried(maps, content[:, :3], None)
-    assert torch.allclose(found.mean(0), points(7)[0][:, :3].mean(0), atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -199,16 +146,6 @@ def test_dictionaries_know_the_colours_of_their_pixels(tmp_path: Path) -> None:
     flipped = build_dictionary([reference(2), reference(1)], clusters=KINDS)
     assert both.colour_mean is not None and flipped.colour_mean is not None
     assert torch.equal(both.colour_mean, flipped.colour_mean), "the order of files plays no part"
-
-
-def test_mistakes(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"colours of shape \(5, 3\)"):
-        build_dictionary([reference(1)._replace(colour=torch.zeros(5, 3))])
-    d = build_dictionary([reference(1)], clusters=2)
-    assert d.colour_mean is not None
-    save_dictionary(tmp_path / "d.safetensors", d._replace(colour_mean=d.colour_mean[:, :2]))
-    with pytest.raises(CheckpointError, match="colour_mean"):
-        load_dictionary(tmp_path / "d.safetensors")
 
 
 @pytest.mark.parametrize("pixels", [1, 2, 50])

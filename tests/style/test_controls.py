@@ -1,9 +1,13 @@
+"""What users ask of a style: strengths, luminance, regions and references by their names."""
+
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import UsageError
+from fprf.style.config import RegionValue, find_reference, labels, parse_region_value
 from fprf.style.controls import allowed_references, blend_strength, keep_luminance, luma
 
 COLOUR = st.tuples(
@@ -15,32 +19,6 @@ def test_the_ends_are_bitwise_and_the_same_object() -> None:
     content, styled = torch.randn(7, 3), torch.randn(7, 3)
     assert blend_strength(content, styled, 0.0) is content
     assert blend_strength(content, styled, 1.0) is styled
-
-
-def test_strengths_of_points_are_bitwise_at_their_ends_too() -> None:
-    content, styled = torch.randn(3, 5), torch.randn(3, 5)
-    mixed = blend_strength(content, styled, torch.tensor([[0.0], [1.0], [0.25]]))
-    assert torch.equal(mixed[0], content[0]) and torch.equal(mixed[1], styled[1])
-    torch.testing.assert_close(mixed[2], blend_strength(content, styled, 0.25)[2])
-
-
-def test_a_style_that_is_not_finite_does_not_show_at_strength_zero() -> None:
-    content = torch.randn(2, 3)
-    assert torch.equal(blend_strength(content, torch.full((2, 3), float("nan")), 0.0), content)
-
-
-@pytest.mark.parametrize("strength", [0.25, 0.5, 0.9])
-def test_between_it_is_linear(strength: float) -> None:
-    content, styled = torch.randn(7, 3), torch.randn(7, 3)
-    expected = (1 - strength) * content.double() + strength * styled.double()
-    for given_as in (strength, torch.full((7, 1), strength)):
-        torch.testing.assert_close(blend_strength(content, styled, given_as).double(), expected, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("strength", [-0.1, 1.1, float("nan"), float("inf")])
-def test_strength_has_a_range(strength: float) -> None:
-    with pytest.raises(UsageError, match="strength"):
-        blend_strength(torch.zeros(1, 1), torch.zeros(1, 1), strength)
 
 
 @settings(max_examples=200, deadline=None)
@@ -73,30 +51,42 @@ def test_hues_survive_where_there_is_room_and_fade_where_not() -> None:
     assert float(light.amax()) == pytest.approx(1.0)
 
 
-def test_a_channel_at_the_luma_of_black_is_a_colour() -> None:
-    """Its tint is 0 and so is its room: 0 / 0 must not reach the pixel."""
-    draw = torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0))
-    r, b = draw[:, 0], draw[:, 2]
-    weights = luma(torch.eye(3))[:, 0]
-    styled = torch.stack([r, (weights[0] * r + weights[2] * b) / (1 - weights[1]), b], 1)
-    exact = luma(styled)[:, 0] == styled[:, 1]
-    assert int(exact.sum()) > 100
-    found = keep_luminance(styled[exact], torch.zeros(int(exact.sum()), 3), 1.0)
-    assert torch.allclose(found, torch.zeros_like(found), atol=1e-6)
-
-
 def test_pins_exclude_the_others_and_forbidding_leaves_the_rest() -> None:
     allowed = allowed_references(4, 3, pin={0: {1}, 3: {0, 2}}, forbid=[(1, 2), (3, 0)])
     assert allowed.tolist() == [[False, True, False], [True, True, False], [True, True, True], [False, False, True]]
 
 
-@pytest.mark.parametrize("wish", [{"pin": {2: {0}}}, {"pin": {0: {2}}}, {"forbid": [(0, -1)]}])
-def test_unknown_numbers_are_named(wish: dict[str, object]) -> None:
-    with pytest.raises(UsageError, match="regions go from 0 to 1, references from 0 to 1"):
-        allowed_references(2, 2, **wish)  # type: ignore[arg-type]
+PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
 
 
-@pytest.mark.parametrize("wish", [{"forbid": [(1, 0), (1, 1)]}, {"pin": {1: {0}}, "forbid": [(1, 0)]}])
-def test_a_region_left_with_nothing_is_named(wish: dict[str, object]) -> None:
-    with pytest.raises(UsageError, match="region 1"):
-        allowed_references(2, 2, **wish)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("text", "wish"),
+    [
+        ("3=autumn.jpg", RegionValue("3", "autumn.jpg")),
+        ("IMG_0012:120,80=0", RegionValue("IMG_0012:120,80", "0")),
+        ("a=b:mask.png=x.jpg", RegionValue("a=b:mask.png", "x.jpg")),
+    ],
+)
+def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: RegionValue) -> None:
+    assert parse_region_value("pin", text) == wish
+
+
+@pytest.mark.parametrize(
+    ("text", "index"),
+    [("autumn.jpg", 0), ("a/autumn.jpg", 0), ("autumn", 0), ("night.jpg", 1), ("1", 1), ("3", 3), ("night.png", 3)],
+)
+def test_references_are_found_by_path_name_number_and_stem(text: str, index: int) -> None:
+    assert find_reference(text, PHOTOS) == index
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (["a/x.jpg", "b/y.jpg"], ("x.jpg", "y.jpg")),
+        (["a/x.jpg", "b/x.jpg"], ("a/x.jpg", "b/x.jpg")),
+        (["1/a/x.jpg", "2/a/x.jpg"], ("1/a/x.jpg", "2/a/x.jpg")),
+        (["a/x.jpg", "a/x.jpg", "a/x.jpg"], ("x.jpg", "x.jpg (2)", "x.jpg (3)")),
+    ],
+)
+def test_labels_are_short_and_different(paths: list[str], names: tuple[str, ...]) -> None:
+    assert labels([Path(p) for p in paths]) == names and len(set(names)) == len(names)

@@ -57,17 +57,6 @@ def setting() -> tuple[torch.Tensor, torch.Tensor, SceneStyle, StyleDictionary]:
     return content, semantic, scene, build_dictionary([Reference(f"r{i}", *points(seed=5 + i)) for i in range(2)], clusters=2)
 
 
-def test_one_style_at_one_strength() -> None:
-    content, semantic, scene, d = setting()
-    stylizer, decoder = RegionOtConfig().build(dictionary=d, scene=scene), Sigmoid()
-    look = Restyle(stylizer, 0.3)
-    assert not look.idle and look.needs == Want.CONTENT | Want.SEMANTIC
-    features, strength, luminance = look.applied(content, semantic)
-    assert torch.equal(features, torch.lerp(content, stylizer(content, semantic), 0.3)) and (strength, luminance) == (0.3, 0.0)
-    assert torch.equal(look.colour(decoder, content, semantic), decoder(features)) and decoder.strength == 0.3
-    assert torch.equal(look.match(semantic), stylizer.match(semantic)), "the overall strength does not count"
-
-
 def test_at_strength_0_nothing_is_asked_for() -> None:
     look = Restyle(Never(), 0.0, luminance=1.0)
     assert look.idle and look.needs == Want.CONTENT
@@ -110,24 +99,6 @@ def test_between_two_styles_features_strengths_and_luminances_are_linear(at: flo
     torch.testing.assert_close(mixed.match(semantic), expected)
 
 
-def test_the_ends_of_a_mix_are_its_styles_bit_for_bit_and_the_other_is_not_called() -> None:
-    content, _, scene, d = setting()
-    a = Restyle(AdainConfig().build(dictionary=d, scene=scene), 0.8)
-    for mixed in (a.mixed(Restyle(Never()), 0.0), Restyle(Never()).mixed(a, 1.0)):
-        assert mixed.needs == Want.CONTENT
-        assert torch.equal(mixed.applied(content, None)[0], a.applied(content, None)[0])
-
-
-def test_mixes_of_mixes_are_flat() -> None:
-    content, _, scene, d = setting()
-    looks = [Restyle(AdainConfig().build(dictionary=d, scene=scene), s) for s in (0.2, 0.5, 0.9)]
-    deep = looks[0].mixed(looks[1], 0.5).mixed(looks[2].mixed(looks[0], 0.25), 0.4)
-    assert [part.share for part in deep.parts] == pytest.approx([0.3, 0.3, 0.3, 0.1])
-    assert all(not part.others for part in deep.parts)
-    wanted = sum(w * look.applied(content, None)[0] for w, look in zip((0.4, 0.3, 0.3), looks, strict=True))
-    torch.testing.assert_close(deep.applied(content, None)[0], wanted, rtol=1e-5, atol=1e-5)
-
-
 def test_a_faded_look_is_the_scene_and_a_mix_with_it_a_strength() -> None:
     content, _, scene, d = setting()
     look = Restyle(AdainConfig().build(dictionary=d, scene=scene), 0.8)
@@ -135,11 +106,3 @@ def test_a_faded_look_is_the_scene_and_a_mix_with_it_a_strength() -> None:
     half = look.faded.mixed(look, 0.5).applied(content, None)
     torch.testing.assert_close(half[0], Restyle(look.stylizer, 0.4).applied(content, None)[0], rtol=1e-5, atol=1e-5)
     assert half[1] == pytest.approx(0.4)
-
-
-def test_a_scene_of_one_region_can_be_kept_without_semantics() -> None:
-    content, _ = points()
-    scene = scene_style(content, None, torch.ones(300), None, 3, 0)
-    d = build_dictionary([Reference("r", points(seed=5)[0], torch.zeros(300, 0))])
-    look = Restyle(AdainConfig().build(dictionary=d, scene=scene), 1.0, RegionWeight(scene, torch.zeros(1, 1)))
-    assert look.needs == Want.CONTENT and torch.equal(look.applied(content, None)[0], content)

@@ -1,10 +1,22 @@
+"""Attention of points and of regions to codes: the formulas of the paper, and what they must not see."""
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import ConfigError
-from fprf.style.matching import Similarity, attention, compared, point_shares, score_spread, unit
+from fprf.style.matching import (
+    Keys,
+    Matching,
+    Similarity,
+    attention,
+    compared,
+    match_keys,
+    point_shares,
+    score_spread,
+    unit,
+    whitener,
+)
 
 
 def plain_attention(q: torch.Tensor, k: torch.Tensor, temperature: float) -> torch.Tensor:
@@ -27,51 +39,6 @@ def test_attention_is_the_papers_within_the_float32_bound(norm: float, temperatu
     torch.testing.assert_close(a.sum(1), torch.ones(40), rtol=0.0, atol=5e-7)
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 9), st.integers(1, 6), st.floats(1e-38, 1e6), st.floats(0, 7e4), st.integers(0, 99))
-def test_attention_is_always_finite_and_sums_to_one(n: int, t: int, temperature: float, norm: float, seed: int) -> None:
-    g = torch.Generator().manual_seed(seed)
-    a = attention(torch.randn(n, 5, generator=g) * norm, torch.randn(t, 5, generator=g) * norm, temperature)
-    assert bool(a.isfinite().all())
-    torch.testing.assert_close(a.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan")])
-def test_temperatures_that_are_not_above_zero_are_refused(temperature: float) -> None:
-    with pytest.raises(ConfigError, match="temperature"):
-        attention(torch.ones(1, 2), torch.ones(1, 2), temperature)
-
-
-def test_zero_queries_and_keys_match_everything_alike() -> None:
-    k = unit(torch.randn(4, 3), torch.zeros(3))
-    torch.testing.assert_close(attention(torch.zeros(2, 3), k, 0.1), torch.full((2, 4), 0.25))
-    torch.testing.assert_close(attention(torch.randn(2, 3), torch.zeros(4, 3), 0.1), torch.full((2, 4), 0.25))
-
-
-def test_prior_multiplies_the_odds() -> None:
-    q, k = torch.randn(5, 3), torch.randn(4, 3)
-    prior = torch.tensor([1.0, 2.0, 0.5, 1.0])
-    expected = attention(q, k, 1.0) * prior
-    torch.testing.assert_close(attention(q, k, 1.0, prior), expected / expected.sum(1, keepdim=True))
-
-
-def test_float32_holds_under_autocast() -> None:
-    q, k = torch.randn(20, 32) * 10, torch.randn(6, 32) * 10
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        a = attention(q, k, 100.0)
-    assert torch.equal(a, attention(q, k, 100.0))
-
-
-def test_unit_gives_unit_rows_and_zero_at_the_centre() -> None:
-    centre = torch.full((6,), 100.0)
-    x = torch.cat([centre[None], centre + torch.randn(5, 6)])
-    u = unit(x, centre)
-    assert torch.equal(u[0], torch.zeros(6))
-    torch.testing.assert_close(u[1:].norm(dim=1), torch.ones(5))
-    # What rounding alone moved away from the centre has no direction either.
-    assert torch.equal(unit(centre[None] * (1 + 1e-7), centre), torch.zeros(1, 6))
-
-
 def test_spread_follows_the_scale_of_the_scores_and_ignores_common_offsets() -> None:
     q, k = torch.randn(7, 5), torch.randn(6, 5)
     spread = score_spread(q, k)
@@ -80,26 +47,6 @@ def test_spread_follows_the_scale_of_the_scores_and_ignores_common_offsets() -> 
     r = (q.double() @ k.double().T).tolist()
     plain = (sum(sum((x - sum(row) / 6) ** 2 for x in row) for row in r) / 42) ** 0.5
     assert spread == pytest.approx(plain, rel=1e-6)
-
-
-@pytest.mark.parametrize("shape", [(0, 3), (3, 0), (1, 3)])
-def test_spread_without_anything_to_tell_apart_is_one(shape: tuple[int, int]) -> None:
-    assert score_spread(torch.randn(shape[0], 4), torch.zeros(shape[1], 4)) == 1.0
-    assert score_spread(torch.randn(3, 4), torch.randn(1, 4)) == 1.0
-
-
-@pytest.mark.parametrize("temperature", [1e-38, 1e-30, 1e-3, 1.0, 100.0, 1e6])
-def test_duplicate_keys_share_evenly_at_any_temperature(temperature: float) -> None:
-    k = torch.randn(3, 8) * 50
-    a = attention(torch.randn(20, 8) * 50, torch.cat([k, k]), temperature)
-    assert bool(a.isfinite().all())
-    torch.testing.assert_close(a[:, :3], a[:, 3:], rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(a.sum(1), torch.ones(20), rtol=0.0, atol=1e-6)
-
-
-def test_one_key_takes_everything() -> None:
-    for scale in (0.0, 1.0, 7e4):
-        assert torch.equal(attention(torch.randn(5, 3) * scale, torch.randn(1, 3) * scale, 0.4), torch.ones(5, 1))
 
 
 @pytest.mark.parametrize("similarity", ["cosine", "dot"])
@@ -155,19 +102,6 @@ def test_shares_of_points_are_those_of_a_loop(wide: torch.dtype, centred: bool, 
         assert bool((found == 0).any()), "else nothing was faint"
 
 
-def test_a_common_offset_of_keys_costs_no_digits() -> None:
-    draw = torch.Generator().manual_seed(0)
-    q, k = torch.randn(6, 8, generator=draw), torch.randn(5, 8, generator=draw) + 1e4
-    a, b = compared(q, k, "dot", queries_centre=q.mean(0), keys_centre=k.mean(0))
-    r, exact = a @ b.T, q.double() @ (k.double() - k.double().mean(0)).T
-    assert float(((r - r[:, :1]).double() - (exact - exact[:, :1])).abs().max()) < 1e-4
-
-
-def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
-    keys = torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)
-    assert score_spread(torch.tensor([[1e6], [0.0]]), keys) == score_spread(torch.tensor([[-1e6]]), keys) == 1.0
-
-
 def test_directions_begin_just_above_rounding_and_have_gradients_at_the_centre() -> None:
     centre = torch.full((4,), 100.0, dtype=torch.float64)
     near, apart = centre * (1 + 0.7e-6), centre * (1 + 1.5e-6)
@@ -176,3 +110,73 @@ def test_directions_begin_just_above_rounding_and_have_gradients_at_the_centre()
     x = torch.cat([centre[None], centre[None] + 1]).requires_grad_(True)
     unit(x, centre).sum().backward()
     assert x.grad is not None and bool(x.grad.isfinite().all())
+
+
+FRAMES = [Matching(0.3), Matching(0.3, whitening=0.5), Matching(0.3, whitening=1.0), Matching(0.3, "cosine", 0.5, 5)]
+
+
+def side(count: int, dims: int, seed: int) -> Keys:
+    g = torch.Generator().manual_seed(seed)
+    stretch = torch.linspace(3.0, 0.3, dims, dtype=torch.float64)
+    keys = torch.randn(count, dims, generator=g, dtype=torch.float64) * stretch
+    return Keys(keys, torch.rand(count, generator=g, dtype=torch.float64) + 0.1)
+
+
+def turned(dims: int, seed: int) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    return torch.linalg.qr(torch.randn(dims, dims, generator=g, dtype=torch.float64)).Q
+
+
+def table(here: Keys, there: Keys, matching: Matching) -> torch.Tensor:
+    return match_keys(here, there, matching, torch.ones(len(there.keys)))
+
+
+def test_without_frame_it_is_attention_of_centred_cosines() -> None:
+    here, there = side(5, 4, 0), side(7, 4, 1)
+    queries, keys = (unit(s.keys, s.share @ s.keys / s.share.sum()) for s in (here, there))
+    expected = attention(queries, keys, 0.3 * score_spread(queries, keys))
+    torch.testing.assert_close(table(here, there, Matching(0.3)), expected)
+
+
+@pytest.mark.parametrize("matching", FRAMES)
+def test_where_a_side_lies_and_how_both_are_turned_decides_nothing(matching: Matching) -> None:
+    here, there, rotation = side(6, 5, 2), side(9, 5, 3), turned(5, 4)
+    plain = table(here, there, matching)
+    moved = table(Keys(here.keys + 7, here.share), Keys(there.keys - 3, 5 * there.share), matching)
+    both = table(Keys(here.keys @ rotation, here.share), Keys(there.keys @ rotation, there.share), matching)
+    torch.testing.assert_close(moved, plain, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(both, plain, rtol=1e-9, atol=1e-9)
+
+
+def test_whitening_takes_the_share_of_the_spread_that_it_is_told() -> None:
+    keys = turned(6, 1)[:, :4] * torch.tensor([9.0, 3.0, 1.0, 1.0], dtype=torch.float64)
+    keys = torch.cat([keys, -keys])  # centred
+    every = Keys(keys, torch.ones(12, dtype=torch.float64))
+
+    def spread(whitening: float) -> torch.Tensor:
+        values = torch.linalg.svdvals(keys @ whitener(every, whitening))
+        return values[0] / values[-1]
+
+    assert torch.equal(whitener(every, 0.0), torch.eye(4, dtype=torch.float64))
+    assert float(spread(0.0)) > float(spread(0.5)) > float(spread(1.0)) > 1
+    half = whitener(every, 0.5)
+    torch.testing.assert_close(half @ half, whitener(every, 1.0))
+    assert torch.equal(whitener(Keys(torch.ones(3, 4), torch.ones(3)), 1.0), torch.eye(4, dtype=torch.float64))
+
+
+def test_what_references_show_too_much_of_does_not_move_the_centre() -> None:
+    """Three kinds in the scene; the references show the first almost alone."""
+    kinds, share = torch.eye(3, dtype=torch.float64), torch.ones(3, dtype=torch.float64)
+    here, there = Keys(kinds, share), Keys(kinds + 0.5, torch.tensor([0.9, 0.05, 0.05], dtype=torch.float64))
+    once, settled = (table(here, there, Matching(0.5, recentred=times)) for times in (0, 5))
+    even = table(here, Keys(kinds + 0.5, share), Matching(0.5))
+    assert float((settled - even).abs().max()) < 0.2 * float((once - even).abs().max()), "as if they showed all alike"
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 6), st.integers(1, 9), st.integers(1, 5), st.sampled_from([0.0, 1e-12, 1e9]), st.sampled_from(FRAMES))
+def test_rows_are_shares_whatever_comes(k: int, t: int, dims: int, scale: float, matching: Matching) -> None:
+    here, there = side(k, dims, k), side(t, dims, t + 9)
+    found = table(Keys(here.keys * scale, here.share), Keys((there.keys * scale).float(), there.share.float()), matching)
+    assert found.shape == (k, t) and found.dtype == torch.float64 and bool((found >= 0).all())
+    torch.testing.assert_close(found.sum(1), torch.ones(k, dtype=torch.float64))

@@ -7,15 +7,17 @@ import torch
 from photo_files import turned_jpeg
 
 from fprf.datamanagers.basis import Basis
-from fprf.datamanagers.config import GuidedConfig
-from fprf.errors import ConfigError, DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.style.dictionary import build_dictionary
 from fprf.style.references import read_reference
 
 CONTENT = RandomConfig(channels=6, stride=2).build()
+
+
 SEMANTIC = RandomConfig(channels=9, stride=8, seed=1).build()
+
+
 BASIS = Basis(torch.randn(9, generator=torch.Generator().manual_seed(0)), torch.linalg.qr(torch.randn(9, 4))[0])
 
 
@@ -66,49 +68,11 @@ def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path)
         assert turned.colour is not None and plain.colour is not None and torch.equal(turned.colour, plain.colour)
 
 
-def test_without_semantics_there_are_none(tmp_path: Path) -> None:
-    path = photo(tmp_path, 80, 90)
-    for semantic, basis in ((None, None), (None, BASIS), (SEMANTIC, None)):
-        r = read_reference(path, content=CONTENT, semantic=semantic, basis=basis)
-        assert r.semantic.shape == (len(r.content), 0)
-
-
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 700), (700, 3), (64, 64), (65, 1000)])
 def test_any_shape_gives_a_dictionary(tmp_path: Path, height: int, width: int) -> None:
     r = read_reference(photo(tmp_path, height, width), content=CONTENT, semantic=SEMANTIC, basis=BASIS)
     assert len(r.content) == len(r.semantic) > 0
     assert all(bool(t.isfinite().all()) for t in build_dictionary([r])[:6])
-
-
-def test_a_photograph_of_one_colour_gives_a_dictionary(tmp_path: Path) -> None:
-    d = build_dictionary([read_reference(photo(tmp_path, 90, 90, flat=True), content=CONTENT, semantic=SEMANTIC, basis=BASIS)])
-    assert all(bool(t.isfinite().all()) for t in d[:6])
-    assert float(d.covariance.abs().max()) < 1e-6
-
-
-def test_the_encoder_sees_what_longest_says_and_nothing_is_enlarged(tmp_path: Path) -> None:
-    path = photo(tmp_path, 300, 400)
-    assert len(read_reference(path, content=CONTENT, semantic=None, basis=None, longest=100).content) == 75 * 100
-    whole = read_reference(path, content=CONTENT, semantic=None, basis=None, longest=4000)
-    usual = read_reference(path, content=CONTENT, semantic=None, basis=None)
-    assert torch.equal(whole.content, usual.content)
-
-
-def test_the_scenes_filter_is_used(tmp_path: Path) -> None:
-    path = photo(tmp_path, 100, 100)
-    a, b = (
-        read_reference(path, content=CONTENT, semantic=None, basis=None, guided=g)
-        for g in (None, GuidedConfig(radius=0.3, eps=0.1))
-    )
-    assert not torch.allclose(a.content, b.content)
-
-
-def test_unreadable_files_and_sizes_are_named(tmp_path: Path) -> None:
-    (tmp_path / "x.jpg").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"x\.jpg"):
-        read_reference(tmp_path / "x.jpg", content=CONTENT, semantic=None, basis=None)
-    with pytest.raises(ConfigError, match="longest"):
-        read_reference(photo(tmp_path, 9, 9), content=CONTENT, semantic=None, basis=None, longest=8)
 
 
 def two_halves(folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: int = 255) -> tuple[Path, Path]:
@@ -130,26 +94,3 @@ def test_a_mask_leaves_only_what_is_white(tmp_path: Path) -> None:
     assert len(some.content) == len(some.semantic) == len(whole.content) // 2
     grid = whole.content.view(80, 120, -1)
     assert torch.equal(some.content, grid[:, 60:].reshape(-1, grid.shape[-1])), "the same features, of fewer pixels"
-
-
-def test_a_mask_of_one_pixel_is_one_sample_and_a_code(tmp_path: Path) -> None:
-    path, mask = two_halves(tmp_path, white=0)
-    pixels = np.zeros((80, 120), np.uint8)
-    pixels[11, 17] = 255
-    cv2.imwrite(str(mask), pixels)
-    for longest, most in ((120, 1), (64, 4)):
-        found = read_reference(path, content=CONTENT, semantic=SEMANTIC, basis=BASIS, longest=longest, mask=mask)
-        assert 1 <= len(found.content) <= most
-        made = build_dictionary([found])
-        assert len(made.keys) >= 1 and all(bool(t.isfinite().all()) for t in made[:6])
-
-
-def test_masks_that_cannot_be_are_named(tmp_path: Path) -> None:
-    path, mask = two_halves(tmp_path, white=0)
-    with pytest.raises(DataError, match=r"mask\.png: the mask selects no pixel of photo\.png"):
-        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
-    path, mask = two_halves(tmp_path, mask_size=(120, 80))
-    with pytest.raises(DataError, match=r"mask\.png: a mask of 80x120 pixels does not fit photo\.png of 120x80"):
-        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
-    with pytest.raises(DataError, match=r"absent\.png"):
-        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=tmp_path / "absent.png")

@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fprf.plugins.stylizers.config import (
     AdainConfig,
@@ -15,7 +13,7 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, whole_style
-from fprf.style.regional import RegionStylizer, RegionWeight, regional
+from fprf.style.regional import regional
 from fprf.style.scene import SceneStyle, membership, region_units, scene_style
 from fprf.types import Want
 
@@ -50,15 +48,6 @@ def test_a_dictionary_of_some_references_is_the_one_built_of_them() -> None:
     assert part.names == expected.names and part.blend == expected.blend
     assert all(torch.equal(a, b) for a, b in zip(part[:6], expected[:6], strict=True))
     assert torch.equal(codes, chosen[d.reference])
-
-
-def test_without_wishes_it_is_the_stylizer_itself() -> None:
-    _, _, scene, d = setting()
-    content, semantic = points()
-    for config in ALL:
-        made = regional(d, scene, torch.ones(3, 3, dtype=torch.bool), config)
-        built = config.build(dictionary=d, scene=scene)
-        assert type(made) is type(built) and torch.equal(made(content, semantic), built(content, semantic))
 
 
 @pytest.mark.parametrize("config", ALL[:3])
@@ -130,25 +119,3 @@ def test_a_scene_without_semantics_can_be_pinned_as_a_whole() -> None:
         assert made.needs == Want.CONTENT
         torch.testing.assert_close(made(content, None).double().mean(0), whole_style(alone)[0], rtol=1e-4, atol=1e-4)
         assert made.match(content[:2, :0]).tolist() == [[0.0, 1.0]] * 2
-
-
-def test_points_do_not_depend_on_their_neighbours_nor_on_their_number() -> None:
-    content, semantic, scene, d = setting()
-    allowed = torch.tensor([[True, False, False], [False, True, False], [False, False, True]])
-    made = regional(d, scene, allowed, LocalAdainConfig())
-    assert isinstance(made, RegionStylizer)
-    whole, order = made(content, semantic), torch.randperm(300)
-    parts = torch.cat([made(content[i], semantic[i]) for i in order.split(37)])
-    torch.testing.assert_close(parts, whole[order], rtol=1e-5, atol=1e-5)
-    assert made(content[:0], semantic[:0]).shape == (0, 6) and made.match(semantic[:0]).shape == (0, len(d.keys))
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.lists(st.sampled_from([0.0, 0.5, 1.0]), min_size=3, max_size=3))
-def test_values_of_regions_are_mixed_by_membership(values: list[float]) -> None:
-    _, semantic, scene, _ = setting()
-    mixed = RegionWeight(scene, torch.tensor(values)[:, None])(semantic)
-    share = belonging(semantic, scene)
-    torch.testing.assert_close(mixed[:, 0], share @ torch.tensor(values), rtol=0.0, atol=1e-6)
-    zero = torch.tensor(values) == 0
-    assert bool((mixed[(share[:, ~zero] == 0).all(1)] == 0).all()), "exactly"

@@ -86,14 +86,6 @@ def test_a_hand_written_file_says_only_what_it_wants(tmp_path: Path) -> None:
     assert not read.sha256 and not read.regions
 
 
-def test_a_reference_that_is_gone_cannot_be_hashed(tmp_path: Path) -> None:
-    file = StyleFile(StyleConfig(references=(tmp_path / "gone.jpg",)))
-    with pytest.raises(DataError, match=r"gone\.jpg: cannot be read"):
-        write_style(tmp_path / "style.json", file)
-    assert not (tmp_path / "style.json").exists()
-    check_photographs(tmp_path, file._replace(sha256={tmp_path / "gone.jpg": "00"}))  # who reads it will say that it is gone
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -117,18 +109,6 @@ def test_what_is_wrong_is_named_with_the_file(tmp_path: Path, text: str, said: s
     with pytest.raises(ConfigError) as caught:
         read_style(photo(tmp_path / "style.json", text))
     assert str(caught.value).startswith(f"{tmp_path / 'style.json'}: ") and said in str(caught.value)
-
-
-def test_an_absent_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.json: cannot be read .*name a style\.json"):
-        read_style(tmp_path / "none.json")
-
-
-def test_a_stylizer_that_is_not_installed_is_missed_when_it_is_built(tmp_path: Path) -> None:
-    path = photo(tmp_path / "style.json", '{"format": 1, "style": {"stylizer": {"type": "acme-magic", "power": 3}}}')
-    read = read_style(path)
-    with pytest.raises(Exception, match="acme-magic"):
-        read.style.stylizer.build(dictionary=None, scene=None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.style.statistics import limit_gain, monge, symmetric_root
-
-LOOSE = 1e12
+from fprf.style.statistics import monge
 
 
 def covariance(c: int, *, rank: int | None = None, decay: float = 2.0, scale: float = 1.0, seed: int = 0) -> torch.Tensor:
@@ -18,11 +16,6 @@ def covariance(c: int, *, rank: int | None = None, decay: float = 2.0, scale: fl
 
 def with_ridge(c: torch.Tensor) -> torch.Tensor:
     return c + 1e-4 * c.diagonal().mean() * torch.eye(len(c), dtype=c.dtype)
-
-
-def test_root_squares_to_the_matrix() -> None:
-    c = covariance(12)
-    torch.testing.assert_close(symmetric_root(c) @ symmetric_root(c), c, rtol=1e-10, atol=1e-12)
 
 
 @settings(max_examples=15, deadline=None)
@@ -39,19 +32,6 @@ def test_the_map_carries_one_covariance_to_the_other_at_any_rank(c: int, ra: int
         assert float((reached - aim).abs().max() / aim.abs().max()) < 1e-8
 
 
-def test_the_map_is_the_formula_of_the_design() -> None:
-    content, style = covariance(8, seed=1), covariance(8, seed=2)
-    root = symmetric_root(with_ridge(style))
-    inner = symmetric_root(root @ with_ridge(content) @ root)
-    torch.testing.assert_close(monge(content, style, gain=LOOSE), root @ inner.inverse() @ root, rtol=1e-7, atol=1e-9)
-
-
-def test_diagonal_covariances_scale_each_channel() -> None:
-    content, style = torch.tensor([4.0, 1.0, 9.0]).diag(), torch.tensor([1.0, 4.0, 9.0]).diag()
-    expected = torch.tensor([0.5, 2.0, 1.0]).double().diag()
-    torch.testing.assert_close(monge(content, style, gain=LOOSE), expected, rtol=1e-3, atol=1e-9)
-
-
 @pytest.mark.parametrize(("c", "rank"), [(1, 1), (7, 0), (7, 1), (64, 3), (128, 128)])
 def test_equal_covariances_give_the_identity(c: int, rank: int) -> None:
     a = covariance(c, rank=rank, decay=8.0)
@@ -64,28 +44,8 @@ def test_gain_is_capped_where_the_scene_is_flat() -> None:
     assert float(monge(lively, flat, gain=8.0).abs().max()) < 1e-6
 
 
-def test_no_gain_above_the_cap_leaves_the_map_bit_for_bit() -> None:
-    t = covariance(6)
-    assert torch.equal(limit_gain(t, 1.0 + 1e-9), t)
-    capped = limit_gain(t, 0.5)
-    assert float(torch.linalg.eigvalsh(capped)[-1]) == pytest.approx(0.5)
-
-
 def test_batches_equal_single_maps() -> None:
     a, b = (torch.stack([covariance(6, seed=s + i) for i in range(3)]) for s in (0, 10))
     both = monge(a, b, gain=8.0)
     for k in range(3):
         torch.testing.assert_close(both[k], monge(a[k], b[k], gain=8.0), rtol=1e-9, atol=1e-11)
-
-
-def test_the_cap_is_for_what_is_above_it() -> None:
-    t = torch.diag(torch.tensor([10.0, 3.0, 0.5, 0.0], dtype=torch.float64))
-    found = limit_gain(t, 3.0)
-    torch.testing.assert_close(found, torch.diag(torch.tensor([3.0, 3.0, 0.5, 0.0], dtype=torch.float64)))
-    below = torch.diag(torch.tensor([3.0, 1.0, -1e-9], dtype=torch.float64))
-    assert torch.equal(limit_gain(below, 3.0), below), "bit for bit where nothing is above"
-
-
-def test_an_eigenvalue_that_rounding_made_negative_is_none() -> None:
-    root = symmetric_root(torch.diag(torch.tensor([4.0, 1.0, -1e-12], dtype=torch.float64)))
-    torch.testing.assert_close(root, torch.diag(torch.tensor([2.0, 1.0, 0.0], dtype=torch.float64)))

@@ -5,13 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import DataError
 from fprf.town.layout import build_town
 from fprf.town.palettes import PALETTES, palette
 from fprf.town.render import cast, colours, directions, geometry, render, shade, walk
 from fprf.town.surface import hashed, noise2, noise3
 
 TOWN = build_town(0)
+
+
 VIEWS = walk(seed=0, views=40, width=48, height=36)
 
 
@@ -68,17 +69,6 @@ def test_views_agree_on_colours():
     difference = np.abs(one[seen][both] - two[y[both], x[both]]).mean(1)
     assert np.median(difference) < 0.02
     assert difference.mean() < 0.05
-
-
-def test_the_mean_of_four_samples_is_the_picture():
-    fine = colours(TOWN, VIEWS[0], palette("day"), 2)
-    mean = fine.reshape(36, 2, 48, 2, 3).mean((1, 3))
-    np.testing.assert_allclose(render(TOWN, VIEWS[0], palette("day")).rgb / 255, mean, atol=0.51 / 255)
-
-
-def test_an_unknown_palette_names_the_known_ones():
-    with pytest.raises(DataError, match=r"dusk.*day.*sunset"):
-        palette("dusk")
 
 
 @settings(max_examples=25, deadline=None)

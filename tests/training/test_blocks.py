@@ -1,24 +1,46 @@
-"""Models of blocks for training, and finished blocks in files."""
+"""Scenes of blocks: the cut, tasks that are resumed to the bit, finished blocks in files and in memory."""
 
 import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from block_world import BlockWorld
+from block_world import BlockWorld, block_flags, digests, done_of, small, steps_of, tensors_of
+from hypothesis import given
+from hypothesis import strategies as st
 
-from fprf.blocks.routing import chart_of
-from fprf.errors import CheckpointError
+from fprf.blocks.plan import boxes_from, boxes_to
+from fprf.cli.train import train_scene
+from fprf.errors import CheckpointError, DataError
+from fprf.fields.layouts import AdaptiveConfig, SingleConfig, StreetConfig
+from fprf.training import tensorfiles, trainer
+from fprf.training.block_plan import estimates, plan_scene, renumber
 from fprf.training.blocks import (
-    inset,
+    SURROUNDINGS,
+    BlockTask,
+    asked_of,
+    folder_of,
     load_boxes,
     load_finished,
     read_done,
     restore,
     save_finished,
     surroundings,
+    train_block,
 )
+from fprf.training.loading import Shelf, load_run
 from fprf.training.run import Run
+from fprf.training.trainer import Report
+from fprf.training.views import render_view
 
 
 @pytest.fixture
@@ -45,39 +67,344 @@ def test_finished_blocks_come_back_as_they_were(parts, tmp_path: Path) -> None: 
         assert torch.equal(other.member.state_dict()[name], tensor)
 
 
-def test_what_does_not_fit_is_named(parts) -> None:  # type: ignore[no-untyped-def]
-    config, facts, boxes = parts
-    member = surroundings(config, facts, boxes).member
-    tensors = {f"member.{name}": t for name, t in member.state_dict().items()}
-    first = next(iter(tensors))
-    for wrong in (
-        {k: v for k, v in tensors.items() if k != first},
-        tensors | {first: tensors[first][:1]},
-        tensors | {"member.more": torch.zeros(1)},
-    ):
-        with pytest.raises(CheckpointError, match="does not fit the config"):
-            restore(member, "member", wrong)
-    restore(member, "member", tensors | {"decoder.other": torch.zeros(1)})
+def asked(world: BlockWorld, block: int, **change: Any) -> str:
+    """Digest of a block's task in a config with other fields."""
+    config = replace(world.config, **change)
+    scene, plan = plan_scene(config)
+    name = "surroundings" if block == SURROUNDINGS else f"{block:02d}"
+    rays = tensorfiles.read(world.root / "blocks" / name / "rays.safetensors")
+    digest: str = asked_of(config, Run(world.root).load_known().facts, scene, plan.boxes, block, rays)["task"]
+    return digest
 
 
-def test_a_folder_of_another_format_is_not_finished(tmp_path: Path) -> None:
-    (tmp_path / "done.json").write_text(json.dumps({"format": 9}))
-    assert read_done(tmp_path) is None
-    with pytest.raises(CheckpointError, match=r"not finished; go on with `fprf train .*config.json`"):
-        load_finished(tmp_path)
+def test_each_block_knows_its_views_and_tiles(block_world: BlockWorld) -> None:
+    scene, plan = plan_scene(block_world.config)
+    document = json.loads((block_world.root / "blocks.json").read_text())
+    assert document["rays"] == plan.rays.tolist() and len(document["rays"]) == 3
+    for block in range(3):
+        rays = tensorfiles.read(block_world.root / f"blocks/{block:02d}/rays.safetensors")
+        assert torch.equal(rays["views"], plan.views_of(block))
+        counted = 0
+        for view, seen in zip(rays["views"].tolist(), rays["seen"], strict=True):
+            mask = plan.mask(block, view, (32, 24))
+            at = int((plan.views == view).nonzero()[0, 0])
+            assert torch.equal(seen.bool(), plan.seen[at, block])
+            counted += int(mask.sum())
+        assert counted == document["rays"][block]
+    around = tensorfiles.read(block_world.root / "blocks/surroundings/rays.safetensors")
+    assert torch.equal(around["views"], scene.train) and bool(around["seen"].bool().all())
 
 
-def test_an_inset_block_shares_nothing_with_what_it_was_cut_from(parts) -> None:  # type: ignore[no-untyped-def]
-    config, facts, boxes = parts
-    around = surroundings(config, facts, boxes)
-    before = {name: t.clone() for name, t in around.member.state_dict().items()}
-    built = inset(config, facts, boxes, 1, around)
-    learned = built.model.learned()
-    assert {id(p) for p in built.member.parameters()} <= {id(p) for p in learned}
-    assert not {id(p) for p in around.member.parameters()} & {id(p) for p in learned}
-    assert not any(p.requires_grad for p in built.model.decoder.parameters())
-    with torch.no_grad():
-        for parameter in learned:
-            parameter.add_(1)
-    assert all(torch.equal(t, before[name]) for name, t in around.member.state_dict().items())
-    assert torch.equal(built.member.chart.low, chart_of(boxes, 1).low)
+def test_the_cut_comes_back_from_its_file(block_world: BlockWorld) -> None:
+    _, plan = plan_scene(block_world.config)
+    found = load_boxes(block_world.root)
+    for mine, theirs in zip(found[:3], plan.boxes[:3], strict=True):
+        assert torch.equal(torch.as_tensor(mine), torch.as_tensor(theirs))
+    assert found.margin == plan.boxes.margin
+    again = boxes_from(json.loads(json.dumps(boxes_to(found))))
+    assert torch.equal(again.low, found.low) and torch.equal(again.turn, found.turn)
+
+
+def test_what_makes_it_another_task_and_what_does_not(block_world: BlockWorld) -> None:
+    base, block = block_world.config, 1
+    was = asked(block_world, block)
+    assert was == asked(block_world, block, steps=99, minutes=3.0, checkpoint_minutes=1.0, device="auto")
+    digests = {
+        asked(block_world, block),
+        asked(block_world, block, seed=1),
+        asked(block_world, block, optimizer=replace(base.optimizer, rate=1e-3)),
+        asked(block_world, block, content=replace(base.content, moves_density=True)),
+        asked(block_world, block, loss=replace(base.loss, rgb=2.0)),
+    }
+    assert len(digests) == 5 and was in digests
+
+
+def test_small_configs_agree_with_their_flags(block_world: BlockWorld, tmp_path: Path) -> None:
+    """The killed run of the fault tests must be the calm one."""
+    from block_world import block_flags
+
+    from fprf.cli.parsing import load_method, parse
+
+    method, _ = load_method("fprf-lite")
+    parsed = parse(method, block_flags(block_world.config.data, tmp_path), prog="x", description="")
+    assert parsed == small(block_world.config.data, tmp_path)
+
+
+def test_one_block_has_no_surroundings(block_world: BlockWorld) -> None:
+    for layout in (SingleConfig(), StreetConfig(segments=1)):
+        config = replace(small(block_world.config.data, block_world.root), blocks=layout)
+        (row,) = estimates(config, *plan_scene(config))
+        assert (row.name, row.views, row.rays) == ("whole", 10, 10 * 32 * 24)
+
+
+tasks = st.lists(st.sampled_from("abcdefgh"), unique=True, max_size=6)
+
+
+def lay(root: Path, names: list[str]) -> None:
+    for number, name in enumerate(names):
+        folder = folder_of(root, number)
+        folder.mkdir(parents=True)
+        (folder / "task.json").write_text(json.dumps({"task": name}))
+        (folder / "weights").write_text(name)
+
+
+def weights_in(root: Path) -> dict[str, str]:
+    return {folder.name: (folder / "weights").read_text() for folder in (root / "blocks").glob("*") if folder.is_dir()}
+
+
+@given(tasks, tasks)
+def test_each_block_finds_what_was_trained_for_it(before: list[str], now: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        lay(root, before)
+        renumber(root, dict(enumerate(now)))
+        found = weights_in(root)
+        for number, task in enumerate(now):
+            if task in before:
+                assert found[f"{number:02d}"] == task
+        assert not [name for name in found if not name.isdigit()]
+
+
+@given(tasks, st.permutations(range(6)), st.integers(0, 12))
+def test_cut_off_anywhere_the_next_call_finishes_it(before: list[str], order: list[int], until: int) -> None:
+    now = {number: before[at] for number, at in enumerate([k for k in order if k < len(before)])}
+    real, left = os.rename, [until]
+
+    def rename(source: Path, target: Path) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        real(source, target)
+
+    with tempfile.TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
+        root = Path(name)
+        lay(root, before)
+        patch.setattr(os, "rename", rename)
+        try:
+            renumber(root, now)
+        except KeyboardInterrupt:
+            left[0] = 99
+            renumber(root, now)
+        assert {k: v for k, v in weights_in(root).items() if k.isdigit()} == {f"{k:02d}": v for k, v in now.items()}
+
+
+_MIB = 1 << 20
+
+
+def shelf_of(root: Path, limit: int | None, told: list[int] | None = None) -> Shelf:
+    run = Run(root)
+    config, _ = run.load_config()
+    boxes = load_boxes(root)
+    around = surroundings(config, run.load_known().facts, boxes).member
+    restore(around, "member", load_finished(folder_of(root, SURROUNDINGS)).tensors)
+    note = (lambda block: None) if told is None else told.append
+    return Shelf(root, boxes, around, device=torch.device("cpu"), limit=limit, told=note)
+
+
+def size_of(root: Path) -> int:
+    """Bytes of one member."""
+    return sum(t.numel() * 4 for t in shelf_of(root, None).held[0].state_dict().values())
+
+
+def test_the_least_recently_used_goes_first(block_world: BlockWorld) -> None:
+    told: list[int] = []
+    room = 2
+    shelf = shelf_of(block_world.root, (room + 1) * size_of(block_world.root), told)
+    kept: list[int] = []
+    fetched = []
+    for block in (0, 1, 0, 2, 1, 0, 0, 2, 1, 2):
+        if block in kept:
+            kept.remove(block)
+        else:
+            fetched.append(block)
+        kept = [*kept, block][-room:]
+        shelf.member(block)
+        assert list(shelf.here) == kept
+    assert told == fetched
+
+
+def test_pictures_do_not_depend_on_the_limit(block_world: BlockWorld) -> None:
+    pictures = []
+    for limit in (None, 1e-6, 2.5 * size_of(block_world.root) / _MIB):
+        trained = load_run(block_world.root, "cpu", limit)
+        config = replace(trained.config.render, chunk=400)
+        pictures.append(render_view(trained.model, trained.known.facts, trained.known.cameras, 0, config).rgb)
+    assert torch.equal(pictures[0], pictures[1]) and torch.equal(pictures[0], pictures[2])
+
+
+NAMES = ("surroundings", "00", "01", "02")
+
+
+def task(world: BlockWorld, root: Path, block: int) -> BlockTask:
+    return BlockTask(root=str(root), data=str(world.config.data), block=block, minutes=None, quiet=True)
+
+
+def copy_of(world: BlockWorld, folder: Path) -> Path:
+    shutil.copytree(world.root, folder / "run")
+    return folder / "run"
+
+
+def same(root: Path, other: Path, name: str) -> bool:
+    mine, theirs = tensors_of(root, name), tensors_of(other, name)
+    return mine.keys() == theirs.keys() and all(torch.equal(mine[k], theirs[k]) for k in mine)
+
+
+def stamps(root: Path, name: str) -> list[int]:
+    return [
+        p.stat().st_mtime_ns
+        for p in sorted((root / "blocks" / name).rglob("*"))
+        if p.is_file() and p.name != "rays.safetensors"
+    ]
+
+
+def test_a_finished_block_is_left_alone(block_world: BlockWorld, tmp_path: Path) -> None:
+    root = copy_of(block_world, tmp_path)
+    before = stamps(root, "01")
+    assert not train_block(task(block_world, root, 1), lambda event: None)
+    assert not train_block(task(block_world, root, SURROUNDINGS), lambda event: None)
+    # Its part of a time limit is another in every call; that is no reason to train on.
+    assert not train_block(replace(task(block_world, root, 1), minutes=7.5), lambda event: None)
+    assert stamps(root, "01") == before
+
+
+@pytest.mark.parametrize("block", [SURROUNDINGS, 0])
+def test_an_interrupted_block_goes_on_to_the_same_bits(
+    block_world: BlockWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
+) -> None:
+    root, name = copy_of(block_world, tmp_path), "surroundings" if block == SURROUNDINGS else f"{block:02d}"
+    shutil.rmtree(root / "blocks" / name / "checkpoints")
+    (root / "blocks" / name / "done.json").unlink()
+    monkeypatch.setattr(trainer, "REPORT_SECONDS", -1.0)
+    seen: list[int] = []
+
+    def interrupt(event: Report) -> None:
+        seen.append(event.step)
+        if event.step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_block(task(block_world, root, block), interrupt)
+    assert not (root / "blocks" / name / "done.json").exists()
+    with pytest.raises(CheckpointError, match="not finished; go on with `fprf train"):
+        load_run(root, "cpu")
+    assert train_block(task(block_world, root, block), lambda event: seen.append(event.step))
+    assert seen[:4] == [1, 2, 3, 4], "it must not start over"
+    assert same(root, block_world.root, name)
+
+
+def test_two_workers_on_a_block_the_second_is_told_and_changes_nothing(block_world: BlockWorld, tmp_path: Path) -> None:
+    """It is refused while the first holds the folder, and finds the block finished afterwards; other blocks are free."""
+    root = copy_of(block_world, tmp_path)
+    shutil.rmtree(root / "blocks/01/checkpoints")
+    (root / "blocks/01/done.json").unlink()
+    met: list[str] = []
+
+    def meanwhile(event: Report) -> None:
+        with pytest.raises(DataError, match=r"01: process \d+ on .+ is training here"):
+            train_block(task(block_world, root, 1), lambda event: None)
+        assert not train_block(task(block_world, root, 2), lambda event: None)
+        met.append("refused")
+
+    assert train_block(task(block_world, root, 1), meanwhile)
+    assert met and same(root, block_world.root, "01")
+    assert not train_block(task(block_world, root, 1), lambda event: None)
+    assert not (root / "blocks/01/.lock").exists()
+
+
+def test_another_task_in_the_folder_starts_anew(block_world: BlockWorld, tmp_path: Path) -> None:
+    root = copy_of(block_world, tmp_path)
+    document = json.loads((root / "config.json").read_text())
+    document["config"]["seed"] = 5
+    (root / "config.json").write_text(json.dumps(document))
+    (root / "blocks/00/events.jsonl").write_text('{"step": 99}\n')
+    assert train_block(task(block_world, root, 0), lambda event: None)
+    assert not same(root, block_world.root, "00")
+    assert done_of(root, "00")["step"] == 6 and not (root / "blocks/00/events.jsonl").exists()
+
+
+def test_more_steps_go_on_from_where_it_stopped(block_world: BlockWorld, tmp_path: Path) -> None:
+    root = copy_of(block_world, tmp_path)
+    train_scene(replace(small(block_world.config.data, root), steps=8), "fprf-lite", quiet=True)
+    for name in NAMES:
+        assert done_of(root, name)["step"] == 8
+        assert steps_of(root, name)[-2:] == [6, 8], "the log goes on"
+    assert digests(root, NAMES) == digests(block_world.root, NAMES)
+
+
+def test_another_cut_trains_only_the_blocks_that_it_concerns(block_world: BlockWorld, tmp_path: Path) -> None:
+    """Halving the heaviest block leaves the others what they were, under whatever number."""
+    town = block_world.config.data
+    coarse, fine = AdaptiveConfig(rays=3700, smallest=2.0), AdaptiveConfig(rays=3300, smallest=2.0)
+    config = replace(small(town, tmp_path / "run"), blocks=coarse)
+    train_scene(config, "fprf-lite", quiet=True)
+    root = tmp_path / "run"
+    first = {folder.name: done_of(root, folder.name) for folder in (root / "blocks").iterdir()}
+    train_scene(replace(config, blocks=fine), "fprf-lite", quiet=True)
+    second = {folder.name: done_of(root, folder.name) for folder in (root / "blocks").iterdir()}
+    assert (len(first), len(second)) == (4, 5)
+    kept = {one["asked"]["task"] for one in first.values()} & {one["asked"]["task"] for one in second.values()}
+    assert len(kept) == 3, "the surroundings, and the two blocks that were not split"
+    assert first["01"]["asked"] == second["02"]["asked"], "they have other numbers now"
+    for one in second.values():
+        old = next((was for was in first.values() if was["asked"]["task"] == one["asked"]["task"]), None)
+        if old is not None:
+            assert (one["seconds"], one["tensors"]) == (old["seconds"], old["tensors"])
+    load_run(root, "cpu")
+
+
+def test_a_block_whose_images_changed_is_trained_again(block_world: BlockWorld, tmp_path: Path) -> None:
+    from fprf.datamanagers.images import load_image
+    from fprf.io.images import write_image
+
+    root, town = copy_of(block_world, tmp_path), tmp_path / "town"
+    shutil.copytree(block_world.config.data, town)
+    picture = town / "images/0003.png"
+    write_image(picture, 255 - load_image(picture))
+    moved = replace(task(block_world, root, 0), data=str(town))
+    assert train_block(moved, lambda event: None)
+    assert not same(root, block_world.root, "00")
+
+
+@pytest.mark.parametrize(
+    "spoil, said",
+    [
+        (lambda folder: (folder / "done.json").write_text("{"), "cannot be read"),
+        (lambda folder: (folder / "done.json").write_text('{"format": 1, "step": 6}'), "cannot be read"),
+        (lambda folder: (folder / "block.safetensors").write_bytes(b"x" * 40), "cannot be read"),
+        (lambda folder: (folder / "done.json").unlink(), "not finished"),
+    ],
+)
+def test_damaged_blocks_are_named(block_world: BlockWorld, tmp_path: Path, spoil, said: str) -> None:  # type: ignore[no-untyped-def]
+    root = copy_of(block_world, tmp_path)
+    spoil(root / "blocks/surroundings")
+    with pytest.raises(CheckpointError, match=said):
+        load_run(root, "cpu")
+
+
+@pytest.mark.fault
+@pytest.mark.timeout(600)
+def test_a_killed_block_is_resumed_to_the_same_bits(block_world: BlockWorld, tmp_path: Path) -> None:
+    """SIGKILL in the middle of block after block; each call goes on from the last checkpoint."""
+    steps, root = 60, tmp_path / "run"
+    calm = tmp_path / "calm"
+    train_scene(replace(small(block_world.config.data, calm), steps=steps), "fprf-lite", quiet=True)
+    command = [sys.executable, "-m", "fprf", "train", "fprf-lite", *block_flags(block_world.config.data, root, steps)]
+    command += ["--checkpoint-minutes", "1e-9"]
+    killed = []
+    for name in ("surroundings", "01"):
+        worker = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | {"OMP_NUM_THREADS": "1"}
+        )
+        checkpoints = root / "blocks" / name / "checkpoints"
+        while worker.poll() is None and len(list(checkpoints.glob("step-*/manifest.json"))) < 2:
+            time.sleep(0.005)
+        worker.send_signal(signal.SIGKILL)
+        worker.wait()
+        killed.append((root / "blocks" / name / "done.json").exists())
+    assert not all(killed), "no block was caught in the middle"
+    saved = max(int(p.parent.name[5:]) for p in (root / "blocks/01/checkpoints").glob("step-*/manifest.json"))
+    assert saved >= 2
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    for name in NAMES:
+        assert done_of(root, name)["step"] == steps
+        assert same(root, calm, name), name

@@ -11,7 +11,7 @@ from fprf.cli.parsing import load_method
 from fprf.cli.train import train_scene
 from fprf.config import IncompleteConfig
 from fprf.errors import CheckpointError, UsageError
-from fprf.training.loading import load_run, load_style
+from fprf.training.loading import load_run
 from fprf.training.views import render_view
 
 
@@ -43,17 +43,6 @@ def test_rendering_needs_no_encoder(moved: Path) -> None:
     trained = load_run(moved)
     view = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render)
     assert bool(view.rgb.isfinite().all())
-
-
-def test_a_scene_without_semantics_has_no_basis(moved: Path) -> None:
-    run = load_run(moved).run
-    tensors = run.load_tensors("style")
-    one = {name: tensors[name][:1] for name in ("region_mean", "region_covariance")} | {"share": torch.ones(1)}
-    run.save_tensors(
-        "style", tensors | one | {"keys": torch.zeros(1, 0), "semantic_mean": torch.zeros(0), "contacts": torch.zeros(1, 1)}
-    )
-    scene, basis = load_style(run)
-    assert basis is None and scene.keys.shape == (1, 0)
 
 
 def test_a_damaged_newest_checkpoint_is_stepped_over_and_named(world: World, moved: Path) -> None:
@@ -92,12 +81,3 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
     assert torch.equal(a.rgb, b.rgb)
     there.run.save_config(there.config, there.method)
     assert (moved / "config.json").read_text() == saved
-
-
-def test_a_changed_config_does_not_fit_its_checkpoint(moved: Path) -> None:
-    trained = load_run(moved)
-    planes = trained.config.content.field
-    changed = replace(trained.config.content, field=replace(planes, hidden=48))  # type: ignore[call-arg]
-    trained.run.save_config(replace(trained.config, content=changed), trained.method)
-    with pytest.raises(CheckpointError, match="does not fit the config"):
-        load_run(moved)

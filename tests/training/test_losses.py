@@ -1,18 +1,24 @@
+"""Terms of the training loss: their values, whom they move, those of packages, depths and sky."""
+
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 import torch
-from tiny_world import World, parameters, rays_of, trained_for
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
+from tiny_world import World, rays_of, trained_for
+from torch import Tensor
 
 from fprf.config import LossConfig
 from fprf.errors import ConfigError, PluginError
 from fprf.interfaces import LossTerm
 from fprf.plugins.losses.config import LossTermConfig
 from fprf.rendering.renderer import Parts, render_rays
-from fprf.training.losses import check_penalties, extra_term, terms, total, wanted
+from fprf.training.losses import SHELL, check_penalties, emptiness, ending, extra_term, terms, total, wanted
 from fprf.training.model import Model, build_model
-from fprf.training.trainer import Report
 from fprf.types import Batch, Rendered, Want
 
 ZERO: dict[str, float] = {
@@ -57,25 +63,6 @@ def test_each_term_is_what_it_says(world: World) -> None:
     assert float(found["content"]) == pytest.approx(float(oracle), rel=1e-5)
     oracle = (out.semantic.double() - batch.semantic.double()).abs().mean() / facts.semantic_scale
     assert float(found["semantic"]) == pytest.approx(float(oracle), rel=1e-5)
-
-
-def test_feature_terms_do_not_depend_on_the_unit_of_the_features(world: World) -> None:
-    model, batch, facts = world.load().model, world.prepared.manager.batch(0), world.prepared.facts
-    config = only(content=1.0, semantic=1.0)
-    out = rendered(world, model, batch, config)
-    plain = terms(config, facts, out, batch, model, step=0)
-    assert out.content is not None and out.semantic is not None
-    assert batch.content is not None and batch.semantic is not None
-    tenfold = terms(
-        config,
-        replace(facts, content_scale=10 * facts.content_scale, semantic_scale=10 * facts.semantic_scale),
-        out._replace(content=10 * out.content, semantic=10 * out.semantic),
-        batch._replace(content=10 * batch.content, semantic=10 * batch.semantic),
-        model,
-        step=0,
-    )
-    for name, value in plain.items():
-        assert float(tenfold[name]) == pytest.approx(float(value), rel=1e-5)
 
 
 def test_penalties_come_when_they_are_due_and_weigh_as_many_times_more(world: World) -> None:
@@ -158,18 +145,6 @@ def test_a_term_of_a_package_counts(world: World) -> None:
             terms(bad, world.prepared.facts, out, batch, model, step=0, extra=extra_term(bad))
 
 
-def test_training_with_a_term_of_a_package_is_reproducible(world: World, tmp_path: Path) -> None:
-    def after(config: LossConfig, folder: str) -> tuple[dict[str, torch.Tensor], set[str]]:
-        seen: list[Report] = []
-        run = trained_for(world, tmp_path / folder, replace(world.config, steps=2, loss=config), report=seen.append)
-        return parameters(run, 2), set(seen[-1].losses)
-
-    plain, extra = world.config.loss, replace(world.config.loss, extra=WeightsConfig())
-    (a, _), (b, names), (c, others) = after(extra, "a"), after(extra, "b"), after(plain, "c")
-    assert all(torch.equal(a[name], b[name]) for name in a) and not all(torch.equal(a[name], c[name]) for name in a)
-    assert names - others == {"extra"}
-
-
 @pytest.mark.parametrize("name", ["semantic", "content"])
 def test_features_never_move_density(world: World, name: str) -> None:
     """Paper: semantics are rendered with detached weights; a method may ask so for content too."""
@@ -184,21 +159,119 @@ def test_features_never_move_density(world: World, name: str) -> None:
         assert all(n.startswith("semantic.") for n in moved), moved
 
 
-def test_content_moves_density_where_it_may(world: World) -> None:
-    model, batch, config = build_model(world.config, world.prepared.facts), world.prepared.manager.batch(0), only(content=1.0)
-    out = rendered(world, model, batch, config, content_moves_density=True)
-    total(config, terms(config, world.prepared.facts, out, batch, model, step=0)).backward()  # type: ignore[no-untyped-call]
-    grads = {n: p.grad for n, p in model.named_parameters() if "to_density" in n and n.startswith("field.")}
-    assert grads and all(g is not None and bool((g != 0).any()) for g in grads.values())
+NAN = float("nan")
 
 
-def test_the_proposal_learns_from_the_interlevel_term_alone(world: World) -> None:
-    model, batch = build_model(world.config, world.prepared.facts), world.prepared.manager.batch(0)
-    with torch.no_grad():
-        next(p for name, p in model.named_parameters() if name.endswith("field.to_density.weight")).mul_(-3).add_(2)
-    for config, learns in ((only(rgb=1.0, distortion=1.0), False), (only(rgb=1e-30, interlevel=1.0), True)):
-        model.zero_grad()
-        parts = terms(config, world.prepared.facts, rendered(world, model, batch, config), batch, model, step=0)
-        total(config, parts).backward()  # type: ignore[no-untyped-call]
-        grads = [p.grad for p in model.sampler.parameters()]
-        assert any(g is not None and bool((g != 0).any()) for g in grads) == learns
+EDGES = torch.linspace(0.0, 10.0, 101)
+
+
+def straight_rays(count: int) -> Tensor:
+    return EDGES.expand(count, -1)
+
+
+def spike(*at: float) -> Tensor:
+    """All weight of each ray in the interval around a distance."""
+    weights = torch.zeros(len(at), 100)
+    for row, t in enumerate(at):
+        weights[row, int(t * 10)] = 1.0
+    return weights
+
+
+def test_a_ray_that_ends_at_its_point_costs_nothing() -> None:
+    found = ending(straight_rays(3), spike(3.0, 5.0, 9.5), torch.tensor([3.0, 5.0, 9.5]))
+    assert found is not None and float(found) == 0.0
+
+
+def test_before_the_point_costs_two_behind_it_one() -> None:
+    before, behind = (ending(straight_rays(1), spike(t), torch.tensor([5.0])) for t in (3.0, 8.0))
+    assert before is not None and behind is not None
+    assert float(before) == 2.0 and float(behind) == 1.0
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0.5, 9.5) | st.just(float("nan")), min_size=1, max_size=6), st.integers(0, 1000))
+def test_only_known_rays_count_and_the_mean_is_theirs(distances: list[float], seed: int) -> None:
+    count = len(distances)
+    weights = torch.rand(count, 100, generator=torch.Generator().manual_seed(seed))
+    weights = weights / weights.sum(1, keepdim=True)
+    distance = torch.tensor(distances)
+    found = ending(straight_rays(count), weights, distance)
+    each = [
+        float(one)
+        for k in range(count)
+        if (one := ending(straight_rays(1), weights[k : k + 1], distance[k : k + 1])) is not None
+    ]
+    if not each:
+        assert found is None
+        return
+    assert found is not None and 0 <= float(found) <= 2
+    torch.testing.assert_close(found, torch.tensor(each).mean(), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("found", [3.0, 5.0, 8.0])
+def test_in_device_coordinates_it_is_about_depths_too(found: float) -> None:
+    """Straight ahead of a near plane at 1, depth z has the ray parameter 1 - 1/z."""
+    depths, end = straight_rays(1)[:, 10:], torch.tensor([5.0])
+    weights = spike(found)[:, 10:]
+    expected = ending(depths, weights, end)
+    assert expected is not None
+    torch.testing.assert_close(ending(1 - 1 / depths, weights, 1 - 1 / end, ndc=True), expected)
+
+
+@pytest.mark.parametrize("known", [[1.0, NAN, 5.0, NAN], [NAN] * 4])
+def test_depths_on_a_device_are_the_same_without_waiting(known: list[float]) -> None:
+    """But for 0 where nothing is known."""
+    weights, distance = torch.rand(4, 100), torch.tensor(known)
+    here = weights.clone().requires_grad_()
+    expected = ending(straight_rays(4), here, distance)
+    if expected is not None:
+        expected.backward()
+    with pretend_cuda() as seen:
+        there = weights.to(CUDA).requires_grad_()
+        given = straight_rays(4).to(CUDA), there, distance.to(CUDA)
+        found = ending(*given)
+        assert found is not None
+        found.backward()
+        assert not seen.syncs
+        gradient = there.grad
+        assert gradient is not None
+        torch.testing.assert_close(found.detach().cpu(), torch.zeros(()) if expected is None else expected.detach())
+        torch.testing.assert_close(gradient.cpu(), torch.zeros_like(weights) if here.grad is None else here.grad)
+
+
+@pytest.mark.parametrize(("shell", "wanted"), [(4.0, (0.3**2 + 1.0**2) / 2), (math.inf, (0.9**2 + 1.0**2) / 2), (0.5, 0.0)])
+def test_what_sky_rays_meet_before_the_shell(shell: float, wanted: float) -> None:
+    t = torch.tensor([[1.0, 3.0, 6.0]]).repeat(3, 1)
+    weights = torch.tensor([[0.3, 0.6], [0.5, 0.5], [1.0, 0.0]], requires_grad=True)
+    found = emptiness(t, weights, torch.tensor([True, False, True]), within=shell)
+    assert found is not None and found.item() == pytest.approx(wanted)
+    found.backward()
+    assert weights.grad is not None and not weights.grad[1].any()
+
+
+@pytest.mark.parametrize("sky", [[True, False, True], [False] * 3])
+def test_sky_on_a_device_is_the_same_without_waiting(sky: list[bool]) -> None:
+    """But for 0 where there is none."""
+    t, weights = torch.tensor([[1.0, 3.0, 6.0]]).repeat(3, 1), torch.tensor([[0.3, 0.6], [0.5, 0.5], [1.0, 0.0]])
+    expected = emptiness(t, weights, torch.tensor(sky), within=SHELL)
+    with pretend_cuda() as seen:
+        given = t.to(CUDA), weights.to(CUDA), torch.tensor(sky).to(CUDA)
+        found = emptiness(*given, within=SHELL)
+        assert found is not None and not seen.syncs
+        assert found.item() == pytest.approx(0.0 if expected is None else expected.item())
+
+
+def test_the_sky_is_cleared(world: World, tmp_path: Path) -> None:
+    """Rays of the upper third are said to be sky: they are emptied where that counts; at weight 0 nothing is computed."""
+
+    def mark(step: int, batch: Batch) -> Batch:
+        return batch._replace(sky=batch.pixel[:, 1] < 8)
+
+    last = {}
+    for weight in (1.0, 1e-9, 0.0):
+        events = []
+        config = replace(world.config, steps=40, loss=replace(world.config.loss, sky=weight))
+        trained_for(world, tmp_path / str(weight), config, change=mark, report=events.append)
+        last[weight] = events[-1].losses
+    assert last[1.0]["sky"] < 0.8 * last[1e-9]["sky"]
+    assert "sky" not in last[0.0]

@@ -13,7 +13,7 @@ from fprf.rendering.cameras import pixel_grid
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.training.loading import Trained
-from fprf.training.matches import MatchMap, match_map, match_pictures, summarize, write_pixels
+from fprf.training.matches import MatchMap, match_map, summarize, write_pixels
 from fprf.training.restyle import Codes, Styled, apply_style
 from fprf.training.views import paint_pixels, render_view
 
@@ -44,15 +44,6 @@ def test_kept_regions_take_nothing(world: World) -> None:
     assert summary["kept_share"] == pytest.approx(float((found.kept * found.opacity).sum() / found.opacity.sum()), abs=1e-5)
 
 
-def test_pinned_regions_take_from_one_reference(world: World) -> None:
-    trained, styled = styled_by(world, pin=tuple(f"{k}=snow.png" for k in range(4)))
-    found = match_map(trained, styled, 0)
-    own = styled.codes.reference == styled.codes.names.index("snow.png")
-    assert float(found.taken[..., ~own].abs().max()) == 0 and torch.allclose(
-        found.taken[..., own].sum(-1), torch.ones(()), atol=1e-4
-    )
-
-
 def test_the_score_is_the_mean_cosine_with_what_is_taken(world: World) -> None:
     trained, styled = styled_by(world, keep=("0",))
     found = match_map(trained, styled, 0)
@@ -73,18 +64,6 @@ def test_the_score_is_the_mean_cosine_with_what_is_taken(world: World) -> None:
     assert int(some.sum()) > 100 and torch.allclose(found.score.double()[some], expected[some], atol=1e-4)
 
 
-def test_two_styles_have_the_codes_of_both(world: World, tmp_path: Path) -> None:
-    from fprf.style.files import write_style
-
-    write_style(tmp_path / "other.json", StyleFile(StyleConfig(references=world.references[:1], clusters=2)))
-    trained, styled = styled_by(world, between=tmp_path / "other.json", at=0.25)
-    assert styled.codes.names[2:] == ("dusk.png",) and len(styled.codes.names) == 3
-    found = match_map(trained, styled, 0)
-    other = styled.codes.reference == 2
-    assert torch.allclose(found.taken[..., other].sum(-1), torch.full((24, 32), 0.25), atol=1e-4)
-    assert found.taken.shape[-1] == len(styled.codes.reference) == len(styled.codes.units)
-
-
 def made_up() -> tuple[MatchMap, Codes]:
     """Two by two pixels: sure of code 0, torn between codes 1 and 2, kept, and empty."""
     taken = torch.tensor([[[1.0, 0, 0], [0, 0.5, 0.5]], [[0, 0, 0], [0, 0, 0]]])
@@ -101,14 +80,6 @@ def test_summaries_count_what_is_there() -> None:
     assert summary["codes"][0] == {"reference": "a.jpg", "cluster": 0, "share": pytest.approx(1 / 3)}
     assert {(c["reference"], c["cluster"]) for c in summary["codes"][1:]} == {("b.jpg", 0), ("b.jpg", 1)}
     assert summary["regions"] == [{"region": 0, "share": pytest.approx(1 / 3)}, {"region": 1, "share": pytest.approx(2 / 3)}]
-
-
-def test_an_empty_view_has_a_summary_too() -> None:
-    found, codes = made_up()
-    nothing = MatchMap(*(torch.zeros_like(t) for t in found))
-    summary = summarize(nothing, codes)
-    assert summary["kept_share"] == summary["score"] == summary["entropy_bits"] == 0 and summary["codes"] == []
-    assert all(picture.shape == (2, 2, 3) for picture in match_pictures(nothing, codes).values())
 
 
 def test_numbers_of_pixels(tmp_path: Path) -> None:

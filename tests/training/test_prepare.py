@@ -1,13 +1,19 @@
+"""Before training: features, tones, the size of images, the first model; and what training came to."""
+
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.datamanagers.scene import Scene
-from fprf.errors import PluginError
-from fprf.training.prepare import cache_folder, device_of, exposure_of, prepare
+from fprf.errors import UsageError
+from fprf.methods import fprf_lite
+from fprf.training.model import build_model
+from fprf.training.prepare import Outcome, cache_folder, exposure_of, find_downscale, outcome, prepare, scene_of, with_downscale
 
 
 def test_features_are_computed_once(world: World) -> None:
@@ -29,14 +35,6 @@ def test_without_semantics(world: World) -> None:
     assert found.manager.batch(0).semantic is None
 
 
-def test_devices() -> None:
-    assert device_of("cpu") == torch.device("cpu")
-    assert device_of("auto").type in ("cpu", "cuda", "mps")
-    for name in ("gpu", "", "cuda:99"):
-        with pytest.raises(PluginError, match="not available here; use cpu or auto"):
-            device_of(name)
-
-
 def test_tones_are_learnt_where_exposures_differ(world: World) -> None:
     """Unless the config decides; a run that goes on keeps what it began with."""
     scene, image = world.prepared.scene, world.prepared.manager.image
@@ -51,3 +49,74 @@ def test_tones_are_learnt_where_exposures_differ(world: World) -> None:
     saved = replace(world.prepared.facts, exposure=(0.0,) * len(scene.paths))
     for facts in (saved, world.prepared.facts):
         assert exposure_of(world.config.tones, unevenly, image, facts) == facts.exposure
+
+
+def test_the_start_is_a_function_of_the_seed(world: World) -> None:
+    facts = world.prepared.facts
+    torch.manual_seed(1)
+    first = build_model(world.config, facts).state_dict()
+    torch.manual_seed(2)
+    second = build_model(world.config, facts).state_dict()
+    other = build_model(replace(world.config, seed=1), facts).state_dict()
+    assert first.keys() == second.keys() == other.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    moved = {name for name in first if not torch.equal(first[name], other[name])}
+    assert moved == {name for name in first if not name.startswith("decoder.")} - {"field.offset"}, "that one starts at 0"
+
+
+def test_the_parts_draw_independently(world: World) -> None:
+    model = build_model(world.config, world.prepared.facts)
+    tables = [value.flatten()[:8] for name, value in model.state_dict().items() if name.endswith("planes.table")]
+    assert len(tables) == 3
+    assert not any(torch.equal(a, b) for i, a in enumerate(tables) for b in tables[:i])
+
+
+def factor(width: int, height: int, views: int, minutes: float | None = None, device: str = "cpu") -> int:
+    return find_downscale(replace(fprf_lite(), minutes=minutes), torch.tensor([[width, height]] * views), device)
+
+
+def test_photographs_are_reduced_as_far_as_docs_say() -> None:
+    assert (factor(2832, 2128, 9, 8), factor(2832, 2128, 9, 60)) == (5, 3)
+    assert (factor(1920, 1080, 131, 8), factor(4032, 3024, 262, 8)) == (3, 8)
+    assert factor(1008, 756, 29) == 2 and factor(1008, 756, 29, device="cuda") == 1
+
+
+@given(
+    side=st.integers(1, 9000),
+    views=st.integers(1, 2000),
+    minutes=st.floats(0.01, 1000),
+    more=st.floats(1, 10),
+    gpu=st.booleans(),
+)
+def test_more_time_and_fewer_images_never_reduce_further(side: int, views: int, minutes: float, more: float, gpu: bool) -> None:
+    device = "cuda" if gpu else "cpu"
+    found = factor(side, side, views, minutes, device)
+    assert (
+        factor(side, side, views, minutes * more, device) <= found
+        and factor(side, side, max(1, views // 2), minutes, device) <= found
+    )
+    assert factor(max(1, side // 2), side, views, minutes, device) <= found
+    least = (1e6 if gpu else 0.2e6) / 4
+    assert found == 1 or side * side / found**2 > least / 2.25
+
+
+def test_a_config_gets_the_size_of_its_scene(world: World) -> None:
+    config = with_downscale(replace(world.config, downscale=None))
+    assert config == world.config and with_downscale(config) is config
+    half = scene_of(replace(config, downscale=2))
+    assert half.cameras.size[0].tolist() == [16, 12]
+    with pytest.raises(UsageError, match="--data FOLDER, or --data town"):
+        scene_of(replace(config, data=None))
+
+
+def test_what_training_came_to(world: World, tmp_path: Path) -> None:
+    config, scene = world.config, world.prepared.scene
+    found = outcome(world.run, config, scene)
+    assert found is not None and found.steps == 15 and found.passes == pytest.approx(15 * 256 / (8 * 32 * 24))
+    told = found.told(world.run, config)
+    assert found.too_short and told.startswith("warning: ") and f"fprf train {world.run}/config.json --steps 600" in told
+    long = Outcome(4000, 24.5, 9.0)
+    timed, reduced = (long.told(world.run, replace(fprf_lite(), **field)) for field in ({"minutes": 8.0}, {"downscale": 5}))
+    assert not long.too_short and "--minutes 16" in timed and "--downscale" not in timed
+    assert "--steps 24000" in reduced and "--downscale 4" in reduced
+    assert outcome(tmp_path, config, scene) is None

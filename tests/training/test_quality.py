@@ -1,4 +1,7 @@
+"""Quality presets, reduced resolution and the light of a view at render time."""
+
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,11 +10,13 @@ import torch
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.errors import PluginError, UsageError
-from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig
+from fprf.errors import PluginError
+from fprf.plugins.samplers.config import SamplerConfig
+from fprf.training.camera_optimizers import Tones
 from fprf.training.loading import Trained
+from fprf.training.model import Model
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
-from fprf.training.views import render_view
+from fprf.training.views import cache_view, render_view
 
 
 def picture(trained: Trained) -> torch.Tensor:
@@ -34,13 +39,6 @@ def test_a_sampler_that_does_not_scale(world: World) -> None:
     with pytest.raises(PluginError, match=r"samples: SamplerConfig does not scale; leave --samples at 1"):
         at_quality(replace(trained, config=config), QualityConfig(quality="best"))
     assert at_quality(replace(trained, config=config), QualityConfig(quality="standard")).model is trained.model
-
-
-def test_a_sampler_that_learns_for_its_number_of_samples(world: World) -> None:
-    trained = world.load()
-    config = replace(trained.config, sampler=ProposalConfig(samples=(16,), final=8, resolutions=(4,)))
-    with pytest.raises(UsageError, match="has learnt for its own number of samples"):
-        at_quality(replace(trained, config=config), QualityConfig(samples=2.0))
 
 
 def test_eval_takes_it(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,10 +70,42 @@ def test_a_reduced_view_is_the_small_oneenlarged(world: World) -> None:
     assert float((half.rgb - whole.rgb).abs().mean()) < 0.05 and not torch.equal(half.rgb, whole.rgb)
 
 
-def test_infinite_depths_are_enlarged_too(world: World) -> None:
-    from fprf.rendering.renderer import enlarged
-    from fprf.types import View
+def lit(world: World) -> Trained:
+    """The run, with tones as if they had been learnt."""
+    trained = world.load()
+    known = trained.known
+    tones = Tones(torch.linspace(-0.5, 0.5, len(known.names)), known.test)
+    with torch.no_grad():
+        tones.gain.copy_(0.2 * torch.randn(len(known.names), 3, generator=torch.Generator().manual_seed(0)))
+    return replace(trained, model=Model(trained.model.parts, tones))
 
-    depth = torch.tensor([[1.0, torch.inf]])
-    found = enlarged(View(torch.rand(1, 2, 3), depth, torch.ones(1, 2), 1.0), [4, 2])
-    assert found.depth.tolist() == [[1.0, 1.0, torch.inf, torch.inf]] * 2
+
+def shown(trained: Trained, *tone: str) -> tuple[torch.Tensor, torch.Tensor]:
+    chosen = at_quality(trained, QualityConfig(tone=tone))
+    known, render = chosen.known, chosen.config.render
+    view = (chosen.model, known.facts, known.cameras, known.test[0], render)
+    return render_view(*view).rgb, cache_view(*view).restyled().rgb
+
+
+def factors(trained: Trained, views: Sequence[int]) -> torch.Tensor:
+    assert trained.model.tones is not None
+    return trained.model.tones(torch.tensor(list(views))).detach()
+
+
+def test_a_view_s_light_multiplies_colours(world: World) -> None:
+    trained = lit(world)
+    view = trained.known.train[2]
+    plain, _ = shown(trained)
+    for text in (trained.known.names[view], str(view), f"{view}=7"):
+        for image in shown(trained, text):
+            torch.testing.assert_close(image, (plain * factors(trained, [view])[0]).clamp(0, 1), atol=1e-6, rtol=1e-5)
+
+
+def test_between_two_views_means_of_logarithms_are_taken(world: World) -> None:
+    trained = lit(world)
+    a, b = trained.known.train[:2]
+    plain, _ = shown(trained)
+    log = factors(trained, (a, b)).log()
+    for texts, share in (((str(a), str(b)), 0.5), ((f"{a}=1", f"{b}=3"), 0.25), ((f"{a}=0.5", f"{b}=0"), 1.0)):
+        wanted = plain * (share * log[0] + (1 - share) * log[1]).exp()
+        torch.testing.assert_close(shown(trained, *texts)[0], wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)

@@ -1,5 +1,7 @@
-"""Regions by number, pixel, mask and key, on the tiny town."""
+"""Regions by number, pixel, mask and key; what users ask of them; the list that explains them."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,20 +10,19 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.errors import DataError, UsageError
-from fprf.style.files import Key
-from fprf.training.loading import Trained, load_style
-from fprf.training.regions import ALIKE, RegionMatch, Regions, find_regions, key_of, membership_view
+from fprf.errors import UsageError
+from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig
+from fprf.style.config import StyleConfig
+from fprf.style.files import Key, StyleFile
+from fprf.training.loading import load_style
+from fprf.training.matches import explain, region_row, region_tile
+from fprf.training.regions import RegionMatch, Regions, find_regions, key_of, membership_view
+from fprf.training.restyle import RegionControls, Styled, apply_style, region_controls
 
 
 def regions_of(world: World, keys: dict[str, Key] | None = None) -> Regions:
     trained = world.load()
     return Regions(trained, *load_style(trained.run), keys or {})
-
-
-def trained_of(regions: Regions) -> Trained:
-    assert isinstance(regions.views, Trained)
-    return regions.views
 
 
 def test_numbers_are_the_scenes(world: World) -> None:
@@ -41,18 +42,10 @@ def test_a_pixel_means_the_region_that_most_of_it_belongs_to(world: World) -> No
     assert find_regions(regions, "0002:7.9,3.2") == find_regions(regions, "0002:7,3")
 
 
-@pytest.mark.parametrize("place", ["32,0", "0,24", "-1,0", "5,99"])
+@pytest.mark.parametrize("place", ["32,0", "-1,0"])
 def test_pixels_outside_are_refused(world: World, place: str) -> None:
     with pytest.raises(UsageError, match=r"0002:.*: outside of the view; x goes from 0 to 31, y from 0 to 23"):
         find_regions(regions_of(world), f"0002:{place}")
-
-
-def test_a_pixel_that_sees_nothing_is_refused(world: World) -> None:
-    regions = regions_of(world)
-    with torch.no_grad():
-        trained_of(regions).model.get_parameter("field.to_density.weight").fill_(-1e6)
-    with pytest.raises(UsageError, match="there is nothing at that pixel"):
-        find_regions(regions, "0002:5,5")
 
 
 def draw(folder: Path, white: np.ndarray) -> Path:
@@ -75,19 +68,6 @@ def test_a_mask_means_what_it_covers(world: World, tmp_path: Path) -> None:
     assert {each.number for each in everything} == set((mass >= 1).nonzero().flatten().tolist()) | {int(mass.argmax())}
 
 
-def test_masks_that_say_nothing_are_named(world: World, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"drawn = 1\.png: the mask selects nothing of view 0002"):
-        find_regions(regions_of(world), f"0002:{draw(tmp_path, np.zeros((24, 32)))}")
-    with pytest.raises(DataError, match=r"absent\.png"):
-        find_regions(regions_of(world), f"0002:{tmp_path / 'absent.png'}")
-
-
-@pytest.mark.parametrize("text", ["sky", "0099:1,1", "a-view", "-1", "1.5", "²"])
-def test_what_names_nothing_is_told_with_what_could(world: World, text: str) -> None:
-    with pytest.raises(UsageError, match=r"neither a number, nor VIEW:X,Y or VIEW:MASK\.png .*\(0000 … 0009\)"):
-        find_regions(regions_of(world), text)
-
-
 def test_keys_find_their_own_regions_and_those_like_them(world: World) -> None:
     regions = regions_of(world)
     assert regions.basis is not None
@@ -101,45 +81,115 @@ def test_keys_find_their_own_regions_and_those_like_them(world: World) -> None:
             assert (found.number, found.name) == (k, name) and found.alike == pytest.approx(1.0, abs=1e-4)
 
 
-def test_several_regions_may_be_like_one_and_one_may_be_like_none(world: World) -> None:
-    regions = regions_of(world)
-    assert regions.basis is not None
-    units = torch.nn.functional.normalize(regions.scene.keys - regions.scene.semantic_mean, dim=1)
-    first = regions._replace(keys={"r0": key_of(regions, 0)})
-    alike = (units @ units[0]).tolist()
-    expected = [k for k, cosine in enumerate(alike) if cosine >= ALIKE]
-    found = find_regions(first, "r0")
-    assert [each.number for each in found] == expected and [f.alike for f in found] == pytest.approx(
-        [alike[k] for k in expected], abs=1e-4
+@pytest.fixture(scope="module")
+def _styled() -> dict[str, Styled]:
+    return {}
+
+
+@pytest.fixture
+def styled(world: World, _styled: dict[str, Styled]) -> Styled:
+    if not _styled:
+        _styled["plain"] = apply_style(world.load(), StyleFile(style_of(world.references)))
+    return _styled["plain"]
+
+
+def style_of(references: Sequence[Path]) -> StyleConfig:
+    return StyleConfig(references=tuple(references), clusters=3)
+
+
+def controls_of(world: World, styled: Styled, file: StyleFile | None = None, **wishes: object) -> RegionControls:
+    style = replace(style_of(world.references), **wishes)  # type: ignore[arg-type]
+    old = styled.controls.regions
+    regions = Regions(old.views, old.scene, old.basis, {} if file is None else file.regions)
+    return region_controls(regions, styled.dictionary, style)
+
+
+def test_forbidding_keeping_and_strengths(world: World, styled: Styled) -> None:
+    controls = controls_of(world, styled, forbid=("0=snow.png",), keep=("1",), region_strength=("2=0.25", "0=0.5"))
+    assert controls.allowed[0].tolist() == [name != "snow.png" for name in styled.dictionary.names]
+    assert controls.strength[:3].tolist() == [0.5, 0.0, 0.25]
+
+
+def test_poor_matches_are_kept_unless_pinned(world: World, styled: Styled) -> None:
+    score = styled.controls.score
+    best = score.amax(1)
+    order = best.argsort()
+    limit = float((best[order[0]] + best[order[1]]) / 2)
+    controls = controls_of(world, styled, keep_below=limit)
+    assert (controls.strength == 0).nonzero().flatten().tolist() == [int(order[0])]
+    assert bool((controls_of(world, styled, keep_below=-1.0).strength == 1).all())
+    pinned = controls_of(world, styled, keep_below=limit, pin=(f"{int(order[0])}=0",))
+    assert bool((pinned.strength == 1).all())
+    # What is forbidden does not count as a match.
+    own = styled.dictionary.names.index("dusk.png")
+    k = int(score[:, styled.dictionary.reference == own].amax(1).argmax())
+    left = float(score[k, styled.dictionary.reference != own].max())
+    forbidden = controls_of(world, styled, keep_below=left + 1e-3 if left < 0.999 else 1.0, forbid=(f"{k}=dusk.png",))
+    assert forbidden.strength[k] == 0
+
+
+@pytest.mark.parametrize(
+    ("wishes", "said"),
+    [
+        ({"keep": ("1",), "pin": ("1=0",)}, "region 1: is to be kept, and to be pinned"),
+        ({"keep": ("1",), "region_strength": ("1=0.5",)}, "region 1: is to be kept"),
+        ({"forbid": ("1=0", "1=1")}, "region 1: every reference is forbidden"),
+        ({"pin": ("1=0",), "forbid": ("1=0",)}, "region 1: every reference is forbidden"),
+        ({"pin": ("1=autumn.jpg",)}, r"reference 'autumn\.jpg': no such reference; there are 0 dusk\.png, 1 snow\.png"),
+        ({"keep": ("44",)}, "region 44: regions go from 0"),
+    ],
+)
+def test_contradictions_and_unknown_names(world: World, styled: Styled, wishes: dict[str, object], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        controls_of(world, styled, **wishes)
+
+
+def test_what_is_saved_means_the_same_on_the_same_scene(world: World, styled: Styled) -> None:
+    controls = controls_of(
+        world, styled, pin=("0=snow.png", "0002:15,20=1"), forbid=("1=0",), keep=("2",) if len(styled.scene.share) > 2 else ()
     )
-    # A second key that is the opposite of the first takes none of its regions.
-    away = regions.basis.lift(regions.scene.semantic_mean - units[0])
-    both = regions._replace(keys={**first.keys, "r1": tuple(away.tolist())})
-    again = find_regions(both, "r0")
-    assert [each._replace(alike=0.0) for each in again] == [each._replace(alike=0.0) for each in found]
-    assert [each.alike for each in again] == pytest.approx([each.alike for each in found], abs=1e-5)
-    nearer = [k for k, cosine in enumerate(alike) if -cosine >= ALIKE]
-    assert [each.number for each in find_regions(both, "r1")] == nearer
+    saved = controls.saved
+    assert all(text.partition("=")[0] in saved.regions for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep))
+    old = styled.controls.regions
+    again = region_controls(Regions(old.views, old.scene, old.basis, saved.regions), styled.dictionary, saved.style)
+    assert torch.equal(again.allowed, controls.allowed) and torch.equal(again.strength, controls.strength)
+    assert again.saved == saved, "names and keys stay as they are, however often it is saved"
+    named = {text.partition("=")[0] for text in (*saved.style.pin, *saved.style.forbid, *saved.style.keep)}
+    assert len(again.notes) == len(named) and "region 'region0' of the style is region 0 here (cosine 1.00)" in again.notes
 
 
-def test_keys_of_another_encoder_are_refused(world: World) -> None:
-    regions = regions_of(world, {"sky": (1.0, 2.0)})
-    said = "region 'sky': the style file knows it by the semantic encoder .*, the scene has bundled-semantic:"
-    with pytest.raises(UsageError, match=said):
-        find_regions(regions, "sky")
-    fitting = regions._replace(keys={"sky": key_of(regions, 0)})
-    with pytest.raises(UsageError, match=said):
-        find_regions(fitting._replace(encoder="dino:small"), "sky")
-    assert find_regions(fitting._replace(encoder=regions.views.semantic_encoder), "sky")
+def test_the_place_of_a_region_is_in_the_view_that_shows_most_of_it(world: World) -> None:
+    trained = world.load()
+    regions = Regions(trained, *load_style(trained.run))
+    shares = [membership_view(regions, v, 32) for v in range(len(trained.known.names))]
+    mass = torch.stack([(share * opacity[..., None]).mean((0, 1)) for share, opacity in shares])
+    for each in explain(regions):
+        view, k = trained.known.names.index(each.view), each.number
+        assert float(mass[view, k]) >= 0.95 * float(mass[:, k].max())
+        own = shares[view][0][each.pixel[1], each.pixel[0], k]
+        assert float(own) >= 0.5 * float(shares[view][0][..., k].max())
+        if float(own) > 0.5:
+            assert find_regions(regions, f"{each.view}:{each.pixel[0]},{each.pixel[1]}")[0].number == k
 
 
-def test_names_of_views_may_be_parts_of_each_other(world: World) -> None:
-    from dataclasses import replace
-
-    regions = regions_of(world)
-    trained = trained_of(regions)
-    known = trained.known
-    names = ("a", "a:1", *known.names[2:])
-    renamed = regions._replace(views=replace(trained, known=replace(known, names=names)))
-    share, _ = membership_view(regions, 1, 32)
-    assert find_regions(renamed, "a:1:5,6")[0].number == int(share[6, 5].argmax())
+@pytest.mark.parametrize("stylizer", [AdainConfig(), RegionAdainConfig()], ids=lambda s: type(s).__name__)
+def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, stylizer: object) -> None:
+    trained = world.load()
+    style = StyleConfig(references=world.references, clusters=3, keep=("1",), forbid=("0=0",))
+    styled = apply_style(trained, StyleFile(replace(style, stylizer=stylizer)))  # type: ignore[arg-type]
+    found = explain(styled.controls.regions, styled)
+    match = styled.restyle.stylizer.match(styled.scene.keys)
+    for each in found:
+        for taken in each.taken:
+            own = styled.dictionary.reference == styled.dictionary.names.index(taken.name)
+            assert taken.share == pytest.approx(float(match[each.number, own].sum()), abs=1e-5)
+            assert taken.score == pytest.approx(float(styled.controls.score[each.number, own].max()))
+        assert [t.share for t in each.taken] == sorted((t.share for t in each.taken), reverse=True)
+        bits = -(match[each.number] * match[each.number].clamp_min(1e-30).log2()).sum()
+        assert each.entropy == pytest.approx(float(bits), abs=1e-4)
+    assert [each.strength for each in found][:2] == [1.0, 0.0] and [each.restricted for each in found][:2] == [True, False]
+    tile = region_tile(found[1], styled.dictionary.names)
+    assert tile.lines[-1] == "kept as it is" and sum(tile.shares) == 0
+    assert sum(region_tile(found[0], styled.dictionary.names).shares) == pytest.approx(1, abs=1e-4)
+    row = region_row(found[0])
+    assert {"references", "entropy_bits", "strength", "restricted"} < row.keys() and len(row["references"]) == 2

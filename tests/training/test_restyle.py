@@ -1,38 +1,23 @@
-from dataclasses import replace
+"""Photographs to styles of a run: every field of a style changes what is rendered, mistakes are told."""
+
+from dataclasses import fields, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from tiny_world import World
 
-from fprf.errors import ConfigError, DataError, UsageError, WeightsError
+from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.images import write_image
-from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.style.config import NO_MASK, StyleConfig
-from fprf.style.files import StyleFile
+from fprf.style.files import StyleFile, write_style
+from fprf.style.references import Encoders
+from fprf.training.loading import Trained
 from fprf.training.restyle import apply_style, restyle
 from fprf.training.views import render_view
-
-
-def test_the_order_of_references_does_not_matter(world: World) -> None:
-    trained, (a, b) = world.load(), world.references
-    one = restyle(trained, [a, b], RegionOtConfig(), weights=(2.0, 1.0)).dictionary
-    two = restyle(trained, [b, a], RegionOtConfig(), weights=(1.0, 2.0)).dictionary
-    assert one.names == two.names
-    for x, y in zip(one, two, strict=True):
-        assert torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y
-
-
-def test_weights_and_blend_count(world: World) -> None:
-    trained = world.load()
-    even = restyle(trained, world.references, AdainConfig()).dictionary
-    heavy = restyle(trained, world.references, AdainConfig(), weights=(9.0, 1.0)).dictionary
-    whole = restyle(trained, world.references, AdainConfig(), blend=1.0).dictionary
-    assert not torch.equal(even.weight, heavy.weight) and not torch.equal(even.mean, whole.mean)
-    for of in whole.reference.unique():
-        codes = whole.mean[whole.reference == of]
-        assert torch.allclose(codes, codes[:1].expand_as(codes), atol=1e-5), "all of its reference's overall style"
 
 
 def test_mistakes(world: World, tmp_path: Path) -> None:
@@ -48,34 +33,22 @@ def test_mistakes(world: World, tmp_path: Path) -> None:
         restyle(trained, [tmp_path / "text.jpg"], RegionOtConfig())
 
 
-@pytest.mark.parametrize("which", ["content", "semantic"])
-def test_other_encoders_than_the_scenes_are_refused(world: World, which: str) -> None:
-    trained = world.load()
-    changed = {f"{which}_encoder": f"bundled-{which}:000000000000"}
-    facts = replace(trained.known.facts, **changed)  # type: ignore[arg-type]
-    with pytest.raises(WeightsError, match=f"{which} encoder: the scene was trained with bundled-{which}:000000000000"):
-        restyle(replace(trained, known=replace(trained.known, facts=facts)), world.references, RegionOtConfig())
-
-
-def paint(path: Path, pixels: np.ndarray) -> Path:
+def write_picture(path: Path, pixels: np.ndarray) -> Path:
     write_image(path, pixels.astype(np.uint8))
     return path
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "colour"),
-    [(1, 1, (3, 200, 90)), (90, 120, (0, 0, 0)), (2, 300, None)],
-)
+@pytest.mark.parametrize(("height", "width", "colour"), [(1, 1, (3, 200, 90)), (90, 120, (0, 0, 0)), (2, 300, None)])
 def test_degenerate_photographs_give_finite_pictures(
     world: World, tmp_path: Path, height: int, width: int, colour: tuple[int, int, int] | None
 ) -> None:
     """One pixel, one colour, a strip of noise: from the file to colours, with every stylizer and any number of clusters."""
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3))
-    path = paint(tmp_path / "x.png", noise if colour is None else np.broadcast_to(colour, (height, width, 3)))
+    path = write_picture(tmp_path / "x.png", noise if colour is None else np.broadcast_to(colour, (height, width, 3)))
     trained = world.load()
     encoders, known = trained.encoders(), trained.known
     for clusters in (1, 13):
-        for stylizer in (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig()):
+        for stylizer in (LocalAdainConfig(), RegionOtConfig()):
             style = StyleConfig(references=(path,), clusters=clusters, stylizer=stylizer, keep_below=-0.5, luminance=0.5)
             styled = apply_style(trained, StyleFile(style), encoders)
             assert all(bool(t.isfinite().all()) for t in styled.dictionary[:6])
@@ -83,34 +56,111 @@ def test_degenerate_photographs_give_finite_pictures(
             assert bool(view.rgb.isfinite().all()), (stylizer, clusters)
 
 
-def test_masks_belong_to_their_references_in_any_order(world: World, tmp_path: Path) -> None:
-    trained = world.load()
-    encoders = trained.encoders()
-    white = np.zeros((40, 56, 3))
-    white[:20] = 255
-    mask, (a, b) = paint(tmp_path / "m.png", white), world.references
-    one = apply_style(trained, StyleFile(StyleConfig(references=(a, b), masks=(mask, NO_MASK))), encoders).dictionary
-    two = apply_style(trained, StyleFile(StyleConfig(references=(b, a), masks=(NO_MASK, mask))), encoders).dictionary
-    assert one.names == two.names and all(torch.equal(x, y) for x, y in zip(one[:6], two[:6], strict=True))
-    plain = apply_style(trained, StyleFile(StyleConfig(references=(a, b))), encoders).dictionary
-    # The order of a dictionary follows what its references hold, so they are compared by name.
-    for name, same in ((a.name, False), (b.name, True)):
-        means = [d.mean[d.reference == d.names.index(name)] for d in (one, plain)]
-        assert (means[0].shape == means[1].shape and torch.equal(*means)) == same
+SECOND: dict[str, object] = {
+    "weights": (5.0, 1.0),
+    "clusters": 1,
+    "blend": 0.9,
+    "strength": 0.5,
+    "luminance": 1.0,
+    "pin": ("0=1",),
+    "forbid": ("0=0",),
+    "keep": ("0",),
+    "region_strength": ("0=0.5",),
+    "keep_below": 0.99,
+    "stylizer": RegionAdainConfig(),
+}
+"""Those of `references`, `masks`, `between` and `at` need files: see below."""
 
 
-@pytest.mark.slow
-def test_a_hundred_photographs_in_any_order(world: World, tmp_path: Path) -> None:
-    drawn = np.random.default_rng(0)
-    paths = tuple(paint(tmp_path / f"{i}.png", drawn.integers(0, 256, (24, 32, 3))) for i in range(100))
-    trained = world.load()
-    encoders = trained.encoders()
-    one, two = (
-        apply_style(trained, StyleFile(StyleConfig(references=order, clusters=3)), encoders)
-        for order in (paths, tuple(paths[i] for i in drawn.permutation(100)))
-    )
-    assert one.dictionary.names == two.dictionary.names
-    assert all(torch.equal(x, y) for x, y in zip(one.dictionary[:6], two.dictionary[:6], strict=True))
-    known = trained.known
-    view = render_view(trained.model, known.facts, known.cameras, 0, trained.config.render, one.restyle)
-    assert bool(view.rgb.isfinite().all())
+STYLIZERS = [LocalAdainConfig(), RegionOtConfig()]
+
+
+class Bench:
+    """A run in memory, and pictures of its first view."""
+
+    def __init__(self, world: World) -> None:
+        self.trained: Trained = world.load()
+        self.encoders: Encoders = self.trained.encoders()
+        self.base = StyleConfig(references=world.references, clusters=3)
+        self.plain = self.render(None)
+        self.first = self.show(self.base)
+
+    def render(self, style: StyleConfig | None) -> torch.Tensor:
+        known, config = self.trained.known, self.trained.config.render
+        look = None if style is None else apply_style(self.trained, StyleFile(style), self.encoders).restyle
+        return render_view(self.trained.model, known.facts, known.cameras, 0, config, look).rgb
+
+    def show(self, style: StyleConfig) -> torch.Tensor:
+        return self.render(style)
+
+
+@pytest.fixture(scope="module")
+def _bench() -> dict[str, Bench]:
+    return {}
+
+
+@pytest.fixture
+def bench(world: World, _bench: dict[str, Bench]) -> Bench:
+    if not _bench:
+        _bench["it"] = Bench(world)
+    return _bench["it"]
+
+
+def test_every_field_has_a_second_value() -> None:
+    assert {field.name for field in fields(StyleConfig)} == {*SECOND, "references", "masks", "between", "at"}
+
+
+@pytest.mark.parametrize("name", SECOND)
+def test_a_second_value_changes_the_picture(bench: Bench, name: str) -> None:
+    second = bench.show(replace(bench.base, **{name: SECOND[name]}))  # type: ignore[arg-type]
+    assert bool(second.isfinite().all()) and float((second - bench.first).abs().max()) > 1e-4
+
+
+def test_references_and_masks_change_the_picture(bench: Bench, tmp_path: Path) -> None:
+    mask = np.zeros((40, 56), np.uint8)
+    mask[20:] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    assert not torch.allclose(bench.show(replace(bench.base, references=bench.base.references[:1])), bench.first, atol=1e-4)
+    masked = bench.show(replace(bench.base, masks=(tmp_path / "mask.png", NO_MASK)))
+    assert not torch.allclose(masked, bench.first, atol=1e-4)
+    assert torch.equal(bench.show(replace(bench.base, masks=(NO_MASK, NO_MASK))), bench.first)
+
+
+def test_between_two_styles(bench: Bench, tmp_path: Path) -> None:
+    other = replace(bench.base, references=bench.base.references[:1], stylizer=AdainConfig(), luminance=0.5)
+    write_style(tmp_path / "other.json", StyleFile(other))
+    mixes = [bench.show(replace(bench.base, between=tmp_path / "other.json", at=at)) for at in (0.0, 0.3, 0.7, 1.0)]
+    end = bench.show(other)
+    assert torch.equal(mixes[0], bench.first) and torch.equal(mixes[3], end)
+    away = [float((mix - bench.first).abs().mean()) for mix in mixes]
+    assert away == sorted(away) and away[1] > 0
+    assert float((mixes[2] - end).abs().mean()) < float((mixes[1] - end).abs().mean())
+
+
+def test_styles_that_lead_back_to_themselves_are_refused(bench: Bench, tmp_path: Path) -> None:
+    a, b = tmp_path / "a.json", tmp_path / "b.json"
+    b.write_text("{}")
+    for path, towards in ((a, b), (b, a)):
+        write_style(path, StyleFile(replace(bench.base, between=towards)))
+    with pytest.raises(ConfigError, match=r"a\.json: lies between styles that lead back to it"):
+        bench.show(replace(bench.base, between=a))
+
+
+@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda s: type(s).__name__)
+def test_region_controls_work_with_every_stylizer(bench: Bench, stylizer: StylizerConfig) -> None:
+    base = replace(bench.base, stylizer=stylizer)
+    first, count = bench.show(base), 4
+    for wish in ({"pin": ("0=1", "1=0")}, {"forbid": ("1=0",)}, {"keep": ("0",)}, {"region_strength": ("0=0.3",)}):
+        assert not torch.allclose(bench.show(replace(base, **wish)), first, atol=1e-5), wish  # type: ignore[arg-type]
+    everything = replace(base, keep=tuple(str(k) for k in range(count)))
+    assert torch.equal(bench.show(everything), bench.plain), "all regions kept: bit for bit"
+    one = replace(base, pin=tuple(f"{k}=1" for k in range(count)))
+    alone = bench.show(replace(base, references=base.references[1:]))
+    assert torch.allclose(bench.show(one), alone, atol=1e-5), "pinned throughout: as if it were the only reference"
+
+
+def test_the_order_of_references_does_not_matter_to_wishes(bench: Bench) -> None:
+    a, b = bench.base.references
+    one = replace(bench.base, pin=("0=snow.png",), forbid=("1=0",), weights=(2.0, 1.0))
+    two = replace(bench.base, references=(b, a), pin=("0=0",), forbid=("1=dusk",), weights=(1.0, 2.0))
+    assert torch.equal(bench.show(one), bench.show(two))

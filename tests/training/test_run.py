@@ -1,5 +1,14 @@
+"""Run folders: what they keep, one process at a time, the images that a run was begun with, its history."""
+
 import json
+import multiprocessing
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.errors import CheckpointError
-from fprf.training.run import Run, view_names
+from fprf.cli.train import train_scene
+from fprf.errors import CheckpointError, DataError, UsageError
+from fprf.training import checkpoint
+from fprf.training.run import IMAGES, LOCK, Run, held, read_history, view_names
 
 
 @pytest.fixture
@@ -18,11 +29,6 @@ def run(world: World, tmp_path: Path) -> Run:
     """A copy without checkpoints, to be spoilt."""
     shutil.copytree(world.run, tmp_path / "run", ignore=shutil.ignore_patterns("checkpoints"))
     return Run(tmp_path / "run")
-
-
-def test_no_file_names_the_place_that_it_lies_in(world: World) -> None:
-    for name in ("config.json", "scene.json", "events.jsonl"):
-        assert str(world.run) not in (world.run / name).read_text()
 
 
 def test_scene_json_gives_the_scene_back(world: World) -> None:
@@ -44,12 +50,6 @@ def test_the_config_comes_back_without_its_folder(world: World) -> None:
     assert config == type(config)(**{**vars(world.config), "output": None})
 
 
-def test_a_folder_that_is_no_run_says_so(tmp_path: Path) -> None:
-    assert not Run(tmp_path).exists
-    with pytest.raises(CheckpointError, match=r"no config\.json here, so it is no run folder"):
-        Run(tmp_path).load_config()
-
-
 def _without(key: str) -> Any:
     return lambda d: {k: v for k, v in d.items() if k != key}
 
@@ -57,7 +57,7 @@ def _without(key: str) -> Any:
 @pytest.mark.parametrize(
     "change",
     [
-        *(_without(key) for key in ("format", "name", "data", "names", "cameras", "train", "test", "facts")),
+        *(_without(key) for key in ("format", "cameras", "facts")),
         lambda d: d | {"format": 99},
         lambda d: d | {"facts": 3},
         lambda d: d | {"facts": d["facts"] | {"space": "box"}},
@@ -65,8 +65,6 @@ def _without(key: str) -> Any:
         lambda d: d | {"facts": _without("channels")(d["facts"])},
         lambda d: d | {"cameras": d["cameras"] | {"pose": [[1.0], [1.0, 2.0]]}},
         lambda d: d | {"cameras": d["cameras"] | {"size": [[10**30, 1]]}},
-        lambda d: d | {"cameras": []},
-        lambda d: [d],
         lambda d: None,
     ],
 )
@@ -75,34 +73,6 @@ def test_a_spoilt_scene_json_is_named(run: Run, change: Any) -> None:
     path.write_text(json.dumps(change(json.loads(path.read_text()))))
     with pytest.raises(CheckpointError, match=r"scene\.json: "):
         run.load_known()
-
-
-@pytest.mark.parametrize("text", ["", "{", '{"format": 1', "\udcff"])
-def test_a_cut_scene_json_is_named(run: Run, text: str) -> None:
-    (run.root / "scene.json").write_bytes(text.encode(errors="surrogateescape"))
-    with pytest.raises(CheckpointError, match=r"scene\.json: cannot be read"):
-        run.load_known()
-
-
-def test_tensors_that_are_absent_or_cut(run: Run) -> None:
-    path = run.root / "style.safetensors"
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(CheckpointError, match=r"style\.safetensors: cannot be read"):
-        run.load_tensors("style")
-    path.unlink()
-    with pytest.raises(CheckpointError, match=r"not written yet; finish training with `fprf train"):
-        run.load_tensors("style")
-
-
-def test_events_are_strict_json_lines(world: World, run: Run) -> None:
-    run.log({"step": 1})
-    lines = (run.root / "events.jsonl").read_text().splitlines()
-    assert json.loads(lines[-1]) == {"step": 1}
-    trained = [event for line in lines if "psnr" in (event := json.loads(line))][-1]
-    keys = {"step", "seconds", "psnr", "rays_per_second", "kept", "skipped_steps", "losses"}
-    assert trained.keys() == keys and trained["step"] == 15 and trained["skipped_steps"] == 0
-    with pytest.raises(ValueError, match="Out of range float"):
-        run.log({"loss": float("nan")})
 
 
 def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> None:
@@ -120,3 +90,150 @@ def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> Non
 def test_names_are_never_alike(paths: list[list[str]]) -> None:
     names = view_names([Path("/scene", *parts).with_suffix(".png") for parts in paths])
     assert len(set(names)) == len(paths) and not any("/" in name for name in names)
+
+
+@pytest.fixture
+def town(world: World, tmp_path: Path) -> Path:
+    shutil.copytree(world.town, tmp_path / "town")
+    return tmp_path / "town"
+
+
+def test_training_goes_on_with_the_same_images_and_with_others_when_asked(world: World, town: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(world.run, run)
+    config = replace(world.config, data=town, output=run, steps=16)
+    image = sorted((town / "images").iterdir())[3]
+    image.write_bytes(sorted((town / "images").iterdir())[4].read_bytes())
+    before = json.loads((run / IMAGES).read_text())
+    with pytest.raises(UsageError, match=f"{image.name} is another"):
+        train_scene(config, "fprf-lite", quiet=True)
+    assert json.loads((run / IMAGES).read_text()) == before and checkpoint.steps(run / "checkpoints")[-1] == 15
+    train_scene(config, "fprf-lite", quiet=True, others=True)
+    after = json.loads((run / IMAGES).read_text())
+    assert [name for name in before["images"] if before["images"][name] != after["images"][name]] == [image.stem]
+    assert checkpoint.steps(run / "checkpoints")[-1] == 16
+    train_scene(replace(config, steps=17), "fprf-lite", quiet=True)
+    assert checkpoint.steps(run / "checkpoints")[-1] == 17
+
+
+HOLDER = "import sys, time; from pathlib import Path; from fprf.training.run import held\n"
+
+
+HOLDER += "with held(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
+
+
+def holder(folder: Path) -> subprocess.Popen[str]:
+    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline() == "held\n"
+    return process
+
+
+def test_a_second_process_is_told_who_is_there_until_that_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = holder(folder)
+    try:
+        with pytest.raises(DataError, match=rf"run: process {process.pid} on .+ is training here; wait") as told, held(folder):
+            pytest.fail("two hold it")
+        assert "\n" not in str(told.value)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    assert (folder / LOCK).exists()
+    with held(folder):
+        assert str(os.getpid()) in (folder / LOCK).read_text()
+    assert not (folder / LOCK).exists()
+
+
+def test_the_same_process_cannot_hold_it_twice(tmp_path: Path) -> None:
+    with held(tmp_path):
+        with pytest.raises(DataError, match=f"process {os.getpid()}"), held(tmp_path):
+            pass
+        assert (tmp_path / LOCK).exists(), "the refused one leaves the holder's file"
+    with held(tmp_path):
+        pass
+
+
+def test_an_empty_folder_is_not_left_behind_and_a_full_one_is(tmp_path: Path) -> None:
+    with held(tmp_path / "a" / "b"):
+        pass
+    assert not (tmp_path / "a" / "b").exists()
+    with pytest.raises(ValueError, match="x"), held(tmp_path / "c"):
+        (tmp_path / "c" / "file").touch()
+        raise ValueError("x")
+    assert [p.name for p in (tmp_path / "c").iterdir()] == ["file"]
+
+
+def _count(folder: Path, rounds: int) -> None:
+    """Add to a number that only one may touch at a time."""
+    done = 0
+    while done < rounds:
+        try:
+            with held(folder):
+                counter = folder / "counter"
+                value = int(counter.read_text())
+                time.sleep(0.001)
+                counter.write_text(str(value + 1))
+                done += 1
+        except DataError:
+            time.sleep(0.0005)
+
+
+def test_never_two_at_a_time(tmp_path: Path) -> None:
+    (tmp_path / "counter").write_text("0")
+    workers = [multiprocessing.get_context("fork").Process(target=_count, args=(tmp_path, 15)) for _ in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(60)
+    assert (tmp_path / "counter").read_text() == "45"
+
+
+def write(folder: Path, *events: dict[str, Any] | str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    text = "\n".join(event if isinstance(event, str) else json.dumps(event) for event in events)
+    (folder / "events.jsonl").write_text(text)
+    return folder
+
+
+def step(number: int, seconds: float, psnr: float = 20.0, **losses: float) -> dict[str, Any]:
+    return {"step": number, "seconds": seconds, "psnr": psnr, "losses": losses}
+
+
+def test_values_by_step(tmp_path: Path) -> None:
+    (history,) = read_history(write(tmp_path, step(1, 0.5, 12.0, rgb=0.3), step(9, 4.0, 15.0, rgb=0.1, content=2.0)))
+    assert (history.name, history.step, history.seconds) == ("", [1, 9], [0.5, 4.0])
+    assert history.values == {"psnr": [12.0, 15.0], "rgb": [0.3, 0.1], "content": [None, 2.0]}
+    assert history.parts == {} and history.notes == []
+
+
+def test_a_resume_from_before_drops_what_came_later(tmp_path: Path) -> None:
+    (history,) = read_history(write(tmp_path, step(1, 1), step(5, 5, 30.0), step(9, 9), step(5, 5.5, 31.0), step(8, 9)))
+    assert history.step == [1, 5, 8] and history.values["psnr"] == [20.0, 31.0, 20.0]
+
+
+def test_parts_add_up_over_resumes_and_other_lines_are_notes(tmp_path: Path) -> None:
+    run = write(
+        tmp_path,
+        {"part": "preparing", "seconds": 2.5},
+        step(1, 1),
+        {"step": 3, "skipped": "rgb"},
+        {"damaged": "step-5: model"},
+        {"part": "preparing", "seconds": 0.5},
+        {"part": "training", "seconds": 7},
+    )
+    (history,) = read_history(run)
+    assert history.parts == {"preparing": 3.0, "training": 7.0} and history.step == [1]
+    assert history.notes == ["step: 3, skipped: rgb", "damaged: step-5: model"]
+
+
+def test_damaged_lines_and_values_are_left_out(tmp_path: Path) -> None:
+    run = write(tmp_path, step(1, 1), '{"step": 2, "seco', "[1]", '{"step": 3, "seconds": 2, "psnr": NaN, "kept": true}')
+    (history,) = read_history(run)
+    assert history.step == [1, 3] and history.values == {"psnr": [20.0, None], "kept": [None, None]}
+
+
+def test_blocks_have_histories_of_their_own(tmp_path: Path) -> None:
+    write(tmp_path / "blocks" / "01", step(3, 1))
+    write(tmp_path / "blocks" / "00", step(2, 1))
+    write(tmp_path / "blocks" / "surroundings", "")
+    assert [(history.name, history.step) for history in read_history(tmp_path)] == [("00", [2]), ("01", [3])]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
+from fprf.rendering.cameras import Cameras, rays_through
 from fprf.rendering.renderer import march
 from fprf.style.scene import from_tensors
 from fprf.training.style_pass import lattice, measure_style
@@ -40,13 +40,6 @@ def test_the_lattice_covers_every_view_by_its_share(sizes: list[tuple[int, int]]
     assert len({(int(v), *p) for v, p in zip(view, pixel.tolist(), strict=True)}) == count, "no pixel twice"
     for one, pixels in zip(views.tolist(), area.tolist(), strict=True):
         assert abs(int((view == one).sum()) - count * pixels / int(area.sum())) <= 1
-
-
-def test_all_pixels_where_there_are_fewer_than_rays() -> None:
-    cameras = cameras_of([(3, 2), (1, 4)])
-    view, pixel = lattice(cameras, torch.tensor([1, 0]), 10**6)
-    assert view.tolist() == [1] * 4 + [0] * 6
-    assert torch.equal(pixel[4:].double(), pixel_grid(cameras, 0)) and torch.equal(pixel[:4].double(), pixel_grid(cameras, 1))
 
 
 def test_statistics_do_not_depend_on_the_chunk(world: World) -> None:
@@ -87,11 +80,3 @@ def test_regions_share_out_the_scene(world: World) -> None:
         replace(world.config, statistics=replace(world.config.statistics, regions=1)), trained.model, scene.cameras, scene.train
     )
     assert len(one.share) == 1 and torch.allclose(one.mean, style.mean)
-
-
-def test_a_scene_without_semantics_is_one_region(world: World) -> None:
-    trained, scene = world.load(), world.prepared.scene
-    trained.model.semantic = None
-    style = measure_style(world.config, trained.model, scene.cameras, scene.train)
-    assert style.keys.shape == (1, 0) and len(style.share) == 1
-    assert torch.allclose(style.region_mean[0], style.mean, rtol=1e-4, atol=1e-5)

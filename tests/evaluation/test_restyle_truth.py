@@ -1,0 +1,285 @@
+"""Styles against the town in that light: the stage, scores against definitions, methods, the verdict, the verb."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+from pretend_cuda import CUDA, pretend_cuda
+from tiny_world import World, stage_of
+from torch import Tensor
+
+from benchmarks.paper_styles import Case, PaperConfig, _by_view, cell_dictionary, set_up
+from fprf.cli import main as cli
+from fprf.datamanagers.images import load_image
+from fprf.errors import DataError, UsageError
+from fprf.evaluation.metrics import psnr
+from fprf.evaluation.restyle import (
+    BOUND,
+    FLAT,
+    GLOBAL,
+    GOALS,
+    MATCHED,
+    PLAIN,
+    dictionary_of,
+    in_scene,
+    nothing,
+    one_by_one,
+    verdict,
+)
+from fprf.evaluation.single_image import encoded
+from fprf.evaluation.town_truth import (
+    PARTS,
+    Reference,
+    Row,
+    best_class_maps,
+    code_classes,
+    photograph,
+    places,
+    shows,
+    town_settings,
+    true_class_maps,
+    true_views,
+)
+from fprf.ops import backend
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig, StylizerConfig
+from fprf.style.config import StyleConfig
+from fprf.style.dictionary import Reference as Samples
+from fprf.style.dictionary import StyleDictionary, build_dictionary
+from fprf.style.files import StyleFile
+from fprf.style.references import Encoders
+from fprf.town.surface import SKY
+from fprf.town.write import read_truth
+from fprf.training.loading import Trained, load_run
+from fprf.training.restyle import apply_style
+from fprf.training.views import CachedView, cache_view
+
+
+def test_the_truth_is_the_town_itself(world: World) -> None:
+    stage = stage_of(world.load(), views=2, frames=8, longest=32)
+    assert stage.settings.seed == 0 and stage.settings.palette == "day"
+    assert len(stage.shown) == len(stage.truth) == 2 and len(stage.passed) == len(stage.path_truth) == 8
+    held_out = world.load().known.test
+    for truth, view in zip(stage.truth, held_out, strict=False):
+        depth, labels = read_truth(world.town, view)
+        assert torch.equal(truth.labels, torch.from_numpy(labels.astype("int64")))
+        assert torch.allclose(truth.depth, torch.from_numpy(depth))
+    photographs = [world.prepared.manager.image(view) for view in held_out[:2]]
+    for rendered, taken in zip(true_views(stage, "day"), photographs, strict=True):
+        assert psnr(rendered, taken) > 60
+    night, day = true_views(stage, "night"), true_views(stage, "day")
+    assert float(night[0].mean()) < 0.5 * float(day[0].mean())
+
+
+def test_runs_of_other_scenes_are_refused(world: World, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(world.town, folder)
+    trained = world.load()
+    moved = replace(trained, config=replace(trained.config, data=folder))
+    assert town_settings(moved.config) == town_settings(trained.config)
+    (folder / "town.json").write_text(json.dumps({"settings": {"seed": 1}}))
+    with pytest.raises(DataError, match=r"town\.json"):
+        town_settings(moved.config)
+    (folder / "town.json").unlink()
+    with pytest.raises(UsageError, match="whose looks in other light nobody knows"):
+        town_settings(moved.config)
+
+
+SIZE = (48, 36)
+
+
+def test_three_references_share_the_work() -> None:
+    found = places((7, 11, 13), SIZE)
+    assert [place.name for place in found["three"]] == list(PARTS)
+    assert [place.seed for place in found["three"]] == [7, 11, 13] and found["one"][0].seed == 7
+    seen = {place.name: photograph(place, "night") for place in found["three"]}
+    for part in PARTS:
+        own = shows(seen[part].classes.numpy(), part)
+        assert own > 0.2
+    assert shows(seen["facades"].classes.numpy(), "facades") > shows(seen["street"].classes.numpy(), "facades")
+
+
+def test_codes_are_of_the_class_that_they_were_made_of(world: World) -> None:
+    trained = world.load()
+    encoders = trained.encoders()
+    assert encoders.semantic is not None
+    guided = trained.config.datamanager.guided
+    shown = photograph(places((7, 11, 13), (96, 72))["one"][0], "autumn")
+    semantic = encoded(shown.image, encoders.semantic, guided, encoders.basis)
+    dictionary = build_dictionary([Samples("street", semantic, semantic)], clusters=8, seed=0)
+    classes = code_classes(dictionary, {"street": shown}, encoders, guided)
+    nearest = torch.cdist(semantic, dictionary.keys).argmin(1)
+    right = (classes[nearest] == shown.classes.flatten()).double().mean()
+    assert SKY in classes.tolist() and float(right) > 0.5, "chance is a twelfth, one class alone a third"
+    with pytest.raises(DataError, match="no semantics"):
+        code_classes(dictionary, {"street": shown}, encoders._replace(semantic=None), guided)
+
+
+def picture(seed: int) -> Tensor:
+    return 0.2 + 0.6 * torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(seed))
+
+
+grid = torch.arange(256).reshape(16, 16) % 3
+
+
+def test_the_best_maps_find_any_map_of_classes() -> None:
+    plain = picture(1)
+    truth = plain.clone()
+    for kind, matrix in enumerate((torch.eye(3).flip(0), 0.5 * torch.eye(3), torch.zeros(3, 3))):
+        truth[grid == kind] = plain[grid == kind] @ matrix + 0.1 * (kind == 1) + 0.3 * (kind == 2)
+    (found,) = best_class_maps([(plain, grid)], [truth])
+    assert psnr(found, truth) > 45
+
+
+def test_true_classes_get_the_references_colours() -> None:
+    plain, style = picture(5), 0.3 + 0.4 * picture(6)
+    style[grid == 2] = style[grid == 2] * 0.5
+    (found,) = true_class_maps([(plain, grid)], [(style, grid)])
+    for kind in range(3):
+        here, there = found[grid == kind], style[grid == kind]
+        assert torch.allclose(here.mean(0), there.mean(0), atol=0.01)
+        assert torch.allclose(here.std(0), there.std(0), atol=0.02)
+    other = torch.full_like(grid, 7)
+    (found,) = true_class_maps([(plain, grid)], [(style, other)])
+    for kind in range(3):
+        assert torch.allclose(found[grid == kind].mean(0), style.reshape(-1, 3).mean(0), atol=0.01)
+
+
+def rows(ours: float, **others: float) -> dict[str, Row]:
+    found: dict[str, Row] = {name: {"psnr": 10.0, "match_inside": None, "consistency": 0.0} for name in (PLAIN, FLAT, *GLOBAL)}
+    for name, value in others.items():
+        found[{"flat": FLAT}.get(name, name)]["psnr"] = value
+    return found | {"best": {"psnr": ours, "match_inside": 0.95, "consistency": 0.01}}
+
+
+def test_every_goal_is_judged_on_its_own() -> None:
+    found = verdict(rows(14.0, adain=12.0, reinhard=11.0, flat=13.5), "best")
+    assert found["best_global"] == "adain"
+    assert found["reached"] == {
+        "over_no_change_db": 4.0, "over_best_global_db": 2.0, "over_2d_db": 0.5, "match_inside": 0.95, "consistency": 0.01,
+    }  # fmt: skip
+    assert found["met"] == {
+        "over_no_change_db": True, "over_best_global_db": True, "over_2d_db": False, "match_inside": True, "consistency": True,
+    }  # fmt: skip
+    assert found["goals"] == dict(GOALS)
+
+
+class Stand:
+    """A loaded run, two of its views, and the dictionary of its references."""
+
+    def __init__(self, world: World) -> None:
+        self.trained: Trained = world.load()
+        self.encoders: Encoders = self.trained.encoders()
+        known, render = self.trained.known, self.trained.config.render
+        self.views: list[CachedView] = [
+            cache_view(self.trained.model, known.facts, known.cameras, view, render) for view in (0, 4)
+        ]
+        self.paths: tuple[Path, ...] = world.references
+        self.dictionary: StyleDictionary = self.of(self.paths)
+
+    def of(self, paths: tuple[Path, ...], clusters: int = 4, blend: float = 0.1) -> StyleDictionary:
+        return dictionary_of(paths, self.encoders, clusters=clusters, blend=blend)[0]
+
+    def plain(self) -> list[torch.Tensor]:
+        return [view.restyled().rgb for view in self.views]
+
+
+@pytest.fixture
+def stand(world: World) -> Stand:
+    return Stand(world)
+
+
+@pytest.mark.parametrize("config", [AdainConfig(), LocalAdainConfig(), RegionToneConfig()])
+def test_in_the_scene_is_what_a_user_gets(stand: Stand, config: StylizerConfig) -> None:
+    style = StyleConfig(references=stand.paths, stylizer=config, clusters=4, blend=0.1)
+    look = apply_style(stand.trained, StyleFile(style), stand.encoders).restyle
+    shown = in_scene(stand.trained, stand.views, config, stand.dictionary, stand.encoders, stand.paths)
+    for picture, view in zip(shown.pictures, stand.views, strict=True):
+        assert torch.equal(picture, view.restyled(look).rgb)
+    assert (shown.taken is None) == isinstance(config, AdainConfig)
+    for taken, picture in zip(shown.taken or [], shown.pictures, strict=False):
+        assert taken.shape == (picture.shape[0] * picture.shape[1], len(stand.dictionary.keys))
+        total = taken.sum(1)
+        assert bool(((total < 1e-4) | ((total - 1).abs() < 1e-4)).all()), "all of a pixel's share, or nothing is there"
+
+
+def measured(world: World, device: str, folder: Path) -> list[Any]:
+    """Pictures and matches of every way to restyle, and whose class codes are."""
+    trained = load_run(world.run, device)
+    encoders = trained.encoders()
+    bench = set_up(trained, encoders, PaperConfig(table="time", views=1), folder)
+    paths, tone = world.references[:1], RegionToneConfig()
+    dictionary = dictionary_of(paths, encoders, clusters=3, blend=0.1)[0]
+    image = torch.from_numpy(load_image(paths[0])).float() / 255
+    shown = Reference(paths[0].name, image, torch.arange(image[..., 0].numel()).view(image.shape[:2]) % 3)
+    plain = nothing(bench.stage.shown).pictures
+    case = Case("night", [shown], list(paths), dictionary, 0.0)
+    found = [
+        in_scene(trained, bench.stage.shown, LocalAdainConfig(), dictionary, encoders, paths),
+        one_by_one(trained, plain, tone, dictionary, encoders),
+        _by_view(bench, tone)(case),
+    ]
+    cells = cell_dictionary({shown.name: image}, trained, encoders)
+    classes = code_classes(dictionary, {shown.name: shown}, encoders, trained.config.datamanager.guided)
+    return [*plain, *(x for each in found for x in (*each.pictures, *(each.taken or []))), *cells[:6], *cells[8:10], classes]
+
+
+def test_ways_to_restyle(world: World, tmp_path: Path) -> None:
+    with backend.plain():
+        expected = measured(world, "cpu", tmp_path)
+    with pretend_cuda() as seen:
+        found = measured(world, str(CUDA), tmp_path)
+    assert seen.uploads and len(found) == len(expected)
+    assert all(a.device.type == "cpu" and torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+SMALL = ["--palettes", "night", "--views", "1", "--longest", "24", "--clusters", "4", "--device", "cpu"]
+
+
+METHODS = {
+    "no change", "reinhard", "histogram", "2d", "adain", "local-adain", "region-adain", "region-ot", "nearest-code",
+    "region-tone", MATCHED, BOUND,
+}  # fmt: skip
+
+
+def bench(world: World, output: Path, *more: str) -> dict[str, Any]:
+    assert cli.main(["bench", "restyle", str(world.run), *SMALL, "--output", str(output), *more]) == 0
+    document: dict[str, Any] = json.loads(output.read_text())
+    return document
+
+
+def test_every_method_is_in_the_table(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page, sheet = tmp_path / "docs/page.md", tmp_path / "docs/sheets/all.png"
+    document = bench(world, tmp_path / "a.json", "--page", str(page), "--sheet", str(sheet))
+    assert set(document["means"]) == {"one", "three"}
+    found = document["palettes"]["night"]["three"]
+    assert set(found["rows"]) == METHODS and set(found["delta_e_by_class"]) == METHODS
+    for name, row in found["rows"].items():
+        assert 0 < row["psnr"] < 99 and -1 <= row["ssim"] <= 1 and row["delta_e"] > 0
+        assert (row["match"] is not None) == (name in METHODS - {"no change", "reinhard", "histogram", "adain", MATCHED, BOUND})
+        assert (row["consistency"] is None) == (name in (MATCHED, BOUND))
+    assert found["rows"]["no change"]["consistency"] == 0
+    assert document["recommended"] == "region-tone" and document["lpips"] is None and document["lpips_missing"]
+    assert document["verdict"]["goals"] == dict(GOALS) and set(document["verdict"]["met"]) == set(GOALS)
+    # A map that knows the truth is nearer to it than doing nothing, whatever the scene.
+    assert found["rows"][BOUND]["psnr"] > found["rows"]["no change"]["psnr"]
+    assert document["provenance"]["torch"] and document["settings"]["town_seed"] == 0
+    text = page.read_text()
+    assert "](sheets/all.png)" in text and all(name in text for name in METHODS)
+    assert cv2.imread(str(sheet)) is not None
+    assert "region-tone" in capsys.readouterr().out
+
+
+def test_mistakes_are_one_line(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "restyle", str(world.run), *SMALL, "--seeds", "0", "1", "2"]) == 2
+    assert "is the town of the run itself" in capsys.readouterr().err
+    assert cli.main(["bench", "restyle", str(world.run), *SMALL, "--palettes", "noon"]) == 2
+    assert "noon" in capsys.readouterr().err
+    assert cli.main(["bench", "restyle", str(tmp_path / "nothing"), *SMALL]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert cli.main(["bench", "restyle", "--frames", "7"]) == 2
+    assert "--frames" in capsys.readouterr().err

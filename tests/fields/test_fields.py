@@ -1,0 +1,153 @@
+"""Fields and what they are made of: contracts, what moves what, density, networks, planes, harmonics."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fprf.errors import ConfigError
+from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.fields.fields import PlanesField, ProposalField
+from fprf.fields.planes import LIMIT, MAX_DEGREE, count, density, harmonics
+from fprf.testing import check_content_field, check_semantic_field
+
+SMALL = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16)
+
+
+def cloud(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    draw = torch.Generator().manual_seed(seed)
+    view = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=-1)
+    return torch.empty(count, 3).uniform_(-1, 1, generator=draw), view
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        SMALL,
+        PlanesConfig(resolutions=(5,), channels=3, hidden=4, layers=0, degree=1),
+        PlanesConfig(resolutions=(3, 4, 6), channels=24, hidden=8, layers=3, degree=2),
+    ],
+)
+def test_the_contract_of_content(config: PlanesConfig) -> None:
+    check_content_field(config)
+
+
+def test_kernels_and_plain_form_agree() -> None:
+    field = SMALL.build(channels=6, seed=0)
+    points, view = cloud(200)
+    view = view[::5].repeat_interleave(5, 0)
+    latent = field.density(points).latent
+    with torch.no_grad():
+        found = field.content(latent, view)
+        assert field.content(latent[:0], view[:0]).shape == (0, 6)
+        exact = field.double().content(latent.double(), view.double())
+    assert torch.allclose(found.double(), exact, atol=1e-5)
+
+
+def test_direction_changes_content_unless_there_is_none() -> None:
+    points, view = cloud(20)
+    for degree, changes in ((1, False), (2, True), (4, True)):
+        field = PlanesConfig(resolutions=(4,), channels=8, hidden=16, degree=degree).build(channels=5, seed=0)
+        latent = field.density(points).latent
+        assert torch.equal(field.content(latent, view), field.content(latent, -view)) != changes
+
+
+def test_density_does_not_meet_the_network() -> None:
+    field = SMALL.build(channels=6, seed=0)
+    assert isinstance(field, PlanesField)
+    field.density(cloud(30)[0]).density.sum().backward()
+    assert all(p.grad is None for p in field.to_content.parameters()) and field.offset.grad is None
+    assert field.planes.table.grad is not None and field.to_density.weight.grad is not None
+
+
+SMALL_SEMANTIC = SemanticPlanesConfig(resolutions=(4, 9), channels=8, hidden=16)
+
+
+@pytest.mark.parametrize("config", [SMALL_SEMANTIC, SemanticPlanesConfig(resolutions=(3,), channels=5, hidden=4, layers=0)])
+def test_the_contract_of_semantics(config: SemanticPlanesConfig) -> None:
+    check_semantic_field(config)
+
+
+U = 2.0**-24
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-80, 15, width=32))
+def test_it_is_exp_below_the_cap(raw: float) -> None:
+    x = torch.tensor([raw], requires_grad=True)
+    value = density(x)
+    # raw - 1 rounds by u of itself, which exp makes a relative error; exp itself is good to 2u.
+    exact = math.exp(raw - 1)
+    slack = U * (abs(raw - 1) + 4)
+    assert abs(value.item() - exact) <= slack * exact + 1e-38
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    wanted = math.exp(max(raw - 1, -LIMIT))
+    assert abs(gradient.item() - wanted) <= (slack + 4 * U) * wanted
+
+
+@pytest.mark.parametrize("raw", [-3e38, -1e4, -200.0, 16.0, 90.0, 1e4, 3e38, math.inf, -math.inf])
+def test_extremes_are_finite(raw: float) -> None:
+    x = torch.tensor([raw], requires_grad=True)
+    value = density(x)
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    assert 0 <= value.item() <= math.exp(LIMIT) * 1.00001
+    # A dense point can become thin again, and empty space can fill: the gradient dies at neither end.
+    assert math.exp(-LIMIT) * 0.9999 <= gradient.item() <= math.exp(LIMIT) * 1.00001
+
+
+def points_of(count: int) -> torch.Tensor:
+    return torch.empty(count, 3).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
+
+
+def test_a_proposal_is_one_scale_and_a_linear_map() -> None:
+    field = ProposalField(6, 8, seed=3)
+    found = field(points_of(20))
+    raw = field.to_density(field.planes(points_of(20)))[:, 0]
+    assert found.shape == (20,) and torch.allclose(found, torch.exp(raw - 1))
+    assert field.planes.resolutions == (6,) and field(points_of(0)).shape == (0,)
+    same, other = ProposalField(6, 8, seed=3), ProposalField(6, 8, seed=4)
+    assert torch.equal(same(points_of(20)), found) and not torch.equal(other(points_of(20)), found)
+
+
+def quadrature() -> tuple[Tensor, Tensor]:
+    """Directions and weights that integrate polynomials up to degree 15 over the sphere exactly, float64."""
+    z, weight = np.polynomial.legendre.leggauss(8)
+    angle = 2 * math.pi * (np.arange(16) + 0.5) / 16
+    radius = np.sqrt(1 - z * z)
+    x, y = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
+    view = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], -1).reshape(-1, 3)
+    return torch.from_numpy(view), torch.from_numpy(np.repeat(weight, 16) * 2 * math.pi / 16)
+
+
+@pytest.mark.parametrize("degree", range(1, MAX_DEGREE + 1))
+def test_they_are_orthonormal(degree: int) -> None:
+    view, weight = quadrature()
+    values = harmonics(view, degree)
+    assert values.shape == (len(view), degree * degree) and count(degree) == degree * degree
+    gram = (values * weight[:, None]).T @ values
+    assert (gram - torch.eye(degree * degree, dtype=torch.float64)).abs().max() <= 1e-12
+
+
+@pytest.mark.parametrize("degree", range(1, MAX_DEGREE + 1))
+def test_each_band_turns_into_itself(degree: int) -> None:
+    """The values of a rotated direction are an orthogonal map of those of the direction, band by band."""
+    view, weight = quadrature()
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(degree)))
+    before, after = harmonics(view, degree), harmonics(view @ turn.T, degree)
+    mixing = (after * weight[:, None]).T @ before
+    assert (before @ mixing.T - after).abs().max() <= 1e-12
+    for band in range(degree):
+        inside = slice(band * band, (band + 1) ** 2)
+        outside = mixing[inside].clone()
+        outside[:, inside] = 0
+        assert outside.abs().max() <= 1e-12
+
+
+@pytest.mark.parametrize("degree", [-1, 0, 5])
+def test_other_degrees_are_refused(degree: int) -> None:
+    with pytest.raises(ConfigError, match=rf"degree: {degree} must lie in \[1, 4\]"):
+        count(degree)
