@@ -1,9 +1,7 @@
 import json
 import shutil
-import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from queue import Queue
 
@@ -100,26 +98,12 @@ def test_films_that_cannot_be_are_refused(world: World, change: dict[str, object
         film_cameras(page_transform(restyler.scene.known.cameras), plan)
 
 
-def test_folders_are_numbered(tmp_path: Path) -> None:
-    assert [new_folder(tmp_path).name for _ in range(3)] == ["0001", "0002", "0003"]
-
-
 def test_a_film_that_fails_ends_its_frames(world: World, tmp_path: Path) -> None:
     out: Queue[Picture | None] = Queue()
     with pytest.raises(Exception, match="no such camera path"):
         restyler = Restyler(world.load())
         list(film_frames(tmp_path, restyler.scene, drawn_by(restyler), out, lambda done, total: None))
     assert out.get_nowait() is None
-
-
-def test_looks_that_differ_get_folders_of_their_own(world: World, tmp_path: Path) -> None:
-    restyler = Restyler(world.load())
-    a, _ = encoded(restyler, world)
-    look = Look(mix=((a, 1.0),))
-    write_film_files(
-        tmp_path, page_transform(restyler.scene.known.cameras), plan_of(restyler, [look, replace(look, blend=0.9)]), ""
-    )
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["keys.json", "path.json", "style-1", "style-2"]
 
 
 @pytest.fixture
@@ -173,27 +157,6 @@ def test_a_flight_goes_from_the_first_key_to_the_last_for_one_client_alone(
     assert any(state.playing for state in listener.states)
 
 
-def test_moves_of_the_client_s_own_do_not_count_while_it_flies(opened: tuple[Session, Listener]) -> None:
-    session, _ = opened
-    here = session.transform.camera_state(session.viewed.scene.cameras, 5)
-    session.move_camera(1, here)
-    gate, flown = threading.Event(), list[CameraState]()
-
-    def fly(eye: CameraState) -> None:
-        flown.append(eye)
-        assert gate.wait(60)
-
-    session.play_flight(1, flight(session, [Look(), Look()]), fly)
-    until(lambda: len(flown) == 1)
-    session.move_camera(1, here)
-    assert session._cameras[1].position != here.position
-    gate.set()
-    session.stop_flight(1)
-    until(lambda: not session.state.playing)
-    session.move_camera(1, here)
-    assert session._cameras[1] == here
-
-
 def test_who_leaves_or_plays_again_ends_the_flight(opened: tuple[Session, Listener]) -> None:
     session, _ = opened
     session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 5))
@@ -207,14 +170,6 @@ def test_who_leaves_or_plays_again_ends_the_flight(opened: tuple[Session, Listen
     session.disconnect(1)
     until(lambda: not session.state.playing)
     assert not session._films._flights
-
-
-def test_a_flight_of_nothing_is_told(opened: tuple[Session, Listener]) -> None:
-    session, listener = opened
-    session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 5))
-    session.play_flight(1, FilmPlan((), 1.0, 24.0, (32, 24)), lambda eye: None)
-    listener.until(lambda: any("no keys" in text for text in listener.said))
-    until(lambda: not session._films._flights)
 
 
 def test_a_thumbnail_is_what_was_seen_last(opened: tuple[Session, Listener]) -> None:

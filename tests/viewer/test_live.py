@@ -156,17 +156,6 @@ def test_another_block_is_another_model(told: Told) -> None:
     assert session.state.training == TrainingProgress(3, 0.5, 19.5, 10.0, "block 01")
 
 
-def test_an_end_that_nobody_sees_is_the_end(told: Told) -> None:
-    told.follower.receive({"done": True})
-    assert told.follower.over
-
-
-def test_the_process_says_where_it_listens_and_ends_with_training() -> None:
-    answers = io.StringIO()
-    main(io.StringIO('{"host": "127.0.0.1", "port": 0, "strict": true}\n'), answers)
-    assert json.loads(answers.getvalue())["address"].startswith("http://127.0.0.1:")
-
-
 def test_a_port_that_is_taken_is_an_error_or_another_port() -> None:
     first = io.StringIO()
     with ViewerServer(make_access("127.0.0.1", None), 0, preload=False) as host:
@@ -176,12 +165,6 @@ def test_a_port_that_is_taken_is_an_error_or_another_port() -> None:
         second = io.StringIO()
         main(io.StringIO(json.dumps({"host": "127.0.0.1", "port": port, "strict": False}) + "\n"), second)
         assert str(port) not in json.loads(second.getvalue())["address"]
-
-
-def test_lines_that_are_none_end_it() -> None:
-    answers = io.StringIO()
-    main(io.StringIO('{"host": "127.0.0.1", "port": 0, "strict": false}\n{"run": "/nowhere", "device": "cpu"}\n{'), answers)
-    assert "address" in answers.getvalue()
 
 
 def event(step: int) -> Report:
@@ -196,25 +179,10 @@ def until(true: Callable[[], bool], act: Callable[[], object] = lambda: None) ->
         time.sleep(0.01)
 
 
-def test_the_viewer_is_told_where_to_listen_and_says_where_it_does() -> None:
-    with LiveViewer(ViewAddress("127.0.0.1", 0), viewer(QUIET)) as view:
-        assert view.address == "http://here/" and not view.looked_at and view.fault is None
-
-
-@pytest.mark.parametrize("script", [REFUSED, "", "print('hello')", "print('[]')", "raise SystemExit(3)"])
+@pytest.mark.parametrize("script", [REFUSED, "", "print('[]')"])
 def test_a_viewer_that_cannot_start_is_one_line(script: str) -> None:
     with pytest.raises(UsageError, match=r"^--view: (no such place|the viewer did not start)"):
         LiveViewer(ViewAddress(), viewer(script))
-
-
-def test_while_nobody_looks_nothing_is_copied_and_nothing_sent(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    with LiveViewer(ViewAddress(), viewer(QUIET)) as view:
-        view.begin(world.run, world.load().model, "cpu")
-        with monkeypatch.context() as patched:
-            patched.setattr(view, "_send", None)
-            patched.setattr(view, "_model", None)
-            for step in range(1000):
-                view(event(step))
 
 
 def test_who_looks_gets_the_parameters_of_now_and_how_it_goes(world: World, tmp_path: Path) -> None:
@@ -239,9 +207,10 @@ def test_what_is_handed_over_does_not_change_with_the_model(world: World, monkey
         view.begin(world.run, model, "cpu")
         view._looking.set()
         view._wanted.set()
-        monkeypatch.setattr(view, "_send", lambda line: said.append(line) if line else None)
-        view(event(1))
-        view(event(2))  # not wanted any more
+        with monkeypatch.context() as patched:
+            patched.setattr(view, "_send", lambda line: said.append(line) if line else None)
+            view(event(1))
+            view(event(2))  # not wanted any more
     copies = [line["snapshot"] for line in said if "snapshot" in line]
     assert len(copies) == 1 and isinstance(copies[0], dict)
     before = {name: tensor.clone() for name, tensor in copies[0].items()}
@@ -280,7 +249,3 @@ def test_no_viewer_holds_training_up(world: World, script: str) -> None:
             assert not view.finish(stay=True)
         else:
             view.finish(stay=False)
-
-
-def test_places() -> None:
-    assert ViewAddress() == ("127.0.0.1", 8080, False)

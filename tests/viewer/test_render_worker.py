@@ -54,14 +54,6 @@ def until(true: Callable[[], bool]) -> None:
     raise AssertionError("it never came")
 
 
-def test_a_request_is_worked_off(bench: Bench) -> None:
-    bench.worker.start()
-    bench.worker.request("a", 1)
-    bench.let(4)
-    until(lambda: bench.closed == [1])
-    assert bench.log == [("a", 1, step) for step in range(4)]
-
-
 def test_a_newer_request_takes_over_between_steps_and_those_between_are_never_begun(bench: Bench) -> None:
     bench.worker.start()
     bench.worker.request("a", 0)
@@ -147,15 +139,6 @@ def test_spare_work_waits_for_clients_and_is_done_in_order(bench: Bench) -> None
     bench.let(12)
     until(lambda: len(bench.closed) == 3)
     assert [request for _, request, _ in bench.log] == [1] * 4 + ["first"] * 4 + ["second"] * 4
-
-
-def test_a_broken_film_makes_way_for_the_next(bench: Bench) -> None:
-    bench.worker.run_when_idle(bench.work("film", "bad"))
-    bench.worker.run_when_idle(bench.work("film", "second"))
-    bench.worker.start()
-    bench.let(8)
-    until(lambda: "second" in bench.closed)
-    assert bench.faults == [(None, "it broke")]
 
 
 def test_closing_ends_the_thread_in_the_middle_of_work() -> None:

@@ -8,7 +8,6 @@ from photographs import encoded
 from tiny_world import World
 
 from fprf.errors import CheckpointError, UsageError
-from fprf.style.config import StyleConfig
 from fprf.style.dictionary import build_dictionary
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
@@ -32,12 +31,6 @@ def test_a_look_is_the_style_that_the_command_line_makes(world: World) -> None:
     look = set_rule(Look(mix=((a, 1.0), (b, 0.5)), strength=0.8, clusters=3, luminance=0.2), 1, "pin", b)
     wanted = apply_style(restyler.scene, StyleFile(style_config(look)))
     assert torch.allclose(seen(restyler, restyler.restyle(look)), seen(restyler, wanted.restyle), atol=2e-5)
-
-
-def test_no_photograph_and_no_strength_are_the_scene_as_it_is(world: World) -> None:
-    restyler = Restyler(world.load())
-    a, _ = encoded(restyler, world)
-    assert restyler.styled(Look()) is None and restyler.styled(Look(mix=((a, 1.0),), strength=0.0)) is None
 
 
 def test_between_two_looks(world: World) -> None:
@@ -111,10 +104,6 @@ def test_what_there_is_to_say_of_a_region(world: World) -> None:
     assert sum(share for _, share in kept.taken) < sum(share for _, share in picked.taken)
 
 
-def test_styles_ask_for_at_least_one_reference() -> None:
-    assert StyleConfig().references == ()
-
-
 @pytest.fixture
 def fresh(world: World, tmp_path: Path) -> Path:
     """A run as it is when training begins: no checkpoint, no style."""
@@ -138,11 +127,6 @@ def test_a_run_that_has_just_begun_renders_and_with_its_parameters_is_the_run(wo
 def test_parameters_of_another_config_are_refused(fresh: Path) -> None:
     with pytest.raises(CheckpointError, match="not those of its config"):
         set_parameters(load_unfinished(fresh, "cpu"), {"x": torch.zeros(3)})
-
-
-def test_no_folder_is_no_run(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"no config\.json"):
-        load_unfinished(tmp_path, "cpu")
 
 
 def test_the_style_of_a_moment_is_that_which_training_measures(world: World, fresh: Path) -> None:

@@ -19,27 +19,20 @@ from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
 from fprf.viewer import server
-from fprf.viewer.server import COOKIE, Access, HttpServer, Request, Response, ViewerServer, is_loopback, make_access
+from fprf.viewer.server import COOKIE, Access, HttpServer, Request, Response, ViewerServer, make_access
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
 THERE = Access("0.0.0.0", TOKEN)
 
 
-@pytest.mark.parametrize("name", ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "127.9.8.7:1"])
-def test_this_machine_by_its_names(name: str) -> None:
-    assert HERE.refusal({"host": name}) is None
-    assert HERE.refusal({"host": name, "origin": f"http://{name}"}) is None
-
-
-@pytest.mark.parametrize("name", ["evil.example:8080", "127.0.0.1.evil.example", "", "[", "192.168.0.7:8080", "localhost.evil"])
-def test_names_made_to_point_here_are_refused(name: str) -> None:
-    assert HERE.refusal({"host": name}) is not None
-
-
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "", "https://localhost:8080"])
-def test_pages_of_other_sites_are_refused(origin: str) -> None:
-    assert HERE.refusal({"host": "127.0.0.1:8080", "origin": origin}) is not None
+def test_this_machine_alone_is_let_in_by_its_names_and_from_its_own_pages() -> None:
+    for name in ("127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "127.9.8.7:1"):
+        assert HERE.refusal({"host": name}) is None and HERE.refusal({"host": name, "origin": f"http://{name}"}) is None
+    for name in ("evil.example:8080", "127.0.0.1.evil.example", "", "[", "192.168.0.7:8080", "localhost.evil"):
+        assert HERE.refusal({"host": name}) is not None
+    for origin in ("http://evil.example", "null", "http://127.0.0.1:9999", "", "https://localhost:8080"):
+        assert HERE.refusal({"host": "127.0.0.1:8080", "origin": origin}) is not None
 
 
 def test_from_elsewhere_a_token_is_needed_in_one_of_three_places() -> None:
@@ -66,11 +59,6 @@ def test_weak_tokens_are_refused(token: str) -> None:
         make_access("127.0.0.1", token)
 
 
-def test_loopback() -> None:
-    assert all(is_loopback(host) for host in ("127.0.0.1", "LocalHost", "::1", "[::1]"))
-    assert not any(is_loopback(host) for host in ("0.0.0.0", "::", "a.b"))
-
-
 async def hello(request: Request) -> Response:
     return Response(200, "text/plain", b"hello")
 
@@ -93,7 +81,7 @@ ROUTES = {("GET", "/"): hello, ("POST", "/echo"): echo, ("GET", "/refused"): ref
 @pytest.fixture
 def http(monkeypatch: pytest.MonkeyPatch) -> Iterator[HttpServer]:
     monkeypatch.setattr(server, "_MAX_BODY", 100_000)
-    monkeypatch.setattr(server, "_TIMEOUT", 1.0)
+    monkeypatch.setattr(server, "_TIMEOUT", 0.5)
     found = HttpServer(HERE, 0, ROUTES)
     yield found
     found.close()
@@ -158,17 +146,11 @@ def test_what_is_wrong_is_refused(http: HttpServer, line: str, headers: tuple[st
     assert status(request(http, "GET /")) == 200
 
 
-def test_another_name_for_this_machine_is_refused(http: HttpServer) -> None:
-    assert status(request(http, "GET /", host="evil.example")) == 403
-
-
 @pytest.mark.parametrize(
     "data",
     [
         b"",
         b"\x16\x03\x01\x02\x00",
-        b"GET / HTTP/1.1\r\n",
-        b"\r\n\r\n",
         b"\0" * 100 + b"\r\n\r\n",
         b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000,
     ],
@@ -193,7 +175,7 @@ def test_idle_connections_are_closed_and_do_not_shut_others_out(http: HttpServer
 def test_who_does_not_read_is_dropped(http: HttpServer) -> None:
     with socket.create_connection(("127.0.0.1", http.port), timeout=30) as wire:
         wire.sendall(f"GET /film HTTP/1.1\r\nHost: 127.0.0.1:{http.port}\r\n\r\n".encode())
-        time.sleep(3)
+        time.sleep(1.5)
         size = 0
         while piece := wire.recv(1 << 20):
             size += len(piece)

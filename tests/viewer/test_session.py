@@ -8,7 +8,7 @@ import pytest
 from photographs import viewed
 from tiny_world import World
 
-from fprf.errors import DataError, UsageError
+from fprf.errors import UsageError
 from fprf.training.loading import load_run
 from fprf.viewer.film import FilmPlan
 from fprf.viewer.gaussian_renderer import Colours
@@ -82,13 +82,6 @@ def test_a_drop_restyles_what_every_client_sees(opened: tuple[Session, Listener]
     assert again.name == "dusk.png (2)" and session.state.shelf == (card, again)
 
 
-def test_what_is_no_photograph_is_told_and_changes_nothing(opened: tuple[Session, Listener]) -> None:
-    session, _ = opened
-    with pytest.raises(DataError, match="photograph"):
-        session.upload(b"not a photograph", "x.png")
-    assert session.state == State(pixels=64)
-
-
 def test_a_state_that_cannot_be_is_told_to_who_wanted_it(opened: tuple[Session, Listener]) -> None:
     session, listener = opened
     assert not session.update(lambda state: replace(state, wipe=7.0), 1)
@@ -127,13 +120,6 @@ def test_a_film_is_made_while_others_look(opened: tuple[Session, Listener]) -> N
     assert (path.parent / "path.json").is_file() and any("film.mp4" in text for text in listener.said)
 
 
-def test_a_film_that_cannot_be_is_told_and_the_next_can(opened: tuple[Session, Listener]) -> None:
-    session, listener = opened
-    session.record_film(FilmPlan((), 1.0, 24.0, (32, 24)))
-    listener.until(lambda: any("no keys" in text for text in listener.said))
-    listener.until(lambda: not session.state.film.busy)
-
-
 def test_who_drops_while_the_viewer_ends_is_not_left_waiting(opened: tuple[Session, Listener], world: World) -> None:
     session, _ = opened
     path = session.uploads.store(world.references[0].read_bytes())
@@ -152,20 +138,6 @@ def test_faults_of_ours_are_told_and_nothing_stops(opened: tuple[Session, Listen
     listener.until(lambda: any(f.final for _, f in listener.frames))
     session.disconnect(1)
     session.disconnect(1)
-
-
-def test_the_rehearsal_leaves_nothing_behind(opened: tuple[Session, Listener]) -> None:
-    session, listener = opened
-    session.warm_up()
-    done = threading.Event()
-
-    def last() -> Iterator[None]:
-        yield
-        done.set()
-
-    session._worker.run_when_idle(last())
-    assert done.wait(120)
-    assert session.state == State(pixels=64) and listener.frames == [] and not session.restyler._styles
 
 
 def test_photographs_that_left_the_shelf_leave_nothing(opened: tuple[Session, Listener], world: World) -> None:

@@ -19,6 +19,7 @@ from fprf.viewer.start_page import StartPage
 
 PROGRAM = f"""#!{sys.executable}
 import json, pathlib, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
 verb, args = sys.argv[3], sys.argv[4:]
 output = pathlib.Path(args[args.index("--output") + 1])
 print("hello from", verb, flush=True)

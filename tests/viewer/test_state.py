@@ -43,11 +43,6 @@ def card(number: int) -> Photograph:
 A, B, C = (card(i) for i in range(3))
 
 
-def test_equal_looks_are_one() -> None:
-    assert Look(mix=((A, 1.0),)) == Look(mix=((A, 1.0),)) and Look(mix=((A, 1.0),)) != Look(mix=((card(0), 1.0),))
-    assert len({Look(), Look(strength=1.0), Look(strength=0.5)}) == 2
-
-
 @pytest.mark.parametrize("wrong", [{"strength": 1.1}, {"blend": -0.1}, {"clusters": 0}, {"temperature": 0.0}, {"at": 2.0}])
 def test_ranges_are_those_of_styles(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
@@ -114,13 +109,6 @@ def test_the_shelf_is_bounded_and_what_is_needed_stays() -> None:
     assert state.look.mix[0][0] is state.shelf[-1]
 
 
-def test_a_shelf_full_of_photographs_in_use_still_takes_one() -> None:
-    state = State(drop_mode="in the mix")
-    for number in range(SHELF + 5):
-        state = add_photograph(state, card(number))
-    assert len(state.shelf) == SHELF and state.shelf[-1].number == SHELF + 4
-
-
 def test_removing_and_keeping() -> None:
     state = save_look(add_photograph(State(), A), "  autumn   light ")
     assert state.saved == (("autumn light", state.look),)
@@ -141,12 +129,6 @@ def test_what_is_shown_and_what_must_be_painted() -> None:
 def test_a_state_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises((UsageError, ConfigError)):
         replace(State(), **wrong)  # type: ignore[arg-type]
-
-
-def test_keys_are_bounded() -> None:
-    key = Key(CameraState((1, 0, 0, 0), (0, 0, 0), 1.0, 1.0), Look())
-    with pytest.raises(UsageError, match="64 keys"):
-        State(keys=(key,) * 65)
 
 
 PLAIN, ONE, TWO = Look(), Look(mix=((A, 1.0),)), Look(mix=((B, 1.0),), strength=0.5)

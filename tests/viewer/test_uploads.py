@@ -117,23 +117,17 @@ def test_memory_beyond_the_room_is_refused() -> None:
     assert ended.returncode == 1 and "MemoryError" in ended.stderr
 
 
-@pytest.mark.parametrize(
-    ("given", "shown"),
-    [
-        ("autumn.jpg", "autumn.jpg"),
-        ("../../etc/passwd", "passwd"),
-        ("C:\\photos\\a b.png", "a b.png"),
-        ("<script>alert(1)</script>.png", "script_.png"),
-        ("", "photograph"),
-        ("....", "photograph"),
-        ("line\nbreak\x00.png", "linebreak.png"),
-        ("Übung-ñ.jpeg", "Übung-ñ.jpeg"),
-    ],
-)
-def test_names_are_shown_plain(given: str, shown: str) -> None:
-    assert shown_name(given) == shown
-
-
-def test_long_names_are_cut_in_their_middle() -> None:
+def test_names_are_shown_plain_and_short() -> None:
+    for given, shown in {
+        "autumn.jpg": "autumn.jpg",
+        "../../etc/passwd": "passwd",
+        "C:\\photos\\a b.png": "a b.png",
+        "<script>alert(1)</script>.png": "script_.png",
+        "": "photograph",
+        "....": "photograph",
+        "line\nbreak\x00.png": "linebreak.png",
+        "Übung-ñ.jpeg": "Übung-ñ.jpeg",
+    }.items():
+        assert shown_name(given) == shown
     found = shown_name("x" * 300 + ".jpg")
     assert len(found) <= 48 and found.endswith(".jpg") and "…" in found

@@ -115,21 +115,6 @@ def test_memory_is_bounded_over_all_clients(watched: Watched, monkeypatch: pytes
     assert watched.renderer._bytes() == 0
 
 
-def test_work_that_is_dropped_keeps_nothing_half(watched: Watched) -> None:
-    work = watched.renderer.render(1, watched.glance(pixels=256))
-    for _ in range(4):
-        next(work)
-    work.close()  # type: ignore[attr-defined]
-    for size, parts in watched.renderer._caches[1].parts.items():
-        assert sum(part.rays for part in parts) == size[0] * size[1]
-    assert watched.look(watched.glance(pixels=256))[-1].final
-
-
-def test_a_fast_machine_begins_sharp(watched: Watched) -> None:
-    watched.renderer._speed.seconds = 1e-9
-    assert len(watched.look(watched.glance())) == 1
-
-
 def painted(restyler: Restyler, shown: ViewSettings, chunk: int = 100) -> Layers:
     trained = restyler.scene
     known, config = trained.known, replace(trained.config.render, chunk=chunk)
@@ -159,17 +144,6 @@ def test_layers_are_what_the_command_line_renders(restyler: Restyler, world: Wor
     assert np.abs(layers.pictures["matches"].astype(int) - wanted).mean() < 0.5
 
 
-@pytest.mark.parametrize("name", ["matches", "regions", "depth"])
-def test_every_map_is_a_picture_and_not_of_one_colour(restyler: Restyler, world: World, name: str) -> None:
-    a, b = encoded(restyler, world)
-    layers = painted(restyler, ViewSettings(Look(mix=((a, 1.0), (b, 1.0)), clusters=3), name))  # type: ignore[arg-type]
-    assert layers.pictures[name].shape == (24, 32, 3) and layers.pictures[name].std() > 1
-
-
-def test_without_a_style_the_match_map_is_grey(restyler: Restyler) -> None:
-    assert (painted(restyler, ViewSettings(Look(), "matches")).pictures["matches"] == 128).all()
-
-
 def test_a_picked_region_stands_out(restyler: Restyler) -> None:
     whole = painted(restyler, ViewSettings(Look()))
     shares = []
@@ -196,11 +170,6 @@ def test_composing_is_arithmetic() -> None:
     ).all()
     assert (composite_layers(layers, ViewSettings(Look(), "matches", map_opacity=0.5)) == 75).all()
     assert (composite_layers(layers, ViewSettings(Look(), "depth")) == 100).all()  # not painted
-
-
-def test_depth_is_infinite_where_nothing_is(restyler: Restyler) -> None:
-    layers = painted(restyler, ViewSettings(Look()))
-    assert layers.depth.shape == (24, 32) and bool((layers.depth > 0).all())
 
 
 def layers_on(world: World, device: str) -> dict[str, Any]:
