@@ -1,6 +1,5 @@
 """Fields of blocks against a plain loop in float64, seams, gradients; blocks that start as their surroundings are."""
 
-import math
 from collections.abc import Sequence
 
 import pytest
@@ -16,11 +15,7 @@ from fprf.rendering.space import Space
 from fprf.types import Boxes, Rays
 
 CHANNELS, DIMS = 5, 4
-
-
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
 SPACE = Space("open", (0.0, 0.0, 0.0), EYE, 1.0, 0.05, 1e3)
 
 
@@ -181,8 +176,6 @@ def test_the_sampler_asks_the_blocks_where_to_look() -> None:
     parts = members(boxes)
     config = ProposalConfig(samples=(12, 10), final=8, resolutions=(4, 8), channels=8)
     lone = Held([parts[1]])
-    found = BlockedSampler(config.build(seed=9), lone, Everywhere())(rays(), space=SPACE, step=0, generator=None)
-    torch.manual_seed(0)
 
     class Charted(nn.Module):
         def __init__(self, inner: nn.Module) -> None:
@@ -193,26 +186,15 @@ def test_the_sampler_asks_the_blocks_where_to_look() -> None:
             out: Tensor = self.inner(parts[1].chart.locate(points))
             return out
 
-    torch.manual_seed(0)
     itself = config.build(seed=1)
     for level in range(2):
         itself.fields[level] = Charted(parts[1].sampler.fields[level])
-    torch.manual_seed(0)
     r = rays()
-    torch.manual_seed(0)
     found = BlockedSampler(config.build(seed=9), lone, Everywhere())(r, space=SPACE, step=0, generator=None)
     wanted = itself(r, space=SPACE, step=0, generator=None)
     assert torch.equal(found.t, wanted.t) and len(found.levels) == len(wanted.levels) == 2
     blended = BlockedSampler(config.build(seed=9), Held(parts), Blend(boxes))(r, space=SPACE, step=0, generator=None)
     assert not torch.equal(blended.t, wanted.t) and bool((blended.t[:, 1:] >= blended.t[:, :-1]).all())
-
-
-def turned_row(count: int = 3, angle: float = 0.0) -> Boxes:
-    low = torch.tensor([[2.0 * i, -1.0, 0.0] for i in range(count)], dtype=torch.float64)
-    high = torch.tensor([[2.0 * i + 2, 1.0, 1.5] for i in range(count)], dtype=torch.float64)
-    c, s = math.cos(angle), math.sin(angle)
-    turn = torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    return Boxes(low, high, turn.expand(count, 3, 3), 0.2)
 
 
 def member(chart: Chart, seed: int, resolutions: tuple[int, ...] = (9, 17)) -> Member:
@@ -245,7 +227,7 @@ def points_in(chart: Chart, count: int = 200) -> Tensor:
 
 @pytest.mark.parametrize("block", [0, 1])
 def test_a_block_says_what_its_surroundings_say(block: int) -> None:
-    boxes = turned_row()
+    boxes = row(3, 0.2)
     around, own = member(surroundings_of(boxes), 0), member(chart_of(boxes, block), 7)
     smooth(around)
     inherit(own, around)

@@ -42,7 +42,7 @@ PARSED = {
 ELSEWHERE = {
     "gabor": "the encoder of examples/plugin: tests/test_example_plugin.py installs and runs it",
     "opacity": "the loss of examples/plugin, likewise",
-    "--tone": "needs a run whose photographs differ in exposure: tests/training/test_tones.py",
+    "--tone": "needs a run whose photographs differ in exposure: tests/training/test_camera_optimizers.py",
 }
 """Commands with these words, and where they are tested instead."""
 TOOLS = ("python3", "python", ".", "pip", "export", "pytest", "ruff", "mypy", "mkdocs")

@@ -111,11 +111,7 @@ PUBLISHED = """
 6.7747 -0.2908 -2.4247 5.8714 -0.0985 -2.2286 0.6377
 2.0776 0.0795 -1.1350 0.9033 -0.0636 -0.5514 0.9082
 """
-
-
 ROWS = torch.tensor([[float(x) for x in line.split()] for line in PUBLISHED.strip().splitlines()], dtype=torch.float64)
-
-
 colours = st.tuples(*[st.floats(0, 1) for _ in range(3)])
 
 

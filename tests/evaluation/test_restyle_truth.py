@@ -46,17 +46,12 @@ from fprf.evaluation.town_truth import (
     true_views,
 )
 from fprf.ops import backend
-from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionToneConfig, StylizerConfig
-from fprf.style.config import StyleConfig
+from fprf.plugins.stylizers.config import LocalAdainConfig, RegionToneConfig
 from fprf.style.dictionary import Reference as Samples
-from fprf.style.dictionary import StyleDictionary, build_dictionary
-from fprf.style.files import StyleFile
-from fprf.style.references import Encoders
+from fprf.style.dictionary import build_dictionary
 from fprf.town.surface import SKY
 from fprf.town.write import read_truth
-from fprf.training.loading import Trained, load_run
-from fprf.training.restyle import apply_style
-from fprf.training.views import CachedView, cache_view
+from fprf.training.loading import load_run
 
 
 def test_the_truth_is_the_town_itself(world: World) -> None:
@@ -168,45 +163,6 @@ def test_every_goal_is_judged_on_its_own() -> None:
     assert found["goals"] == dict(GOALS)
 
 
-class Stand:
-    """A loaded run, two of its views, and the dictionary of its references."""
-
-    def __init__(self, world: World) -> None:
-        self.trained: Trained = world.load()
-        self.encoders: Encoders = self.trained.encoders()
-        known, render = self.trained.known, self.trained.config.render
-        self.views: list[CachedView] = [
-            cache_view(self.trained.model, known.facts, known.cameras, view, render) for view in (0, 4)
-        ]
-        self.paths: tuple[Path, ...] = world.references
-        self.dictionary: StyleDictionary = self.of(self.paths)
-
-    def of(self, paths: tuple[Path, ...], clusters: int = 4, blend: float = 0.1) -> StyleDictionary:
-        return dictionary_of(paths, self.encoders, clusters=clusters, blend=blend)[0]
-
-    def plain(self) -> list[torch.Tensor]:
-        return [view.restyled().rgb for view in self.views]
-
-
-@pytest.fixture
-def stand(world: World) -> Stand:
-    return Stand(world)
-
-
-@pytest.mark.parametrize("config", [AdainConfig(), LocalAdainConfig(), RegionToneConfig()])
-def test_in_the_scene_is_what_a_user_gets(stand: Stand, config: StylizerConfig) -> None:
-    style = StyleConfig(references=stand.paths, stylizer=config, clusters=4, blend=0.1)
-    look = apply_style(stand.trained, StyleFile(style), stand.encoders).restyle
-    shown = in_scene(stand.trained, stand.views, config, stand.dictionary, stand.encoders, stand.paths)
-    for picture, view in zip(shown.pictures, stand.views, strict=True):
-        assert torch.equal(picture, view.restyled(look).rgb)
-    assert (shown.taken is None) == isinstance(config, AdainConfig)
-    for taken, picture in zip(shown.taken or [], shown.pictures, strict=False):
-        assert taken.shape == (picture.shape[0] * picture.shape[1], len(stand.dictionary.keys))
-        total = taken.sum(1)
-        assert bool(((total < 1e-4) | ((total - 1).abs() < 1e-4)).all()), "all of a pixel's share, or nothing is there"
-
-
 def measured(world: World, device: str, folder: Path) -> list[Any]:
     """Pictures and matches of every way to restyle, and whose class codes are."""
     trained = load_run(world.run, device)
@@ -238,8 +194,6 @@ def test_ways_to_restyle(world: World, tmp_path: Path) -> None:
 
 
 SMALL = ["--palettes", "night", "--views", "1", "--longest", "24", "--clusters", "4", "--device", "cpu"]
-
-
 METHODS = {
     "no change", "reinhard", "histogram", "2d", "adain", "local-adain", "region-adain", "region-ot", "nearest-code",
     "region-tone", MATCHED, BOUND,

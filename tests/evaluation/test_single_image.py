@@ -22,8 +22,6 @@ from fprf.style.look import Restyle
 from fprf.style.scene import own_style
 
 GUIDED = GuidedConfig()
-
-
 TWO_SIDED = [RegionAdainConfig(), RegionOtConfig()]
 
 
@@ -128,8 +126,6 @@ def bands(heights: tuple[int, ...], colours: list[tuple[float, float, float]]) -
 
 
 DAY = [(0.2, 0.4, 0.9), (0.9, 0.2, 0.2), (0.2, 0.8, 0.2)]
-
-
 NIGHT = [(0.1, 0.15, 0.3), (0.3, 0.1, 0.08), (0.1, 0.28, 0.08)]
 
 

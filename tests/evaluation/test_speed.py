@@ -110,8 +110,6 @@ def test_skipping_moves_the_gradient_and_exactness_does_not(world: World) -> Non
 
 
 CPU = torch.device("cpu")
-
-
 SECONDS = st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=9)
 
 

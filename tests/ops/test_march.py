@@ -17,15 +17,9 @@ from fprf.rendering.stepfun import keep_heaviest, midpoints, resample, shifts, t
 from fprf.types import Rays
 
 QUICK = settings(max_examples=25, deadline=None)
-
-
 U = 2.0**-24
 """Unit round-off of float32."""
-
-
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
 KINDS: tuple[Kind, ...] = ("contraction", "box", "ndc")
 
 

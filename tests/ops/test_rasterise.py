@@ -11,12 +11,8 @@ from fprf.ops import backend, rasterise
 
 ROUGH = 1.1e-4
 """Relative error of the kernels' exponential."""
-
-
 STOP = 1e-3
 """Share of the light below which they go no deeper."""
-
-
 Tensors = list[Tensor]
 
 

@@ -14,8 +14,6 @@ from fprf.ops import triplane_numba
 from fprf.ops.triplane import lookup, lookup_reference, point_slopes_reference, rows, split, variation, variation_reference
 
 QUICK = settings(max_examples=20, deadline=None)
-
-
 U = 2.0**-24
 """Unit round-off of float32."""
 

@@ -17,11 +17,7 @@ from fprf.ops import triplane_triton
 from fprf.ops.triplane import lookup, lookup_reference, rows
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="triton is not installed")
-
-
 GPU = torch.cuda.is_available()
-
-
 DEVICE = torch.device("cuda" if GPU else "cpu")
 
 

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-
-
 KERNELS = ("dense", "guided", "march", "mixture", "rasterise", "triplane")
 
 

@@ -50,6 +50,18 @@ def mobilenet_tensors(*, folded: bool, width: int = 4, last: int = 13) -> dict[s
     return tensors
 
 
+def vgg_file(folder: Path, last: int = 6) -> Path:
+    """VGG-19's shape up to conv3_4, a few filters wide and `last` of them at conv2_1, random."""
+    draw = torch.Generator().manual_seed(0)
+    tensors, inputs = {}, 3
+    for place, outputs in {0: 4, 2: 4, 5: last, 7: 6, 10: 8, 12: 8, 14: 8, 16: 8}.items():
+        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3, generator=draw) / (3 * inputs**0.5)
+        tensors[f"features.{place}.bias"] = torch.zeros(outputs)
+        inputs = outputs
+    save_file(tensors, folder / "vgg.safetensors")
+    return folder / "vgg.safetensors"
+
+
 def teacher_files(folder: Path) -> tuple[Path, Path]:
     """MobileNetV2 with its norms, DeepLab's backbone without."""
     save_file(mobilenet_tensors(folded=False, width=26), folder / "mobilenet.safetensors")

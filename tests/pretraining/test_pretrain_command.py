@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from photo_folder import photo_folder, teacher_files
-from safetensors.torch import save_file
+from photo_folder import photo_folder, teacher_files, vgg_file
 from torch import Tensor, nn
 
 from fprf.cli.pretrain import run
@@ -28,16 +27,6 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(photo_folder(tmp_path_factory.mktemp("photos") / "all", 4))
 
 
-def vgg(folder: Path) -> str:
-    """VGG-19's shape up to conv2_1, random."""
-    tensors = {}
-    for place, (inputs, outputs) in {0: (3, 8), 2: (8, 8), 5: (8, 64)}.items():
-        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3) / (3 * inputs**0.5)
-        tensors[f"features.{place}.bias"] = torch.zeros(outputs)
-    save_file(tensors, folder / "vgg.safetensors")
-    return str(folder / "vgg.safetensors")
-
-
 def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
     found: dict[str, float] = json.loads(capsys.readouterr().out)
     return found
@@ -45,7 +34,18 @@ def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
 
 def test_content(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "content.safetensors"
-    args = ["--images", photos, "--teachers", vgg(tmp_path), "--output", str(output), "--size", "32", "--crops", "2"]
+    args = [
+        "--images",
+        photos,
+        "--teachers",
+        str(vgg_file(tmp_path, 64)),
+        "--output",
+        str(output),
+        "--size",
+        "32",
+        "--crops",
+        "2",
+    ]
     assert main(["content", *args, *QUICK]) == 0
     report = report_of(capsys)
     assert report["steps"] == 2

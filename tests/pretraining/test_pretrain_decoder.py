@@ -8,8 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
-from photo_folder import photo_folder
-from safetensors.torch import save_file
+from photo_folder import photo_folder, vgg_file
 
 from fprf.cli.pretrain import run
 from fprf.errors import WeightsError
@@ -21,8 +20,6 @@ from fprf.pretraining.loop import report_path, samples_folder
 from fprf.training.model import build_decoder
 
 ENCODER = ["--encoder", "random", "--encoder.channels", "6", "--encoder.stride", "2"]
-
-
 QUICK = ["--pixels", "60", "--batch", "64", "--size", "24", "--pairs", "1"]
 
 
@@ -33,16 +30,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def vgg(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """VGG-19's shape up to conv3_4, a few filters wide, random."""
-    draw = torch.Generator().manual_seed(0)
-    tensors, inputs = {}, 3
-    for place, outputs in {0: 4, 2: 4, 5: 6, 7: 6, 10: 8, 12: 8, 14: 8, 16: 8}.items():
-        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3, generator=draw) / (3 * inputs**0.5)
-        tensors[f"features.{place}.bias"] = torch.zeros(outputs)
-        inputs = outputs
-    file = tmp_path_factory.mktemp("vgg") / "vgg.safetensors"
-    save_file(tensors, file)
-    return str(file)
+    return str(vgg_file(tmp_path_factory.mktemp("vgg")))
 
 
 def made(photos: str, output: Path, *more: str) -> dict[str, float]:

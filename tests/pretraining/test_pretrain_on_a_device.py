@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from photo_folder import photo_folder, teacher_files
+from photo_folder import photo_folder, teacher_files, vgg_file
 from pretend_cuda import pretend_cuda
-from safetensors.torch import save_file
 
 from fprf.cli.pretrain import run
 from fprf.ops import backend
@@ -17,24 +16,13 @@ from tools.distil.__main__ import main
 SMALL = ["--steps", "2", "--batch", "2", "--samples", "1e9"]
 
 
-def vgg(folder: Path) -> str:
-    """VGG-19's shape up to conv3_4, random and thin."""
-    tensors, inputs = {}, 3
-    for place, outputs in {0: 6, 2: 6, 5: 6, 7: 6, 10: 6, 12: 6, 14: 6, 16: 6}.items():
-        tensors[f"features.{place}.weight"] = torch.randn(outputs, inputs, 3, 3) / (3 * inputs**0.5)
-        tensors[f"features.{place}.bias"] = torch.zeros(outputs)
-        inputs = outputs
-    save_file(tensors, folder / "vgg.safetensors")
-    return str(folder / "vgg.safetensors")
-
-
 @pytest.mark.parametrize("kind", ["decoder", "content", pytest.param("semantic", marks=pytest.mark.slow)])
 def test_the_same_weights_and_report(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images = str(photo_folder(tmp_path / "photos", 4))
     own = {
         "decoder": ["--encoder", "random", "--encoder.channels", "5", "--pixels", "50", "--style", "0.1", "--content", "0.1",
-                    "--every", "1", "--size", "16", "--style-weights", vgg(tmp_path)],
-        "content": ["--teachers", vgg(tmp_path), "--size", "32", "--crops", "1"],
+                    "--every", "1", "--size", "16", "--style-weights", str(vgg_file(tmp_path))],
+        "content": ["--teachers", str(vgg_file(tmp_path)), "--size", "32", "--crops", "1"],
         "semantic": ["--teachers", *map(str, teacher_files(tmp_path)), "--size", "32", "--towns", "0"],
     }[kind]  # fmt: skip
     found = {}

@@ -6,14 +6,13 @@ from typing import Any
 
 import pytest
 import torch
-import toy_parts as toys
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor, nn
 from toy_parts import Never, Ones, Shift, Squash, Uniform, parts_of, rays_of, space_of
 
-from fprf.interfaces import ContentField, Decoder
+from fprf.interfaces import ContentField
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.rendering.renderer import Parts, march, render_rays
 from fprf.rendering.space import Kind, Space
@@ -22,12 +21,8 @@ from fprf.style.look import Restyle
 from fprf.types import FieldSample, Rays, Rendered, Want
 
 pytestmark = pytest.mark.usefixtures("form")
-
-
 QUICK = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 """The form that is rendered by stays the same throughout a test."""
-
-
 ALL = Want.DENSITY | Want.COLOUR | Want.CONTENT | Want.SEMANTIC
 
 
@@ -208,8 +203,6 @@ def test_nothing_is_computed_that_nobody_wants() -> None:
 
 
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
 NEAR = 0.1
 
 
@@ -230,21 +223,10 @@ class Told(ContentField):
         return {}
 
 
-class Plain(Decoder):
-    def forward(self, content: Tensor) -> Tensor:
-        return content.sigmoid()
-
-    def restyled(self, content: Tensor, styled: Tensor, strength: float | Tensor) -> Tensor:
-        return self(styled)
-
-    def frozen_colour(self, content: Tensor) -> None:
-        return None
-
-
 def told_parts(kind: Kind, samples: int) -> Parts:
     values = torch.rand(4 * samples, generator=torch.Generator().manual_seed(0))
     space = Space(kind, (0.0, 0.0, 0.0), EYE, 1.0, NEAR, 1e3)
-    return Parts(space, UniformConfig(samples=samples).build(seed=0), Told(values), None, Plain())
+    return Parts(space, UniformConfig(samples=samples).build(seed=0), Told(values), None, Squash())
 
 
 def told_rays(parts: Parts, count: int) -> Rays:
@@ -274,8 +256,8 @@ def test_near_densities_learn_by_the_square_of_their_distance(kind: Kind) -> Non
 
 def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
     """Rays that want gradients are rendered as the same rays without, and where samples lie moves nothing."""
-    parts = toys.parts_of(proposal=True)
-    still = toys.rays_of("contraction", 6)
+    parts = parts_of(proposal=True)
+    still = rays_of("contraction", 6)
     moved = still._replace(origin=still.origin.clone().requires_grad_(True))
     want = Want.CONTENT | Want.COLOUR | Want.SEMANTIC
     one, other = (render_rays(rays, parts, want=want, budget=0.0) for rays in (still, moved))
@@ -288,7 +270,7 @@ def test_a_pose_learns_from_what_is_seen_but_not_from_semantics() -> None:
     assert not other.sampled.t.requires_grad
 
 
-class Aided(toys.Squash):
+class Aided(Squash):
     """A decoder with a part that helps it: alone it answers half."""
 
     def frozen_colour(self, content: Tensor) -> Tensor:  # type: ignore[override]
@@ -296,7 +278,7 @@ class Aided(toys.Squash):
 
 
 def test_training_also_renders_what_the_decoder_says_alone() -> None:
-    parts, rays = toys.parts_of()._replace(decoder=Aided()), toys.rays_of("contraction", 4)
+    parts, rays = parts_of()._replace(decoder=Aided()), rays_of("contraction", 4)
     behind = torch.tensor([0.2, 0.4, 0.6])
     found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, step=0, background=behind)
     transmittance = 1 - found.opacity[:, None]

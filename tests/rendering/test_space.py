@@ -12,15 +12,9 @@ from torch import Tensor
 from fprf.rendering.space import Kind, Space, contract, uncontract
 
 QUICK = settings(max_examples=40, deadline=None)
-
-
 U = 2.0**-24
 """Unit round-off of float32."""
-
-
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
 coordinate = st.floats(-(2.0**100), 2.0**100, width=32)
 
 

@@ -20,15 +20,9 @@ from fprf.rendering.stepfun import (
 )
 
 QUICK = settings(max_examples=40, deadline=None)
-
-
 U = 2.0**-24
 """Unit round-off of float32."""
-
-
 GRID = (0.0, 1e-38, 1e-10, 1.0, 1e10, 1e30)
-
-
 SMALLEST = 2.0**-126
 """Below it float32 is denormal: an absolute error of that size is no error."""
 

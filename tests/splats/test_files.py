@@ -18,11 +18,7 @@ from fprf.splats.files.base import spatial_order
 from fprf.splats.gaussians import Gaussians
 
 SHAPE = ("means", "quaternions", "log_scales", "logits")
-
-
 COUNT = 600
-
-
 STEP = {  # half a step of positions (of their range), ln-scales (of theirs), opacities, mean colours and harmonics
     ".ply": (0.0, 0.0, 1e-7, 0.0, 0.0),
     ".compressed.ply": (0.5 / 1023, 0.5 / 1023, 0.5 / 255, 0.5 / 255, 0.5 * 8 / 256),

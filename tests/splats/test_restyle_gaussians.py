@@ -27,8 +27,6 @@ from fprf.style.files import StyleFile, write_style
 from fprf.training.restyle import apply_style
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
-
-
 TONE = RegionToneConfig(centred=False)
 
 

@@ -13,11 +13,7 @@ from fprf.style.dictionary import build_dictionary
 from fprf.style.references import read_reference
 
 CONTENT = RandomConfig(channels=6, stride=2).build()
-
-
 SEMANTIC = RandomConfig(channels=9, stride=8, seed=1).build()
-
-
 BASIS = Basis(torch.randn(9, generator=torch.Generator().manual_seed(0)), torch.linalg.qr(torch.randn(9, 4))[0])
 
 

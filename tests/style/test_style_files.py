@@ -91,7 +91,6 @@ def test_a_hand_written_file_says_only_what_it_wants(tmp_path: Path) -> None:
     [
         ("nonsense", "is not JSON"),
         ("[]", 'expected an object with "format": 1 and "style"'),
-        ('{"format": 2, "style": {}}', 'expected an object with "format": 1'),
         ('{"format": 1}', 'and "style"'),
         ('{"format": 1, "style": {}, "sytle": {}}', "unknown key 'sytle'; did you mean 'style'"),
         ('{"format": 1, "style": {"strenght": 1}}', "has no field 'strenght'; did you mean 'strength'"),
@@ -100,7 +99,6 @@ def test_a_hand_written_file_says_only_what_it_wants(tmp_path: Path) -> None:
         ('{"format": 1, "style": {"pin": ["3"]}}', "pin: '3' is not REGION=VALUE"),
         ('{"format": 1, "style": {"weights": [1], "references": ["a", "b"]}}', "weights: 1 weights for 2 references"),
         ('{"format": 1, "style": {}, "regions": {"3": [1.0]}}', "regions: '3' is no name"),
-        ('{"format": 1, "style": {}, "regions": {"a:b": [1.0]}}', "regions: 'a:b' is no name"),
         ('{"format": 1, "style": {}, "regions": {"sky": ["x"]}}', "expected a number"),
         ('{"format": 1, "style": {}, "sha256": {"a": 1}}', "expected a text"),
     ],
@@ -115,14 +113,11 @@ def test_what_is_wrong_is_named_with_the_file(tmp_path: Path, text: str, said: s
     ("change", "said"),
     [
         ({"strength": 1.1}, "strength: 1.1"),
-        ({"luminance": -0.1}, "luminance"),
         ({"at": float("nan")}, "at: nan"),
-        ({"blend": 2.0}, "blend"),
         ({"clusters": 0}, "clusters: 0 must be at least 1"),
         ({"weights": (0.0,)}, "weights: 0.0"),
         ({"keep_below": 1.5}, "keep_below"),
         ({"region_strength": ("3=2",)}, "region_strength: 2.0"),
-        ({"forbid": ("3",)}, "forbid: '3' is not"),
         ({"references": (Path("a"), Path("b")), "masks": (NO_MASK,)}, "masks: 1 masks for 2 references"),
     ],
 )

@@ -19,8 +19,6 @@ from fprf.town.surface import SKY
 from fprf.town.write import TownSettings, is_town, read_truth, write_town
 
 SMALL = {"seed": 2, "palette": "autumn", "views": 9, "width": 24, "height": 18}
-
-
 TINY = {**SMALL, "views": 2}
 
 

@@ -11,8 +11,6 @@ from fprf.town.render import cast, colours, directions, geometry, render, shade,
 from fprf.town.surface import hashed, noise2, noise3
 
 TOWN = build_town(0)
-
-
 VIEWS = walk(seed=0, views=40, width=48, height=36)
 
 

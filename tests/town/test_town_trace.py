@@ -12,8 +12,6 @@ from fprf.town.render import _enter, cast, directions, shadowed, walk
 from fprf.town.shapes import Cylinder, Ellipsoid, Finish, Material, Polyhedron, box, cylinder, ellipsoid, extrude, pyramid
 
 GREY = Finish(Material.TRIM)
-
-
 TOWN = build_town(0)
 
 

@@ -160,8 +160,6 @@ def test_features_never_move_density(world: World, name: str) -> None:
 
 
 NAN = float("nan")
-
-
 EDGES = torch.linspace(0.0, 10.0, 101)
 
 

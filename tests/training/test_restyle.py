@@ -70,8 +70,6 @@ SECOND: dict[str, object] = {
     "stylizer": RegionAdainConfig(),
 }
 """Those of `references`, `masks`, `between` and `at` need files: see below."""
-
-
 STYLIZERS = [LocalAdainConfig(), RegionOtConfig()]
 
 

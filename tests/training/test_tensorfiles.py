@@ -10,8 +10,6 @@ from fprf.errors import CheckpointError
 from fprf.training import tensorfiles
 
 KINDS = (torch.float32, torch.float16, torch.bfloat16, torch.float64, torch.int64, torch.uint8, torch.bool)
-
-
 SHARED = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 

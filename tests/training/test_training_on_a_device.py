@@ -29,8 +29,6 @@ from fprf.training.trainer import Report, train
 from fprf.types import Batch
 
 STEPS = 4
-
-
 NAN = float("nan")
 
 

@@ -23,8 +23,6 @@ from fprf.training.restyle import dress
 from fprf.training.views import cache_view, render_view
 
 STYLIZERS = (AdainConfig(colours=0.5), LocalAdainConfig(similarity="dot"), RegionOtConfig(), RegionToneConfig())
-
-
 PLACES: tuple[tuple[str, Callable[[], Any]], ...] = (("cpu", backend.plain), (str(CUDA), pretend_cuda))
 
 
