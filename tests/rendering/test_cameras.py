@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.rendering.cameras import LIMIT, Cameras, PixelRays, grid_rays, normals, pixel_grid, project, rays_through, sees
-from fprf.rendering.lens import FISHEYE, OPENCV, PANORAMA, PINHOLE, lens_reach
+from fprf.rendering.lens import FISHEYE, OPENCV, PANORAMA, PINHOLE, bend, lens_reach, unbend
 from fprf.rendering.paths import eye_strips, look_at, panoramas, pinhole
 
 QUICK = settings(max_examples=25, deadline=None)
@@ -279,3 +279,15 @@ def test_whatever_the_depths_normals_face_the_camera(around: bool) -> None:
     pixel = pixel_grid(cameras, 0)
     _, direction = rays_through(cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
     assert ((found.view(-1, 3).double() * direction).sum(-1) < 1e-6).all() and (found.norm(dim=-1) > 0.99).all()
+
+
+@pytest.mark.parametrize("k1", [-0.3, -1.0, 0.2])
+def test_a_radius_that_hardly_grows_is_inverted(k1: float) -> None:
+    """With k2 = 0.45 k1² the slope touches 0; above it Newton alone overshoots by far."""
+    u = torch.cat([torch.linspace(0, 3, 301), torch.tensor([1e-9, 30.0, 1e4])]).double() / abs(k1) ** 0.5
+    distortion = torch.tensor([[k1, 0.451 * k1 * k1, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(len(u), 6)
+    lens = torch.full((len(u),), OPENCV)
+    reach, plane = lens_reach(distortion, lens), torch.stack([u, torch.zeros_like(u)], 1)
+    assert bool(reach.isinf().all())
+    back = bend(distortion, lens, reach, unbend(distortion, lens, reach, plane))
+    assert ((back - plane).abs() <= 1e-11 * (1 + u[:, None])).all()

@@ -227,3 +227,17 @@ def test_gradients_are_scaled_and_values_are_not() -> None:
     found = scale_gradient(x, by)
     (found * torch.tensor([1.0, 1.0, -1.0])).sum().backward()
     assert found.tolist() == x.tolist() and x.grad is not None and x.grad.tolist() == [0.5, 0.0, -4.0]
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-9, 5e-8, 1e-7, 2e-7, 1e-3])
+def test_faint_weights_cost_a_finite_share(weight: float) -> None:
+    s, w = torch.tensor([[0.0, 1.0]]), torch.tensor([[weight]])
+    found = float(interlevel(s, w, s, torch.zeros(1, 1)))
+    assert found == pytest.approx(weight**2 / (weight + 1e-7), rel=1e-5)
+
+
+def test_a_proposal_on_the_same_edges_bounds_each_step_alone() -> None:
+    s = torch.tensor([[0.0, 0.25, 0.5, 1.0]])
+    w, bound = torch.tensor([[0.2, 0.5, 0.3]]), torch.tensor([[0.1, 0.5, 0.1]])
+    wanted = (0.1**2 / 0.2 + 0.2**2 / 0.3) / 3
+    assert float(interlevel(s, w, s, bound)) == pytest.approx(wanted, rel=1e-4)

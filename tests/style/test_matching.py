@@ -180,3 +180,14 @@ def test_rows_are_shares_whatever_comes(k: int, t: int, dims: int, scale: float,
     found = table(Keys(here.keys * scale, here.share), Keys((there.keys * scale).float(), there.share.float()), matching)
     assert found.shape == (k, t) and found.dtype == torch.float64 and bool((found >= 0).all())
     torch.testing.assert_close(found.sum(1), torch.ones(k, dtype=torch.float64))
+
+
+def test_zero_queries_and_keys_match_everything_alike() -> None:
+    k = unit(torch.randn(4, 3), torch.zeros(3))
+    torch.testing.assert_close(attention(torch.zeros(2, 3), k, 0.1), torch.full((2, 4), 0.25))
+    torch.testing.assert_close(attention(torch.randn(2, 3), torch.zeros(4, 3), 0.1), torch.full((2, 4), 0.25))
+
+
+def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
+    keys = torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)
+    assert score_spread(torch.tensor([[1e6], [0.0]]), keys) == score_spread(torch.tensor([[-1e6]]), keys) == 1.0

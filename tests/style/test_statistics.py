@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import NumericsError
-from fprf.style.statistics import covariance, dead_channels, deviation, empty, group_moments, merge, moments
+from fprf.style.statistics import covariance, dead_channels, deviation, empty, group_moments, merge, mix, moments
 
 
 def rows(n: int, c: int, *, scale: float = 1.0, offset: float = 0.0, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -104,3 +104,25 @@ def test_one_bad_number_among_good_ones_is_refused(bad: float) -> None:
     if bad != -1.0:
         with pytest.raises(NumericsError, match="a content feature"):
             moments(x, w)
+
+
+def test_the_largest_mean_says_what_rounding_is() -> None:
+    found = deviation(torch.tensor([1e4, 0.0, 1.0]), torch.zeros(3))
+    assert found.tolist() == pytest.approx([1e-2] * 3)
+
+
+def test_weights_are_shares_of_whatever_they_sum_to() -> None:
+    """Half a row's weight is as good as ten rows'; shares of groups need not sum to 1."""
+    x = torch.randn(50, 3, dtype=torch.float64)
+    light, heavy = (covariance(moments(x, torch.full((50,), w))) for w in (0.002, 20.0))
+    torch.testing.assert_close(light, heavy, rtol=1e-12, atol=0.0)
+    means, spreads = torch.randn(4, 3), torch.eye(3).expand(4, 3, 3)
+    share = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    for one, other in zip(mix(means, spreads, share), mix(means, spreads, 7 * share), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
+
+
+def test_a_variance_that_rounding_made_negative_is_none() -> None:
+    mean, variance = torch.zeros(3), torch.tensor([-1e-9, 1.0, 1.0])
+    assert deviation(mean, variance).tolist() == pytest.approx([0.01, 1.0, 1.0])
+    assert dead_channels(mean, variance).tolist() == [True, False, False]

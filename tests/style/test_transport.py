@@ -3,7 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.style.statistics import monge
+from fprf.style.statistics import limit_gain, monge, symmetric_root
 
 
 def covariance(c: int, *, rank: int | None = None, decay: float = 2.0, scale: float = 1.0, seed: int = 0) -> torch.Tensor:
@@ -49,3 +49,16 @@ def test_batches_equal_single_maps() -> None:
     both = monge(a, b, gain=8.0)
     for k in range(3):
         torch.testing.assert_close(both[k], monge(a[k], b[k], gain=8.0), rtol=1e-9, atol=1e-11)
+
+
+def test_the_cap_is_for_what_is_above_it() -> None:
+    t = torch.diag(torch.tensor([10.0, 3.0, 0.5, 0.0], dtype=torch.float64))
+    found = limit_gain(t, 3.0)
+    torch.testing.assert_close(found, torch.diag(torch.tensor([3.0, 3.0, 0.5, 0.0], dtype=torch.float64)))
+    below = torch.diag(torch.tensor([3.0, 1.0, -1e-9], dtype=torch.float64))
+    assert torch.equal(limit_gain(below, 3.0), below), "bit for bit where nothing is above"
+
+
+def test_an_eigenvalue_that_rounding_made_negative_is_none() -> None:
+    root = symmetric_root(torch.diag(torch.tensor([4.0, 1.0, -1e-12], dtype=torch.float64)))
+    torch.testing.assert_close(root, torch.diag(torch.tensor([2.0, 1.0, 0.0], dtype=torch.float64)))
