@@ -52,13 +52,6 @@ def test_a_plane_is_found_under_a_large_offset() -> None:
     assert (back - (flat - flat.mean(0))).abs().max() <= 1000 * UNIT * 16
 
 
-def test_through_tensors_and_back() -> None:
-    basis = fit_basis(torch.randn(30, 5), 2)
-    again = Basis.from_tensors(basis.tensors())
-    assert torch.equal(again.matrix, basis.matrix) and torch.equal(again.mean, basis.mean)
-    assert again.energy == basis.energy
-
-
 def test_what_cannot_be_fitted_or_read_is_named() -> None:
     with pytest.raises(ConfigError, match=r"semantic\.dim"):
         fit_basis(torch.randn(3, 3), 0)

@@ -22,7 +22,6 @@ from fprf.datamanagers.batches import PixelRuns, RayBatches, allocate_pixels
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_mask
 from fprf.datamanagers.parsers.config import TransformsConfig
-from fprf.datamanagers.parsers.views import find_masks
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
 from fprf.interfaces import DataManager, Encoder
@@ -134,30 +133,6 @@ def test_the_share_of_semantic_rays(tmp_path: Path, share: float, expected: int 
     assert torch.equal(batch.semantic, store.at(batch.view[:expected], batch.pixel[:expected], batch.rgb[:expected]))
 
 
-@pytest.mark.parametrize("channels", [3, 4])
-def test_transparency_shows_the_background_that_is_given(tmp_path: Path, channels: int) -> None:
-    scene, images = make_scene(tmp_path, channels=channels)
-    given = (0.2, 0.0, 1.0)
-    config = RayBatchesConfig(rays=64)
-    manager = config.build(scene=scene, content=None, semantic=None, dim=4, cache=tmp_path, seed=0, background=given)
-    batch = manager.batch(0)
-    for view in range(len(SIZES)):
-        alpha = images[view][..., 3:] / 255 if channels == 4 else np.ones((*images[view].shape[:2], 1))
-        expected = torch.from_numpy(images[view][..., :3] / 255 * alpha + np.array(given) * (1 - alpha)).float()
-        assert (manager.image(view) - expected).abs().max() <= 0.51 / 255
-        for pixel, rgb in zip(batch.pixel[batch.view == view].long(), batch.rgb[batch.view == view], strict=True):
-            assert (rgb - expected[pixel[1], pixel[0]]).abs().max() <= 0.51 / 255
-
-
-def test_a_scene_without_training_views_is_refused(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
-    empty = Scene(
-        name="empty", paths=scene.paths, cameras=scene.cameras, train=torch.zeros(0, dtype=torch.long), test=scene.train
-    )
-    with pytest.raises(DataError, match="empty: no training views"):
-        make(empty, tmp_path)
-
-
 def test_a_device_draws_what_the_host_draws(tmp_path: Path) -> None:
     """Pixels, colours, features, masks, sky and depths; its generator is the CPU's here, which on a card is another one."""
     scene, _ = make_scene(tmp_path)
@@ -207,12 +182,6 @@ def test_runs_are_the_list(masks: list[list[bool]], first: int) -> None:
     assert everything[runs.holds(everything)].tolist() == wanted
 
 
-def test_nothing_is_a_set_too() -> None:
-    runs = PixelRuns.of([])
-    assert len(runs) == 0 and not runs.holds(torch.tensor([0, 5])).any()
-    assert len(PixelRuns.of([(4, torch.zeros(9, dtype=torch.bool))])) == 0
-
-
 def test_a_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(file: int, offset: int, size: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -244,16 +213,6 @@ def test_marked_rays_pass_their_points_at_the_distance_told(world: World, tmp_pa
     assert bool((apart <= 0.75 * pixel + 1e-6).all())
 
 
-def test_a_batch_stays_a_function_of_its_step(world: World, tmp_path: Path) -> None:
-    one, other = manager(world, tmp_path, 0.25), manager(world, tmp_path, 0.25)
-    a, b, c = one.batch(5), other.batch(5), other.batch(6)
-    assert a.distance is not None and b.distance is not None
-    assert torch.equal(a.pixel, b.pixel) and torch.equal(a.distance[48:], b.distance[48:])
-    assert not torch.equal(a.pixel, c.pixel)
-    plain = manager(world, tmp_path, 0.0).batch(5)
-    assert plain.distance is None and torch.equal(plain.pixel[:48], a.pixel[:48]), "the other rays are what they were"
-
-
 def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World, tmp_path: Path) -> None:
     scene = world.prepared.scene
     first, second = scene.train.tolist()[:2]
@@ -271,15 +230,6 @@ def write_mask(path: Path, pixels: np.ndarray) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), pixels)
     return path
-
-
-@pytest.mark.parametrize("name", ["{}.png.png", "{}.png"])
-def test_masks_beside_the_images_are_found(tmp_path: Path, name: str) -> None:
-    write_transforms(tmp_path, Capture.make(5))
-    write_mask(tmp_path / "masks" / name.format("0002"), np.zeros((16, 24), np.uint8))
-    scene = TransformsConfig().build().parse(tmp_path, 1)
-    assert scene.sky_masks == ()
-    assert [path is not None for path in scene.masks] == [False, False, True, False, False]
 
 
 def test_frames_name_their_masks(tmp_path: Path) -> None:
@@ -301,23 +251,6 @@ def test_frames_name_their_masks(tmp_path: Path) -> None:
         TransformsConfig().build().parse(tmp_path, 1)
 
 
-def test_folders_of_cameras_and_splits_have_theirs(tmp_path: Path) -> None:
-    images = [
-        tmp_path / "images/left/1.jpg",
-        tmp_path / "images/right/1.jpg",
-        tmp_path / "train/rgbs/7.jpg",
-        Path("/other/8.jpg"),
-    ]
-    wanted = [
-        write_mask(tmp_path / "masks/left/1.jpg.png", np.ones((2, 2), np.uint8)),
-        None,
-        write_mask(tmp_path / "train/masks/7.png", np.ones((2, 2), np.uint8)),
-        None,
-    ]
-    assert list(find_masks(tmp_path, images, "masks")) == wanted
-    assert find_masks(tmp_path, images, "sky_masks") == ()
-
-
 @pytest.mark.parametrize(
     ("low", "high", "kind"), [(0, 255, np.uint8), (0, 1, np.uint8), (20, 200, np.uint8), (0, 65535, np.uint16)]
 )
@@ -329,12 +262,6 @@ def test_bright_is_true(tmp_path: Path, low: int, high: int, kind: type, channel
     assert np.array_equal(load_mask(path, (7, 9)), mask)
     double = load_mask(path, (14, 18))
     assert np.array_equal(double, mask.repeat(2, 0).repeat(2, 1))
-
-
-def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
-    path = write_mask(tmp_path / "m.png", np.ones((40, 10), np.uint8))
-    with pytest.raises(DataError, match="10x40 pixels do not fit an image of 60x40"):
-        load_mask(path, (60, 40))
 
 
 def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
@@ -355,13 +282,6 @@ def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
     assert torch.equal(ours.pixel, theirs.pixel)
 
 
-def test_a_mask_that_leaves_nothing_is_told(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
-    paths = tuple(write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES))
-    with pytest.raises(DataError, match="none of 4 training views"):
-        make(replace(scene, masks=paths), tmp_path)
-
-
 def test_rays_know_whether_they_look_into_the_sky(tmp_path: Path) -> None:
     scene, _ = make_scene(tmp_path)
     upper = np.zeros((16, 24), np.uint8)
@@ -370,3 +290,19 @@ def test_rays_know_whether_they_look_into_the_sky(tmp_path: Path) -> None:
     batch = make(replace(scene, sky_masks=(path, None, None, None, None)), tmp_path, rays=3000).batch(0)
     assert batch.sky is not None and batch.sky.dtype == torch.bool
     assert torch.equal(batch.sky, (batch.view == 0) & (batch.pixel[:, 1] < 5)) and bool(batch.sky.any())
+
+
+def test_scenes_that_leave_nothing_to_learn_are_refused(tmp_path: Path) -> None:
+    scene, _ = make_scene(tmp_path)
+    dark = tuple(write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES))
+    other = write_mask(tmp_path / "m.png", np.ones((40, 10), np.uint8))
+    for wrong in ({"train": scene.train[:0]}, {"masks": dark}, {"masks": (other,) * len(SIZES)}):
+        with pytest.raises(DataError):
+            make(replace(scene, **wrong), tmp_path)  # type: ignore[arg-type]
+
+
+def test_masks_beside_the_images_are_found(tmp_path: Path) -> None:
+    write_transforms(tmp_path, Capture.make(5))
+    write_mask(tmp_path / "masks" / "0002.png.png", np.zeros((16, 24), np.uint8))
+    scene = TransformsConfig().build().parse(tmp_path, 1)
+    assert [path is not None for path in scene.masks] == [False, False, True, False, False] and scene.sky_masks == ()

@@ -40,15 +40,6 @@ def encoded(suffix: str, image: np.ndarray) -> bytes:
 NOISE = np.random.default_rng(0).integers(0, 256, (12, 18, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff"])
-def test_lossless_files_come_back_bit_for_bit_as_rgb(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(encoded(suffix, NOISE))
-    loaded = load_image(path)
-    assert loaded.dtype == np.uint8 and loaded.flags.c_contiguous
-    assert np.array_equal(loaded, NOISE[:, :, ::-1])
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".bmp", ".tiff"])
 def test_headers_tell_the_size_without_decoding(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / "wrong_extension.txt"
@@ -66,13 +57,6 @@ def test_transparency_is_straight_and_shows_the_background(tmp_path: Path) -> No
     assert red.tolist() == [[[10, 20, 30], [255, 0, 0], [206, 4, 6]]]
 
 
-def test_transparency_is_composited_before_reduction(tmp_path: Path) -> None:
-    # A hidden pixel's colour must not bleed: black hidden beside opaque red on white is the mean of red and white.
-    image = np.array([[[0, 0, 255, 255], [0, 0, 0, 0]]] * 2, dtype=np.uint8)
-    (tmp_path / "a.png").write_bytes(encoded(".png", image))
-    assert load_image(tmp_path / "a.png", (1, 1))[0, 0].tolist() == [255, 128, 128]
-
-
 def test_grey_palette_and_grey_with_alpha(tmp_path: Path) -> None:
     kinds = {
         "grey": (png((3, 1), 8, 0, [bytes([0, 100, 255])]), [[0] * 3, [100] * 3, [255] * 3]),
@@ -87,12 +71,6 @@ def test_grey_palette_and_grey_with_alpha(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(data)
         assert load_image(tmp_path / name).tolist() == [expected], name
     assert read_header(tmp_path / "palette").alpha and not read_header(tmp_path / "grey").alpha
-
-
-def test_16_bits_are_rounded_to_8(tmp_path: Path) -> None:
-    deep = np.array([[[0, 257 * 7, 65535], [128, 129, 257 * 200 + 128]]], dtype=np.uint16)
-    (tmp_path / "a.png").write_bytes(encoded(".png", deep))
-    assert load_image(tmp_path / "a.png")[0, :, ::-1].tolist() == [[0, 7, 255], [0, 1, 200]]
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -122,15 +100,6 @@ def test_heic_comes_upright_and_needs_its_package(tmp_path: Path, monkeypatch: p
     (tmp_path / "a.heic").write_bytes(HEIC[:-40])
     with pytest.raises(DataError, match="cannot be decoded"):
         load_image(tmp_path / "a.heic")
-
-
-@pytest.mark.skipif(not cv2.haveImageWriter("x.avif"), reason="this OpenCV has no AVIF")
-def test_avif(tmp_path: Path) -> None:
-    flat = np.full((12, 18, 4), (200, 40, 30, 128), dtype=np.uint8)
-    (tmp_path / "a.avif").write_bytes(encoded(".avif", flat[:, :, :3]))
-    (tmp_path / "b.avif").write_bytes(encoded(".avif", flat))
-    assert read_header(tmp_path / "a.avif") == (18, 12, False, "avif") and read_header(tmp_path / "b.avif").alpha
-    assert abs(load_image(tmp_path / "a.avif").astype(int) - (30, 40, 200)).max() < 8
 
 
 def test_folders_of_photographs_are_listed_without_what_cannot_be_read(tmp_path: Path) -> None:
@@ -177,22 +146,6 @@ def test_damaged_files_are_named(tmp_path: Path, content: bytes, finding: str) -
     with pytest.raises(DataError, match=re.escape(finding)) as caught:
         load_image(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_thumbnail_s_end_does_not_hide_truncation(tmp_path: Path) -> None:
-    jpeg = encoded(".jpg", NOISE)
-    thumbnail = encoded(".jpg", NOISE[:4, :4])
-    whole = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail + jpeg[2:]
-    (tmp_path / "a.jpg").write_bytes(whole)
-    assert load_image(tmp_path / "a.jpg").shape == (12, 18, 3)
-    (tmp_path / "a.jpg").write_bytes(whole[:-20])
-    with pytest.raises(DataError, match="truncated"):
-        load_image(tmp_path / "a.jpg")
-
-
-def test_an_absent_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"nothing\.png: cannot be read"):
-        load_image(tmp_path / "nothing.png")
 
 
 def test_an_image_that_was_rotated_after_parsing_is_refused(tmp_path: Path) -> None:

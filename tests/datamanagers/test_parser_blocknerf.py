@@ -10,28 +10,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from record_files import example, record, town_records, varint
+from record_files import example, record, town_records
 
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, read_examples, read_records
 from fprf.datamanagers.parsers.config import BlockNerfConfig, parse_scene, recognise
 from fprf.errors import ConfigError, DataError
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
-
-
-@pytest.mark.parametrize(
-    "data, value",
-    [
-        (b"", 0),
-        (b"123456789", 0xE3069283),
-        (bytes(32), 0x8A9136AA),
-        (b"\xff" * 32, 0x62A8AB43),
-        (bytes(range(32)), 0x46DD794E),
-        (bytes(range(31, -1, -1)), 0x113FDB5C),
-    ],
-)
-def test_values_of_rfc_3720(data: bytes, value: int) -> None:
-    assert crc32c(data) == value
 
 
 @pytest.mark.parametrize("length", [16383, 16384, 16385, 20000, 99_991])
@@ -75,54 +60,16 @@ def test_what_was_written_is_read(tmp_path_factory, written, packed: bool) -> No
 
 @settings(deadline=None)
 @given(st.data())
-def test_a_flipped_bit_is_found_wherever_it_is(tmp_path_factory, data: st.DataObject) -> None:  # type: ignore[no-untyped-def]
+def test_a_flipped_bit_and_a_lost_end_are_found_wherever_they_are(tmp_path_factory, data: st.DataObject) -> None:  # type: ignore[no-untyped-def]
     whole = bytearray(record(b"some bytes") + record(b"more"))
     at = data.draw(st.integers(0, 8 * len(whole) - 1))
     whole[at // 8] ^= 1 << at % 8
     path = tmp_path_factory.mktemp("flipped") / "a.tfrecord"
-    path.write_bytes(bytes(whole))
-    with pytest.raises(DataError, match=r"record [01]: .*; (download|split)"):
-        list(read_records(path))
-
-
-@pytest.mark.parametrize("cut", [1, 5, 11, 12, 15, 21, 25])
-def test_a_cut_file_is_named(tmp_path: Path, cut: int) -> None:
-    path = tmp_path / "a.tfrecord"
-    path.write_bytes(record(b"some bytes")[:cut])
-    with pytest.raises(DataError, match="record 0: the file ends"):
-        list(read_records(path))
-
-
-@pytest.mark.parametrize(
-    "data, said",
-    [
-        (varint(1 << 3 | 2) + varint(50) + b"short", "50 bytes where 5 are left"),
-        (varint(1 << 3 | 4), "wire type 4"),
-        (b"\x80" * 11, "more than ten bytes"),
-        (b"\x0a", "ends within a number"),
-    ],
-)
-def test_bad_messages_are_named(tmp_path: Path, data: bytes, said: str) -> None:
-    path = tmp_path / "a.tfrecord"
-    path.write_bytes(record(data))
-    with pytest.raises(DataError, match=said):
-        list(read_examples(path))
-
-
-def test_asking_for_something_else_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "a.tfrecord"
-    path.write_bytes(record(example({"a": b"x", "b": [1, 2], "c": np.array([1.0, np.inf], np.float32)})))
-    (one,) = read_examples(path)
-    for call in (
-        lambda: one.blob("b"),
-        lambda: one.integer("b"),
-        lambda: one.integer("none"),
-        lambda: one.numbers("a"),
-        lambda: one.numbers("c"),
-        lambda: one.numbers("c", 3),
-    ):
-        with pytest.raises(DataError, match=r"a.tfrecord: record 0: \w+ holds .* is needed"):
-            call()
+    first = len(record(b"some bytes"))
+    for damaged in (whole, record(b"some bytes")[: data.draw(st.integers(1, first - 1))]):
+        path.write_bytes(bytes(damaged))
+        with pytest.raises(DataError, match=r"record [01]: .*; (download|split)"):
+            list(read_records(path))
 
 
 number = st.floats(-1, 1)
@@ -166,24 +113,6 @@ def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p
     np.testing.assert_allclose(found.focal, (40.0, 42.0), rtol=3e-4)
     np.testing.assert_allclose(found.centre, (31.0, 25.5), atol=2e-2)
     np.testing.assert_allclose(found.distortion, truth.distortion[0].numpy(), atol=2e-3)
-
-
-def test_a_rolling_shutter_is_told_by_its_drift() -> None:
-    origin, direction = rays_of(camera(np.eye(3)))
-    moved = origin + np.linspace(-0.1, 0.1, 48, dtype=np.float32)[:, None, None] * np.array([1, 0, 0], np.float32)
-    found = fit_camera(moved, direction)
-    assert found.drift == pytest.approx(0.1, rel=1e-3) and found.error < 1e-3
-
-
-def test_rays_of_no_camera_have_a_large_error_or_are_refused() -> None:
-    origin, direction = rays_of(camera(np.eye(3)))
-    noisy = direction + np.random.default_rng(0).normal(0, 0.1, direction.shape).astype(np.float32)
-    assert fit_camera(origin, noisy).error > 1.5
-    for wrong in (np.zeros_like(direction), direction[:, ::-1], np.random.default_rng(0).normal(size=direction.shape)):
-        with pytest.raises(ValueError, match="rays"):
-            fit_camera(origin, wrong.astype(np.float32))
-    with pytest.raises(ValueError, match="too few"):
-        fit_camera(origin[:2, :2], direction[:2, :2])
 
 
 @pytest.fixture(scope="module")
@@ -287,18 +216,3 @@ def test_records_that_cannot_be_are_named(tmp_path: Path, change: dict[str, obje
     with pytest.raises(DataError, match=said) as caught:
         parse_scene(folder, 1, None)
     assert "a_train.tfrecord: record 0" in str(caught.value)
-
-
-def test_an_image_of_another_size_is_refused(tmp_path: Path) -> None:
-    folder = tmp_path / "data"
-    folder.mkdir()
-    done, image = cv2.imencode(".png", np.full((12, 12, 3), 90, np.uint8))
-    assert done
-    (folder / "a.tfrecord").write_bytes(record(example(good_features() | {"image": image.tobytes()})))
-    with pytest.raises(DataError, match="12x12 pixels, but its camera has 32x24"):
-        parse_scene(folder, 1, None)
-
-
-def test_no_files(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no \*\.tfrecord files"):
-        parse_scene(tmp_path, 1, BlockNerfConfig())

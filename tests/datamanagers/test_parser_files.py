@@ -1,67 +1,40 @@
 """What a scene folder's files may say, and what they may not; poses made exact, sizes and numbers checked."""
 
 import io
-import os
 import struct
 import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import rotations, write_image
+from capture_files import rotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.datamanagers.parsers.files import as_record, image_names, path_inside, read_json, read_npy, read_npz
-from fprf.datamanagers.parsers.views import View, assemble_scene, rigid_pose
+from fprf.datamanagers.parsers.views import rigid_pose
 from fprf.errors import DataError
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        b'{"a": NaN}',
-        b'{"a": -Infinity}',
-        b'{"a": 1e400}',
-        b'{"a": 1, "a": 2}',
-        b"[" * 100_000,
-        b'{"a": ' + b"9" * 5000 + b"}",
-        b"\xff\xfe",
-        b"",
-        b"{",
-        b"{} {}",
-    ],
-)
-def test_loose_json_is_refused(tmp_path: Path, text: bytes) -> None:
+def test_loose_json_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
-    path.write_bytes(text)
-    with pytest.raises(DataError, match=r"a\.json: no valid JSON") as caught:
-        read_json(path)
-    assert len(str(caught.value)) < 500
+    for text in (
+        b'{"a": NaN}', b'{"a": -Infinity}', b'{"a": 1e400}', b'{"a": 1, "a": 2}', b"[" * 100_000,
+        b'{"a": ' + b"9" * 5000 + b"}", b"\xff\xfe", b"", b"{", b"{} {}",
+    ):  # fmt: skip
+        path.write_bytes(text)
+        with pytest.raises(DataError, match=r"a\.json: no valid JSON") as caught:
+            read_json(path)
+        assert len(str(caught.value)) < 500
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "/etc/passwd",
-        "../a.png",
-        "images/../../a.png",
-        "..",
-        "a\\..\\..\\b",
-        "C:\\a.png",
-        "C:a.png",
-        "\\\\host\\share\\a.png",
-        "",
-        ".",
-        "a\0b",
-        "\ud800",
-        "images/../a.png",
-    ],
-)
-def test_paths_that_leave_the_root_are_refused(text: str) -> None:
-    with pytest.raises(DataError, match="here: the path"):
-        path_inside(Path("root"), "here", text)
+def test_paths_that_leave_the_root_are_refused() -> None:
+    for text in (
+        "/etc/passwd", "../a.png", "images/../../a.png", "..", "a\\..\\..\\b", "C:\\a.png", "C:a.png",
+        "\\\\host\\share\\a.png", "", ".", "a\0b", "\ud800", "images/../a.png",
+    ):  # fmt: skip
+        with pytest.raises(DataError, match="here: the path"):
+            path_inside(Path("root"), "here", text)
 
 
 def test_paths_inside_are_normalised() -> None:
@@ -92,51 +65,6 @@ def test_arrays_come_back(kind: str, shape: tuple[int, ...]) -> None:
     array = np.arange(int(np.prod(shape)), dtype=kind).reshape(shape)
     read = read_npy("here", npy(array))
     assert read.dtype == np.float64 and read.shape == shape and np.array_equal(read, array)
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"\x93NUMPY",
-        npy(np.zeros(3))[:-1],
-        npy(np.zeros(3)) + b"x",
-        npy(np.asfortranarray(np.zeros((2, 3)))),
-        npy(np.array(["a"])),
-        npy(np.zeros(8, np.uint8)).replace(b"|u1", b"|f1"),  # there are no floats of one byte
-        npy(np.zeros(3)).replace(b"(3,)", b"(9999999999999999,)"),
-        b"\x93NUMPY\x01\x00"
-        + struct.pack("<H", 70)
-        + b"{'descr': '<f8', 'fortran_order': False, 'shape': ("
-        + b"9" * 60
-        + b",)}",
-    ],
-)
-def test_odd_arrays_are_refused(data: bytes) -> None:
-    with pytest.raises(DataError, match=r"^here: "):
-        read_npy("here", data)
-
-
-def test_pickles_are_never_opened(tmp_path: Path) -> None:
-    canary = tmp_path / "canary"
-
-    class Bomb:
-        def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-            return os.mkdir, (str(canary),)
-
-    np.save(tmp_path / "a.npy", np.array([Bomb()], dtype=object), allow_pickle=True)
-    with pytest.raises(DataError):
-        read_npy("a", (tmp_path / "a.npy").read_bytes())
-    np.savez(tmp_path / "a.npz", xyz=np.array([Bomb()], dtype=object))
-    with pytest.raises(DataError):
-        read_npz(tmp_path / "a.npz", "xyz")
-    assert not canary.exists()
-
-
-def test_an_archive_without_the_array_says_so(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", other=np.zeros(3))
-    with pytest.raises(DataError, match="no array 'xyz'"):
-        read_npz(tmp_path / "a.npz", "xyz")
 
 
 @pytest.mark.parametrize("field", [20, 24])
@@ -174,14 +102,6 @@ def test_records_fall_back_and_name_the_place() -> None:
             as_record("f", empty).records("frames")
 
 
-@pytest.mark.parametrize("shape", ["(3)", "((3, 2))", "(3 2)", "(-3, 2)", "(3,, 2)", "3, 2", "(1e1,)"])
-def test_shapes_that_are_none_are_refused(shape: str) -> None:
-    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + np.arange(6.0).tobytes()
-    with pytest.raises(DataError):
-        read_npy("x", data)
-
-
 def pose(seed: int = 0) -> np.ndarray:
     draw = np.random.default_rng(seed)
     return np.concatenate([rotations(draw.normal(size=(1, 3)))[0], draw.normal(size=(3, 1))], 1)
@@ -197,57 +117,3 @@ def test_rounded_rotations_are_repaired(seed: int, amount: float) -> None:
     assert np.abs(repaired[:, :3].T @ repaired[:, :3] - np.eye(3)).max() < 1e-14
     assert np.abs(repaired - exact).max() <= 2 * amount + 1e-14
     assert np.array_equal(repaired[:, 3], exact[:, 3])
-
-
-@pytest.mark.parametrize(
-    ("change", "finding"),
-    [
-        (lambda p: p * 1.01, "no rotation"),
-        (lambda p: p * [[1], [1], [-1]], "reflection"),
-        (lambda p: p * 0, "no rotation"),
-        (lambda p: p * 1e200, "no rotation"),
-        (lambda p: p + np.array([0, 0, 0, 1e13]), "position .* lies beyond"),
-        (lambda p: p * np.nan, "no finite"),
-        (lambda p: p + np.inf, "no finite"),
-        (lambda p: p[:2], "no finite 3x4"),
-    ],
-)
-def test_other_matrices_are_refused(change: object, finding: str) -> None:
-    with pytest.raises(DataError, match=f"^frame 7: .*{finding}"):
-        rigid_pose("frame 7", change(pose()))  # type: ignore[operator]
-
-
-def view(folder: Path, name: str = "a.png", **fields: object) -> View:
-    if not (folder / name).exists():
-        write_image(folder / name, (24, 16))
-    whole = View(name=name, path=folder / name, pose=pose(), size=(24, 16), focal=(20.0, 21.0), centre=(12.5, 8.0))
-    return replace(whole, **fields)  # type: ignore[arg-type]
-
-
-def test_reduced_images_scale_the_cameras(tmp_path: Path) -> None:
-    whole = view(tmp_path, size=(97, 65), centre=(48.5, 32.5))
-    cameras = assemble_scene(tmp_path, [whole], downscale=1, reduced=True).cameras
-    assert cameras.size[0].tolist() == [24, 16]
-    assert cameras.centre[0].tolist() == [12.0, 8.0]
-    assert cameras.focal[0].tolist() == pytest.approx([20 * 24 / 97, 21 * 16 / 65])
-
-
-@pytest.mark.parametrize(
-    ("fields", "reduced", "finding"),
-    [
-        ({"size": (48, 32)}, False, "24x16 pixels, but its camera has 48x32"),
-        ({"size": (16, 24)}, True, "24x16 pixels, but its camera has 16x24"),
-        ({"focal": (0.0, 1.0)}, False, "focal length is 0.0"),
-        ({"focal": (1.0, -1.0)}, False, "focal length is -1.0"),
-        ({"focal": (float("nan"), 1.0)}, False, "not all finite"),
-        ({"centre": (float("inf"), 1.0)}, False, "not all finite"),
-        ({"distortion": (1e300, 0.0, 0.0, 0.0, 0.0, 0.0)}, False, "not all finite and sane"),
-        ({"depths": (2.0, 1.0)}, False, "0 < near < far"),
-        ({"depths": (0.0, 1.0)}, False, "0 < near < far"),
-        ({"depths": (1.0, float("inf"))}, False, "0 < near < far"),
-    ],
-)
-def test_views_that_cannot_be_are_named(tmp_path: Path, fields: dict[str, object], reduced: bool, finding: str) -> None:
-    with pytest.raises(DataError, match=finding) as caught:
-        assemble_scene(tmp_path, [view(tmp_path, **fields)], downscale=1, reduced=reduced)
-    assert "a.png" in str(caught.value)

@@ -8,7 +8,6 @@ import torch
 from capture_files import Capture, write_colmap, write_image
 
 from fprf.datamanagers.parsers.config import ColmapConfig, MegaNerfConfig, PhotoTourismConfig, parse_scene, recognise
-from fprf.datamanagers.parsers.phototourism import read_list
 from fprf.errors import DataError
 
 
@@ -43,37 +42,6 @@ def test_a_meganerf_folder_is_the_capture(tmp_path: Path, unit: float | None) ->
     assert parse_scene(tmp_path, 2, None).cameras.size[0].tolist() == [12, 8]
 
 
-class Evil:
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return print, ("ran",)
-
-
-def test_metadata_run_no_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_meganerf(tmp_path, Capture.make(3))
-    torch.save({"W": Evil()}, tmp_path / "train/metadata/0001.pt")
-    with pytest.raises(DataError, match=r"0001.pt: no tensors of torch.save"):
-        parse_scene(tmp_path, 1, None)
-    assert "ran" not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        ({"W": 24}, "W, H, c2w"),
-        ([1, 2], "holds a list"),
-        ({"W": 24, "H": 16, "c2w": torch.eye(3), "intrinsics": torch.ones(4)}, "c2w is"),
-        ({"W": 24, "H": 16, "c2w": torch.eye(4), "intrinsics": torch.ones(3)}, "intrinsics"),
-        ({"W": 24, "H": 16, "c2w": 2 * torch.eye(4), "intrinsics": torch.ones(4)}, "pose"),
-    ],
-)
-def test_metadata_that_cannot_be_are_named(tmp_path: Path, content: object, said: str) -> None:
-    write_meganerf(tmp_path, Capture.make(3))
-    torch.save(content, tmp_path / "train/metadata/0001.pt")
-    with pytest.raises(DataError, match=said) as caught:
-        parse_scene(tmp_path, 1, None)
-    assert "0001.pt" in str(caught.value)
-
-
 def test_meganerf_files_that_are_missing(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no \*.pt files"):
         parse_scene(tmp_path, 1, MegaNerfConfig())
@@ -86,13 +54,6 @@ def test_meganerf_files_that_are_missing(tmp_path: Path) -> None:
         parse_scene(tmp_path, 1, None)
     torch.save({"pose_scale_factor": -1.0}, tmp_path / "coordinates.pt")
     with pytest.raises(DataError, match="pose_scale_factor is -1"):
-        parse_scene(tmp_path, 1, None)
-
-
-def test_an_image_on_both_sides_is_refused(tmp_path: Path) -> None:
-    write_meganerf(tmp_path, Capture.make(3), held=())
-    write_meganerf(tmp_path, Capture.make(3), held=(0, 1, 2))
-    with pytest.raises(DataError, match=r"000\d is in train and in val"):
         parse_scene(tmp_path, 1, None)
 
 
@@ -134,23 +95,3 @@ def test_tables_that_do_not_fit(tmp_path: Path) -> None:
         parse_scene(tmp_path, 1, None)
     write_table(tmp_path / "b.tsv", [(name, str(k), "train") for k, name in enumerate(capture.names)])
     assert len(parse_scene(tmp_path, 1, PhotoTourismConfig(list="b.tsv")).train) == 3
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("filename\tid\tsplit\na.jpg\t1\tvalidation\n", "line 2: split is 'validation'"),
-        ("filename\tid\na.jpg\t1\n", "line 2 lacks"),
-        ("name,id,split\na.jpg,1,train\n", "line 2 lacks"),
-    ],
-)
-def test_bad_tables_are_named(tmp_path: Path, text: str, said: str) -> None:
-    path = tmp_path / "list.tsv"
-    path.write_text(text)
-    with pytest.raises(DataError, match=said):
-        read_list(path)
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match=r"cannot be read|lacks"):
-        read_list(path)
-    with pytest.raises(DataError, match="cannot be read"):
-        read_list(tmp_path / "none.tsv")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capture_files import Capture, write_image, write_llff
+from capture_files import Capture, write_llff
 
 from fprf.datamanagers.parsers.config import LlffConfig
 from fprf.errors import DataError
@@ -32,22 +32,3 @@ def test_the_folder_is_images_else_the_least_reduced_else_as_told(tmp_path: Path
     assert LlffConfig(images="images_16").build().parse(tmp_path, 2).paths[0].parent.name == "images_16"
     with pytest.raises(DataError, match="leaves"):
         LlffConfig(images="../elsewhere").build().parse(tmp_path, 1)
-
-
-def refuse(folder: Path, finding: str) -> None:
-    with pytest.raises(DataError, match=finding) as caught:
-        LlffConfig().build().parse(folder, 1)
-    assert "\n" not in str(caught.value)
-
-
-def test_images_and_poses_must_be_as_many(tmp_path: Path) -> None:
-    write_llff(tmp_path, Capture.make(11))
-    write_image(tmp_path / "images" / "extra.png", (24, 16))
-    refuse(tmp_path, "12 images but 11 poses")
-
-
-def test_no_image_folder_and_an_empty_one(tmp_path: Path) -> None:
-    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))
-    refuse(tmp_path, "no folder images or images_N")
-    (tmp_path / "images").mkdir()
-    refuse(tmp_path, "no image among 0 files")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from capture_files import Capture, write_llff, write_odm, write_polycam, write_record3d, write_transforms
 
+from fprf.datamanagers.parsers import config as parsers
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 
@@ -67,4 +68,12 @@ def test_wrong_values_are_refused_in_one_line(tmp_path: Path, what: str, change:
             changed(tmp_path, file, lambda c: values[""])
     with pytest.raises(DataError) as fault:
         parse_scene(tmp_path, 1, None)
+    assert "\n" not in str(fault.value) and str(tmp_path) in str(fault.value)
+
+
+@pytest.mark.parametrize("name", ["BlockNerf", "MegaNerf", "PhotoTourism", "Polycam", "Record3D", "Odm", "Llff", "Colmap"])
+def test_a_folder_without_the_files_of_a_format_is_refused(tmp_path: Path, name: str) -> None:
+    np.save(tmp_path / "poses_bounds.npy", np.zeros((3, 17)))
+    with pytest.raises(DataError) as fault:
+        getattr(parsers, f"{name}Config")().build().parse(tmp_path, 1)
     assert "\n" not in str(fault.value) and str(tmp_path) in str(fault.value)

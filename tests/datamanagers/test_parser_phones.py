@@ -36,15 +36,6 @@ def test_polycam(tmp_path: Path, corrected: bool, inner: str) -> None:
     assert_same(parse_scene(tmp_path / "p", 1, None), wanted(tmp_path, capture))
 
 
-def test_polycam_s_corrected_cameras_are_taken_first(tmp_path: Path) -> None:
-    first, better = Capture.make(3), Capture.make(3, seed=1)
-    write_polycam(tmp_path / "p" / "keyframes", first)
-    write_polycam(tmp_path / "p" / "keyframes", better, corrected=True)
-    found = parse_scene(tmp_path / "p", 1, None)
-    assert np.allclose(found.cameras.pose.numpy(), better.poses, atol=1e-9)
-    assert {path.parent.name for path in found.paths} == {"corrected_images"}
-
-
 def test_polycam_s_images_without_a_camera_are_left_out(tmp_path: Path) -> None:
     cameras = write_polycam(tmp_path / "keyframes", Capture.make(5))
     (cameras / "0002.json").unlink()
@@ -53,12 +44,6 @@ def test_polycam_s_images_without_a_camera_are_left_out(tmp_path: Path) -> None:
         file.rename(file.with_name(f"x{file.name}"))
     with pytest.raises(DataError, match="has the name of an image"):
         parse_scene(tmp_path, 1, None)
-
-
-def test_what_is_no_export_says_what_is_needed(tmp_path: Path) -> None:
-    for config, told in ((PolycamConfig(), "raw data"), (Record3DConfig(), "EXR and JPG"), (OdmConfig(), "ODM project")):
-        with pytest.raises(DataError, match=told):
-            config.build().parse(tmp_path, 1)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -89,15 +74,6 @@ def test_record3d_s_lenses_may_change_from_image_to_image(tmp_path: Path) -> Non
     assert torch.cat([cameras.focal, cameras.centre], 1).tolist() == rows
 
 
-def test_record3d_without_numbered_images(tmp_path: Path) -> None:
-    file = write_record3d(tmp_path, Capture.make(2))
-    for path in (tmp_path / "rgb").iterdir():
-        path.rename(path.with_name(f"frame-{path.name}"))
-    with pytest.raises(DataError, match="nothing numbered"):
-        parse_scene(tmp_path, 1, None)
-    assert file.is_file()
-
-
 @pytest.mark.parametrize("report", [False, True])
 def test_odm(tmp_path: Path, report: bool) -> None:
     capture = Capture.make(9, focal=(20.0, 21.0), k=(0.05, -0.02, 0.001, -0.002))
@@ -110,17 +86,6 @@ def test_odm(tmp_path: Path, report: bool) -> None:
         assert np.allclose(found.points.numpy(), capture.points)
         pixel, depth = project(found.cameras, torch.zeros(40, dtype=torch.int64), found.points)
         assert bool((depth > 0).all()) and bool(pixel.isfinite().all())
-
-
-def test_odm_s_cameras_hold_for_photographs_of_any_size(tmp_path: Path) -> None:
-    capture = Capture.make(3)
-    write_odm(tmp_path / "o", capture, reduced=4)
-    assert_same(parse_scene(tmp_path / "o", 1, None), wanted(tmp_path, capture))
-
-
-def test_the_middle_of_opensfm_s_image_is_ours(tmp_path: Path) -> None:
-    write_odm(tmp_path, Capture.make(2), c_x=0.25, c_y=-0.125)
-    assert parse_scene(tmp_path, 1, None).cameras.centre[0].tolist() == [12 + 6, 8 - 3]
 
 
 @pytest.mark.parametrize(
@@ -137,31 +102,6 @@ def test_odm_s_lenses(tmp_path: Path, camera: dict[str, object], lens: int, dist
     write_odm(tmp_path, Capture.make(2), **camera)
     cameras = parse_scene(tmp_path, 1, None).cameras
     assert cameras.lens.tolist() == [lens] * 2 and cameras.distortion[0].tolist() == distortion
-
-
-def test_of_several_reconstructions_the_largest_is_read(tmp_path: Path) -> None:
-    file = write_odm(tmp_path, Capture.make(4))
-    whole = json.loads(file.read_text())
-    small = {**whole[0], "shots": {"0003.png": whole[0]["shots"].pop("0003.png")}}
-    file.write_text(json.dumps([small, *whole]))
-    assert [path.name for path in parse_scene(tmp_path, 1, None).paths] == ["0000.png", "0001.png", "0002.png"]
-
-
-def test_a_report_of_several_cameras_must_say_which(tmp_path: Path) -> None:
-    file = write_odm(tmp_path, Capture.make(2), report=True)
-    cameras = json.loads((tmp_path / "cameras.json").read_text())
-    (tmp_path / "cameras.json").write_text(json.dumps({**cameras, "other": cameras["v2 phone"]}))
-    with pytest.raises(DataError, match="which of 2 cameras"):
-        parse_scene(tmp_path, 1, None)
-    shots = json.loads(file.read_text())
-    for feature in shots["features"]:
-        feature["properties"]["camera"] = "other"
-    file.write_text(json.dumps(shots))
-    assert len(parse_scene(tmp_path, 1, None).paths) == 2
-    shots["features"] *= 2
-    file.write_text(json.dumps(shots))
-    with pytest.raises(DataError, match="occurs twice"):
-        parse_scene(tmp_path, 1, None)
 
 
 def test_odm_s_images_stay_inside_and_missing_ones_are_named(tmp_path: Path) -> None:

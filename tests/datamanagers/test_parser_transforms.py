@@ -35,14 +35,6 @@ def test_global_and_per_frame_intrinsics_are_the_same(tmp_path: Path) -> None:
     assert one.depths is None and one.test.tolist() == [0, 8]
 
 
-def test_depths_stand_by_frame_or_once(tmp_path: Path) -> None:
-    content = write_transforms(tmp_path, Capture.make(3), near=2.0, far=8.0)
-    content["frames"][1]["near"] = 3.0  # type: ignore[index]
-    edit(tmp_path, content)
-    depths = parse(tmp_path).depths
-    assert depths is not None and depths.tolist() == [[2.0, 8.0], [3.0, 8.0], [2.0, 8.0]]
-
-
 @pytest.mark.parametrize(
     ("camera", "lens", "distortion"),
     [
@@ -73,16 +65,6 @@ def test_what_is_left_out_follows_from_the_image(tmp_path: Path) -> None:
     assert parse(tmp_path).cameras.focal[0].tolist() == [30.0, 30.0]
     edit(tmp_path, content, fl_x=30.0, camera_angle_y=math.pi / 2)
     assert parse(tmp_path).cameras.focal[0].tolist() == pytest.approx([30.0, 8.0])
-
-
-def test_another_file_is_named_by_the_config(tmp_path: Path) -> None:
-    content = write_transforms(tmp_path, Capture.make(3))
-    (tmp_path / "transforms_4.json").write_text(json.dumps({**content, "frames": content["frames"][:2]}))  # type: ignore[index]
-    assert len(parse(tmp_path, file="transforms_4.json").paths) == 2
-    with pytest.raises(DataError, match="leaves"):
-        parse(tmp_path, file="../transforms.json")
-    with pytest.raises(DataError, match="cannot be read"):
-        parse(tmp_path, file="absent.json")
 
 
 def blender(folder: Path, part: str, count: int) -> None:

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from capture_files import Capture, write_colmap, write_llff, write_transforms
@@ -15,7 +14,6 @@ from fprf.datamanagers.parsers.config import (
     DataParserConfig,
     LlffConfig,
     Recognised,
-    TownConfig,
     TransformsConfig,
     parse_scene,
     recognise,
@@ -77,14 +75,6 @@ def test_blender_and_a_single_file_of_another_name(tmp_path: Path) -> None:
         recognise(tmp_path)
     (tmp_path / "transforms_train.json").write_text("{}")
     assert recognise(tmp_path) == TransformsConfig()
-
-
-def test_the_town_is_a_name_and_not_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert recognise(Path("town")) == TownConfig()
-    (tmp_path / "town").mkdir()
-    with pytest.raises(DataError, match="but nothing"):
-        recognise(Path("town"))
 
 
 def test_what_was_found_is_said(tmp_path: Path) -> None:
@@ -189,14 +179,6 @@ def test_real_scenes(shared: Path, name: str) -> None:
         if scene.depths is not None:
             near, far = scene.depths[pairs[inside, 0]].unbind(-1)
             assert ((depth[inside] > 0.5 * near) & (depth[inside] < 2 * far)).double().mean() > 0.9
-
-
-def test_real_points_of_both_sources_agree(shared: Path) -> None:
-    folder = shared / "data" / "scenes" / "street_lund"
-    one = parse_scene(folder, 1, TransformsConfig()).points
-    other = parse_scene(folder, 1, ColmapConfig()).points
-    assert one is not None and other is not None
-    assert np.allclose(np.sort(one.numpy(), 0), np.sort(other.numpy(), 0), rtol=1e-6)
 
 
 class Parser(DataParser):
