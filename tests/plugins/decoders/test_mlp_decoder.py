@@ -46,11 +46,6 @@ def test_another_encoder_is_refused(tmp_path: Path) -> None:
         load_decoder(path, encoder="vgg19:relu2_1:normalised:aaaa", channels=7)
 
 
-def test_no_shipped_decoder_names_those_that_ship() -> None:
-    with pytest.raises(WeightsError, match=r"encoder dinov2:.* those of .*bundled-content:"):
-        MlpDecoderConfig().build(encoder="dinov2:dinov2-small:block12:stride8:0", channels=384)
-
-
 @pytest.mark.parametrize("config", [BundledContentConfig(), Vgg19Config()])
 def test_encoders_that_ship_have_a_decoder_of_each_objective(config: EncoderConfig) -> None:
     encoder = config.build()

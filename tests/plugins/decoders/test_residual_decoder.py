@@ -9,11 +9,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_world import World, parameters, rays_of, trained_for
+from tiny_world import World, rays_of, trained_for
 
 from fprf.config import TrainConfig
 from fprf.plugins.decoders.config import MlpDecoderConfig, ResidualDecoderConfig
-from fprf.plugins.decoders.decoders import MlpDecoder, ResidualDecoder, residual_share
+from fprf.plugins.decoders.decoders import MlpDecoder, ResidualDecoder
 from fprf.plugins.encoders.config import BundledContentConfig
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.rendering.renderer import Parts, render_rays
@@ -130,18 +130,6 @@ def test_the_formula_in_float64(strength: float, fade: float, shift: float, seed
     torch.testing.assert_close(found.double(), expected, rtol=0, atol=2e-5 / min(fade, 1.0))
 
 
-@settings(max_examples=30, deadline=None)
-@given(strength=st.floats(0, 1), fade=st.floats(0.05, 5), change=st.floats(0, 10))
-def test_the_share_falls_with_the_change_and_with_the_strength(strength: float, fade: float, change: float) -> None:
-    changes = torch.tensor([[0.0], [change], [change + 1]]).expand(3, 3)
-    share = residual_share(changes, strength, fade)[:, 0].tolist()
-    assert share[0] == 1
-    assert 1 >= share[1] >= share[2] >= 1 - strength - 1e-6
-    assert residual_share(changes, 0.0, fade).tolist() == [[1.0]] * 3
-    at_fade = residual_share(torch.full((1, 3), fade), 1.0, fade)
-    assert float(at_fade) == pytest.approx(1 / math.e, rel=1e-5)
-
-
 @torch.no_grad()
 def test_saturated_colours_of_the_scene_do_not_leak() -> None:
     """A head that turns a grey scene green: a full style that changes the colour shows the style's colour alone."""
@@ -155,24 +143,6 @@ def test_saturated_colours_of_the_scene_do_not_leak() -> None:
     leak = float((made.restyled(content, styled, 1.0) - made.frozen(styled)).abs().max())
     assert leak < 0.05 * own
     assert own > 0.3
-
-
-def test_a_resumed_run_is_the_one_that_never_stopped(world: World, tmp_path: Path) -> None:
-    config = replace(residual_config(world), steps=6)
-    whole = trained_for(world, tmp_path / "whole", config)
-
-    def broken(step: int, batch: Batch) -> Batch:
-        if step == 4:
-            raise KeyboardInterrupt
-        return batch
-
-    with pytest.raises(KeyboardInterrupt):
-        trained_for(world, tmp_path / "broken", config, change=broken)
-    resumed = trained_for(world, tmp_path / "broken", config)
-    expected, found = parameters(whole, 6), parameters(resumed, 6)
-    assert expected.keys() == found.keys()
-    assert any("decoder.head" in name for name in expected)
-    assert all(torch.equal(expected[name], found[name]) for name in expected)
 
 
 @pytest.mark.parametrize("stylizer", [AdainConfig(), RegionAdainConfig(), RegionOtConfig()])

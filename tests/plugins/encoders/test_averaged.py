@@ -46,14 +46,6 @@ def test_a_flip_is_the_mean_of_both_looks() -> None:
     assert torch.equal(plain(image), inner(image))
 
 
-def test_one_larger_size_is_a_finer_stride() -> None:
-    image, inner = torch.rand(1, 3, 24, 36), RandomConfig(stride=4).build()
-    encoder = AveragedEncoder(inner, flip=False, scales=(2.0,))
-    assert encoder(image).shape == (1, 16, 12, 18)
-    larger = F.interpolate(image, (48, 72), mode="bilinear", antialias=True)
-    torch.testing.assert_close(encoder(image), inner(larger))
-
-
 def test_sizes_meet_on_the_finest_ones_cells() -> None:
     image, inner = torch.rand(1, 3, 32, 48), RandomConfig(stride=4).build()
     both = AveragedEncoder(inner, flip=False, scales=(0.5, 1.0))(image)

@@ -1,25 +1,14 @@
 """Encoders side by side: weights, units, strides, and the command line that nests them."""
 
-from pathlib import Path
-
-import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from network_files import deeplab_file
 from torch import Tensor
 
-from fprf.cli.parsing import parse
-from fprf.errors import WeightsError
-from fprf.methods import fprf_lite
-from fprf.plugins.codec import from_json, to_json
 from fprf.plugins.encoders.composed import ConcatEncoder
 from fprf.plugins.encoders.config import (
-    AveragedConfig,
-    BundledSemanticConfig,
     ConcatConfig,
-    DeepLabConfig,
     RandomConfig,
 )
 from fprf.plugins.encoders.frozen import street
@@ -54,30 +43,3 @@ def test_the_finest_of_each_axis_counts() -> None:
     """Cells of 6 and 5 pixels on a strip: neither part decides both axes alone."""
     encoder = ConcatConfig(first=RandomConfig(stride=6), second=RandomConfig(stride=5), third=RandomConfig(stride=30)).build()
     assert encoder(torch.rand(1, 3, 31, 7)).shape[2:] == (7, 2)
-
-
-def test_a_missing_parts_weights_are_told(tmp_path: Path) -> None:
-    with pytest.raises(WeightsError, match=r"absent\.safetensors"):
-        ConcatConfig(first=DeepLabConfig(weights=tmp_path / "absent.safetensors")).build()
-
-
-def test_nested_on_the_command_line(tmp_path: Path) -> None:
-    file = deeplab_file(tmp_path)
-    line = (
-        f"--semantic.encoder concat --semantic.encoder.first deeplab --semantic.encoder.first.weights {file} "
-        "--semantic.encoder.first.layer backbone.13 --semantic.encoder.second averaged "
-        "--semantic.encoder.second.inner bundled-semantic --semantic.encoder.third random "
-        "--semantic.encoder.weights 1 0.5 --semantic.encoder.third.channels 3"
-    ).split()
-    encoder = parse(fprf_lite(), line, prog="x", description="").semantic.encoder
-    assert encoder == ConcatConfig(
-        first=DeepLabConfig(weights=file, layer="backbone.13"),
-        second=AveragedConfig(inner=BundledSemanticConfig()),
-        third=RandomConfig(channels=3),
-        weights=(1.0, 0.5),
-    )
-    assert from_json(to_json(encoder), ConcatConfig) == encoder
-    built = encoder.build()
-    for part in (encoder.first, encoder.second, encoder.third):
-        assert part.build().identity in built.identity
-    assert built(torch.rand(1, 3, 48, 64)).shape == (1, built.channels, 12, 16)

@@ -1,6 +1,7 @@
 """What every encoder owes: any size, no randomness, no gradient, a telling identity, batches like single images."""
 
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -74,13 +75,6 @@ def test_any_size(built: tuple[Encoder, int], height: int, width: int) -> None:
     assert features.dtype == torch.float32
 
 
-def test_a_batch_is_its_images(built: tuple[Encoder, int]) -> None:
-    images = torch.rand(3, 3, 33, 50)
-    together = built[0](images)
-    alone = torch.cat([built[0](image[None]) for image in images])
-    torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-4)
-
-
 def test_a_bright_spot_answers_where_it_is(built: tuple[Encoder, int]) -> None:
     """The centre of the squared changes lies in its cell or beside it; deep networks with random weights look far around."""
     encoder, stride = built
@@ -96,34 +90,19 @@ def test_a_bright_spot_answers_where_it_is(built: tuple[Encoder, int]) -> None:
 
 def test_identities_differ_with_settings(tmp_path: Path) -> None:
     file, other = vgg_file(tmp_path), vgg_file(tmp_path, normalisation=False)
+    keras, one, two = mobilenet_file(tmp_path, tensorflow=True), RandomConfig(), RandomConfig(seed=1)
     configs = [
-        RandomConfig(),
-        RandomConfig(seed=1),
-        RandomConfig(stride=2),
-        RandomConfig(channels=3),
-        BundledContentConfig(),
-        BundledSemanticConfig(),
-        Vgg16Config(weights=file),
-        Vgg19Config(weights=file),
-        Vgg19Config(weights=file, normalise=False),
-        Vgg19Config(weights=file, layer="conv2_1"),
-        Vgg19Config(weights=other),
-        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=False)),
-        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=True)),
-        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=True), layer="features.12"),
-        DeepLabConfig(weights=deeplab_file(tmp_path)),
-        DeepLabConfig(weights=deeplab_file(tmp_path), layer="logits"),
-        EspNetConfig(weights=espnet_file(tmp_path)),
-        EspNetConfig(weights=espnet_file(tmp_path), layer="level3"),
-        AveragedConfig(inner=RandomConfig()),
-        AveragedConfig(inner=RandomConfig(seed=1)),
-        AveragedConfig(inner=RandomConfig(), flip=False),
-        AveragedConfig(inner=RandomConfig(), scales=(1.0, 2.0)),
-        ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1)),
-        ConcatConfig(first=RandomConfig(seed=1), second=RandomConfig()),
-        ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1), weights=(0.5,)),
-        ConcatConfig(first=RandomConfig(), second=RandomConfig(seed=1), third=RandomConfig(seed=2)),
-    ]
+        one, two, RandomConfig(stride=2), RandomConfig(channels=3), BundledContentConfig(), BundledSemanticConfig(),
+        Vgg16Config(weights=file), Vgg19Config(weights=file), Vgg19Config(weights=file, normalise=False),
+        Vgg19Config(weights=file, layer="conv2_1"), Vgg19Config(weights=other),
+        MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=False)), MobileNetV2Config(weights=keras),
+        MobileNetV2Config(weights=keras, layer="features.12"), DeepLabConfig(weights=deeplab_file(tmp_path)),
+        DeepLabConfig(weights=deeplab_file(tmp_path), layer="logits"), EspNetConfig(weights=espnet_file(tmp_path)),
+        EspNetConfig(weights=espnet_file(tmp_path), layer="level3"), AveragedConfig(inner=one), AveragedConfig(inner=two),
+        AveragedConfig(inner=one, flip=False), AveragedConfig(inner=one, scales=(1.0, 2.0)),
+        ConcatConfig(first=one, second=two), ConcatConfig(first=two, second=one),
+        ConcatConfig(first=one, second=two, weights=(0.5,)), ConcatConfig(first=one, second=two, third=RandomConfig(seed=2)),
+    ]  # fmt: skip
     identities = [config.build().identity for config in configs]
     assert len(set(identities)) == len(configs)
     assert identities == [config.build().identity for config in configs]
@@ -135,3 +114,11 @@ def test_an_identity_names_no_folder(tmp_path: Path) -> None:
     one, two = (Vgg19Config(weights=vgg_file(tmp_path / name)).build().identity for name in "ab")
     assert one == two
     assert str(tmp_path) not in one
+
+
+def test_parts_default_to_what_ships() -> None:
+    """Composed encoders build without a file or a network."""
+    for kind in (AveragedConfig, ConcatConfig):
+        parts = [getattr(kind(), field.name) for field in fields(kind)]
+        shipped = [part for part in parts if isinstance(part, EncoderConfig)]
+        assert shipped and all(part.build().channels > 0 for part in shipped)

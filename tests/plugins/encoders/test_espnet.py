@@ -154,23 +154,3 @@ def test_labels_of_a_street(shared: Path) -> None:
         scores = F.interpolate(encoder(image), image.shape[2:], mode="bilinear", align_corners=True)
         labels = torch.from_numpy(cv2.imread(str(scene / f"labels_city/{name}.png"), cv2.IMREAD_UNCHANGED))
         assert float((scores[0].argmax(0) == labels).float().mean()) > 0.8
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("layer", ["level3", "level4"])
-def test_cells_lie_where_they_look(shared: Path, layer: str) -> None:
-    """The features of a mirrored photograph, mirrored back, agree best where they are, and to both sides alike."""
-    from fprf.pretraining.photos import load_photo
-    from tools.distil.examples import crop
-
-    encoder = EspNetConfig(layer=layer, weights=shared / "weights/espnetv2_s2.0_city.safetensors").build()
-    photos = sorted((shared / "data/pretrain/bsds500").glob("*.jpg"))[:4]
-    images = torch.stack([crop(load_photo(path), 256, (1.0, 1.0), torch.Generator().manual_seed(0)) for path in photos])
-    found, mirrored = encoder(images), encoder(images.flip(-1)).flip(-1)
-    mean, last = found.mean(dim=(0, 2, 3), keepdim=True), found.shape[-1] - 1
-    agree = {
-        shift: float(F.cosine_similarity((found - mean)[..., 1 + shift : last + shift], (mirrored - mean)[..., 1:last]).mean())
-        for shift in (-1, 0, 1)
-    }
-    assert agree[0] > max(agree[-1], agree[1]) + 0.1
-    assert abs(agree[1] - agree[-1]) < 0.1

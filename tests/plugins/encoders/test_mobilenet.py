@@ -92,20 +92,6 @@ def test_deeplabs_scores(tmp_path: Path) -> None:
     torch.testing.assert_close(encoder(image).double(), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_only_what_the_layer_needs_is_in_the_identity(tmp_path: Path) -> None:
-    tensors = deeplab_tensors()
-    save_file(tensors, tmp_path / "one.safetensors")
-    tensors["backbone.9.conv.0.0.bias"] += 1
-    save_file(tensors, tmp_path / "two.safetensors")
-
-    def identity(layer: str, name: str) -> str:
-        return DeepLabConfig(layer=layer, weights=tmp_path / f"{name}.safetensors").build().identity
-
-    assert identity("backbone.8", "one") == identity("backbone.8", "two")
-    assert identity("backbone.9", "one") != identity("backbone.9", "two")
-    assert identity("logits", "one") != identity("logits", "two")
-
-
 def test_files_that_do_not_fit(tmp_path: Path) -> None:
     tensors = mobilenet_tensors(folded=False)
     short = {name: value for name, value in tensors.items() if not name.startswith("features.14")}

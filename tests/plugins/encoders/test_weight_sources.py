@@ -12,7 +12,7 @@ from fprf.errors import WeightsError
 from fprf.plugins import weights
 from fprf.plugins.encoders.config import DeepLabConfig, EncoderConfig, EspNetConfig, MobileNetV2Config
 from fprf.plugins.encoders.mobilenet import DEEPLAB_SOURCE as DEEPLAB
-from fprf.plugins.weights import WeightSource, find_weights, stated_triple, torchvision_file
+from fprf.plugins.weights import find_weights
 
 
 @pytest.fixture(autouse=True)
@@ -58,20 +58,3 @@ def test_the_hash_in_a_name_is_a_promise(home: Path) -> None:
     torch.save(mobilenet_tensors(folded=False), cache / "mobilenet_v2-b0353104.pth")
     with pytest.raises(WeightsError, match="promises b0353104; delete it and fetch https"):
         MobileNetV2Config().build()
-
-
-def test_pinned_files_alone_are_downloaded() -> None:
-    pinned = torchvision_file("Net", "net-0123abcd.pth", "--flag")
-    assert pinned.pinned and pinned.origin == "https://download.pytorch.org/models/net-0123abcd.pth"
-    with pytest.raises(WeightsError, match=r"Net's weights.*no network.*SHA-256 begins with 0123abcd.*--flag FILE"):
-        find_weights(pinned, None)
-    with pytest.raises(WeightsError, match=r"Net: net.pth is not in .*fprf/weights nor in .*torch.*\(somewhere\)"):
-        find_weights(WeightSource("Net", "net.pth", "somewhere", "--flag"), None)
-
-
-def test_three_numbers(tmp_path: Path) -> None:
-    assert stated_triple({}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [1, 2, 3]
-    assert stated_triple({"mean": "[4,5,6]"}, "mean", (1.0, 2.0, 3.0), tmp_path).tolist() == [4, 5, 6]
-    for wrong in ("[1,2]", "1", "null", "grey", '["a","b","c"]'):
-        with pytest.raises(WeightsError, match="not three numbers"):
-            stated_triple({"mean": wrong}, "mean", (1.0, 2.0, 3.0), tmp_path)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fprf.errors import DataError, PluginError
+from fprf.errors import PluginError
 from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.executors.executors import resources
 from fprf.testing import check_executor
@@ -109,22 +109,3 @@ def test_tasks_run_elsewhere_and_a_killed_worker_is_started_again(executor: RayC
 
     found = executor.build().map(once_killed, ["a", "b"])
     assert os.getpid() not in found and len(found) == 2
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_errors_arrive_as_they_were_raised(executor: RayConfig) -> None:
-    def broken(task: int) -> int:
-        raise DataError(f"task {task}: no data")
-
-    with pytest.raises(DataError, match="no data"):
-        executor.build().map(broken, [1, 2])
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_a_worker_that_keeps_dying_is_told(executor: RayConfig) -> None:
-    def killed(task: int) -> int:
-        os.kill(os.getpid(), signal.SIGKILL)
-        return task
-
-    with pytest.raises(PluginError, match="died 1 times"):
-        RayConfig(retries=0).build().map(killed, [1])

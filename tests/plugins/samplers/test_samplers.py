@@ -72,14 +72,6 @@ def test_edges_are_spaced_by_the_space(config: SamplerConfig) -> None:
     assert found.levels == ()
 
 
-def test_every_ray_stands_alone() -> None:
-    sampler, rays = SMALL.build(seed=0), rays_of(6)
-    whole = sample(sampler, rays)
-    for k in range(6):
-        one = sample(sampler, Rays(*(x[k : k + 1] for x in rays)))
-        assert torch.allclose(one.s, whole.s[k : k + 1], atol=1e-5)
-
-
 class Wall(nn.Module):
     """Dense where the first coordinate is beyond a place, thin before; stands in for a proposal, as blocks' fields do."""
 
@@ -109,15 +101,6 @@ def test_samples_go_where_the_density_is() -> None:
     assert int(((untrusting.t > 0.9) & (untrusting.t < 1.15)).sum()) < 20
 
 
-def test_the_compiled_form_places_samples_as_the_plain_one_does() -> None:
-    """Where nothing is learnt densities are compiled; in double precision they never are."""
-    sampler, rays = SMALL.build(seed=0), rays_of(200)
-    found = sample(sampler, rays)
-    plain = sample(sampler.double(), Rays(*(x.double() for x in rays)))
-    assert found.s.dtype == torch.float32 and plain.s.dtype == torch.float64
-    assert float((found.s - plain.s).abs().max()) <= 1e-3 and float((found.s - plain.s).abs().mean()) <= 1e-5
-
-
 def test_annealing_rises_from_even_to_trusted() -> None:
     sampler = ProposalConfig(anneal_steps=100, anneal_slope=10.0).build(seed=0)
     assert isinstance(sampler, ProposalSampler)
@@ -140,19 +123,6 @@ def test_proposals_learn_at_every_step_then_ever_more_rarely() -> None:
     assert learns[100:] == [step % 5 == 0 for step in range(100, 400)]
     always = ProposalConfig(update_every=1, warm_up=0).build(seed=0)
     assert isinstance(always, ProposalSampler) and all(always.learns(step) for step in range(20))
-
-
-def test_levels_come_only_in_steps_that_learn() -> None:
-    sampler, rays = (
-        ProposalConfig(samples=(16, 12), final=9, resolutions=(6, 8), update_every=2, warm_up=0).build(seed=0),
-        rays_of(4),
-    )
-    learning, resting, shown = (sample(sampler, rays, step=step, seed=0) for step in (4, 5, None))
-    assert [level.weights.shape for level in learning.levels] == [(4, 16), (4, 12)]
-    assert [level.s.shape for level in learning.levels] == [(4, 17), (4, 13)]
-    assert all(level.weights.requires_grad and not level.s.requires_grad for level in learning.levels)
-    assert resting.levels == shown.levels == ()
-    assert not learning.t.requires_grad and not resting.t.requires_grad
 
 
 def test_the_interlevel_loss_reaches_every_level_and_lowers() -> None:

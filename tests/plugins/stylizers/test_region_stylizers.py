@@ -80,26 +80,6 @@ def test_the_scenes_own_style_is_the_identity(config: Config, regions: int, temp
         assert float((out - content).abs().max() / content.abs().max()) < 1e-5
 
 
-def test_one_region_that_meets_one_code_gets_its_statistics() -> None:
-    content, semantic, scene, _ = setting(regions=1)
-    other = points(seed=9)[0]
-    d = build_dictionary([Reference("s", other, semantic)], clusters=1)
-    out = RegionOtConfig(gain=1e6).build(dictionary=d, scene=scene)(content, None).double()
-    torch.testing.assert_close(out.mean(0), other.double().mean(0), rtol=1e-4, atol=1e-4)
-    reached, aim = torch.cov(out.T), torch.cov(other.double().T)
-    assert float((reached - aim).abs().max() / aim.abs().max()) < 2e-3
-
-
-@pytest.mark.parametrize("config", BOTH)
-def test_high_temperatures_move_all_regions_alike(config: Config) -> None:
-    content, semantic, scene, d = setting()
-    out = config(temperature=1e6).build(dictionary=d, scene=scene)(content, semantic)
-    # One affine map for all: residuals of a least-squares fit vanish.
-    lifted = torch.cat([content, torch.ones(600, 1)], 1).double()
-    fit = lifted @ torch.linalg.lstsq(lifted, out.double()).solution
-    assert float((fit - out).abs().max()) < 1e-3
-
-
 @pytest.mark.parametrize("config", BOTH)
 def test_smoothness_makes_regions_alike_that_meet(config: Config) -> None:
     _, _, scene, d = setting()
@@ -113,25 +93,6 @@ def test_smoothness_makes_regions_alike_that_meet(config: Config) -> None:
     pinned = d._replace(allowed=torch.tensor([[True, False], [True, True], [True, True]]))
     alone = [config(smoothness=s).build(dictionary=pinned, scene=scene).get_buffer("table")[0] for s in (0.0, 1e6)]
     assert torch.equal(*alone), "what is pinned takes from no neighbour that is not"
-
-
-@pytest.mark.parametrize("similarity", ["cosine", "dot"])
-def test_the_table_is_the_softmax_of_the_scores(similarity: Similarity) -> None:
-    _, _, scene, d = setting()
-    table = region_table(scene, d, Matching(0.4, similarity))
-    torch.testing.assert_close(table, plain_table(scene, d, 0.4, similarity), rtol=1e-6, atol=1e-9)
-    torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))
-
-
-@pytest.mark.parametrize("config", BOTH)
-def test_gain_bounds_what_noise_becomes(config: Config) -> None:
-    content, semantic, _, d = setting()
-    flat = scene_style(content * 0 + 3, semantic, torch.ones(600), None, 3, 0)
-    made = config(gain=2.0).build(dictionary=d, scene=flat)
-    base = made(torch.full((600, 6), 3.0), semantic)
-    noise = torch.randn(600, 6) * 0.01
-    moved = made(3 + noise, semantic) - base
-    assert bool((moved.norm(dim=1) <= 2.0 * noise.norm(dim=1) + 1e-5).all())
 
 
 @settings(max_examples=25, deadline=None)
@@ -155,20 +116,9 @@ def test_never_nan_for_degenerate_scenes_and_styles(
         assert out.shape == (rows, 4) and bool(out.isfinite().all())
 
 
-@pytest.mark.parametrize("config", BOTH)
-def test_points_do_not_depend_on_their_neighbours(config: Config) -> None:
-    content, semantic, scene, d = setting()
-    made = config().build(dictionary=d, scene=scene)
-    whole = made(content, semantic)
-    order = torch.randperm(600)
-    parts = torch.cat([made(content[i], semantic[i]) for i in order.split(37)])
-    torch.testing.assert_close(parts, whole[order], rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("config", BOTH)
-def test_float32_is_float64_within_the_bound(config: Config) -> None:
-    content, semantic, scene, d = setting()
-    made = config().build(dictionary=d, scene=scene)
-    single = made(content, semantic)
-    double = made.double()(content.double(), semantic.double())
-    assert float((single - double).abs().max() / double.abs().max()) < 1e-5
+@pytest.mark.parametrize("similarity", ["cosine", "dot"])
+def test_the_table_is_the_softmax_of_the_scores(similarity: Similarity) -> None:
+    _, _, scene, d = setting()
+    table = region_table(scene, d, Matching(0.4, similarity))
+    torch.testing.assert_close(table, plain_table(scene, d, 0.4, similarity), rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))
