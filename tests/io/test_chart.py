@@ -42,12 +42,6 @@ def test_points_lie_where_their_numbers_say() -> None:
     assert [label.text for label in whole.iter("text")][-1] == "step" and "A, dB" in text
 
 
-def test_logarithms_space_by_factors_and_leave_out_nothing_else() -> None:
-    _, (points,) = drawn(line_chart("A", [Series("a", [0, 1, 2, 3, 4], [1.0, 0.1, 0.0, None, 0.01])], "step", "", log=True))
-    assert len(points) == 3
-    assert points[1][1] - points[0][1] == pytest.approx(points[2][1] - points[1][1], abs=0.11)
-
-
 def test_what_has_no_points_is_no_chart() -> None:
     assert line_chart("A", [], "", "") == line_chart("A", [Series("a", [1], [None])], "", "") == ""
     assert line_chart("A", [Series("a", [1.0], [-1.0])], "", "", log=True) == ""

@@ -155,18 +155,6 @@ def test_a_large_film_is_linked_beside_the_page(tmp_path: Path) -> None:
     assert video["src"] == "../films/my%20flight%20%231.mp4"
 
 
-def test_an_animated_picture_plays_without_h264_and_stands_beside_upright_views(tmp_path: Path) -> None:
-    flight = tmp_path / "flight.webp"
-    write_video(flight, (np.full((32, 24, 3), index * 20, np.uint8) for index in range(6)), 12)
-    page = page_of(tmp_path / "wide.html", video=flight, credits=["By A <a@b>", EVIL])
-    (shown,) = page.all("img", **{"class": "flight"})
-    assert base64.b64decode(shown["src"].removeprefix("data:image/webp;base64,")) == flight.read_bytes()
-    assert page.all("section", id="flight") and {"By A <a@b>", EVIL} <= {*page.text}
-    upright = [picture(index, 40, 30) for index in range(3)]
-    page = page_of(tmp_path / "upright.html", video=flight, originals=upright, styles=[Style("dusk", upright)])
-    assert page.all("figure", **{"class": "beside"}) and not page.all("section", id="flight")
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -181,3 +169,15 @@ def test_what_does_not_fit_is_named(tmp_path: Path, changes: dict[str, Any], mes
     with pytest.raises(DataError, match=message):
         write_gallery(tmp_path / "g.html", **content(**changes))
     assert not list(tmp_path.iterdir())
+
+
+def test_an_animated_picture_plays_without_h264_and_stands_beside_upright_views(tmp_path: Path) -> None:
+    flight = tmp_path / "flight.webp"
+    write_video(flight, (np.full((32, 24, 3), index * 20, np.uint8) for index in range(6)), 12)
+    page = page_of(tmp_path / "wide.html", video=flight, credits=["By A <a@b>", EVIL])
+    (shown,) = page.all("img", **{"class": "flight"})
+    assert base64.b64decode(shown["src"].removeprefix("data:image/webp;base64,")) == flight.read_bytes()
+    assert page.all("section", id="flight") and {"By A <a@b>", EVIL} <= {*page.text}
+    upright = [picture(index, 40, 30) for index in range(3)]
+    page = page_of(tmp_path / "upright.html", video=flight, originals=upright, styles=[Style("dusk", upright)])
+    assert page.all("figure", **{"class": "beside"}) and not page.all("section", id="flight")

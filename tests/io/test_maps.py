@@ -32,31 +32,6 @@ def test_where_nothing_is_it_is_grey(nothing: float) -> None:
     assert depth_limits([depth], [torch.zeros(5, 5)]) == (0.0, 1.0)
 
 
-def test_views_share_a_scale() -> None:
-    depths = [torch.full((4, 4), 1.0), torch.full((4, 4), 4.0)]
-    solid = [torch.ones(4, 4)] * 2
-    limits = depth_limits(depths, solid)
-    assert limits == pytest.approx((0.25, 1.0))
-    near, far = (depth_image(depth, each, limits) for depth, each in zip(depths, solid, strict=True))
-    assert lightness(near).mean() > lightness(far).mean() + 100
-
-
-def simulate(colours: np.ndarray, kind: str) -> np.ndarray:
-    """Dichromats' view (Viénot, Brettel, Mollon 1999), linear RGB of sRGB colours."""
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    rows = {"protan": [[0.112, 0.888, 0], [0.112, 0.888, 0], [0.004, -0.004, 1]],
-            "deutan": [[0.293, 0.707, 0], [0.293, 0.707, 0], [-0.022, 0.022, 1]], "normal": np.eye(3)}  # fmt: skip
-    return np.clip(linear @ np.array(rows[kind]).T, 0, 1) ** (1 / 2.2)
-
-
-@pytest.mark.parametrize("kind", ["normal", "protan", "deutan"])
-def test_the_palette_is_told_apart_by_the_colour_blind(kind: str) -> None:
-    seen = simulate(palette(7).numpy().astype(float), kind)
-    apart = np.linalg.norm(seen[:, None] - seen, axis=-1) + np.eye(7)
-    assert apart.min() > 0.1
-    assert apart[:4, :4].min() > 0.2
-
-
 def certain(codes: torch.Tensor, count: int) -> torch.Tensor:
     return torch.nn.functional.one_hot(codes, count).float()
 

@@ -1,6 +1,3 @@
-import base64
-import struct
-import zlib
 from pathlib import Path
 
 import cv2
@@ -11,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, NumericsError
-from fprf.io.images import data_uri, encode, shrink, srgb_to_linear, to_uint8, write_exr, write_image
+from fprf.io.images import encode, shrink, srgb_to_linear, to_uint8, write_exr, write_image
 
 
 def ramp(height: int = 40, width: int = 60) -> np.ndarray:
@@ -48,13 +45,6 @@ def test_other_endings_and_other_arrays_are_refused(tmp_path: Path) -> None:
         encode(np.zeros((1, 20000, 3), np.uint8), "webp")
 
 
-def test_a_data_uri_holds_the_picture() -> None:
-    kind, data = data_uri(ramp(), "png").split(",")
-    assert kind == "data:image/png;base64"
-    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-    assert np.array_equal(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), ramp())
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 80))
 def test_shrinking_keeps_the_shape_and_the_mean(height: int, width: int, side: int) -> None:
@@ -66,55 +56,11 @@ def test_shrinking_keeps_the_shape_and_the_mean(height: int, width: int, side: i
         assert np.abs(small.mean((0, 1)) - picture.mean((0, 1))).max() < 3
 
 
-def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """A reader by the specification, for what is written here."""
-    data = path.read_bytes()
-    assert data[:8] == struct.pack("<II", 20000630, 2)
-    at, attributes = 8, {}
-    while data[at] != 0:
-        name, kind, rest = data[at:].split(b"\0", 2)[0], data[at:].split(b"\0", 2)[1], 0
-        at += len(name) + len(kind) + 2
-        (size,) = struct.unpack_from("<I", data, at)
-        attributes[name.decode()] = data[at + 4 : at + 4 + size]
-        at += 4 + size + rest
-    at += 1
-    x0, y0, x1, y1 = struct.unpack("<4i", attributes["dataWindow"])
-    width, height = x1 - x0 + 1, y1 - y0 + 1
-    names, listed = [], attributes["channels"]
-    while listed[0] != 0:
-        name, _, listed = listed.partition(b"\0")
-        kind, _, sx, sy = struct.unpack("<IB3xII", listed[:16])
-        assert (kind, sx, sy) == (2, 1, 1)
-        names.append(name.decode())
-        listed = listed[16:]
-    found = {name: np.zeros((height, width), np.float32) for name in names}
-    for offset in struct.unpack_from(f"<{height}Q", data, at):
-        y, size = struct.unpack_from("<iI", data, offset)
-        body = data[offset + 8 : offset + 8 + size]
-        whole = width * 4 * len(names)
-        if size < whole:
-            steps = np.frombuffer(zlib.decompress(body), np.uint8).astype(np.int64)
-            flat = ((np.cumsum(steps) - 128 * np.arange(len(steps))) & 255).astype(np.uint8)
-            half = (len(flat) + 1) // 2
-            body = np.stack([flat[:half], flat[half:]], 1).tobytes()
-        row = np.frombuffer(body, "<f4").reshape(len(names), width)
-        for k, name in enumerate(names):
-            found[name][y] = row[k]
-    return found
-
-
 def planes(height: int = 9, width: int = 14) -> dict[str, np.ndarray]:
     drawn = np.random.default_rng(0)
     smooth = np.linspace(0, 3, height * width, dtype=np.float32).reshape(height, width)
     noise = drawn.normal(0, 1e9, (height, width)).astype(np.float32)
     return {"R": smooth, "G": smooth * 0, "B": noise, "Z": smooth + 7, "N.X": -smooth}
-
-
-def test_every_bit_comes_back(tmp_path: Path) -> None:
-    write_exr(tmp_path / "a.exr", planes())
-    found = read_exr(tmp_path / "a.exr")
-    assert list(found) == ["B", "G", "N.X", "R", "Z"], "channels are in the order of their names"
-    assert all(np.array_equal(found[name], plane) for name, plane in planes().items())
 
 
 def test_ffmpeg_reads_it(tmp_path: Path) -> None:

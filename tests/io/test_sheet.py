@@ -6,22 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError
-from fprf.io.sheet import Tile, contact_sheet, seam_positions, side_by_side, wipe
+from fprf.io.sheet import seam_positions, side_by_side, wipe
 from fprf.io.video import missing_frames
 
 
 def picture(height: int = 20, width: int = 30) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
-
-
-@pytest.mark.parametrize("count", [0, 1, 4, 5, 9])
-def test_tiles_are_laid_out_in_rows(count: int) -> None:
-    page = contact_sheet([Tile(picture(), ("0: 12 % of the scene", "größer.jpg 80 %"), (0.6, 0.2))] * count)
-    assert page.dtype == np.uint8 and page.shape[2] == 3
-    if count:
-        one = contact_sheet([Tile(picture(), ("0: 12 % of the scene", "größer.jpg 80 %"), (0.6, 0.2))])
-        rows, columns = -(-count // 4), min(4, count)
-        assert page.shape[0] == 8 + rows * (one.shape[0] - 8) and page.shape[1] == 8 + columns * (one.shape[1] - 8)
 
 
 def flat(value: int, width: int = 40, height: int = 6) -> np.ndarray:
