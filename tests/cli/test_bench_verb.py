@@ -43,17 +43,3 @@ def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert all(name in rows for name in document["falls_short"])
     text = capsys.readouterr().out
     assert "faster" in text and all(name in text for name in compared), "nothing is cut off"
-
-
-@pytest.mark.parametrize(
-    ("args", "told"),
-    [
-        (["sped"], "fprf bench sped: no such benchmark; allowed are speed, restyle, peer"),
-        (["speed", "nowhere"], "nowhere: no config.json here"),
-        (["profile", "run"], "run `python -m benchmarks profiling` in a clone of fprf"),
-    ],
-)
-def test_mistakes(args: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["bench", *args]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and told in err and err.startswith("error: ") and err.count("\n") == 1

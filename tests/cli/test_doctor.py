@@ -3,9 +3,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tiny_world import World
 
 from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder, scene_folder
-from fprf.errors import ConfigError, DataError, UsageError
+from fprf.errors import DataError, UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import save_config
 
@@ -31,13 +32,6 @@ def trained(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_finished_run_is_well(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run([str(trained)]) == 0
-    text = capsys.readouterr().out
-    assert "method fprf-lite" in text and f"step {LAST} of {LAST}" in text
-    assert "problem" not in text and "optional" not in text
-
-
 def test_an_unfinished_run_says_how_to_go_on(trained: Path) -> None:
     (trained / "checkpoints" / f"step-{LAST:07d}" / "manifest.json").unlink()
     (trained / "style.safetensors").unlink()
@@ -60,36 +54,17 @@ def test_a_missing_plugin_of_a_run_is_named(trained: Path) -> None:
     assert run([str(trained)]) == 0, "it renders without its encoder"
 
 
-def test_a_run_with_a_damaged_config_is_an_error(trained: Path) -> None:
-    (trained / "config.json").write_text("{")
-    with pytest.raises(ConfigError, match="is not JSON"):
-        run([str(trained)])
-
-
-def test_scene_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_folders(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(DataError, match="no such folder"):
         run([str(tmp_path / "none")])
     with pytest.raises(DataError, match=r"transforms\.json"):
         run([str(tmp_path)])
     with pytest.raises(UsageError):
         run(["a", "b"])
-    frames = [{"file_path": f"{i}.png", "transform_matrix": _pose(i)} for i in range(3)]
-    camera = {"fl_x": 50.0, "fl_y": 50.0, "cx": 16.0, "cy": 12.0, "w": 32, "h": 24}
-    (tmp_path / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
-    import cv2
-    import numpy as np
-
-    for i in range(3):
-        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((24, 32, 3), np.uint8))
-    found = _by_name(scene_folder(tmp_path))
-    assert found["format"].found == "transforms" and found["views"].found == "3 of 32 x 24 pixels, pinhole lens"
-    assert found["next"].found == f"fprf train --data {tmp_path}"
-    assert run(["--target", str(tmp_path)]) == 0
-    assert "32 x 24" in capsys.readouterr().out
-
-
-def _pose(i: int) -> list[list[float]]:
-    return [[1, 0, 0, i * 0.5], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
+    found = _by_name(scene_folder(world.town))
+    assert found["format"].found == "transforms" and found["views"].found == "10 of 32 x 24 pixels, pinhole lens"
+    assert found["next"].found == f"fprf train --data {world.town}"
+    assert run(["--target", str(world.town)]) == 0 and "32 x 24" in capsys.readouterr().out
 
 
 def test_a_method_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

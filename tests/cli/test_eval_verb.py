@@ -46,30 +46,3 @@ def test_data_that_has_moved(run: Path, world: World, tmp_path: Path, capsys: py
     assert f"error: {tmp_path / 'gone'}: no such folder" in capsys.readouterr().err
     shutil.copytree(world.town, tmp_path / "there")
     assert cli.main(["eval", str(run), "--data", str(tmp_path / "there"), "--no-images"]) == 0
-
-
-def test_other_images_than_the_runs(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    other = tmp_path / "other"
-    shutil.copytree(world.town, other)
-    (other / "images" / "0003.png").rename(other / "images" / "0103.png")
-    manifest = other / "transforms.json"
-    manifest.write_text(manifest.read_text().replace("images/0003.png", "images/0103.png"))
-    assert cli.main(["eval", str(run), "--data", str(other)]) == 2
-    assert "its images are not those of the run; name the folder with --data" in capsys.readouterr().err
-
-
-def test_mistakes(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for args, told in (
-        ([], "RUN is missing"),
-        ([str(tmp_path)], "no config.json here, so it is no run folder"),
-        ([str(tmp_path / "absent")], "so it is no run folder"),
-        ([str(run), "--split", "half"], "--split half: "),
-        ([str(run), "--device", "tpu"], "'tpu' is not available here"),
-    ):
-        assert cli.main(["eval", *args]) == 2
-        out, err = capsys.readouterr()
-        assert out == "" and told in err and err.startswith("error: ") and err.count("\n") == 1
-    known = json.loads((run / "scene.json").read_text())
-    (run / "scene.json").write_text(json.dumps(known | {"test": []}))
-    assert cli.main(["eval", str(run)]) == 2
-    assert "--split test: the run holds no such views" in capsys.readouterr().err.splitlines()[-1]

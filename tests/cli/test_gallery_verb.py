@@ -56,20 +56,3 @@ def test_style_files_and_a_flight(run: Path, world: World) -> None:
     page = gallery(run, "--styles", str(style), "--views", "0000", "--frames", "2", "--path", "orbit")
     assert re.findall(r'data-style="\d".*?<span>([^<]*)</span></button>', page) == ["mine"]
     assert (run / "gallery.mp4").stat().st_size > 100 and 'id="flight"' in page
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ([], "name photographs with --references, or style files with --styles"),
-        (["--references", "EMPTY"], "holds no images (.avif"),
-        (["--references", "PHOTO", "--output", "page.pdf"], "--output page.pdf: the page is an .html file"),
-        (["--references", "PHOTO", "--views", "0099"], "--views 0099: no such view in the run"),
-    ],
-)
-def test_mistakes(run: Path, world: World, words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
-    (run.parent / "empty").mkdir()
-    given = {"EMPTY": str(run.parent / "empty"), "PHOTO": str(world.references[0])}
-    assert cli.main(["gallery", str(run), *(given.get(word, word) for word in words)]) == 2
-    assert told in capsys.readouterr().err
-    assert not (run / "gallery.html").exists()

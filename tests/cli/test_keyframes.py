@@ -3,14 +3,12 @@
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.cli import main as cli
 from fprf.cli.keyframes import Key, fade, keyed_looks, read_keyframes
 from fprf.errors import ConfigError
 from fprf.plugins.stylizers.config import AdainConfig
@@ -21,11 +19,6 @@ from fprf.style.files import StyleFile, write_style
 def write(path: Path, *rows: object, **rest: object) -> Path:
     path.write_text(json.dumps({"format": 1, "keyframes": rows, **rest}))
     return path
-
-
-def test_keys_come_in_order_with_paths_from_the_file(tmp_path: Path) -> None:
-    path = write(tmp_path / "k.json", {"frame": 9, "style": "a/b.json"}, {"frame": 0, "style": None})
-    assert read_keyframes(path) == (Key(0, None), Key(9, tmp_path / "a" / "b.json"))
 
 
 @pytest.mark.parametrize(
@@ -86,29 +79,3 @@ def test_each_frame_has_its_look(world: World, styles: tuple[Path, Path]) -> Non
         rising = looks(at)
         assert rising is not None and [part.strength for part in rising.parts] == strengths
         assert {part.luminance for part in rising.parts} == {0.5}, "luminance does not fade: it is kept throughout"
-
-
-def test_a_film_fades_from_plain_to_styled(world: World, styles: tuple[Path, Path], tmp_path: Path) -> None:
-    keys = write(tmp_path / "k.json", {"frame": 0, "style": None}, {"frame": 3, "style": "dusk.json"})
-    common = ["render", str(world.run), "--path", "orbit", "--frames", "5", "--output"]
-    assert cli.main([*common, str(tmp_path / "plain")]) == 0
-    assert cli.main([*common, str(tmp_path / "full"), "--style", str(styles[0])]) == 0
-    assert cli.main([*common, str(tmp_path / "keyed"), "--keyframes", str(keys)]) == 0
-    plain, full, keyed = (
-        [cv2.imread(str(p)).astype(int) for p in sorted((tmp_path / name).glob("*.png"))] for name in ("plain", "full", "keyed")
-    )
-    assert np.array_equal(keyed[0], plain[0]) and np.array_equal(keyed[3], full[3]) and np.array_equal(keyed[4], full[4])
-    away = [np.abs(keyed[i] - plain[i]).mean() / np.abs(full[i] - plain[i]).mean() for i in range(4)]
-    assert away == sorted(away) and 0 < away[1] < 0.5 < away[2] < 1
-
-
-@pytest.mark.parametrize(
-    ("args", "said"),
-    [
-        (["--keyframes", "absent.json"], "absent.json: cannot be read"),
-        (["--keyframes", "k.json", "--references", "a.jpg"], "--keyframes: names styles of its own"),
-    ],
-)
-def test_mistakes(world: World, tmp_path: Path, args: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["render", str(world.run), *args, "--output", str(tmp_path / "out")]) == 2
-    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -1,3 +1,4 @@
+import json
 import os
 import subprocess
 import sys
@@ -34,16 +35,6 @@ def test_help_lists_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
     assert "\x1b" not in text, "no colours into a pipe"
 
 
-def test_no_verb_is_a_mistake_that_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([]) == 2
-    assert "usage: fprf VERB" in capsys.readouterr().out
-
-
-def test_an_unknown_verb_suggests_one(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["trian"]) == 2
-    assert capsys.readouterr().err.startswith("error: fprf trian: no such verb; did you mean 'train'? (verbs: demo,")
-
-
 def test_arguments_and_exit_code_pass_through(monkeypatch: pytest.MonkeyPatch) -> None:
     heard: list[list[str]] = []
 
@@ -57,10 +48,24 @@ def test_arguments_and_exit_code_pass_through(monkeypatch: pytest.MonkeyPatch) -
     assert heard == [["a", "--b"], ["a"]]
 
 
-def test_a_users_mistake_is_one_line_and_2(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    _verb(monkeypatch, _raising(DataError("x.jpg: broken; remove it")))
-    assert cli.main(["doctor"]) == 2
-    assert capsys.readouterr() == ("", "error: x.jpg: broken; remove it\n")
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (DataError("x.jpg: broken; remove it"), 2, "error: x.jpg: broken; remove it\n"),
+        (MemoryError(), 2, None),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (SystemExit(None), 0, ""),
+        (SystemExit(5), 5, ""),
+        (SystemExit("text"), 1, None),
+    ],
+)
+def test_how_a_verb_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, code: int, said: str | None
+) -> None:
+    _verb(monkeypatch, _raising(error))
+    assert cli.main(["doctor"]) == code
+    out, err = capsys.readouterr()
+    assert out == "" and (said is None or err == said) and err.count("\n") <= 1
 
 
 def test_our_fault_is_short_and_1(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,18 +85,6 @@ def test_debug_shows_the_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert "Traceback (most recent call last)" in capsys.readouterr().err
 
 
-def test_an_interrupt_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    _verb(monkeypatch, _raising(KeyboardInterrupt()))
-    assert cli.main(["doctor"]) == 130
-    assert capsys.readouterr().err == "interrupted\n"
-
-
-@pytest.mark.parametrize(("code", "wanted"), [(None, 0), (0, 0), (5, 5), ("text", 1)])
-def test_an_exit_is_a_code(monkeypatch: pytest.MonkeyPatch, code: int | str | None, wanted: int) -> None:
-    _verb(monkeypatch, _raising(SystemExit(code)))
-    assert cli.main(["doctor"]) == wanted
-
-
 def test_a_reader_that_leaves_is_met_with_silence() -> None:
     read, write = os.pipe()
     os.close(read)
@@ -102,14 +95,27 @@ def test_a_reader_that_leaves_is_met_with_silence() -> None:
     assert (ended.returncode, ended.stderr) == (141, b"")
 
 
-def test_python_m_works_from_anywhere(tmp_path: Path) -> None:
-    ended = subprocess.run(
-        [sys.executable, "-m", "fprf", "plugins", "--nope"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr == "error: --nope: no such flag; `fprf plugins --help` lists all\n"
+@pytest.mark.parametrize("verb", sorted(cli.VERBS.keys() - {"completion"}))
+def test_every_verb_describes_itself_and_every_flag_has_a_meaning(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    word = {"train": ["fprf-lite"], "bench": ["speed"], "pretrain": ["decoder"]}.get(verb, [])
+    assert cli.main([verb, *word, "--describe"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["prog"].startswith(f"fprf {verb}") and found["description"]
+    assert found["flags"] and [row["flag"] for row in found["flags"] if not row["meaning"]] == []
+
+
+def test_a_cluster_is_started_with_a_token_and_without_usage_statistics(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["cluster", "--head", "node7", "--port", "7001"]) == 0
+    said = capsys.readouterr().out
+    assert "ray start --head --port 7001" in said and "ray start --address node7:7001" in said
+    starts = [line for line in said.splitlines() if "export " in line]
+    assert len(starts) == 2
+    assert all("RAY_USAGE_STATS_ENABLED=0" in line and "RAY_AUTH_MODE=token" in line for line in starts)
+
+
+def test_without_viser_view_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert cli.main(["view", str(tmp_path)]) == 2
+    assert "pip install 'fprf[viewer]'" in capsys.readouterr().err

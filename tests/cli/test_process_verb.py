@@ -84,15 +84,6 @@ def test_what_is_done_is_not_done_again(photos: Path) -> None:
     assert calls(photos)[0].startswith("features OPENCV 1600 0.png 1.png")
 
 
-def test_an_image_that_changed_starts_features_anew(photos: Path) -> None:
-    assert process(photos) == 0
-    calls(photos)
-    add(photos, 3, (30, 16))
-    assert process(photos) == 0
-    told = calls(photos)
-    assert told[:2] == ["features SIMPLE_RADIAL 1600 0.png 1.png 2.png 4.png", "features SIMPLE_RADIAL 1600 3.png"]
-
-
 @pytest.mark.parametrize("step", ["features", "matches", "mapping"])
 def test_a_step_that_breaks_off_goes_on_where_it_stood(photos: Path, step: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert process(photos, plan={"fail": step}) == 2

@@ -56,22 +56,6 @@ def test_a_camera_path_file(run: Path, tmp_path: Path) -> None:
     assert [image.shape for image in pictures(tmp_path / "frames").values()] == [(10, 15, 3)] * 2
 
 
-@pytest.mark.parametrize(
-    ("args", "told"),
-    [
-        (["--path", "spirale"], "--path spirale: neither a file nor one of spiral, orbit, interpolate, dataset"),
-        (["--show", "match", "--path", "orbit"], "--show match: needs a style that holds throughout"),
-        (["--show", "colour", "normals", "--lens", "stereo"], "--show: a stereo panorama shows colour and depth only"),
-        (["--styles", "dusk", "--path", "orbit"], "--styles dusk: write NAME=PHOTO,PHOTO or NAME=STYLE.json"),
-    ],
-)
-def test_mistakes(run: Path, args: list[str], told: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert cli.main(["render", str(run), *args, "--output", str(tmp_path / "out")]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.startswith("error: ") and err.count("\n") == 1 and told in err
-    assert not (tmp_path / "out").exists()
-
-
 def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: World, tmp_path: Path) -> None:
     common = ["render", str(run), "--path", "dataset", "--split", "test", "--output"]
     dusk = f"dusk={world.references[0]}"

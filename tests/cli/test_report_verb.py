@@ -38,10 +38,3 @@ def test_blocks_are_lines_of_one_chart_and_trouble_is_told(tmp_path: Path, capsy
     text = page.read_text("utf-8")
     assert text.count("<polyline") == 6 and "&lt;b&gt;step-2" in text and "<b>step" not in text
     HTMLParser().feed(text)
-
-
-def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["report", str(tmp_path / "none")]) == 2
-    assert "no such folder" in capsys.readouterr().err
-    assert cli.main(["report", str(tmp_path)]) == 2
-    assert "no events.jsonl" in capsys.readouterr().err and not (tmp_path / "report.html").exists()

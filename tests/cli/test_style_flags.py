@@ -38,12 +38,6 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "style.json"
 
 
-def test_flags_alone() -> None:
-    config, found = read("RUN", "--references", "a.jpg", "b.jpg", "--strength", "0.5", "--frames", "7")
-    assert (config.run, config.frames, config.style) == (Path("RUN"), 7, None)
-    assert found == StyleFile(StyleConfig(references=(Path("a.jpg"), Path("b.jpg")), strength=0.5))
-
-
 def test_flags_of_many_values_may_be_repeated() -> None:
     args = [
         "RUN",
@@ -108,8 +102,3 @@ def test_a_preset_lies_over_the_file_and_below_the_flags(file: Path, capsys: pyt
 def test_every_preset_is_what_its_flags_say(name: str) -> None:
     assert read("RUN", f"--{name}")[1] == read("RUN", *preset_flags(name).split())[1]
     assert with_preset(StyleConfig(), name) != StyleConfig()
-
-
-def test_an_unknown_preset_is_refused() -> None:
-    with pytest.raises(UsageError, match="'gentel': no such preset; did you mean 'gentle'"):
-        with_preset(StyleConfig(), "gentel")

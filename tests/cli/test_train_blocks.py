@@ -46,12 +46,6 @@ def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.Ca
     assert (run / "blocks/00/done.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("memory", ["0", "-5", "nan"])
-def test_limits_that_are_none_are_refused(world: World, capsys: pytest.CaptureFixture[str], memory: str) -> None:
-    assert main(["eval", str(world.run), "--max-memory", memory]) == 2
-    assert "--max-memory" in capsys.readouterr().err
-
-
 def test_time_is_shared_between_the_surroundings_and_the_blocks() -> None:
     config = TrainConfig(minutes=10.0)
     around, each = block_minutes(config, 4, 60.0)

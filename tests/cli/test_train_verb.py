@@ -53,38 +53,6 @@ def test_another_config_in_an_existing_run_is_refused_before_any_work(
     assert (world.run / "config.json").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("args", "told"),
-    [
-        (["fprf-litee"], "did you mean 'fprf-lite'"),
-        (["--sampler", "uniform"], "--sampler: no such flag; `fprf train fprf-splats --help`"),
-        (["fprf-lite", "--steps", "-1"], "--steps: -1 must be at least 0"),
-        (["fprf-lite", "--loss.rgb", "0", "--loss.content", "0", "--loss.semantic", "0"], "nothing would be learnt"),
-        (["absent/config.json"], "absent/config.json: cannot be read"),
-        (["fprf-lite"], "no scene is named: give --data FOLDER, or --data town"),
-    ],
-)
-def test_mistakes_on_the_command_line(
-    args: list[str], told: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert told in mistake(capsys, "train", *args)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_mistakes_in_the_data(capsys: pytest.CaptureFixture[str], tmp_path: Path, world: World) -> None:
-    absent, empty = tmp_path / "absent", tmp_path / "empty"
-    empty.mkdir()
-    output = ["--output", str(tmp_path / "run")]
-    assert f"{absent}: no such folder" in mistake(capsys, "train", "fprf-lite", "--data", str(absent), *output)
-    line = mistake(capsys, "train", "fprf-lite", "--data", str(empty), *output)
-    assert f"{empty}: no transforms.json" in line and "but nothing" in line
-    assert "a folder, not a method" in mistake(capsys, "train", str(world.run))
-    assert "'tpu' is not available here" in mistake(
-        capsys, "train", "fprf-lite", *[("tpu" if a == "cpu" else a) for a in flags(world, tmp_path / "run")]
-    )
-
-
 def test_an_interrupt_is_130_and_the_run_goes_on(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

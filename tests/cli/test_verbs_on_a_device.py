@@ -72,18 +72,8 @@ def between(world: World, folder: Path) -> list[str]:
     """A style on the way to another, with regions that are kept and pinned, and numbers for every pixel."""
     style = {"format": 1, "style": {"references": [str(world.references[1])], "clusters": 3}}
     (folder / "other.json").write_text(json.dumps(style))
-    controls = ["--keep", "0", "--pin", "1=dusk.png", "--forbid", "2=snow.png", "--strength", "0.7", "--luminance", "0.5"]
-    return [
-        *references(world),
-        *controls,
-        "--between",
-        str(folder / "other.json"),
-        "--at",
-        "0.3",
-        "--pixels",
-        "--output",
-        "OUT",
-    ]
+    controls = "--keep 0 --pin 1=dusk.png --forbid 2=snow.png --strength 0.7 --luminance 0.5 --at 0.3 --pixels --output OUT"
+    return [*references(world), "--between", str(folder / "other.json"), *controls.split()]
 
 
 def references(world: World) -> list[str]:
@@ -92,7 +82,6 @@ def references(world: World) -> list[str]:
 
 VERBS: dict[str, Callable[[World, Path], list[str]]] = {
     "stylize": lambda world, folder: [*VIEW, *between(world, folder)],
-    "stylize --explain": lambda world, _: [*references(world), "--explain", "--output", "OUT"],
     "render": keyed,
     "render --path": lambda *_: ["--path", "spiral", "--frames", "2", "--resolution", "0.5", "--show", "colour", "depth",
                                  "normals", "--output", "OUT"],

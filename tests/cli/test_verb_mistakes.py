@@ -1,0 +1,126 @@
+"""Mistakes that a user can make with each verb: exit 2, one line that names what is wrong, and nothing is written."""
+
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from tiny_world import World
+
+from fprf.cli import main as cli
+
+LOOSE = "--tolerance 0.3 --agree 1"
+MISTAKES = f"""
+    bench sped | no such benchmark
+    bench speed nowhere | nowhere: no config.json
+    bench profile run | python -m benchmarks profiling
+    eval | RUN is missing
+    eval photos | no run folder
+    eval absent | no run folder
+    eval run --split half | --split half
+    eval run --device tpu | 'tpu'
+    eval run --max-memory nan | --max-memory
+    eval moved | gone: no such folder
+    eval other | its images are not those of the run
+    eval untested | --split test
+    export run plx | 'plx'
+    export run --witnesses 0 | --witnesses
+    export run --presence 1.5 | --presence
+    export run --points 0 | --points
+    export run --views 1 | --views
+    export run --edge 0 | --edge
+    export run --lut-size 1 | --lut-size
+    export run --styles A | NAME=
+    export run --styles a=absent.png | absent.png
+    export run --styles a=x.png b=x.png --output out/one.ply | one file holds one style
+    export run cameras --output out/one.splat | holds splat
+    export run lut --output out | --references
+    export run ply {LOOSE} --presence 1 --output out | --presence
+    export run ply --tolerance 1e-6 --output out | no surface
+    gallery run | --references
+    gallery run --references empty | no images
+    gallery run --references A.png --output page.pdf | page.pdf
+    gallery run --references A.png --views 0099 | --views 0099
+    render run --path spirale | --path spirale
+    render run --path path.json | path.json
+    render run --show match --path orbit | --show match
+    render run --show colour normals --lens stereo | --show
+    render run --styles dusk --path orbit | NAME=
+    render run --path orbit --frames 2 --output a.mov | .mp4
+    render run --keyframes absent.json | absent.json
+    render run --keyframes keys.json --references A.png | --keyframes
+    report absent | no such folder
+    report empty | no events.jsonl
+    stylize run | --references
+    stylize run --references A.png B.png --weights 1 | --weights
+    stylize run --references A.png --pin 77=A | region 77
+    stylize run --references A.png --forbid 0=0 | region 0
+    stylize run --references A.png --keep 0000:99,1 | 0000:99,1
+    stylize run --references A.png --between absent.json | absent.json
+    stylize run --references A.png --views 000 | --views 000
+    stylize run --references A.png --stylizer region-to | 'region-tone'
+    stylize unmeasured --references A.png | fprf train
+    train fprf-litee | 'fprf-lite'
+    train --sampler uniform | --sampler
+    train fprf-lite --steps -1 | --steps
+    train fprf-lite --loss.rgb 0 --loss.content 0 --loss.semantic 0 | nothing would be learnt
+    train absent/config.json | absent/config.json
+    train fprf-lite | --data
+    train fprf-lite --data absent | absent: no such folder
+    train fprf-lite --data empty | but nothing
+    train run | not a method
+    train run/config.json --device tpu | 'tpu'
+    trian | 'train'
+    view run --port 70000 | --port
+    view run --pixels 3 | --pixels
+    view run --token short | --token
+    view run --host no.such.host.invalid --port 0 --token a-long-enough-token | no.such.host.invalid
+    view photos --port 0 | no config.json
+"""
+
+
+@pytest.fixture(scope="module")
+def _place(_world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders and files of the names above."""
+    folder = tmp_path_factory.mktemp("mistakes")
+    for name in ("run", "moved", "other", "untested", "unmeasured"):
+        shutil.copytree(_world.run, folder / name)
+    for name in ("photos", "empty"):
+        (folder / name).mkdir()
+    for name, path in zip("AB", _world.references, strict=True):
+        shutil.copy(path, folder / f"{name}.png")
+    config = folder / "moved" / "config.json"
+    config.write_text(config.read_text().replace(str(_world.town), str(folder / "gone")))
+    town = shutil.copytree(_world.town, folder / "town-with-other-names")
+    (town / "images" / "0003.png").rename(town / "images" / "0103.png")
+    manifest = town / "transforms.json"
+    manifest.write_text(manifest.read_text().replace("images/0003.png", "images/0103.png"))
+    config = folder / "other" / "config.json"
+    config.write_text(config.read_text().replace(str(_world.town), str(town)))
+    known = folder / "untested" / "scene.json"
+    known.write_text(json.dumps(json.loads(known.read_text()) | {"test": []}))
+    (folder / "unmeasured" / "style.safetensors").unlink()
+    (folder / "path.json").write_text("{}")
+    (folder / "keys.json").write_text(json.dumps({"format": 1, "keyframes": [{"frame": 0, "style": None}]}))
+    return folder
+
+
+def files(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("line", [line.strip() for line in MISTAKES.strip().splitlines()])
+def test_a_mistake_is_one_line(
+    line: str, world: World, _place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command, _, told = line.partition(" | ")
+    if command.startswith("view"):
+        monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    monkeypatch.chdir(_place)
+    before = files(_place)
+    assert cli.main(shlex.split(command)) == 2
+    out, err = capsys.readouterr()
+    lines = [each for each in err.splitlines() if not each.startswith("{")]
+    assert out == "" and len(lines) == 1 and lines[0].startswith("error: ") and told in lines[0]
+    assert files(_place) == before
