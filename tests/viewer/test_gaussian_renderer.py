@@ -12,11 +12,10 @@ from splat_ball import ball
 from test_session import Listener
 from tiny_world import World
 
-from fprf.errors import UsageError
 from fprf.io.images import to_uint8
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.splats.files import read_capture, write_capture, write_gaussians
+from fprf.splats.files import read_capture
 from fprf.splats.look_config import LookConfig
 from fprf.splats.scene import SplatScene, look_at_capture
 from fprf.style.files import StyleFile
@@ -113,14 +112,6 @@ def test_pictures_and_gaussians_in_the_look_of_now_are_files(
     again = read_capture(tmp_path / "x.ply").gaussians
     assert torch.equal(again.harmonics, styled.shown.harmonics) and torch.equal(again.means, scene.gaussians.means)
     assert not torch.equal(again.harmonics, scene.gaussians.harmonics)
-    # A capture keeps all that is not a colour, its Gaussians that are not finite included.
-    broken = replace(scene.gaussians, means=torch.cat([scene.gaussians.means[:-1], torch.full((1, 3), torch.nan)]))
-    write_gaussians(tmp_path / "y.ply", broken)
-    capture = read_capture(tmp_path / "y.ply")
-    write_capture(tmp_path / "z.ply", capture, styled.shown.harmonics[:-1])
-    whole = read_capture(tmp_path / "z.ply").gaussians
-    assert torch.equal(whole.harmonics[:-1], styled.shown.harmonics[:-1])
-    assert torch.equal(whole.harmonics[-1], broken.harmonics[-1]) and bool(whole.means[-1].isnan().all())
 
 
 def test_a_flight_moves_the_browser_s_camera(opened: tuple[Session, Listener], scene: SplatScene) -> None:
@@ -138,13 +129,3 @@ def test_gaussians_on_the_page_have_their_places_and_shapes(scene: SplatScene) -
     assert torch.allclose(means.double(), transform.to_page(scene.gaussians.means), atol=1e-5)
     lengths, wanted = torch.linalg.eigvalsh(covariances.double()).clamp_min(0).sqrt(), scene.gaussians.log_scales.double().exp()
     assert torch.allclose(lengths, transform.scale * wanted.sort(1).values, rtol=1e-3, atol=1e-5)
-
-
-def test_scenes_of_another_kind_are_refused() -> None:
-    class Other:
-        cameras = look_at_capture(
-            ball(50), False, BundledSemanticConfig().build(), LookConfig(views=2, size=(48, 36), regions=1)
-        ).cameras
-
-    with pytest.raises(UsageError, match="Other"):
-        Session(Viewed(Other(), "other", 0), State())  # type: ignore[arg-type]

@@ -93,15 +93,6 @@ def test_nothing_is_wanted_before_somebody_comes(told: Told) -> None:
     assert told.tick(60) == [{"looking": False}]
 
 
-def test_who_comes_before_the_run_has_begun_waits_for_it(told: Told) -> None:
-    told.host.visited.set()
-    assert told.tick() == [{"looking": True}]
-    told.follower.receive({"snapshot": str(told.newest)})  # of no run: cannot be
-    assert told.host.session is None
-    told.follower.receive({"run": str(told.run), "device": "cpu"})
-    assert told.tick() == [{"want": True}]
-
-
 def test_new_parameters_are_wanted_when_everybody_has_seen_the_old_ones(told: Told) -> None:
     session = told.begin()
     session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 0))
@@ -143,17 +134,6 @@ def test_at_the_end_the_run_is_what_was_saved(told: Told, world: World) -> None:
     assert session.state.training == TrainingProgress(15, 1.0) and session.viewed.scene.step == 15
     assert told.tick(0.5) == [] and not told.follower.over  # somebody looks still
     assert told.tick(60) == [{"looking": False}] and told.follower.over
-
-
-def test_another_block_is_another_model(told: Told) -> None:
-    session = told.begin()
-    before = session.viewed.scene
-    told.follower.receive({"run": str(told.run), "device": "cpu", "block": None, "what": "block 01"})
-    told.follower.receive({"snapshot": str(told.newest)})
-    settle(session)
-    assert session.viewed.scene is not before and session.restyler.scene is session.viewed.scene is session.renderer._trained
-    told.follower.receive({"report": [3, 0.5, 19.5, 10.0]})
-    assert session.state.training == TrainingProgress(3, 0.5, 19.5, 10.0, "block 01")
 
 
 def test_a_port_that_is_taken_is_an_error_or_another_port() -> None:
@@ -249,3 +229,14 @@ def test_no_viewer_holds_training_up(world: World, script: str) -> None:
             assert not view.finish(stay=True)
         else:
             view.finish(stay=False)
+
+
+def test_lines_that_are_none_end_it() -> None:
+    answers = io.StringIO()
+    main(io.StringIO('{"host": "127.0.0.1", "port": 0, "strict": false}\n{"run": "/nowhere", "device": "cpu"}\n{'), answers)
+    assert "address" in answers.getvalue()
+
+
+def test_an_end_that_nobody_sees_is_the_end(told: Told) -> None:
+    told.follower.receive({"done": True})
+    assert told.follower.over

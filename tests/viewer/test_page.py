@@ -152,3 +152,7 @@ def test_keys_are_edited_by_their_places(page: Page) -> None:
     picture = cv2.imdecode(np.frombuffer(answer.body, np.uint8), 1)
     assert answer.content_type == "image/jpeg" and picture.shape == (12, 16, 3) and abs(int(picture.mean()) - 200) < 3
     assert ask(page, "GET", "/fprf/key", {"key": "0"}).status == 404
+
+
+def test_no_film_is_no_page(page: Page) -> None:
+    assert ask(page, "GET", "/fprf/film").status == 404

@@ -8,7 +8,6 @@ from photographs import encoded
 from tiny_world import World
 
 from fprf.errors import CheckpointError, UsageError
-from fprf.style.dictionary import build_dictionary
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.scene import SceneStyle
@@ -16,7 +15,7 @@ from fprf.training.loading import load_run, load_style
 from fprf.training.regions import membership_view
 from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
-from fprf.viewer.restyler import Restyler, concatenate, load_unfinished, matching_regions, measure_encoders, set_parameters
+from fprf.viewer.restyler import Restyler, load_unfinished, matching_regions, measure_encoders, set_parameters
 from fprf.viewer.state import Look, set_rule, style_config
 
 
@@ -48,19 +47,6 @@ def test_between_two_looks(world: World) -> None:
     )
 
 
-def test_joining_is_building_at_once(world: World) -> None:
-    restyler = Restyler(world.load())
-    cards = encoded(restyler, world)
-    parts = [build_dictionary([card.reference], clusters=3) for card in cards]
-    found = concatenate(parts, [card.name for card in cards], [1.0, 2.0])
-    references = [card.reference._replace(weight=weight) for card, weight in zip(cards, (1.0, 2.0), strict=True)]
-    wanted = build_dictionary(references, clusters=3)
-    for name in found.names:
-        mine, its = found.reference == found.names.index(name), wanted.reference == wanted.names.index(name)
-        for field in ("keys", "mean", "covariance", "share", "weight", "colour_mean", "colour_covariance"):
-            assert torch.equal(getattr(found, field)[mine], getattr(wanted, field)[its])
-
-
 def test_styles_are_kept_and_bounded(world: World) -> None:
     restyler = Restyler(world.load())
     a, _ = encoded(restyler, world)
@@ -88,20 +74,6 @@ def test_a_click_finds_the_region_that_is_there(world: World) -> None:
         assert restyler.region_at(cameras, (x + 0.5, y + 0.5)) == int(share[y, x].argmax())
     with pytest.raises(UsageError, match="outside"):
         restyler.region_at(cameras, (32.0, 1.0))
-
-
-def test_what_there_is_to_say_of_a_region(world: World) -> None:
-    restyler = Restyler(world.load())
-    a, b = encoded(restyler, world)
-    assert restyler.region_info(Look(), 0).taken == ()
-    look = Look(mix=((a, 1.0), (b, 1.0)), clusters=3)
-    picked = restyler.region_info(look, 1)
-    assert {name for name, _ in picked.taken} == {"dusk.png", "snow.png"}
-    assert sum(share for _, share in picked.taken) == pytest.approx(1.0, abs=1e-4) and 0 < picked.share < 1
-    # A soft membership leaves a little to the neighbours of a pinned region.
-    assert dict(restyler.region_info(set_rule(look, 1, "pin", b), 1).taken)["snow.png"] > 0.5
-    kept = restyler.region_info(set_rule(look, 1, "keep"), 1)
-    assert sum(share for _, share in kept.taken) < sum(share for _, share in picked.taken)
 
 
 @pytest.fixture

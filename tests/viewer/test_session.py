@@ -147,3 +147,17 @@ def test_photographs_that_left_the_shelf_leave_nothing(opened: tuple[Session, Li
         session.upload(data, "x.png")
     assert len(list(session.uploads.folder.glob("*.png"))) == SHELF == len(session.state.shelf)
     assert {key[0] for key in session.restyler._dictionaries} <= session.state.photographs
+
+
+def test_the_rehearsal_leaves_nothing_behind(opened: tuple[Session, Listener]) -> None:
+    session, listener = opened
+    session.warm_up()
+    done = threading.Event()
+
+    def last() -> Iterator[None]:
+        yield
+        done.set()
+
+    session._worker.run_when_idle(last())
+    assert done.wait(120)
+    assert session.state == State(pixels=64) and listener.frames == [] and not session.restyler._styles

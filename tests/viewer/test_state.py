@@ -15,7 +15,6 @@ from fprf.viewer.state import (
     Key,
     Look,
     Photograph,
-    RegionInfo,
     State,
     add_key,
     add_photograph,
@@ -41,14 +40,6 @@ def card(number: int) -> Photograph:
 
 
 A, B, C = (card(i) for i in range(3))
-
-
-@pytest.mark.parametrize("wrong", [{"strength": 1.1}, {"blend": -0.1}, {"clusters": 0}, {"temperature": 0.0}, {"at": 2.0}])
-def test_ranges_are_those_of_styles(wrong: dict[str, float]) -> None:
-    with pytest.raises(ConfigError):
-        replace(Look(), **wrong)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError):
-        Look(mix=((A, 0.0),))
 
 
 def test_weights_order_and_void_wishes() -> None:
@@ -119,12 +110,6 @@ def test_removing_and_keeping() -> None:
         save_look(state, "  ")
 
 
-def test_what_is_shown_and_what_must_be_painted() -> None:
-    assert State().view.layers == {"look"}
-    state = State(map="matches", wipe=0.3, picked=RegionInfo(2, 0.1, ()))
-    assert state.view.layers == {"look", "matches", "plain", "region 2"}
-
-
 @pytest.mark.parametrize("wrong", [{"map": "x"}, {"wipe": 1.5}, {"pixels": 3}, {"pixels": 5000}, {"map_opacity": -1.0}])
 def test_a_state_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises((UsageError, ConfigError)):
@@ -186,11 +171,6 @@ def test_shifting_keeps_all_keys_and_follows_the_chosen_one(count: int, data: st
     assert rest == sorted(rest)
 
 
-def test_going_to_a_key_takes_its_look() -> None:
-    state = State(keys=(key(0, ONE), key(1, TWO)), selected_key=1, look=PLAIN)
-    assert restore_key(state).look == TWO and restore_key(select_key(state, 0)).look == ONE
-
-
 def test_looks_fade_from_key_to_key_as_in_the_film() -> None:
     keys = (key(0, ONE), key(1, TWO), key(2, TWO))
     assert interpolate_looks(keys, 0.0) == ONE and interpolate_looks(keys, 1.0) == TWO and interpolate_looks(keys, 1.7) == TWO
@@ -205,3 +185,10 @@ def test_looks_that_are_fades_themselves_hold_for_half_the_way() -> None:
     between = replace(ONE, towards=TWO, at=0.3)
     keys = (key(0, between), key(1, PLAIN))
     assert interpolate_looks(keys, 0.4) == between and interpolate_looks(keys, 0.6) == PLAIN
+
+
+def test_a_shelf_full_of_photographs_in_use_still_takes_one() -> None:
+    state = State(drop_mode="in the mix")
+    for number in range(SHELF + 5):
+        state = add_photograph(state, card(number))
+    assert len(state.shelf) == SHELF and state.shelf[-1].number == SHELF + 4

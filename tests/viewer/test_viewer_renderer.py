@@ -159,19 +159,6 @@ def test_a_picked_region_stands_out(restyler: Restyler) -> None:
     assert np.allclose(sum(shares), 1, atol=1e-3)
 
 
-def test_composing_is_arithmetic() -> None:
-    look, plain, over = (np.full((4, 10, 3), value, np.uint8) for value in (100, 200, 50))
-    layers = Layers({"look": look, "plain": plain, "matches": over}, None, torch.ones(4, 10))
-    assert np.array_equal(composite_layers(layers, ViewSettings(Look())), look)
-    wiped = composite_layers(layers, ViewSettings(Look(), wipe=0.3))
-    assert (wiped[:, :3] == 200).all() and (wiped[:, 3:] == 100).all()
-    assert (composite_layers(layers, ViewSettings(Look(), wipe=0.0)) == 100).all() and (
-        composite_layers(layers, ViewSettings(Look(), wipe=1.0)) == 200
-    ).all()
-    assert (composite_layers(layers, ViewSettings(Look(), "matches", map_opacity=0.5)) == 75).all()
-    assert (composite_layers(layers, ViewSettings(Look(), "depth")) == 100).all()  # not painted
-
-
 def layers_on(world: World, device: str) -> dict[str, Any]:
     """Every layer of a view, and what there is to say of a region in it."""
     trained = load_run(world.run, device)
@@ -235,3 +222,7 @@ def test_speed_learns_and_forgets() -> None:
     for _ in range(40):
         speed.update(1000, 0.001)
     assert speed.seconds < 2e-6
+
+
+def test_without_a_style_the_match_map_is_grey(restyler: Restyler) -> None:
+    assert (painted(restyler, ViewSettings(Look(), "matches")).pictures["matches"] == 128).all()
