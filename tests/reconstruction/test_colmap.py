@@ -53,17 +53,6 @@ def test_progress_and_descriptors(database: Path, tmp_path: Path) -> None:
         MatchTables(tmp_path / "other.db")
 
 
-def test_reading_while_another_writes(database: Path) -> None:
-    base = sqlite3.connect(database)
-    base.execute("PRAGMA journal_mode=WAL")
-    base.execute("BEGIN IMMEDIATE")
-    base.execute("INSERT INTO keypoints VALUES (9, 10, 6, '')")
-    assert count_rows(database) == (3, 3)
-    base.commit()
-    assert count_rows(database) == (4, 3)
-    base.close()
-
-
 def proper(pairs: list[tuple[int, int]], count: int) -> bool:
     return all(0 <= a < b < count for a, b in pairs) and pairs == sorted(set(pairs))
 
@@ -115,18 +104,3 @@ def test_images_of_one_place_are_alike() -> None:
     pairs = similar_pairs(found, 2)
     same = [(a, b) for a in range(24) for b in range(a + 1, 24) if a // 3 == b // 3]
     assert len(set(pairs) & set(same)) >= 0.9 * len(same), "of each image's two nearest"
-
-
-def test_images_without_features() -> None:
-    nothing = np.zeros((0, 128), np.uint8)
-    assert not vlad_vectors(lambda _: nothing, 2, np.ones((4, 128), np.float32)).any()
-    assert build_vocabulary(lambda _: nothing, 2, 4).shape == (0, 128) and build_vocabulary(lambda _: nothing, 0, 4).shape == (
-        0,
-        128,
-    )
-    few = np.ones((3, 128), np.uint8)
-    assert build_vocabulary(lambda _: few, 1, 64).shape == (3, 128)
-    many = np.random.default_rng(0).integers(0, 255, (5001, 128), dtype=np.uint8)
-    assert np.linalg.norm(vlad_vectors(lambda _: many, 1, build_vocabulary(lambda _: many, 1, 4))[0]) == pytest.approx(
-        1, abs=1e-5
-    )

@@ -3,6 +3,7 @@ import struct
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,26 +19,18 @@ from fprf.reconstruction.config import SfmConfig
 from fprf.reconstruction.images import (
     Lens,
     choose_frames,
-    frame_name,
     frame_scores,
     gather_images,
     lens_of,
     natural_order,
     read_lens,
     save_frames,
-    sharpness,
 )
-from fprf.reconstruction.scene_folder import SceneFolder, State
+from fprf.reconstruction.scene_folder import SceneFolder, State, dropped_images
 
 
 def noise(height: int = 60, width: int = 80, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
-
-
-def test_blur_lowers_it_step_by_step() -> None:
-    image = noise(240, 320)
-    scores = [sharpness(cv2.GaussianBlur(image, (0, 0), sigma)) for sigma in (0.5, 1, 2, 4)]
-    assert scores == sorted(scores, reverse=True) and scores[0] > 20 * scores[-1]
 
 
 @settings(deadline=None)
@@ -49,63 +42,13 @@ def test_every_frame_is_chosen_or_has_a_reason(scores: list[float], count: int, 
     assert all(choice.dropped.values())
 
 
-@settings(deadline=None)
-@given(st.lists(st.floats(1, 2), min_size=1, max_size=80), st.integers(1, 30))
-def test_windows_are_even_and_give_their_sharpest(scores: list[float], count: int) -> None:
-    chosen = choose_frames(scores, count, 0.3).chosen  # none can be below 0.3 of its neighbours
-    windows = min(count, len(scores))
-    edges = [round(k * len(scores) / windows) for k in range(windows + 1)]
-    assert len(chosen) == windows
-    for frame, low, high in zip(chosen, edges, edges[1:], strict=False):
-        assert low <= frame < high and scores[frame] == max(scores[low:high])
-
-
-def test_a_blurred_stretch_gives_no_frame() -> None:
-    scores = [100.0, 90, 110, 5, 4, 6, 95, 120, 80]
-    choice = choose_frames(scores, 3, 0.3)
-    assert choice.chosen == [2, 7]
-    assert choice.dropped[5] == "blurred, like all frames around it (sharpness 6, usual there is 115)"
-    assert choice.dropped[3] == "less sharp than frame 5 (5 < 6)"
-    assert choose_frames(scores, 3, 0.0).chosen == [2, 5, 7]
-
-
-BLURRED = (1, 2, 5)
-
-
-def frames(count: int = 8) -> list[np.ndarray]:
-    drawn = np.random.default_rng(0)
-    base = cv2.resize(drawn.integers(0, 256, (12, 16, 3), dtype=np.uint8), (160, 120), interpolation=cv2.INTER_NEAREST)
-    made = []
-    for k in range(count):
-        frame = np.roll(base, 5 * k, axis=1)
-        cv2.putText(frame, str(k), (20, 90), cv2.FONT_HERSHEY_SIMPLEX, 3, (255, 255, 255), 8)
-        made.append(cv2.GaussianBlur(frame, (0, 0), 4) if k in BLURRED else frame)
-    return made
-
-
-@pytest.fixture
-def video(tmp_path: Path) -> Path:
-    write_video(tmp_path / "clip.mp4", frames(), 24, h264=False)
-    return tmp_path / "clip.mp4"
-
-
-def test_saved_frames_are_those_asked_for(video: Path, tmp_path: Path) -> None:
-    save_frames(video, [0, 3, 7], tmp_path / "out", lambda *_: None)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [frame_name(k) for k in (0, 3, 7)]
-    for k, truth in enumerate(frames()):
-        path = tmp_path / "out" / frame_name(k)
-        if path.is_file():
-            found = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
-            assert np.abs(found.astype(int) - truth).mean() < 12, "coded twice, but the same picture"
-            assert sharpness(found) > 0
-
-
-def test_what_is_no_video_is_named(tmp_path: Path, video: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_video_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    write_video(tmp_path / "clip.mp4", [noise(32, 48)] * 3, 24, h264=False)
     (tmp_path / "no.mp4").write_bytes(b"nothing of the kind" * 100)
     with pytest.raises(DataError, match=r"no\.mp4: no video that can be opened"):
         frame_scores(tmp_path / "no.mp4", lambda *_: None)
     with pytest.raises(DataError, match="frame 99 was there before"):
-        save_frames(video, [2, 99], tmp_path / "out", lambda *_: None)
+        save_frames(tmp_path / "clip.mp4", [2, 99], tmp_path / "out", lambda *_: None)
 
 
 def tiff(order: str, model: bytes = b"Phone 9\0", focal: tuple[int, int] = (425, 100), short: int = 26) -> bytes:
@@ -224,13 +167,6 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
     assert abs(load_image(jpeg).astype(int) - load_image(source / "IMG 0.HEIC")).mean() < 3
 
 
-def test_a_folder_of_other_files_is_told_by_what_it_holds(tmp_path: Path) -> None:
-    for name in ("a.dng", "b.DNG", "c.txt"):
-        (tmp_path / name).write_bytes(b"x")
-    with pytest.raises(DataError, match=r"0 usable images.*holds \.dng \.txt files.*convert"):
-        gathered(tmp_path, SceneFolder(tmp_path / "scene"))
-
-
 def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) -> None:
     place = SceneFolder(tmp_path / "scene")
     before = {name: (place.images / name).stat().st_mtime_ns for name in gathered(photos, place).images}
@@ -294,3 +230,45 @@ def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
     for knob, value in {"frames": 2, "blurred": 1.5, "features": 5, "side": 9, "overlap": 0, "threads": 0}.items():
         with pytest.raises(ConfigError, match=knob):
             SfmConfig(**{knob: value})
+
+
+class Matches:
+    """Features and partners of images by name."""
+
+    def __init__(self, **known: tuple[int, int]) -> None:
+        self.known = known
+
+    def features_of(self, name: str) -> int:
+        return self.known[name][0]
+
+    def partners(self, name: str, least: int) -> int:
+        assert least > 0
+        return self.known[name][1]
+
+
+FOUND = Matches(a=(900, 3), b=(900, 2), bare=(0, 0), lonely=(50, 0), apart=(80, 1), odd=(70, 4))
+MODELS: list[dict[str, Any]] = [
+    {"images": ["a", "b"], "points": 10, "error_pixels": 0.5, "track_length": 3.0},
+    {"images": ["apart", "elsewhere"], "points": 4, "error_pixels": 0.7, "track_length": 2.0},
+]
+STATE = {
+    "source": "/photos",
+    "images": dict.fromkeys(["a", "apart", "b", "bare", "lonely", "odd"]),
+    "dropped": {"broken.jpg": "the JPEG is truncated"},
+    "seconds": {"features": 1.5},
+}
+
+
+def test_every_image_has_its_reason() -> None:
+    found = dropped_images(list(STATE["images"]), STATE["dropped"], FOUND, MODELS)
+    assert [(drop.image, drop.step) for drop in found] == [
+        ("broken.jpg", "choosing"),
+        ("bare", "features"),
+        ("lonely", "matching"),
+        ("apart", "mapping"),
+        ("odd", "mapping"),
+    ]
+    reasons = {drop.image: drop.reason for drop in found}
+    assert reasons["broken.jpg"] == "the JPEG is truncated" and "no other image" in reasons["lonely"]
+    assert reasons["apart"] == "in part 2 (2 images), apart from the rest; take views in between"
+    assert reasons["odd"] == "fits 4 images, but no pose was found for it"

@@ -1,39 +1,18 @@
 """A phone-like folder, the town's views as JPEG without poses, through COLMAP itself and back to the truth."""
 
-import json
-import shlex
 import shutil
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
-from alignment import align, misses
+from alignment import misses
 
 from fprf.cli import main as cli
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.video import write_video
 from fprf.town.write import write_town
-from fprf.training.run import Run
-
-
-def test_the_measure_is_blind_to_similarities_and_to_nothing_else() -> None:
-    drawn = np.random.default_rng(0)
-    turns = np.stack([cv2.Rodrigues(v)[0] for v in drawn.normal(size=(9, 3))])
-    truth = np.concatenate([turns, drawn.normal(size=(9, 3, 1))], 2)
-    turn, scale, offset = cv2.Rodrigues(np.array([0.3, -1.0, 2.0]))[0], 3.5, np.array([1.0, 2.0, -3.0])
-    moved = np.concatenate([turn @ turns, (scale * truth[:, :, 3] @ turn.T + offset)[:, :, None]], 2)
-    found = align(moved[:, :, 3], truth[:, :, 3])
-    assert found[0] == pytest.approx(1 / scale) and np.allclose(found[1], turn.T)
-    assert misses(moved, truth).position < 1e-12 and misses(moved, truth).degrees < 1e-4
-    extent = np.linalg.norm(np.ptp(truth[:, :, 3], axis=0))
-    shaken = moved.copy()
-    shaken[4, 0, 3] += 0.1 * scale * extent
-    assert 0.05 < misses(shaken, truth).position <= 0.1
-    shaken[2, :, :3] = shaken[2, :, :3] @ cv2.Rodrigues(np.array([0.0, 0.1, 0.0]))[0]
-    assert misses(shaken, truth).degrees > 4
 
 
 def photographed(town: Path, folder: Path) -> None:
@@ -87,25 +66,3 @@ def test_poses_of_the_town_are_within_a_percent_of_the_truth(tmp_path: Path, kin
     assert focal == pytest.approx(1, abs=0.01)
     shutil.rmtree(tmp_path / "scene" / "sfm")
     assert len(parse_scene(tmp_path / "scene", 1, None).paths) == len(stems), "what is only needed to go on may go"
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-@pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed (extra sfm)")
-def test_the_printed_commands_lead_from_photographs_to_a_style(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As `process` prints them, with fewer steps and a photograph in place of PHOTO.jpg."""
-    monkeypatch.chdir(tmp_path)
-    write_town(tmp_path / "town", seed=0, palette="day", views=16, width=960, height=720)
-    photographed(tmp_path / "town", tmp_path / "phone")
-    shutil.copy(next((tmp_path / "phone").iterdir()), "PHOTO.jpg")
-    assert cli.main(["process", "phone", "--output", "my_scene"]) == 0
-    train, stylize = (shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines()[-2:])
-    train[train.index("--minutes") + 1] = "25"
-    assert cli.main([*train, "--steps", "800"]) == 0 and cli.main(stylize) == 0
-    run = Run(Path(stylize[1]))
-    assert cli.main(["eval", stylize[1]]) == 0
-    assert run.load_known().cameras.size[0].tolist() == [480, 360]
-    assert json.loads((run.root / "metrics.json").read_text())["psnr"] > 17
-    assert list(run.root.glob("styles/PHOTO/*.png"))
