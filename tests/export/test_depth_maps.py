@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from analytic import RADIUS, globe, plane_depth, ring
+from analytic import plane_depth, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
@@ -42,27 +42,6 @@ def test_normals_of_a_plane_are_exact(tilt: float, turn: float) -> None:
     assert torch.allclose(seen.facing.double(), way @ normal, atol=1e-5)
 
 
-def test_normals_at_an_edge_are_those_of_the_pixels_own_surface() -> None:
-    """Two planes, one twice as far: no normal mixes them, and every inner pixel has one."""
-    cameras = ring(1, size=(12, 10))
-    back = cameras.pose[0, :, 2]
-    near = plane_depth(cameras, 0, back, float(back @ (cameras.pose[0, :, 3] - 3 * back)))
-    far = plane_depth(cameras, 0, back, float(back @ (cameras.pose[0, :, 3] - 6 * back)))
-    depth = torch.cat([near[:, :6], far[:, 6:]], 1)
-    seen = surface_points(DepthMaps(cameras, (depth,)), 0)
-    assert len(seen.point) == 10 * 8
-    assert torch.allclose(seen.normal.double(), back.expand(80, 3), atol=1e-6)
-
-
-def test_what_is_a_pixel_thin_faces_the_camera() -> None:
-    cameras = ring(1, size=(9, 9))
-    depth = torch.full((9, 9), torch.inf)
-    depth[:, 4] = 2.0
-    seen = surface_points(DepthMaps(cameras, (depth,)), 0)
-    assert len(seen.point) == 7
-    assert bool((seen.facing > 0.99).all())
-
-
 @settings(deadline=None)
 @given(offset=st.floats(-0.5, 0.5))
 def test_the_gap_is_how_far_in_front_of_the_surface_a_point_is(offset: float) -> None:
@@ -77,18 +56,6 @@ def test_the_gap_is_how_far_in_front_of_the_surface_a_point_is(offset: float) ->
     # 1/distance of a plane is linear up to the cosine's curvature over a pixel, (1/focal)^2 / 8 of it a direction.
     assert torch.allclose(gap, torch.full_like(gap, offset), atol=3 * 3 / 4 / 50**2)
     assert torch.allclose(distance, there - offset, atol=1e-9)
-
-
-def test_gaps_outside_and_towards_the_sky() -> None:
-    maps = globe(4)
-    place = maps.cameras.pose[0, :, 3]
-    _, corner = rays_through(maps.cameras, torch.tensor([0]), torch.tensor([[2.0, 2.0]]))
-    points = torch.stack([2 * place, torch.zeros(3, dtype=torch.float64), place + 2 * corner[0]])
-    gap, distance = depth_gaps(maps, 0, points)
-    assert bool(gap[0].isnan()), "behind the camera"
-    assert float(gap[1]) == pytest.approx(-RADIUS, abs=2e-3), "hidden inside the sphere"
-    assert bool(gap[2].isinf()) and float(gap[2]) > 0, "floating before the sky"
-    assert torch.allclose(distance, (points - place).norm(dim=-1))
 
 
 def test_lookups_do_not_mix_two_surfaces() -> None:

@@ -32,30 +32,11 @@ def test_a_table_is_applied_trilinearly(seed: int, size: int) -> None:
     nodes = identity(size)
     assert torch.allclose(apply_lattice(table, nodes.view(-1, 3)).view_as(table), table, atol=1e-12)
     assert torch.allclose(apply_lattice(nodes, colour), colour, atol=1e-12)
+    assert torch.equal(fit_lattice(colour, 1 - colour, torch.zeros(50), size), nodes), "without weights it is the identity"
     product = nodes.prod(-1, keepdim=True).expand(-1, -1, -1, 3)
     if size == 2:
         assert torch.allclose(apply_lattice(product, colour), colour.prod(-1, keepdim=True).expand(-1, 3), atol=1e-12)
     assert torch.allclose(apply_lattice(nodes, 3 * colour - 1), (3 * colour - 1).clamp(0, 1), atol=1e-12)
-
-
-@FEW
-@given(seed=seeds, size=st.sampled_from([5, 9, 17]))
-def test_no_change_is_the_identity(seed: int, size: int) -> None:
-    colour = drawn(seed, 300, 3)
-    assert torch.equal(fit_lattice(colour, colour, torch.ones(300), size), identity(size))
-    assert torch.equal(fit_lattice(colour, 1 - colour, torch.zeros(300), size), identity(size))
-
-
-def test_a_linear_map_is_found_where_there_are_colours_and_fades_where_there_are_none() -> None:
-    colour = 0.2 + 0.3 * drawn(0, 20000, 3)
-    matrix = torch.eye(3, dtype=torch.float64) + 0.3 * (drawn(1, 3, 3) - 0.5)
-    target = (colour - 0.35) @ matrix.T + torch.tensor([0.4, 0.5, 0.3], dtype=torch.float64)
-    table = fit_lattice(colour, target, torch.ones(20000), 17)
-    left = (apply_lattice(table, colour) - target).square().mean().sqrt()
-    assert float(left) < 0.05 * float((target - colour).square().mean().sqrt())
-    moved = (table - identity(17)).norm(dim=-1)
-    assert float(moved[16, 16, 16]) < 0.25 * float(moved.amax())
-    assert float(table.amin()) >= 0 and float(table.amax()) <= 1
 
 
 def test_it_minimises_what_it_says() -> None:

@@ -8,11 +8,9 @@ import torch
 import trimesh
 from analytic import RADIUS, globe
 
-from fprf.errors import DataError
 from fprf.export.mesh import (
     Mesh,
     build_mesh,
-    components,
     surface_nets,
     write_mesh_glb,
     write_mesh_ply,
@@ -52,30 +50,6 @@ def test_the_mesh_lies_on_the_sphere_with_its_normals(mesh: Mesh) -> None:
     assert float((outwards * mesh.normal).sum(1).quantile(0.05)) > 0.9
     assert torch.allclose(mesh.normal.norm(dim=1), torch.ones(len(mesh.point)), atol=1e-5)
     assert int(mesh.face.amax()) == len(mesh.point) - 1 and len(torch.unique(mesh.face)) == len(mesh.point)
-
-
-def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake() -> None:
-    maps = globe(10)
-    cloud = fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
-    with pytest.raises(DataError, match="no surface for a mesh; raise --mesh-edge"):
-        build_mesh(maps, cloud, edge=50.0)
-
-
-def test_components_of_three_balls() -> None:
-    """Against joining the ends of edges one by one."""
-    balls = trimesh.util.concatenate([ball(3.0), ball(4.0), ball(2.5)])
-    label = components(len(balls.vertices), torch.from_numpy(np.array(balls.faces))).tolist()
-    parts = list(range(len(balls.vertices)))
-
-    def top(k: int) -> int:
-        while parts[k] != k:
-            k = parts[k]
-        return k
-
-    for a, b in balls.edges.tolist():
-        low, high = sorted((top(a), top(b)))
-        parts[high] = low
-    assert label == [top(k) for k in range(len(parts))] and len(set(label)) == 3
 
 
 def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:

@@ -5,20 +5,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 import trimesh
 from analytic import RADIUS, globe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import DataError
 from fprf.export.depth_maps import DepthMaps, surface_points
 from fprf.export.point_cloud import (
     LEVELS,
     SPAN,
     Cloud,
-    finest_only,
     fuse,
     keys,
     origin_comment,
@@ -57,22 +54,6 @@ def test_what_one_view_alone_claims_is_dropped() -> None:
     assert not bool((cloud.view == 3).any())
 
 
-def test_noise_within_the_tolerance_is_averaged() -> None:
-    maps = globe(8)
-    draw = torch.Generator().manual_seed(0)
-    noisy = tuple(d * (1 + 0.005 * torch.randn(d.shape, generator=draw)) for d in maps.depth)
-    cloud = fused(maps._replace(depth=noisy), edge=0.2)
-    off = (cloud.point.norm(dim=-1) - RADIUS)[cloud.point[:, 2].abs() < 0.5]
-    # 0.005 of 3 metres a pixel. Voxels before and behind the surface hold few pixels, those on it dozens.
-    assert float(off.abs().median()) < 0.4 * 0.015 and float(off.std()) < 0.8 * 0.015
-
-
-def test_views_that_agree_on_nothing() -> None:
-    maps = globe(2)
-    with pytest.raises(DataError, match=r"no surface that two views agree on.*--tolerance"):
-        fused(maps._replace(depth=tuple(torch.full_like(d, 1.0 + k) for k, d in enumerate(maps.depth))))
-
-
 def test_it_is_the_same_far_from_the_origin() -> None:
     """World coordinates of a survey: 4.5e6 m from the origin."""
     maps = globe(6)
@@ -101,18 +82,6 @@ def test_keys_tell_voxels_and_levels_apart(seed: int) -> None:
     key = keys(cell, level)
     same = (cell[:, None] == cell).all(-1) & (level[:, None] == level)
     assert torch.equal(key[:, None] == key, same)
-
-
-@settings(deadline=None, max_examples=30)
-@given(seed=seeds)
-def test_coarse_points_give_way_to_finer_ones_in_their_voxel(seed: int) -> None:
-    points = drawn(seed, 60, 3) * 8
-    level = torch.randint(0, 3, (60,), generator=torch.Generator().manual_seed(seed))
-    alone = finest_only(points, level, 1.0)
-    for i in range(60):
-        edge = 2.0 ** int(level[i])
-        inside = (torch.floor(points / edge) == torch.floor(points[i] / edge)).all(-1)
-        assert bool(alone[i]) == (not bool((inside & (level < level[i])).any()))
 
 
 @settings(deadline=None, max_examples=30)
