@@ -1,12 +1,19 @@
 """The code of docs/python.md, word for word, on the tiny run."""
 
+import ast
+import json
 import os
 import re
+from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
 import pytest
 from tiny_world import World
+
+from fprf.methods import fprf_splats
+from fprf.splats.files import read_capture
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "python.md"
 
@@ -30,3 +37,35 @@ def test_the_page_runs(
     assert "torch.Size([120, 160, 3])" in told and "'autumn.jpg'" in told and "'night.jpg'" in told
     made = {path.name for path in tmp_path.iterdir()}
     assert {"autumn.png", "film.mp4", "mine.json", "between-0.png", "between-2.png"} <= made
+
+
+NOTEBOOK = Path(__file__).resolve().parents[2] / "docs" / "tour.ipynb"
+
+
+def cells(kind: str) -> list[str]:
+    return ["".join(cell["source"]) for cell in json.loads(NOTEBOOK.read_text("utf-8"))["cells"] if cell["cell_type"] == kind]
+
+
+def test_every_cell_runs_in_order_on_the_garden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    few = replace(fprf_splats(), steps=10, initial=800, cap=900, downscale=8)
+    replace(few, data=Path(str(files("fprf") / "garden")), output=Path("demo/run")).verbs().train("fprf-splats", quiet=True)
+    names: dict[str, object] = {}
+    for number, source in enumerate(cells("code"), 1):
+        exec(compile(source, f"cell {number}", "exec"), names)
+    told = capsys.readouterr().out
+    assert "25 captured views" in told and "film.mp4:" in told and "'night.jpg'" in told
+    assert len(read_capture(Path("night.ply")).gaussians) > 500
+    made = {path.name for path in tmp_path.iterdir()}
+    assert {"plain.png", "wide.png", "autumn.png", "mine.json", "film.mp4"} <= made
+
+
+def test_the_notebook_is_clean_and_every_import_is_used() -> None:
+    whole = json.loads(NOTEBOOK.read_text("utf-8"))
+    assert whole["nbformat"] == 4 and len(cells("markdown")) >= 5
+    assert not [cell for cell in whole["cells"] if cell.get("outputs") or cell.get("execution_count")], "clear its outputs"
+    tree = ast.parse("\n".join(cells("code")))
+    imported = {alias.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    assert imported <= {"fprf", "torch"}

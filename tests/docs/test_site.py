@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import json
 import os
 import re
 import subprocess
@@ -11,6 +12,7 @@ from types import ModuleType
 
 import pytest
 
+from fprf.cli import main as cli
 from fprf.cli.main import VERBS
 from fprf.cli.parsing import LIST_FLAGS
 
@@ -77,3 +79,19 @@ def test_a_page_has_every_flag_of_its_verb(hooks: ModuleType, verb: str, capsys:
 )
 def test_links_lead_to_the_same_files(hooks: ModuleType, source: str, page: str, text: str, wanted: str) -> None:
     assert hooks.moved(text, source, page) == wanted
+
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "defaults.md").read_text("utf-8")
+SECTIONS = dict(re.findall(r"^## fprf (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
+ROW = re.compile(r"^\| `(--[\w.-]+)` \| `([^`]*)` \| (.+) \| .*\|$", re.MULTILINE)
+
+
+@pytest.mark.parametrize("title", SECTIONS)
+def test_it_says_the_values_of_the_configs(title: str, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = ROW.findall(SECTIONS[title])
+    assert len(rows) > 5 and len(rows) == SECTIONS[title].count("\n| `--"), "a row that the pattern does not read"
+    assert cli.main([*title.partition(",")[0].split(), "--describe"]) == 0
+    known = json.loads(capsys.readouterr().out)
+    values = {row["flag"]: row["default"] for row in [*known["flags"], *known["slots"]]}
+    assert {flag: value for flag, value, _ in rows} == {flag: values.get(flag) for flag, _, _ in rows}
+    assert all(why.strip() for _, _, why in rows)
