@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -13,7 +13,6 @@ from tiny_world import World
 from torch import Tensor, nn
 
 from fprf.cli import main as cli
-from fprf.cli.train import train_scene
 from fprf.errors import PluginError
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import StylizerConfig
@@ -65,17 +64,6 @@ def run(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=240)
 
 
-def test_help_and_the_list_with_all_of_them_installed(tmp_path: Path) -> None:
-    with packages_in(tmp_path) as packages:
-        install(packages)
-        packages.raw("acme-damaged", "[fprf.encoders]\nno equals sign\n")
-    shown = run(tmp_path, "--help")
-    assert shown.returncode == 0 and "usage: fprf VERB" in shown.stdout and not shown.stderr
-    listed = run(tmp_path, "plugins")
-    assert listed.returncode == 0 and all(name in listed.stdout for name in BROKEN) and "hello" not in listed.stdout
-    assert "clash" in listed.stdout and "vgg19" in listed.stdout
-
-
 @pytest.mark.parametrize("name", [name for name in BROKEN if name not in ("dies", "slow", "unbuilt", "prints")])
 def test_one_that_is_asked_for_is_named_with_its_package(
     tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -88,12 +76,6 @@ def test_one_that_is_asked_for_is_named_with_its_package(
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith("error: ") and name in first and f"acme-{name} 1" in first
     assert "acme-clash-1" in second and "acme-clash-2" in second
-
-
-def test_training_with_all_of_them_installed(world: World, tmp_path: Path) -> None:
-    with packages_in(tmp_path) as packages:
-        install(packages)
-        train_scene(replace(world.config, output=tmp_path / "run", steps=1), "fprf-lite", quiet=True)
 
 
 @pytest.mark.fault
@@ -160,15 +142,6 @@ def test_a_field_that_breaks_its_contract_is_named(world: World, wrong: str, tol
     with pytest.raises(PluginError, match=r"fprf\.fields: 'planes' \(fprf\..*from fprf .*\): " + told) as caught:
         check_parts(world.config, parts._replace(field=Field(parts.field, wrong)), facts.channels, facts.dim)
     assert "\n" not in str(caught.value)
-
-
-def test_parts_are_asked_in_the_terms_of_their_space(world: World) -> None:
-    """In NDC near and far are no ends of rays: near lies beyond far there."""
-    facts = world.prepared.facts
-    parts = build_model(world.config, facts).parts
-    for kind, near, far in (("ndc", 3.0, 1.0), ("contraction", 0.1, 100.0), ("box", 0.5, 4.0)):
-        space = replace(parts.space, kind=kind, near=near, far=far)
-        check_parts(world.config, parts._replace(space=space), facts.channels, facts.dim)
 
 
 @pytest.mark.parametrize("part", ["decoder", "semantic", "sampler"])
