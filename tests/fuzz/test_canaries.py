@@ -11,7 +11,6 @@ from test_readers import NAMES
 
 import fprf
 from benchmarks.readers import targets
-from fprf.datamanagers.parsers.files import read_npy, read_npz
 from fprf.errors import FprfError
 from fprf.plugins.weights import WeightSource, read_tensors
 
@@ -55,15 +54,6 @@ def test_no_reader_runs_what_it_reads(tmp_path: Path, canary: Path) -> None:
                 target.read()
             assert not canary.exists(), target.name
         target.file.write_bytes(whole)
-
-
-def test_no_array_and_no_archive_of_objects(tmp_path: Path, canary: Path) -> None:
-    payloads(canary, tmp_path)
-    with pytest.raises(FprfError):
-        read_npy("x", (tmp_path / "objects.npy").read_bytes())
-    with pytest.raises(FprfError):
-        read_npz(tmp_path / "objects.npz", "points")
-    assert not canary.exists()
 
 
 @pytest.mark.parametrize("name", ["new.pt", "old.pt"])
