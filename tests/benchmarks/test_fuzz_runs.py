@@ -1,8 +1,6 @@
 """`benchmarks/fuzz.py`: readers that die, fall silent, fail and grow are told; what was done is gone on from."""
 
-import json
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -43,22 +41,6 @@ def test_a_reader_that_ends_its_process_is_told_and_gone_on_behind(script: Modul
     script.watch(reader(tmp_path, lambda data: os._exit(7)), total, 300, 0)
     assert total["faults"] == ["0 and on: the process ended with 7"] and total["rounds"] == 300
     assert (tmp_path / "x").read_bytes() == b"valid bytes of a file"
-
-
-def test_a_reader_that_hangs_is_ended(script: ModuleType, tmp_path: Path) -> None:
-    total = script.fresh()
-    script.watch(reader(tmp_path, lambda data: time.sleep(100)), total, 300, 0, silence=0.5)
-    assert total["faults"] == ["0 and on: the process was silent for 0 s"]
-
-
-def test_a_run_goes_on_from_its_output(script: ModuleType, tmp_path: Path) -> None:
-    output = tmp_path / "fuzz.json"
-    for rounds in (40, 100):
-        script.measure(tmp_path / str(rounds), rounds, 3, ["style.json"], output)
-    found = json.loads(output.read_text())
-    assert found["readers"]["style.json"]["rounds"] == 100 and found["rounds"] == 100
-    script.measure(tmp_path / "other", 20, 4, ["style.json"], output)
-    assert json.loads(output.read_text())["readers"]["style.json"]["rounds"] == 20, "another seed begins anew"
 
 
 def test_parts_of_a_run_are_the_run(tmp_path: Path) -> None:

@@ -54,39 +54,19 @@ def module(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return __import__(name)
 
 
-@pytest.mark.parametrize(("fails", "status"), [("nothing", 0), ("speed", 1)])
-def test_a_failed_step_is_reported_and_the_others_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str, status: int
-) -> None:
-    code, commands = script(tmp_path / "run", "--dry", fails=fails)
+def test_a_failed_step_is_reported_and_the_others_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, commands = script(tmp_path / "run", "--dry", fails="speed")
     assert code == 1, "what gpu_rows.py says"
     assert [next(w for w in c if w in ("pytest", "train", "eval", "speed", "profiling", "roofline")) for c in commands] == [
         "pytest", "train", "eval", "speed", "profiling", "roofline"
     ]  # fmt: skip
     output = tmp_path / "gpu.json"
     monkeypatch.setattr(sys, "argv", ["gpu_rows.py", str(tmp_path / "run" / "work"), "--output", str(output)])
-    assert module("gpu_rows", monkeypatch).main() == status
+    assert module("gpu_rows", monkeypatch).main() == 1
     found = json.loads(output.read_text())
     assert {each["step"]: each["passed"] for each in found["steps"]} == {
-        "tests": True, "train": True, "eval": True, "speed": fails != "speed", "profile": True, "roofline": True
+        "tests": True, "train": True, "eval": True, "speed": False, "profile": True, "roofline": True
     }  # fmt: skip
     rows = {row["name"]: row for row in found["rows"]}
     assert rows["held-out PSNR"]["goal"] == 26 and rows["held-out PSNR"]["goal_is"] == "at least"
-    assert found["profile"]
-    if fails == "speed":
-        assert len(rows) == 2 and found["steps"][3]["said"] == "this is why\n"
-    else:
-        assert rows["stylised, local-adain, frames of 1008x756"]["goal"] == 60
-        assert rows["a new style to its first frame"]["goal"] == 100
-        assert any("against reference" in name and {"peer", "error", "peer_error"} <= rows[name].keys() for name in rows)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_dry(tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHON": sys.executable, "XDG_CACHE_HOME": str(tmp_path)}
-    command = ["bash", str(ROOT / "benchmarks" / "gpu.sh"), "--dry", "--output", str(tmp_path / "gpu.json")]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=tmp_path, timeout=1200)
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads((tmp_path / "gpu.json").read_text())
-    assert len(found["rows"]) > 10 and all(each["passed"] for each in found["steps"])
+    assert found["profile"] and len(rows) == 2 and found["steps"][3]["said"] == "this is why\n"

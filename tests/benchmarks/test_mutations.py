@@ -1,9 +1,6 @@
 """Mutants: what is changed, that one thing is, and that tests are asked about it."""
 
 import ast
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 from benchmarks import mutants
@@ -44,32 +41,3 @@ def test_samples_are_functions_of_module_and_seed_and_every_module_has_tests() -
     for module, tests in mutants.MODULES.items():
         assert (BENCHMARKS.parent / module).is_file(), module
         assert any((BENCHMARKS.parent / "tests" / name).is_file() for name in tests), module
-
-
-def test_mistakes_that_tests_notice_are_told_from_those_that_they_do_not(
-    tmp_path: Path,
-) -> None:
-    """In a small tree of its own, each run in a forked process."""
-    (tmp_path / "toyish").mkdir()
-    (tmp_path / "toyish" / "__init__.py").write_text("")
-    source = "def f(x):\n    return x + 1\n\ndef unseen(x):\n    return x * 2\n"
-    (tmp_path / "toyish" / "sums.py").write_text(source)
-    (tmp_path / "tests").mkdir()
-    test = "from toyish.sums import f, unseen\n\ndef test_f():\n    assert f(2) == 3 and unseen(1) == 2 and unseen(0) == 0\n"
-    (tmp_path / "tests" / "test_toyish_sums.py").write_text(test)
-    (tmp_path / "pyproject.toml").write_text("[tool.pytest.ini_options]\n")
-    program = f"""
-import sys; sys.path[:0] = [{str(BENCHMARKS.parent)!r}]
-import json; from benchmarks import mutants; from pathlib import Path
-mutants.MODULES["toyish/sums.py"] = ("test_toyish_sums.py",)
-print(json.dumps(mutants.measure_module("toyish/sums.py", 100, 0, {{}}, Path({str(tmp_path)!r}))))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, check=True)
-    row = json.loads(done.stdout.splitlines()[-1])
-    assert row["possible"] == row["tried"] == 4
-    assert row["found"] == ["2:11 Add to Sub", "2:15 1 to 2", "5:11 Mult to Div", "5:15 2 to 3"] and row["survived"] == []
-    (tmp_path / "tests" / "test_toyish_sums.py").write_text(test.replace("unseen(1) == 2 and ", ""))
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path, check=True)
-    row = json.loads(done.stdout.splitlines()[-1])
-    assert [each["change"] for each in row["survived"]] == ["5:11 Mult to Div", "5:15 2 to 3"]
-    assert row["survived"][0]["where"] == "toyish/sums.py:5" and row["survived"][0]["line"] == "return x * 2"
