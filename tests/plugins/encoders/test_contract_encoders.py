@@ -8,8 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from network_files import deeplab_file, espnet_file, mobilenet_file
-from vgg_files import vgg_file
+from network_files import deeplab_file, espnet_file, mobilenet_file, vgg_file
 
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import (

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
+from network_files import LAYERS, vgg_file, vgg_tensors
 from safetensors.torch import save_file
 from torch import Tensor, nn
-from vgg_files import LAYERS, vgg_file, vgg_tensors
 
 from fprf.errors import WeightsError
 from fprf.plugins import weights

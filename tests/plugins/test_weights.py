@@ -1,4 +1,4 @@
-"""Where weights are looked for, and what is said where they are not."""
+"""Weights files: what goes in comes out, whole or not at all."""
 
 import shutil
 import urllib.error
@@ -6,13 +6,54 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from network_files import deeplab_file, mobilenet_tensors
 
 from fprf.errors import WeightsError
 from fprf.plugins import weights
 from fprf.plugins.encoders.config import DeepLabConfig, EncoderConfig, EspNetConfig, MobileNetV2Config
 from fprf.plugins.encoders.mobilenet import DEEPLAB_SOURCE as DEEPLAB
-from fprf.plugins.weights import find_weights
+from fprf.plugins.weights import find_weights, read_weights, tensors_hash, write_weights
+
+
+@settings(max_examples=15, deadline=None)
+@given(shape=st.lists(st.integers(1, 4), max_size=3), half=st.booleans(), seed=st.integers(0, 9))
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, shape: list[int], half: bool, seed: int) -> None:
+    path = tmp_path_factory.mktemp("w") / "deep/er.safetensors"
+    value = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+    value = value.half() if half else value
+    write_weights(path, {"a": value, "n": torch.tensor([3])}, {"kind": "x"})
+    tensors, metadata = read_weights(path)
+    assert metadata == {"kind": "x"}
+    assert tensors["a"].dtype == torch.float32
+    assert torch.equal(tensors["a"], value.float())
+    assert tensors["n"].dtype == torch.int64
+    assert [file.name for file in path.parent.iterdir()] == ["er.safetensors"]
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "w.safetensors"
+    write_weights(path, {"a": torch.zeros(2)}, {})
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_weights(path, {"a": torch.ones(2)}, {})
+    assert torch.equal(read_weights(path)[0]["a"], torch.zeros(2))
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 99))
+def test_the_hash_sees_names_shapes_and_values_alone(seed: int) -> None:
+    value = torch.randn(2, 3, generator=torch.Generator().manual_seed(seed))
+    base = tensors_hash({"a": value, "b": value})
+    assert len(base) == 12
+    assert base == tensors_hash({"b": value.clone(), "a": value.double()})
+    others = [{"a": value, "c": value}, {"a": value.view(3, 2), "b": value}, {"a": value, "b": value + 1e-6}]
+    assert base not in [tensors_hash(other) for other in others]
 
 
 @pytest.fixture(autouse=True)

@@ -9,8 +9,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.interfaces import Encoder
-from fprf.plugins.encoders.composed import AveragedEncoder
-from fprf.plugins.encoders.config import AveragedConfig, RandomConfig
+from fprf.plugins.encoders.composed import AveragedEncoder, ConcatEncoder
+from fprf.plugins.encoders.config import (
+    AveragedConfig,
+    ConcatConfig,
+    RandomConfig,
+)
+from fprf.plugins.encoders.frozen import street
 
 
 class Slope(Encoder):
@@ -52,3 +57,34 @@ def test_sizes_meet_on_the_finest_ones_cells() -> None:
     small = F.interpolate(image, (16, 24), mode="bilinear", antialias=True)
     coarse = F.interpolate(inner(small), (8, 12), mode="bilinear")
     torch.testing.assert_close(both, (coarse + inner(image)) / 2)
+
+
+def length(features: Tensor) -> Tensor:
+    """Root mean square length about the mean."""
+    return (features - features.mean((0, 2, 3), keepdim=True)).square().sum(1).mean().sqrt()
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(0.05, 20), st.floats(0.05, 20), st.integers(1, 40), st.integers(1, 40))
+def test_each_part_has_the_length_of_its_weight(first: float, second: float, few: int, many: int) -> None:
+    parts = (RandomConfig(channels=few, stride=8), RandomConfig(channels=many, seed=1))
+    encoder = ConcatConfig(first=parts[0], second=parts[1], weights=(first, second)).build()
+    assert encoder.channels == few + many
+    found = encoder(street())
+    # The unit is kept to three digits, and the coarser part loses a little where it is interpolated.
+    torch.testing.assert_close(length(found[:, few:]), torch.tensor(second), rtol=6e-3, atol=0)
+    assert 0.6 * first < float(length(found[:, :few])) <= first * 1.01
+
+
+def test_parts_are_their_encoders_to_a_factor() -> None:
+    image = torch.rand(2, 3, 40, 56)
+    parts = [RandomConfig(stride=8).build(), RandomConfig(stride=4, seed=1).build()]
+    found = ConcatEncoder(parts, (3.0, 0.5), (2.0, 4.0))(image)
+    coarse = F.interpolate(parts[0](image), (10, 14), mode="bilinear") * 1.5
+    torch.testing.assert_close(found, torch.cat([coarse, parts[1](image) * 0.125], dim=1))
+
+
+def test_the_finest_of_each_axis_counts() -> None:
+    """Cells of 6 and 5 pixels on a strip: neither part decides both axes alone."""
+    encoder = ConcatConfig(first=RandomConfig(stride=6), second=RandomConfig(stride=5), third=RandomConfig(stride=30)).build()
+    assert encoder(torch.rand(1, 3, 31, 7)).shape[2:] == (7, 2)
