@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.io.figures import figures, number
 from fprf.io.report import Series, axis_ticks, line_chart, write_scalars
 from fprf.training.run import History
 
@@ -66,3 +67,24 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"training", "02"}
     found = read(tmp_path / "training")
     assert found == {"psnr": [(10, 1.5, 12.0)], "colour": [(10, 1.5, 0.5), (20, 3.0, 0.25)]} == read(tmp_path / "02")
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (None, "–"), ("504 × 378", "504 × 378"), (True, "yes"), (0, "0"), (0.0, "0"), (34, "34"), (412345, "412,345"),
+        (27.3128, "27.31"), (0.84123, "0.841"), (-0.5, "-0.500"), (93.24, "93.2"), (2101.3, "2,101"), (2.1e-5, "2.1e-05"),
+    ],
+)  # fmt: skip
+def test_numbers_as_people_read_them(value: float | int | str | None, shown: str) -> None:
+    assert number(value) == shown
+
+
+def test_keys_become_labels_with_units() -> None:
+    rows = list(
+        figures({"psnr": 27.31, "seconds": 4, "peak_rss_mib": 2048, "feature_bytes": 12, "train_seconds": 1.5, "x": "y"})
+    )
+    assert [row.group for row in rows] == [""] * 6
+    assert [(row.label, row.unit) for row in rows] == [
+        ("PSNR", "dB"), ("Time", "s"), ("Peak memory", "MiB"), ("Feature", "B"), ("Train", "s"), ("X", ""),
+    ]  # fmt: skip
