@@ -1,14 +1,12 @@
 """What libraries say when memory is short, parts that get smaller, and the one line at the end."""
 
 import cv2
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pretend_cuda import pretend_cuda
 
-from fprf.cli import main as cli
 from fprf.errors import OutOfMemoryError
 from fprf.memory import LEAST, chunk_size, free_memory, in_parts, out_of_memory, wanted
 
@@ -50,15 +48,6 @@ def test_what_each_library_says(error: BaseException, short: bool, bytes_: int |
     assert wanted(error) == bytes_
 
 
-def test_the_errors_of_the_installed_libraries() -> None:
-    """More than a process can address: refused without being tried."""
-    huge = 1 << 46
-    for ask in (lambda: torch.empty(huge), lambda: np.empty(huge), lambda: bytearray(huge)):
-        with pytest.raises((RuntimeError, MemoryError)) as told:
-            ask()
-        assert out_of_memory(told.value)
-
-
 @settings(deadline=None)
 @given(st.integers(0, 20_000), st.integers(500, 9000), st.integers(1, 9000))
 def test_everything_is_done_once_and_in_order_whatever_fits(count: int, size: int, fits: int) -> None:
@@ -94,19 +83,6 @@ def test_other_errors_and_too_little_for_the_least_are_raised() -> None:
     assert tried == [5000, 2500, 1250, 1024]
     with pytest.raises(OutOfMemoryError, match="300 rays at a time"):
         list(in_parts(300, 300, short))
-
-
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError(TORCH), opencv(-4)])
-def test_the_command_line_ends_with_one_line_and_2(
-    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def fail(args: list[str]) -> int:
-        raise error
-
-    monkeypatch.setattr("fprf.cli.plugins.run", fail)
-    assert cli.main(["plugins"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: fprf: not enough memory")
 
 
 def test_chunks_follow_the_memory_of_an_accelerator_alone() -> None:

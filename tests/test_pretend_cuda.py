@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from pretend_cuda import CUDA, MPS, pretend_cuda
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 
@@ -58,13 +58,6 @@ def test_waits_and_copies_are_counted(what: dict[str, Callable[[], object]], nam
 def test_what_cuda_refuses_is_refused(wrong: Callable[[], object]) -> None:
     with pretend_cuda(), pytest.raises((RuntimeError, TypeError)):
         wrong()
-
-
-def test_apple_s_device_has_no_float64() -> None:
-    with pretend_cuda(mps=True):
-        assert torch.ones(3, device=MPS).device == MPS
-        with pytest.raises(TypeError, match="float64"):
-            torch.ones(3, device=MPS).double()
 
 
 def test_values_shapes_and_gradients_are_those_of_the_cpu() -> None:
