@@ -13,6 +13,7 @@ from fprf.rendering.cameras import Cameras, project
 from fprf.rendering.space import Space
 from fprf.types import Boxes
 from fprf.viewer.cameras import (
+    CameraState,
     PageTransform,
     box_edges,
     camera_frustums,
