@@ -16,7 +16,7 @@ from fprf.plugins import registry
 from fprf.plugins.codec import from_json, load_config, save_config, to_json
 from fprf.plugins.encoders.config import DinoConfig, Vgg19Config
 from fprf.plugins.samplers.config import ProposalConfig
-from fprf.plugins.slots import slots
+from fprf.plugins.slots import replace, slots
 from fprf.testing import check_config
 
 METHODS = [name for name in registry.installed("fprf.methods") if registry.entry("fprf.methods", name).package[:5] == "fprf "]
@@ -70,8 +70,7 @@ def test_a_plugin_can_be_chosen_and_all_its_fields_set(group: str, name: str) ->
     places = [slot.path for slot in slots(default) if slot.kind.group == group and issubclass(chosen, slot.kind)]
     if not places:
         pytest.skip(f"no slot of the knob tree takes {group}")
-    config = parse(default, [f"--{places[0]}", name], prog="x", description="")
-    assert {slot.path: type(slot.value) for slot in slots(config)}[places[0]] is chosen
+    config = replace(default, places[0], chosen())
     assert parse(default, list(command_line(config)), prog="x", description="") == config
 
 

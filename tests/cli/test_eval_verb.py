@@ -27,7 +27,9 @@ def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str
     assert "psnr" in table and f"{metrics['psnr']:.3f}" in table and "rays/s" in table
 
 
-def test_poses_are_fitted_where_that_is_asked_and_told(run: Path) -> None:
+def test_poses_are_fitted_where_that_is_asked_and_told(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = {"steps": 20, "rays": 256, "rate": 2e-3}
+    monkeypatch.setattr("fprf.evaluation.evaluate.AlignmentConfig.__init__.__kwdefaults__", few)
     assert cli.main(["eval", str(run), "--no-images"]) == 0
     plain = json.loads((run / "metrics.json").read_text())
     assert "fitted_poses" not in plain

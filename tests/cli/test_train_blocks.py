@@ -34,8 +34,6 @@ def test_from_training_to_styles(world: World, tmp_path: Path, capsys: pytest.Ca
     assert 5 < metrics["psnr"] < 40
     assert main(["stylize", str(run), "--references", *map(str, world.references), "--max-memory", "1"]) == 0
     assert len(list((run / "styles").rglob("*.png"))) >= 2
-    assert main(["eval", str(run), "--samples", "1.5"]) == 0
-    assert json.loads((run / "metrics.json").read_text())["psnr"] != metrics["psnr"]
     film = ["render", str(run), "--path", "interpolate", "--frames", "3", "--output", str(tmp_path / "film")]
     assert main([*film, "--max-memory", "1"]) == 0
     assert len(list((tmp_path / "film").glob("*.png"))) >= 3

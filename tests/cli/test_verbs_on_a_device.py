@@ -1,7 +1,6 @@
 """Verbs with `--device cuda:0`, pretended: the files of the CPU, bit for bit, where both take plain torch."""
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -34,14 +33,12 @@ def ran(args: list[str], device: str) -> dict[str, int]:
 
 
 def content(path: Path) -> Any:
-    """What a file says, without times; of a page its pictures."""
+    """What a file says, without times."""
     if path.suffix == ".json":
         return timeless(json.loads(path.read_text()))
     if path.suffix == ".safetensors":
         tensors, metadata = read_weights(path)
         return metadata, {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
-    if path.suffix == ".html":
-        return re.findall(r"data:[^\"')]*", path.read_text())
     return path.read_bytes()
 
 
@@ -85,7 +82,6 @@ VERBS: dict[str, Callable[[World, Path], list[str]]] = {
     "render": keyed,
     "render --path": lambda *_: ["--path", "spiral", "--frames", "2", "--resolution", "0.5", "--show", "colour", "depth",
                                  "normals", "--output", "OUT"],
-    "gallery": lambda world, _: [*references(world), *VIEW, "--output", "OUT/page.html"],
     "export": lambda world, _: ["ply", "splat", "glb", "cameras", "lut", "--images", *LOOSE, *references(world),
                                 "--output", "OUT"],
 }  # fmt: skip

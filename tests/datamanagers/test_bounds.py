@@ -182,3 +182,10 @@ def test_any_rig_has_a_space(count: int, seed: int, alpha: bool, exponent: float
     inside = located(scene, space)
     assert inside.isfinite().all()
     assert space.kind == "box" or inside.abs().max() <= 1 + 1e-5
+
+
+def test_points_behind_every_camera_say_nothing() -> None:
+    scene = forward()
+    assert scene.points is not None
+    behind = scene.points * torch.tensor([1.0, -1.0, 1.0], dtype=F64)
+    assert find_kind(replace(scene, points=behind)) == "contraction"

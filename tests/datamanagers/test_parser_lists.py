@@ -95,3 +95,10 @@ def test_tables_that_do_not_fit(tmp_path: Path) -> None:
         parse_scene(tmp_path, 1, None)
     write_table(tmp_path / "b.tsv", [(name, str(k), "train") for k, name in enumerate(capture.names)])
     assert len(parse_scene(tmp_path, 1, PhotoTourismConfig(list="b.tsv")).train) == 3
+
+
+def test_an_image_on_both_sides_is_refused(tmp_path: Path) -> None:
+    write_meganerf(tmp_path, Capture.make(3), held=())
+    write_meganerf(tmp_path, Capture.make(3), held=(0, 1, 2))
+    with pytest.raises(DataError, match=r"000\d is in train and in val"):
+        parse_scene(tmp_path, 1, None)

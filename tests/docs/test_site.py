@@ -14,7 +14,6 @@ import pytest
 
 from fprf.cli import main as cli
 from fprf.cli.main import VERBS
-from fprf.cli.parsing import LIST_FLAGS
 
 ROOT = Path(__file__).resolve().parents[2]
 MISSING = "the extra `docs` is not installed: pip install -e '.[docs]'"
@@ -42,26 +41,6 @@ def test_it_builds_without_a_warning(tmp_path: Path) -> None:
         text = page.read_text()
         assert not re.search(r'<(?:script|img)[^>]+src="https?:|<link[^>]+rel="stylesheet"[^>]+href="https?:', text)
     assert "restyle" in (tmp_path / "search" / "search_index.json").read_text()
-
-
-@pytest.mark.parametrize("verb", sorted(VERBS.keys() - {"completion"}))
-def test_a_page_has_every_flag_of_its_verb(hooks: ModuleType, verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    page = hooks.verb_page(verb, VERBS[verb])
-    assert page.startswith(f"# fprf {verb}\n") and f"fprf {verb} {VERBS[verb].usage}" in page
-    words = hooks._WORDS[verb] if verb in hooks._FIRST else ("fprf-lite",) if verb == "train" else (None,)
-    for word in words:
-        try:
-            importlib.import_module(f"fprf.cli.{verb}").run([*([word] if word else []), LIST_FLAGS])
-        except SystemExit:
-            flags = [line for line in capsys.readouterr().out.splitlines() if line.startswith("--")]
-        else:
-            flags = []
-        assert flags
-        absent = [
-            flag for flag in flags if not re.search(rf"{flag}(?![\w.-])", page) and f"`{flag.lstrip('-').upper()}`" not in page
-        ]
-        assert not absent
-    assert "| <br>" not in page, "every field says what it means"
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import torch
 import trimesh
 from analytic import RADIUS, globe
 
+from fprf.errors import DataError
 from fprf.export.mesh import (
     Mesh,
     build_mesh,
@@ -68,3 +69,10 @@ def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     assert np.abs(shade[:, :3] / 65535 - srgb_to_linear(colour.double().numpy())).max() < 1e-5, "glTF's colours are linear"
     document = (tmp_path / "m.glb").read_bytes()
     assert document[:4] == b"glTF" and int.from_bytes(document[8:12], "little") == len(document)
+
+
+def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake() -> None:
+    maps = globe(10)
+    cloud = fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
+    with pytest.raises(DataError, match="no surface for a mesh; raise --mesh-edge"):
+        build_mesh(maps, cloud, edge=50.0)

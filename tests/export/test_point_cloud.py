@@ -16,6 +16,7 @@ from fprf.export.point_cloud import (
     LEVELS,
     SPAN,
     Cloud,
+    finest_only,
     fuse,
     keys,
     origin_comment,
@@ -131,3 +132,15 @@ def test_far_from_its_origin_a_capture_is_moved_and_the_file_says_so(tmp_path: P
     assert np.abs(found.vertices + origin.numpy() - far.point.numpy()).max() < 1e-6
     assert f"comment {origin_comment(origin)[0]}".encode() in (tmp_path / "points.ply").read_bytes()
     assert all(f"{value:.0f}" in origin_comment(origin)[0] for value in origin.tolist())
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=seeds)
+def test_coarse_points_give_way_to_finer_ones_in_their_voxel(seed: int) -> None:
+    points = drawn(seed, 60, 3) * 8
+    level = torch.randint(0, 3, (60,), generator=torch.Generator().manual_seed(seed))
+    alone = finest_only(points, level, 1.0)
+    for i in range(60):
+        edge = 2.0 ** int(level[i])
+        inside = (torch.floor(points / edge) == torch.floor(points[i] / edge)).all(-1)
+        assert bool(alone[i]) == (not bool((inside & (level < level[i])).any()))

@@ -16,12 +16,20 @@ LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--no-sky"]
 LOOKS = {"": "plain", ".dusk": "dusk", ".snow": "snow"}
 
 
+@pytest.fixture(scope="module")
+def _made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("export") / "all"
+
+
 @pytest.fixture
-def folder(world: World, tmp_path: Path) -> Path:
+def folder(world: World, _made: Path) -> Path:
+    """Written once."""
+    if _made.exists():
+        return _made
     styles = [f"{name}={path}" for name, path in zip(("dusk", "snow"), world.references, strict=True)]
-    words = ["export", str(world.run), *LOOSE, "--styles", *styles, "--lut-size", "9", "--output", str(tmp_path)]
+    words = ["export", str(world.run), *LOOSE, "--styles", *styles, "--lut-size", "9", "--output", str(_made)]
     assert cli.main(words) == 0
-    return tmp_path
+    return _made
 
 
 def test_all_files_of_one_geometry_agree(folder: Path) -> None:
