@@ -64,12 +64,10 @@ class Held(Members):
         self._members = tuple(members)
 
     def member(self, number: int) -> Member:
-        """The member."""
         return self._members[number]
 
     @property
     def held(self) -> Sequence[Member]:
-        """Every member."""
         return self._members
 
 
@@ -107,7 +105,6 @@ class BlockedField(ContentField):
         return FieldSample(density.index_select(0, back), latent.index_select(0, back))
 
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
-        """Blended content features."""
         owner, points = latent[:, 0].detach(), latent[:, 1:4].detach()
         whole = self.router.whole(points)
         if whole is not None and whole.weight is None:

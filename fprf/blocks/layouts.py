@@ -60,7 +60,6 @@ class SingleLayout(BlockLayout):
     """The default."""
 
     def cut(self, site: Site) -> Boxes:
-        """The region as one cell."""
         low, high = bounds(site)
         return Boxes(low[None], high[None], torch.eye(3, dtype=low.dtype)[None], 0.0)
 
@@ -188,7 +187,6 @@ class StreetLayout(BlockLayout):
         self.config = config
 
     def cut(self, site: Site) -> Boxes:
-        """The segments, in the order of the path."""
         stretches = self._stretches(site)
         boxes = [_box(site, stretch) for stretch in stretches]
         low, high, turn, free = (torch.stack(parts) for parts in zip(*boxes, strict=True))

@@ -173,11 +173,9 @@ class Everywhere(Router):
     """One member over everything."""
 
     def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
-        """One group."""
         return [self.whole(points)]
 
     def whole(self, points: Annotated[Tensor, "N 3"]) -> Group:
-        """The group of all points."""
         return Group((0,), _all(points), None)
 
 
@@ -192,7 +190,6 @@ class Inset(Router):
         self.chart = chart
 
     def __call__(self, points: Annotated[Tensor, "N 3"]) -> list[Group]:
-        """Up to two groups."""
         whole = self.whole(points)
         if whole is not None:
             return [whole]

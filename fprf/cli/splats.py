@@ -35,21 +35,17 @@ class SplatVerbs(Verbs):
         self.config = config
 
     def plan(self, method: str) -> None:
-        """Refuse: Gaussians are not trained in blocks."""
         raise UsageError(f"--plan: {method} trains a scene in one piece; leave --plan out")
 
     def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
-        """Train Gaussians."""
         if view is not None:
             raise UsageError(f"--view: {method} is not shown while it trains; leave --view out")
         return _train(self.config, method, quiet, others)
 
     def needs(self) -> "list[Need]":
-        """Nothing: what it takes is installed with fprf."""
         return []
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
-        """Judge renders, lenses included, as those of fields are judged."""
         import torch
 
         from ..evaluation.evaluate import judge_views
@@ -82,7 +78,6 @@ class SplatVerbs(Verbs):
         return store(config, known, opened.method, views, found, renders)
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
-        """Write files of Gaussians, as they are and in every style, and the cameras."""
         from ..export.config import Plan, look_file, make_looks, styles_of
         from ..splats.files import ENDINGS, write_gaussians
         from ..splats.training import open_gaussians

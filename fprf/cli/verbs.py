@@ -59,20 +59,17 @@ class FieldVerbs(Verbs):
         self.config = config
 
     def plan(self, method: str) -> None:
-        """Show the blocks and what they will cost."""
         from .blocks import show_plan
         from .train import default_output
 
         show_plan(self.config, method, self.config.output or default_output(self.config, method))
 
     def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
-        """Train a model."""
         from .train import train_scene
 
         return train_scene(self.config, method, quiet=quiet, view=view, others=others)
 
     def needs(self) -> "list[Need]":
-        """List packages and weights that plug-ins and the decoder lack."""
         from ..training.prepare import decoder_needs, plugin_needs
 
         missing = plugin_needs(self.config)
@@ -81,13 +78,11 @@ class FieldVerbs(Verbs):
         return missing
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
-        """Judge a model."""
         from .eval import evaluate_fields
 
         return evaluate_fields(config)
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
-        """Fuse rendered depths, colour them, write the files."""
         from .export import export_fields
 
         export_fields(config, file)

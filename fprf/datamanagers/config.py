@@ -109,7 +109,6 @@ class RayBatchesConfig(DataManagerConfig):
         seen: Callable[[int], Tensor] | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> DataManager:
-        """The data manager."""
         from .batches import RayBatches
 
         return RayBatches(

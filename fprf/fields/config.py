@@ -58,7 +58,6 @@ class PlanesConfig(ContentFieldConfig):
         between("content.field.degree", self.degree, 1, 4)
 
     def build(self, *, channels: int, seed: int) -> ContentField:
-        """The field."""
         from .fields import PlanesField
 
         return PlanesField(self, channels=channels, seed=seed)
@@ -82,7 +81,6 @@ class SemanticPlanesConfig(SemanticFieldConfig):
         _check_network("semantic.field", self.hidden, self.layers)
 
     def build(self, *, channels: int, seed: int) -> SemanticField:
-        """The field."""
         from .fields import SemanticPlanes
 
         return SemanticPlanes(self, channels=channels, seed=seed)

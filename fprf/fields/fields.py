@@ -54,7 +54,6 @@ class SemanticPlanes(SemanticField):
         self.network = mlp(self.planes.out, config.hidden, config.layers, channels, generator=generator)
 
     def forward(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N D"]:
-        """Semantic features."""
         maps = weights(self.network)
         return dense.network(self.planes(points), maps, [None] * len(maps))
 

@@ -37,7 +37,6 @@ class SingleConfig(LayoutConfig):
     cuts: ClassVar[bool] = False
 
     def build(self) -> BlockLayout:
-        """The layout."""
         from ..blocks.layouts import SingleLayout
 
         return SingleLayout()
@@ -62,7 +61,6 @@ class GridConfig(LayoutConfig):
         _check_margin(self.margin)
 
     def build(self) -> BlockLayout:
-        """The layout."""
         from ..blocks.layouts import GridLayout
 
         return GridLayout(self)
@@ -86,7 +84,6 @@ class AdaptiveConfig(LayoutConfig):
         _check_margin(self.margin)
 
     def build(self) -> BlockLayout:
-        """The layout."""
         from ..blocks.layouts import AdaptiveLayout
 
         return AdaptiveLayout(self)
@@ -110,7 +107,6 @@ class StreetConfig(LayoutConfig):
         _check_margin(self.margin)
 
     def build(self) -> BlockLayout:
-        """The layout."""
         from ..blocks.layouts import StreetLayout
 
         return StreetLayout(self)

@@ -40,7 +40,6 @@ class Missing(PluginConfig):
     """Reason why it cannot be loaded."""
 
     def needs(self) -> tuple[Need, ...]:
-        """The package that provides it."""
         package = self.package or "the package that provides it"
         return (Need(self.reason, f"install {package}, or choose another with --{self.slot} NAME"),)
 

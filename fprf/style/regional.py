@@ -84,7 +84,6 @@ class RegionStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        """Semantics where points must be told apart."""
         return self._part(0).needs if self.alone else Want.CONTENT | Want.SEMANTIC
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:

@@ -305,7 +305,6 @@ class _MadeUp(DataManager):
         self.scene, self.facts, self.rays = scene, facts, rays
 
     def batch(self, step: int) -> Batch:
-        """Any pixels."""
         generator = torch.Generator().manual_seed(step)
         view = self.scene.train[torch.randint(len(self.scene.train), (self.rays,), generator=generator)]
         at = torch.rand(self.rays, 2, dtype=torch.float64, generator=generator) * self.scene.cameras.size[view]
@@ -315,7 +314,6 @@ class _MadeUp(DataManager):
         return Batch(view, at.floor() + 0.5, grey, content, semantic)
 
     def image(self, view: int) -> torch.Tensor:
-        """Grey."""
         width, height = self.scene.cameras.size[view].tolist()
         return torch.full((height, width, 3), 0.5)
 

@@ -57,7 +57,6 @@ class Shelf(Members):
 
     @property
     def held(self) -> Sequence[Member]:
-        """The surroundings."""
         return (self._around,)
 
     @property
@@ -122,7 +121,6 @@ class Trained(Scene):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the captured views."""
         return self.known.names
 
     @property
@@ -132,7 +130,6 @@ class Trained(Scene):
 
     @property
     def device(self) -> torch.device:
-        """The model's."""
         return self.model.device
 
     @property
@@ -141,7 +138,6 @@ class Trained(Scene):
         return self.known.facts.semantic_encoder
 
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:
-        """Render as the run's config says."""
         config = self.config.render if resolution is None else replace(self.config.render, resolution=resolution)
         return render_view(self.model, self.known.facts, cameras, view, config, self.look)
 
@@ -158,7 +154,6 @@ class Trained(Scene):
         return paint_pixels(self.model, cameras, view, pixel, self.config.render, values, semantic=semantic)
 
     def restyled(self, look: Restyle | None) -> "Trained":
-        """The same model in a look."""
         return replace(self, look=look)
 
     def cached(self, cameras: Cameras, view: int) -> CachedView:
@@ -167,11 +162,9 @@ class Trained(Scene):
 
     @property
     def decoder(self) -> Decoder:
-        """The model's."""
         return self.model.decoder
 
     def measured(self) -> tuple[SceneStyle, Basis | None]:
-        """Style and basis that training measured."""
         return load_style(self.run)
 
     @torch.inference_mode()
@@ -187,7 +180,6 @@ class Trained(Scene):
         config: StylizerConfig,
         allowed: Annotated[Tensor, "K references"],
     ) -> ColourMaps | None:
-        """Those behind the scene's decoder."""
         decoder, smoothing = self.model.decoder, config.smoothing(style, allowed)
         return colour_maps(
             stylizer, dictionary, style, decoder, features=config.features, share=config.colours, smoothing=smoothing

@@ -202,13 +202,11 @@ class CachedView(SceneView):
 
     @torch.inference_mode()
     def restyled(self, restyle: Restyle | None = None) -> View:
-        """The view in a style, or as it is."""
         rgb = torch.cat([part.colour(self.decoder, restyle) for part in self.parts])
         return View(rgb.view(*self.size, 3), self.depth, self.opacity, self.kept)
 
     @torch.inference_mode()
     def match(self, restyle: Restyle) -> Annotated[Tensor, "N T"]:
-        """Composited shares of the style codes."""
         shares = [
             part.mean(restyle.match(part.content[:, :0] if part.semantic is None else part.semantic)) for part in self.parts
         ]

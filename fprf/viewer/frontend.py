@@ -90,7 +90,6 @@ class ViserFrontend(Frontend):
         handle.flush()
 
     def recolour(self, colours: Colours) -> None:
-        """Send the Gaussians again with other colours."""
         if self._splats is not None:
             packed = self._splats.buffer.copy()
             rgba = packed[:, 7:].view(np.uint8)  # red, green, blue, opacity
@@ -99,7 +98,6 @@ class ViserFrontend(Frontend):
             self._viser.flush()
 
     def changed(self, before: State, now: State) -> None:
-        """Bring controls and page up to date."""
         with self._lock:
             self.panel.follow(before, now)
             if now.picking != before.picking:

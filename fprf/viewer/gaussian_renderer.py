@@ -49,7 +49,6 @@ class GaussianRenderer(SceneRenderer):
             self._show(colours)
 
     def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
-        """Rasterise a view on this machine."""
         if self._framed[0] is not look:
             self._framed = (look, self._scene.restyled(look))
         yield

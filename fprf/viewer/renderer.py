@@ -164,11 +164,9 @@ class ProgressiveRenderer(SceneRenderer):
         self._speed, self._cached_speed = speeds or first_speeds()
 
     def forget(self, client: Hashable) -> None:
-        """Drop the kept features of a client's view."""
         self._caches.pop(client, None)
 
     def frame(self, cameras: Cameras, view: int, look: Restyle | None) -> Generator[None, None, Picture]:
-        """Render a view, a step each chunk of rays."""
         rows = []
         for part in self._parts(cameras, view):
             rows.append(part.colour(self._trained.model.decoder, look))

@@ -77,7 +77,6 @@ class LlffConfig(DataParserConfig):
         return Recognised(0.8, "poses_bounds.npy") if (data / "poses_bounds.npy").is_file() else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .llff import LlffParser
 
         return LlffParser(self)
@@ -100,7 +99,6 @@ class TransformsConfig(DataParserConfig):
         return Recognised(0.4, names[0]) if len(names) == 1 else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .transforms import TransformsParser
 
         return TransformsParser(self)
@@ -121,7 +119,6 @@ class ColmapConfig(DataParserConfig):
         return Recognised(0.5, f"a model in {folder}") if folder is not None else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .colmap import ColmapParser
 
         return ColmapParser(self)
@@ -156,7 +153,6 @@ class TownConfig(DataParserConfig):
         return Recognised(1.0, "the embedded scene") if data == Path("town") and not data.exists() else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .town import TownParser
 
         return TownParser(self)
@@ -185,7 +181,6 @@ class BlockNerfConfig(DataParserConfig):
         return Recognised(0.3, record) if record is not None else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .blocknerf import BlockNerfParser
 
         return BlockNerfParser(self)
@@ -200,7 +195,6 @@ class MegaNerfConfig(DataParserConfig):
         return Recognised(0.7, "train/metadata") if (data / "train/metadata").is_dir() else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .meganerf import MegaNerfParser
 
         return MegaNerfParser(self)
@@ -222,7 +216,6 @@ class PhotoTourismConfig(DataParserConfig):
         return Recognised(0.6, tables[0]) if len(tables) == 1 and model is not None else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .phototourism import PhotoTourismParser
 
         return PhotoTourismParser(self)
@@ -240,7 +233,6 @@ class PolycamConfig(DataParserConfig):
         return Recognised(0.3, f"{record[1]}") if record is not None else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .polycam import PolycamParser
 
         return PolycamParser(self)
@@ -264,7 +256,6 @@ class Record3DConfig(DataParserConfig):
         return Recognised(0.3, record[0].name) if record is not None else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .record3d import Record3DParser
 
         return Record3DParser(self)
@@ -285,7 +276,6 @@ class OdmConfig(DataParserConfig):
         return Recognised(0.3, record.name) if record is not None else None
 
     def build(self) -> DataParser:
-        """The parser."""
         from .odm import OdmParser
 
         return OdmParser(self)

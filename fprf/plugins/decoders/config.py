@@ -47,7 +47,6 @@ class MlpDecoderConfig(DecoderConfig):
         return absent_file(self.weights)
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
-        """The decoder whose file names this encoder."""
         from .decoders import load_decoder
 
         return load_decoder(self.weights, encoder=encoder, channels=channels, objective=self.objective)
@@ -73,7 +72,6 @@ class ResidualDecoderConfig(DecoderConfig):
         return absent_file(self.weights)
 
     def build(self, *, encoder: str, channels: int, seed: int = 0) -> Decoder:
-        """The decoder whose file names this encoder, with a head that changes nothing yet."""
         import torch
 
         from .decoders import ResidualDecoder, load_decoder

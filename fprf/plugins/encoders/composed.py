@@ -32,7 +32,6 @@ class AveragedEncoder(FrozenEncoder):
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features on the cells of the finest view."""
         return torch.stack(finest([self._look(image, scale) for scale in self._scales])).mean(dim=0)
 
     def _look(self, image: Tensor, scale: float) -> Tensor:

@@ -53,11 +53,9 @@ class BundledContentConfig(EncoderConfig):
     """A file made by `python -m tools.distil content`. By default the one that ships."""
 
     def needs(self) -> tuple[Need, ...]:
-        """The file, where one is named."""
         return absent_file(self.weights)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where the file is absent or no content encoder."""
         from .bundled import load_content_encoder
 
         return load_content_encoder(self.weights)
@@ -71,11 +69,9 @@ class BundledSemanticConfig(EncoderConfig):
     """A file made by `python -m tools.distil semantic`. By default the one that ships."""
 
     def needs(self) -> tuple[Need, ...]:
-        """The file, where one is named."""
         return absent_file(self.weights)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where the file is absent or no semantic encoder."""
         from .bundled import load_semantic_encoder
 
         return load_semantic_encoder(self.weights)
@@ -98,14 +94,12 @@ class Vgg16Config(EncoderConfig):
             raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-16; allowed are conv1_1, relu1_1 ... relu5_3")
 
     def needs(self) -> tuple[Need, ...]:
-        """The weights."""
         from ..weights import weights_needed
         from .vgg import SOURCES
 
         return weights_needed(SOURCES["vgg16"], self.weights)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where weights are missing or end before the layer."""
         from .vgg import build_vgg16
 
         return build_vgg16(self.layer, weights=self.weights, normalise=self.normalise)
@@ -129,7 +123,6 @@ class Vgg19Config(EncoderConfig):
             raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-19; allowed are conv1_1, relu1_1 ... relu5_4")
 
     def needs(self) -> tuple[Need, ...]:
-        """The weights, beyond the layers that ship."""
         from ..weights import weights_needed
         from .vgg import BUNDLED_LAYERS, SOURCES
 
@@ -137,7 +130,6 @@ class Vgg19Config(EncoderConfig):
         return () if ships else weights_needed(SOURCES["vgg19"], self.weights)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where weights are missing or end before the layer."""
         from .vgg import build_vgg19
 
         return build_vgg19(self.layer, weights=self.weights, normalise=self.normalise)
@@ -158,11 +150,9 @@ class DinoConfig(EncoderConfig):
         _check_transformer(self.layer, self.stride)
 
     def needs(self) -> tuple[Need, ...]:
-        """The package transformers, and the model."""
         return _transformer_needs(self.model)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where transformers or the model is absent."""
         from .vit import build_vit
 
         return build_vit("dino", self.model, layer=self.layer, stride=self.stride)
@@ -183,11 +173,9 @@ class Dinov2Config(EncoderConfig):
         _check_transformer(self.layer, self.stride)
 
     def needs(self) -> tuple[Need, ...]:
-        """The package transformers, and the model."""
         return _transformer_needs(self.model)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where transformers or the model is absent."""
         from .vit import build_vit
 
         return build_vit("dinov2", self.model, layer=self.layer, stride=self.stride)
@@ -208,11 +196,9 @@ class Dinov3Config(EncoderConfig):
         _check_transformer(self.layer, self.stride)
 
     def needs(self) -> tuple[Need, ...]:
-        """The package transformers, and the model."""
         return _transformer_needs(self.model)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where transformers or the model is absent."""
         from .vit import build_vit
 
         return build_vit("dinov3", self.model, layer=self.layer, stride=self.stride)
@@ -235,7 +221,6 @@ class RandomConfig(EncoderConfig):
         at_least("seed", self.seed, 0)
 
     def build(self) -> Encoder:
-        """The encoder."""
         from .bundled import RandomEncoder
 
         return RandomEncoder(channels=self.channels, stride=self.stride, seed=self.seed)
@@ -274,14 +259,12 @@ class MobileNetV2Config(EncoderConfig):
             raise ConfigError(f"layer: {self.layer!r} is no layer of MobileNetV2; allowed are features.0 ... features.18")
 
     def needs(self) -> tuple[Need, ...]:
-        """The weights."""
         from ..weights import weights_needed
         from .mobilenet import SOURCE
 
         return weights_needed(SOURCE, self.weights)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where weights are missing or end before the layer."""
         from .mobilenet import build_mobilenet
 
         return build_mobilenet(self.layer, weights=self.weights)
@@ -303,14 +286,12 @@ class DeepLabConfig(EncoderConfig):
             )
 
     def needs(self) -> tuple[Need, ...]:
-        """The weights."""
         from ..weights import weights_needed
         from .mobilenet import DEEPLAB_SOURCE
 
         return weights_needed(DEEPLAB_SOURCE, self.weights)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where weights are missing or lack the layer."""
         from .mobilenet import build_deeplab
 
         return build_deeplab(self.layer, weights=self.weights)
@@ -327,14 +308,12 @@ class EspNetConfig(EncoderConfig):
     By default the second, in the weights cache."""
 
     def needs(self) -> tuple[Need, ...]:
-        """The weights."""
         from ..weights import weights_needed
         from .espnet import SOURCE
 
         return weights_needed(SOURCE, self.weights)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where weights are missing or lack the layer."""
         from .espnet import build_espnet
 
         return build_espnet(self.layer, weights=self.weights)
@@ -358,7 +337,6 @@ class AveragedConfig(EncoderConfig):
             positive("scales", scale)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where the inner one's weights are missing."""
         from .composed import AveragedEncoder
 
         return AveragedEncoder(self.inner.build(), flip=self.flip, scales=self.scales)
@@ -382,7 +360,6 @@ class ConcatConfig(EncoderConfig):
             positive("weights", weight)
 
     def build(self) -> Encoder:
-        """The encoder. Raises WeightsError where a part's weights are missing, ConfigError for more weights than parts."""
         from .composed import build_concat
 
         parts = [part for part in (self.first, self.second, self.third) if part is not None]

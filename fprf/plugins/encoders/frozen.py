@@ -105,7 +105,6 @@ class FrozenEncoder(Encoder):
 
     @property
     def channels(self) -> int:
-        """Channels of the features."""
         return self._channels
 
 

@@ -35,7 +35,6 @@ class SerialConfig(ExecutorConfig):
     """One task after the other, in this process."""
 
     def build(self) -> Executor:
-        """The executor."""
         from .executors import SerialExecutor
 
         return SerialExecutor()
@@ -64,7 +63,6 @@ class RayConfig(ExecutorConfig):
             at_least("executor.gpus", self.gpus, 0.0)
 
     def needs(self) -> tuple[Need, ...]:
-        """The package ray."""
         if importlib.util.find_spec("ray") is not None:
             return ()
         return (Need("the package ray", "pip install 'fprf[cluster]', or choose --executor serial"),)
@@ -74,7 +72,6 @@ class RayConfig(ExecutorConfig):
         return self if self.gpus is not None else replace(self, gpus=float(device == "cuda"))
 
     def build(self) -> Executor:
-        """The executor."""
         from .executors import RayExecutor
 
         return RayExecutor(self)

@@ -41,13 +41,11 @@ class UniformConfig(SamplerConfig):
         at_least("sampler.samples", self.samples, 1)
 
     def build(self, *, seed: int) -> Sampler:
-        """The sampler; it has no parameters."""
         from .samplers import UniformSampler
 
         return UniformSampler(self)
 
     def scaled(self, share: float) -> UniformConfig:
-        """More or fewer samples."""
         return replace(self, samples=max(1, round(share * self.samples)))
 
 
@@ -92,12 +90,10 @@ class ProposalConfig(SamplerConfig):
             )
 
     def build(self, *, seed: int) -> Sampler:
-        """The sampler, its planes drawn from the seed."""
         from .samplers import ProposalSampler
 
         return ProposalSampler(self, seed=seed)
 
     def scaled(self, share: float) -> ProposalConfig:
-        """More or fewer samples at every level."""
         samples = tuple(max(2, round(share * n)) for n in self.samples)
         return replace(self, samples=samples, final=max(1, round(share * self.final)))

@@ -39,7 +39,6 @@ class UniformSampler(Sampler):
         step: int | None,
         generator: torch.Generator | None,
     ) -> Sampled:
-        """Even edges."""
         s = even_edges(rays, self.samples, generator)
         return Sampled(s, space.distance(s, rays.near, rays.far))
 
@@ -58,7 +57,6 @@ class ProposalSampler(Sampler):
 
     @property
     def fields(self) -> nn.ModuleList:
-        """One a level."""
         return self.levels
 
     def forward(

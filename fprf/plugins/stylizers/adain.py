@@ -34,11 +34,9 @@ class IdentityStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        """Content alone."""
         return Want.CONTENT
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
-        """The content itself."""
         return content
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
@@ -67,7 +65,6 @@ class AdainStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        """Content alone."""
         return Want.CONTENT
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
@@ -135,7 +132,6 @@ class LocalAdainStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        """Semantics only where there is something to choose."""
         return Want.CONTENT | Want.SEMANTIC if self.matched else Want.CONTENT
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
@@ -150,7 +146,6 @@ class LocalAdainStylizer(Stylizer):
             return ((features - self.content_mean) * self.gain + self.style_mean).to(content)
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
-        """R^S: softmax of the scores."""
         if not self.matched:
             return self.odds.expand(len(semantic), -1)
         query = semantic.to(self.keys)

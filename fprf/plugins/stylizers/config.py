@@ -64,7 +64,6 @@ class IdentityConfig(StylizerConfig):
     """Leaves the scene as it is: shows what the decoder alone does."""
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        """The stylizer that changes nothing."""
         from .adain import IdentityStylizer
 
         return IdentityStylizer(dictionary)
@@ -75,7 +74,6 @@ class AdainConfig(StylizerConfig):
     """Global AdaIN (paper, single reference): one mean and deviation of all references. Needs no semantics."""
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        """Global AdaIN towards these references."""
         from .adain import AdainStylizer
 
         return AdainStylizer(dictionary, scene)
@@ -100,7 +98,6 @@ class LocalAdainConfig(StylizerConfig):
         positive("stylizer.temperature", self.temperature)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        """Local AdaIN towards these references."""
         from .adain import LocalAdainStylizer
 
         return LocalAdainStylizer(
@@ -155,7 +152,6 @@ class _RegionConfig(StylizerConfig):
         return region_smoothing(scene, self.smoothness, allowed)
 
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
-        """The two-sided stylizer towards these references, with this kind of maps."""
         from ...style.matching import Matching
         from .region import ChannelMaps, MatrixMaps, TwoSidedStylizer, plan_regions
 

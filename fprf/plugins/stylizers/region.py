@@ -145,7 +145,6 @@ class TwoSidedStylizer(Stylizer):
 
     @property
     def needs(self) -> Want:
-        """Semantics only where there is more than one region."""
         return Want.CONTENT if len(self.units) == 1 else Want.CONTENT | Want.SEMANTIC
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
@@ -162,7 +161,6 @@ class TwoSidedStylizer(Stylizer):
             return moved.to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
-        """Memberships times the table."""
         with full_precision(semantic):
             return self._membership(semantic) @ self.table
 
