@@ -24,8 +24,8 @@ from fprf.io.images import shrink, write_image
 from fprf.plugins.stylizers.config import RegionToneConfig
 from fprf.style.config import PRESETS, StyleConfig, with_preset
 from fprf.style.files import StyleFile
+from fprf.style.restyle import apply_style
 from fprf.training.loading import load_run
-from fprf.training.restyle import apply_style
 from fprf.training.views import cache_view
 
 from .common import RESULTS, arguments, report

@@ -29,7 +29,7 @@ from fprf.rendering import renderer, space
 from fprf.rendering.cameras import Cameras
 from fprf.style import matching
 from fprf.style.look import Restyle
-from fprf.training.restyle import restyle
+from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
 from .common import RESULTS, arguments, report

@@ -23,10 +23,10 @@ from fprf.plugins import slots
 from fprf.plugins.stylizers.config import StylizerConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.look import Restyle
+from fprf.style.restyle import Styled
 from fprf.training.loading import Trained
 from fprf.training.model import Facts, Model
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
-from fprf.training.restyle import Styled
 from fprf.training.run import Run
 from fprf.training.trainer import Report, train
 from fprf.training.views import render_view

@@ -35,12 +35,12 @@ from fprf.plugins.samplers.config import ProposalConfig
 from fprf.process import keep_memory
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
+from fprf.style.restyle import apply_style
 from fprf.town.write import write_town
 from fprf.training import trainer
 from fprf.training.block_plan import lay_out, plan_scene
 from fprf.training.blocks import load_boxes
 from fprf.training.loading import Trained, load_run
-from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
 
 from .blocks import costs, jumps, ratios

@@ -46,10 +46,10 @@ from fprf.style.dictionary import BLEND, StyleDictionary, blend_codes
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.references import Encoders
+from fprf.style.restyle import apply_style
 from fprf.style.scene import scene_style
 from fprf.style.statistics import covariance, group_moments, moments
 from fprf.training.loading import Trained
-from fprf.training.restyle import apply_style
 from fprf.training.views import cache_view
 
 from .style_runs import PLAIN, Exhibit, judge_exhibit

@@ -26,9 +26,9 @@ from fprf.io.maps import palette
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.look import Restyle
+from fprf.style.restyle import restyle
 from fprf.training.loading import Trained, load_run
 from fprf.training.prepare import scene_of
-from fprf.training.restyle import restyle
 from fprf.training.run import view_names
 
 from .knobs import BUDGETS, Point, Scenes, as_rendered, front, measure, plain_settings, styled_settings, trained_points

@@ -76,7 +76,7 @@ def _do(part: str, asked: dict[str, Any]) -> float | None:
     known = trained.known
     if part in ("render", "restyle"):
         from fprf.plugins.stylizers.config import RegionOtConfig
-        from fprf.training.restyle import restyle
+        from fprf.style.restyle import restyle
         from fprf.training.views import render_view
 
         look = restyle(trained, subject.references, RegionOtConfig()).restyle if part == "restyle" else None

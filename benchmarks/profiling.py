@@ -30,8 +30,8 @@ from fprf.evaluation.subject import attempt, find, fresh_model, loop_of, setting
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.renderer import render_rays
+from fprf.style.restyle import restyle
 from fprf.training.model import Model, background_of
-from fprf.training.restyle import restyle
 from fprf.types import Rays, Want
 
 __all__ = ["PREFIX", "REST", "Range", "attribute", "exclusive", "labelled", "profile"]

@@ -16,8 +16,8 @@ from fprf.evaluation.subject import Subject, attempt, find, settings, test_view,
 from fprf.io.figures import number
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import RegionOtConfig
+from fprf.style.restyle import restyle
 from fprf.training.prepare import Prepared
-from fprf.training.restyle import restyle
 from fprf.training.views import render_view
 
 __all__ = ["Series", "exponent", "scaling"]

@@ -103,7 +103,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     from fprf.splats.scene import look_at_capture
     from fprf.style.config import StyleConfig
     from fprf.style.files import StyleFile
-    from fprf.training.restyle import apply_style
+    from fprf.style.restyle import apply_style
 
     torch.set_num_threads(1)
     start = time.process_time()

@@ -23,11 +23,11 @@ from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.renderer import render_rays
 from fprf.style.look import Restyle
+from fprf.style.restyle import restyle
 from fprf.testing import cases
 from fprf.training import tensorfiles
 from fprf.training.loading import Trained
 from fprf.training.model import Facts, Model, background_of
-from fprf.training.restyle import restyle
 from fprf.types import Rays, Want
 
 from .readers import fuzz, targets

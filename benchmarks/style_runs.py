@@ -27,9 +27,9 @@ from fprf.io.images import shrink, to_uint8, write_image
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
+from fprf.style.restyle import apply_style
 from fprf.town.write import read_truth
 from fprf.training.loading import Trained, load_run
-from fprf.training.restyle import apply_style
 from fprf.training.views import cache_view
 
 from .pictures import SETS, town_reference

@@ -29,11 +29,11 @@ from .rendering.paths import look_at, make_path, pinhole, upwards
 from .style.config import StyleConfig, with_preset
 from .style.files import StyleFile, check_photographs, read_style, with_folders, write_style
 from .style.look import Restyle
+from .style.match_maps import MatchMap, match_map
 from .style.references import Encoders
+from .style.restyle import Styled, apply_style, mixed
 from .training.loading import LoadedRun, open_run
-from .training.matches import MatchMap, match_map
 from .training.quality import Name, QualityConfig
-from .training.restyle import Styled, apply_style, mixed
 
 __all__ = ["Shot", "TrainedScene", "open_scene"]
 

@@ -18,11 +18,11 @@ from tiny_world import World
 from fprf.config import TrainConfig
 from fprf.ops import triplane, triplane_triton
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.style.restyle import restyle
 from fprf.style.scene import to_tensors
 from fprf.training import trainer
 from fprf.training.loading import load_run
 from fprf.training.prepare import prepare
-from fprf.training.restyle import restyle
 from fprf.training.run import Run
 from fprf.training.style_pass import measure_style
 from fprf.training.views import render_view

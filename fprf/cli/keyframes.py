@@ -58,7 +58,7 @@ def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:
 def keyed_looks(scene: "Scene", keys: Sequence[Key]) -> "Callable[[int], Restyle | None]":
     """The look of each frame; every style is built once, before the first frame."""
     from ..style.files import check_photographs, read_style
-    from ..training.restyle import apply_style
+    from ..style.restyle import apply_style
 
     encoders = scene.encoders()
     looks: dict[Path | None, Restyle | None] = {None: None}

@@ -201,8 +201,8 @@ def _takes(scene: "Scene", config: RenderVerbConfig, file: "StyleFile") -> "list
 
 
 def _styled_take(scene: "Scene", name: str, file: "StyleFile") -> "Take":
+    from ..style.restyle import apply_style
     from ..training.film import Take
-    from ..training.restyle import apply_style
 
     styled = apply_style(scene, file)
     for note in styled.controls.notes:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..io.images import Picture
     from ..splats.files import Capture
     from ..splats.scene import Semantics, SplatScene
-    from ..training.restyle import Styled
+    from ..style.restyle import Styled
 
 __all__ = ["RestyleConfig", "run", "seen_capture"]
 
@@ -74,8 +74,8 @@ def run(args: list[str]) -> int:
     from ..io.images import write_image
     from ..plugins.encoders.config import BundledSemanticConfig
     from ..splats.files import read_capture, write_capture
-    from ..training.regions import Regions
-    from ..training.restyle import apply_style
+    from ..style.regions import Regions
+    from ..style.restyle import apply_style
 
     begun = time.perf_counter()
     capture, encoder = read_capture(config.capture), BundledSemanticConfig().build()

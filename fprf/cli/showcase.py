@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..io.images import Picture
     from ..style.files import StyleFile
-    from ..training.restyle import Styled
+    from ..style.restyle import Styled
     from ..types import View
 
 __all__ = ["Shown", "restyled", "write_page"]
@@ -39,8 +39,8 @@ class Shown(NamedTuple):
 def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display) -> list[Shown]:
     """Each style on the views, with match maps and how well the views agree with each other."""
     from ..style.config import labels
-    from ..training.matches import match_map, match_picture, summarize
-    from ..training.restyle import apply_style
+    from ..style.match_maps import match_map, match_picture, summarize
+    from ..style.restyle import apply_style
 
     encoders, shown = scene.encoders(), []
     for i, (name, file) in enumerate(chosen):

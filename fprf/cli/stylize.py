@@ -15,9 +15,9 @@ from .style_flags import read_flags
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
-    from ..training.matches import Region
-    from ..training.regions import Regions
-    from ..training.restyle import Styled
+    from ..style.match_maps import Region
+    from ..style.regions import Regions
+    from ..style.restyle import Styled
     from ..training.run import Known
 
 __all__ = ["StylizeConfig", "print_explained", "run"]
@@ -70,10 +70,10 @@ def run(args: list[str]) -> int:
     """Build the style; explain it, map it, or render the views; write style.json."""
     config, file = read_flags(StylizeConfig(), args, prog="fprf stylize", description=_DESCRIPTION, positional=("run",))
     from ..style.dictionary import save_dictionary
+    from ..style.regions import Regions
+    from ..style.restyle import apply_style
     from ..style.statistics import dead_channels
     from ..training.loading import open_run
-    from ..training.regions import Regions
-    from ..training.restyle import apply_style
 
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
@@ -103,7 +103,7 @@ def run(args: list[str]) -> int:
 def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], config: StylizeConfig) -> dict[str, Any]:
     """Pictures and match maps of the views; what was matched and how long it took."""
     from ..io.images import to_uint8, write_image
-    from ..training.matches import match_map, match_pictures, summarize, write_pixels
+    from ..style.match_maps import match_map, match_pictures, summarize, write_pixels
 
     shown = not config.match_only
     maps = ("match", "score", "entropy") if config.match_only else ("match",) if config.matches else ()
@@ -143,7 +143,7 @@ def print_explained(output: Path, regions: "Regions", styled: "Styled | None") -
     from ..io.atomic import write_json
     from ..io.images import write_image
     from ..io.sheet import contact_sheet
-    from ..training.matches import explain, region_row, region_tile
+    from ..style.match_maps import explain, region_row, region_tile
 
     explained = explain(regions, styled)
     names = styled.dictionary.names if styled is not None else ()

@@ -25,8 +25,8 @@ from ..style.config import StyleConfig, labels
 from ..style.dictionary import StyleDictionary, build_dictionary
 from ..style.files import StyleFile
 from ..style.references import Encoders, encode_photograph
+from ..style.restyle import dress
 from ..training.loading import open_run
-from ..training.restyle import dress
 from ..types import Want
 from .config import RestyleConfig
 from .consistency import steadiness

@@ -22,10 +22,10 @@ from ..plugins import slots
 from ..plugins.stylizers.config import LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
 from ..rendering.cameras import Cameras
 from ..style.look import Restyle
+from ..style.restyle import restyle
 from ..training.loading import Trained
 from ..training.model import Facts, Model
 from ..training.prepare import Prepared
-from ..training.restyle import restyle
 from ..training.views import cache_view, render_view
 from .config import SpeedConfig
 from .report import Outcome, Row, document, ratio, rows_table, spread

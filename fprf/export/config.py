@@ -197,7 +197,7 @@ def styles_of(config: ExportConfig, base: StyleFile, report: Callable[[str], Non
 
 def make_looks(scene: "Scene", styles: Sequence[Named]) -> list[Look]:
     """The scene as it is, and each style. Raises UsageError for two of one name, and what `apply_style` raises."""
-    from ..training.restyle import apply_style
+    from ..style.restyle import apply_style
 
     names = [style.name for style in styles]
     for name in names:

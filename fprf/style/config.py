@@ -4,7 +4,7 @@ What users write about regions, `REGION`, `REGION=REFERENCE`, `REGION=NUMBER`, a
 
 A region is named by its number, by its name in a style file, by a pixel of a view (`VIEW:X,Y`) or by a mask over one
 (`VIEW:MASK.png`); a reference by its file or by its number, from 0 in the order given. What each text means is found out on
-a scene (`training.regions`); here is only the grammar.
+a scene (`style.regions`); here is only the grammar.
 """
 
 import re

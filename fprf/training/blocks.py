@@ -36,13 +36,13 @@ from ..errors import CheckpointError, ConfigError
 from ..interfaces import DataManager, Decoder
 from ..io.atomic import write_json
 from ..plugins.codec import to_json
+from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
 from ..types import Boxes
 from . import tensorfiles
 from .camera_optimizers import Poses, Tones
 from .checkpoint import reached
 from .model import Facts, Model, build_decoder, poses_of, tones_of
-from .plugin_checks import check_parts
 from .prepare import Prepared, build_encoders, cache_folder, scene_of
 from .run import Run, held
 from .trainer import Report, train

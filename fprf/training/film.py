@@ -12,9 +12,9 @@ from ..io.images import Picture, srgb_to_linear, to_uint8
 from ..io.maps import depth_image, depth_limits
 from ..rendering.cameras import Cameras, normals
 from ..rendering.paths import eye_strips
+from ..style.match_maps import match_map, match_picture
+from ..style.restyle import Styled
 from ..types import View
-from .matches import match_map, match_picture
-from .restyle import Styled
 
 __all__ = ["Channel", "Take", "limits_of", "panels", "planes", "shoot"]
 

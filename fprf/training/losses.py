@@ -14,10 +14,10 @@ from ..config import LossConfig
 from ..errors import ConfigError, PluginError
 from ..interfaces import LossTerm
 from ..plugins.registry import nearest
+from ..rendering.plugin_checks import check_term
 from ..rendering.stepfun import distortion, interlevel, midpoints
 from ..types import Batch, Rendered, Want
 from .model import Facts, Model
-from .plugin_checks import check_term
 
 __all__ = ["FADE", "NEARBY", "SHELL", "check_penalties", "emptiness", "ending", "extra_term", "terms", "total", "wanted"]
 

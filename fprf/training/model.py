@@ -11,10 +11,10 @@ from ..config import TrainConfig
 from ..errors import WeightsError
 from ..interfaces import Decoder
 from ..plugins.decoders.remedy import pretrain_line
+from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from .camera_optimizers import Poses, Tones
-from .plugin_checks import check_parts
 
 __all__ = ["Facts", "Model", "background_of", "build_decoder", "build_model", "poses_of", "tones_of"]
 

@@ -24,9 +24,9 @@ from ..io.maps import depth_image, match_image, palette
 from ..rendering.cameras import Cameras
 from ..style.look import Restyle
 from ..style.regional import RegionWeight
+from ..style.restyle import Styled
 from ..style.scene import SceneStyle
 from ..training.loading import Trained
-from ..training.restyle import Styled
 from ..training.views import Part, view_parts
 from .cameras import CameraState, PageTransform, picture_size
 from .restyler import Restyler

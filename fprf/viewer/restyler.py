@@ -25,14 +25,14 @@ from ..style.files import StyleFile
 from ..style.look import Restyle
 from ..style.matching import unit
 from ..style.references import Encoders, encode_photograph
+from ..style.regions import memberships
+from ..style.restyle import Styled, dress, mixed
 from ..style.scene import SceneStyle
 from ..training import tensorfiles
 from ..training.blocks import RAYS, built_block, folder_of, load_boxes
 from ..training.loading import Trained, encoders_of
 from ..training.model import build_model
 from ..training.prepare import device_of
-from ..training.regions import memberships
-from ..training.restyle import Styled, dress, mixed
 from ..training.run import Run
 from ..training.style_pass import measure_style
 from .state import Look, Photograph, RegionInfo, simplified, style_config

@@ -28,7 +28,7 @@ from fprf.evaluation.subject import (
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
 from fprf.rendering.renderer import march
-from fprf.training.restyle import restyle
+from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
 

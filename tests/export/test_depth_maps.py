@@ -160,6 +160,6 @@ def test_near_a_point_nothing_else_of_its_rays_is_seen(world: World) -> None:
 
 def trained_restyle(world: World) -> Restyle:
     from fprf.plugins.stylizers.config import RegionOtConfig
-    from fprf.training.restyle import restyle
+    from fprf.style.restyle import restyle
 
     return restyle(world.load(), world.references, RegionOtConfig()).restyle

@@ -12,8 +12,8 @@ from tiny_world import World
 from fprf.export.lut import ColourPairs, apply_lattice, colour_pairs, fit_lattice, fit_quality, identity, write_cube
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.style.look import Restyle
+from fprf.style.restyle import restyle
 from fprf.training.loading import load_style
-from fprf.training.restyle import restyle
 from fprf.training.views import render_view
 
 FEW = settings(deadline=None, max_examples=15)

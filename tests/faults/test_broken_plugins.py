@@ -16,10 +16,10 @@ from fprf.cli import main as cli
 from fprf.errors import PluginError
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import StylizerConfig
+from fprf.rendering.plugin_checks import check_parts, check_stylizer
 from fprf.style.scene import own_style
 from fprf.testing import cases
 from fprf.training.model import build_model
-from fprf.training.plugin_checks import check_parts, check_stylizer
 from fprf.types import FieldSample, Want
 
 CONFIG = '''

@@ -24,7 +24,7 @@ from fprf.splats.views import camera_of, draw, find_views
 from fprf.style.config import StyleConfig
 from fprf.style.controls import luma
 from fprf.style.files import StyleFile, write_style
-from fprf.training.restyle import apply_style
+from fprf.style.restyle import apply_style
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
 TONE = RegionToneConfig(centred=False)

@@ -12,9 +12,9 @@ from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionO
 from fprf.rendering.cameras import pixel_grid
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
+from fprf.style.match_maps import MatchMap, match_map, summarize, write_pixels
+from fprf.style.restyle import Codes, Styled, apply_style
 from fprf.training.loading import Trained
-from fprf.training.matches import MatchMap, match_map, summarize, write_pixels
-from fprf.training.restyle import Codes, Styled, apply_style
 from fprf.training.views import paint_pixels, render_view
 
 

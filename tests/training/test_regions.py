@@ -14,10 +14,10 @@ from fprf.errors import UsageError
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import Key, StyleFile
+from fprf.style.match_maps import explain, region_row, region_tile
+from fprf.style.regions import RegionMatch, Regions, find_regions, key_of, membership_view
+from fprf.style.restyle import RegionControls, Styled, apply_style, region_controls
 from fprf.training.loading import load_style
-from fprf.training.matches import explain, region_row, region_tile
-from fprf.training.regions import RegionMatch, Regions, find_regions, key_of, membership_view
-from fprf.training.restyle import RegionControls, Styled, apply_style, region_controls
 
 
 def regions_of(world: World, keys: dict[str, Key] | None = None) -> Regions:

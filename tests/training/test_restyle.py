@@ -15,8 +15,8 @@ from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionA
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.files import StyleFile, write_style
 from fprf.style.references import Encoders
+from fprf.style.restyle import apply_style, restyle
 from fprf.training.loading import Trained
-from fprf.training.restyle import apply_style, restyle
 from fprf.training.views import render_view
 
 

@@ -17,10 +17,10 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.rendering.cameras import pixel_grid
 from fprf.style.look import Restyle
+from fprf.style.match_maps import match_map
+from fprf.style.restyle import restyle
 from fprf.style.scene import own_style
 from fprf.training.loading import load_style
-from fprf.training.matches import match_map
-from fprf.training.restyle import restyle
 from fprf.training.views import cache_view, render_view, view_parts
 
 STYLIZERS = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())

@@ -16,10 +16,10 @@ from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionO
 from fprf.style.config import StyleConfig
 from fprf.style.dictionary import StyleDictionary, build_dictionary
 from fprf.style.files import StyleFile
+from fprf.style.match_maps import match_map
 from fprf.style.references import Encoders, encode_photograph
+from fprf.style.restyle import dress
 from fprf.training.loading import Trained, load_run
-from fprf.training.matches import match_map
-from fprf.training.restyle import dress
 from fprf.training.views import cache_view, render_view
 
 STYLIZERS = (AdainConfig(colours=0.5), LocalAdainConfig(similarity="dot"), RegionOtConfig(), RegionToneConfig())

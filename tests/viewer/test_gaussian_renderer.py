@@ -19,7 +19,7 @@ from fprf.splats.files import read_capture
 from fprf.splats.look_config import LookConfig
 from fprf.splats.scene import SplatScene, look_at_capture
 from fprf.style.files import StyleFile
-from fprf.training.restyle import apply_style
+from fprf.style.restyle import apply_style
 from fprf.viewer.cameras import page_transform
 from fprf.viewer.film import FilmPlan
 from fprf.viewer.gaussian_renderer import page_gaussians

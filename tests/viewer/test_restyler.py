@@ -10,10 +10,10 @@ from tiny_world import World
 from fprf.errors import CheckpointError, UsageError
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
+from fprf.style.regions import membership_view
+from fprf.style.restyle import apply_style
 from fprf.style.scene import SceneStyle
 from fprf.training.loading import load_run, load_style
-from fprf.training.regions import membership_view
-from fprf.training.restyle import apply_style
 from fprf.training.views import render_view
 from fprf.viewer.restyler import Restyler, load_unfinished, matching_regions, measure_encoders, set_parameters
 from fprf.viewer.state import Look, set_rule, style_config
@@ -67,7 +67,7 @@ def test_a_click_finds_the_region_that_is_there(world: World) -> None:
     trained = restyler.scene
     _, *_ = encoded(restyler, world)
     cameras = trained.known.cameras.select(torch.tensor([2]))
-    from fprf.training.regions import Regions
+    from fprf.style.regions import Regions
 
     share, _ = membership_view(Regions(trained, restyler.encoders.scene, restyler.encoders.basis), 2, 1000)
     for x, y in ((3, 4), (20, 18), (31, 23)):

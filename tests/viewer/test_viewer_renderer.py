@@ -15,8 +15,8 @@ from tiny_world import World
 from fprf.io.images import to_uint8
 from fprf.io.maps import match_image
 from fprf.ops import backend
+from fprf.style.match_maps import match_map
 from fprf.training.loading import load_run
-from fprf.training.matches import match_map
 from fprf.training.views import render_view, view_parts
 from fprf.viewer import renderer
 from fprf.viewer.cameras import page_transform

@@ -4,7 +4,7 @@ A handful of points cost milliseconds, and nothing afterwards. `fprf.testing` ha
 """
 
 from collections.abc import Callable
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,10 +16,12 @@ from ..plugins import registry
 from ..plugins.config import PluginConfig
 from ..plugins.losses.config import LossTermConfig
 from ..plugins.stylizers.config import StylizerConfig
-from ..rendering.renderer import Parts
-from ..style.dictionary import StyleDictionary
-from ..style.scene import SceneStyle
 from ..types import Rays, Want
+from .renderer import Parts
+
+if TYPE_CHECKING:
+    from ..style.dictionary import StyleDictionary
+    from ..style.scene import SceneStyle
 
 __all__ = ["check_parts", "check_stylizer", "check_term"]
 
@@ -59,7 +61,7 @@ def check_parts(config: TrainConfig, parts: Parts, channels: int, dim: int) -> N
 
 
 @torch.no_grad()
-def check_stylizer(config: StylizerConfig, stylizer: Stylizer, dictionary: StyleDictionary, scene: SceneStyle) -> None:
+def check_stylizer(config: StylizerConfig, stylizer: Stylizer, dictionary: "StyleDictionary", scene: "SceneStyle") -> None:
     """A stylizer on the CPU, at some points about the scene's mean. Raises PluginError."""
     needs = stylizer.needs
     if Want.CONTENT not in needs or needs | Want.CONTENT | Want.SEMANTIC != Want.CONTENT | Want.SEMANTIC:

@@ -12,11 +12,11 @@ from ..datamanagers.images import load_image
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
-from ..style.config import Pixel, pixel_of
-from ..style.files import Key
-from ..style.matching import scores, unit
-from ..style.regional import RegionWeight
-from ..style.scene import SceneStyle
+from .config import Pixel, pixel_of
+from .files import Key
+from .matching import scores, unit
+from .regional import RegionWeight
+from .scene import SceneStyle
 
 __all__ = ["ALIKE", "RegionMatch", "Regions", "find_regions", "key_of", "membership_view", "memberships"]
 

@@ -11,17 +11,17 @@ from torch import Tensor
 from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
-from ..style.config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value, parse_strength
-from ..style.controls import allowed_references
-from ..style.dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
-from ..style.files import StyleFile, check_photographs, read_style
-from ..style.look import Restyle
-from ..style.matching import scores, unit
-from ..style.references import Encoders, encode_photograph
-from ..style.regional import RegionWeight, regional
-from ..style.scene import SceneStyle
-from .plugin_checks import check_stylizer
+from ..rendering.plugin_checks import check_stylizer
+from .config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value, parse_strength
+from .controls import allowed_references
+from .dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
+from .files import StyleFile, check_photographs, read_style
+from .look import Restyle
+from .matching import scores, unit
+from .references import Encoders, encode_photograph
+from .regional import RegionWeight, regional
 from .regions import RegionMatch, Regions, find_regions, key_of
+from .scene import SceneStyle
 
 __all__ = ["Codes", "RegionControls", "Styled", "apply_style", "dress", "mixed", "region_controls", "region_scores", "restyle"]
 

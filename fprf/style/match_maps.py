@@ -20,8 +20,8 @@ from ..io.images import Picture, to_uint8
 from ..io.maps import match_image, match_summary, scale_image
 from ..io.sheet import Tile, highlight
 from ..rendering.cameras import Cameras, pixel_grid
-from ..style.matching import unit
-from ..style.regional import RegionWeight
+from .matching import unit
+from .regional import RegionWeight
 from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled
 
