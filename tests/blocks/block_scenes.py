@@ -1,5 +1,6 @@
 """Scenes without images: cameras over a plane or along a path, and points that they see."""
 
+import math
 from pathlib import Path
 
 import torch
@@ -7,6 +8,7 @@ from torch import Tensor
 
 from fprf.datamanagers.scene import Scene
 from fprf.rendering.cameras import Cameras
+from fprf.rendering.paths import pinhole
 
 __all__ = ["cameras_at", "drone", "scene_of", "street"]
 
@@ -16,15 +18,7 @@ def cameras_at(position: Tensor, ahead: Tensor, upright: Tensor, size: tuple[int
     back = -ahead / ahead.norm(dim=-1, keepdim=True)
     right = torch.nn.functional.normalize(torch.linalg.cross(upright.expand_as(back), back), dim=-1)
     pose = torch.stack([right, torch.linalg.cross(back, right), back, position], -1)
-    count = len(position)
-    return Cameras(
-        pose=pose,
-        focal=torch.full((count, 2), size[0] / 2, dtype=torch.float64),
-        centre=torch.tensor([[size[0] / 2, size[1] / 2]], dtype=torch.float64).expand(count, 2),
-        size=torch.tensor([size]).expand(count, 2),
-        distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.zeros(count, dtype=torch.int64),
-    )
+    return pinhole(pose, width=size[0], height=size[1], fov=math.degrees(2 * math.atan(size[1] / size[0])))
 
 
 def scene_of(cameras: Cameras, points: Tensor | None, seen: Tensor | None = None) -> Scene:

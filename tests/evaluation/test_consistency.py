@@ -14,7 +14,7 @@ from fprf.errors import DataError, NumericsError
 from fprf.evaluation.consistency import consistency, path_pairs, published, steadiness, warp
 from fprf.evaluation.town_truth import short_path, town_view
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
-from fprf.rendering.paths import look_at
+from fprf.rendering.paths import look_at, pinhole
 from fprf.town.layout import build_town
 from fprf.town.palettes import palette
 from fprf.town.render import geometry, render, walk
@@ -27,14 +27,8 @@ def row_of_cameras(count: int, step: float = 0.1) -> Cameras:
     x = (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * step
     position = torch.stack([x, 0.2 * x, torch.full_like(x, 3.0)], -1)
     pose = look_at(position, torch.zeros_like(position), torch.tensor([0.0, 1, 0], dtype=torch.float64))
-    return Cameras(
-        pose=pose,
-        focal=torch.full((count, 2), 50.0, dtype=torch.float64),
-        centre=torch.tensor([[24.3, 17.6]], dtype=torch.float64).repeat(count, 1),
-        size=torch.tensor([[WIDTH, HEIGHT]]).repeat(count, 1),
-        distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.zeros(count, dtype=torch.int64),
-    )
+    cameras = pinhole(pose, width=WIDTH, height=HEIGHT, fov=math.degrees(2 * math.atan(HEIGHT / 2 / 50)))
+    return replace(cameras, centre=torch.tensor([[24.3, 17.6]], dtype=torch.float64).repeat(count, 1))
 
 
 def paint(points: torch.Tensor) -> torch.Tensor:
@@ -139,14 +133,7 @@ STILL_FRAMES = 9
 
 def still() -> Cameras:
     pose = torch.eye(4, dtype=torch.float64)[None, :3].repeat(STILL_FRAMES, 1, 1)
-    return Cameras(
-        pose=pose,
-        focal=torch.full((STILL_FRAMES, 2), 12.0, dtype=torch.float64),
-        centre=torch.full((STILL_FRAMES, 2), 6.0, dtype=torch.float64),
-        size=torch.full((STILL_FRAMES, 2), 12),
-        distortion=torch.zeros(STILL_FRAMES, 6, dtype=torch.float64),
-        lens=torch.zeros(STILL_FRAMES, dtype=torch.int64),
-    )
+    return pinhole(pose, width=12, height=12, fov=53.0)
 
 
 def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
@@ -173,14 +160,8 @@ FILM_WIDTH, FILM_HEIGHT, FILM_FRAMES = 96, 72, 8
 @pytest.fixture(scope="module")
 def path() -> Cameras:
     view = walk(seed=0, views=10, width=FILM_WIDTH, height=FILM_HEIGHT)[3]
-    start = Cameras(
-        pose=torch.from_numpy(view.pose)[None],
-        focal=torch.full((1, 2), view.focal, dtype=torch.float64),
-        centre=torch.tensor([[FILM_WIDTH / 2, FILM_HEIGHT / 2]], dtype=torch.float64),
-        size=torch.tensor([[FILM_WIDTH, FILM_HEIGHT]]),
-        distortion=torch.zeros(1, 6, dtype=torch.float64),
-        lens=torch.zeros(1, dtype=torch.int64),
-    )
+    fov = math.degrees(2 * math.atan(FILM_HEIGHT / 2 / view.focal))
+    start = pinhole(torch.from_numpy(view.pose)[None], width=FILM_WIDTH, height=FILM_HEIGHT, fov=fov)
     return short_path(start, FILM_FRAMES)
 
 

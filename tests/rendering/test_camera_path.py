@@ -1,4 +1,5 @@
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,7 @@ from hypothesis import strategies as st
 
 from fprf.errors import DataError
 from fprf.rendering.camera_path import read_camera_path, write_camera_path
-from fprf.rendering.cameras import Cameras
-from fprf.rendering.paths import look_at
+from fprf.rendering.paths import look_at, pinhole
 
 IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
@@ -30,14 +30,7 @@ def test_what_is_written_reads_back(
     draw = torch.Generator().manual_seed(seed)
     position = torch.randn(count, 3, dtype=torch.float64, generator=draw)
     pose = look_at(position, position + torch.randn(count, 3, dtype=torch.float64, generator=draw), torch.eye(3).double()[2])
-    cameras = Cameras(
-        pose=pose,
-        focal=torch.full((count, 2), focal, dtype=torch.float64),
-        centre=torch.tensor([[160.0, 120.0]]).double().repeat(count, 1),
-        size=torch.tensor([[320, 240]]).repeat(count, 1),
-        distortion=torch.zeros(count, 6).double(),
-        lens=torch.zeros(count, dtype=torch.int64),
-    )
+    cameras = pinhole(pose, width=320, height=240, fov=math.degrees(2 * math.atan(120 / focal)))
     path = tmp_path_factory.getbasetemp() / "path.json"
     write_camera_path(path, cameras, fps)
     found, rate = read_camera_path(path)

@@ -1,6 +1,7 @@
 """Gaussians from photographs: that they learn, go on where they stopped, and come out as every verb says."""
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
 from fprf.ops.rasterise import rasterise
 from fprf.rendering.cameras import project
+from fprf.rendering.paths import pinhole
 from fprf.splats import initial, photographs
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
@@ -245,21 +247,12 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
 
 def test_matches_between_views_give_points_on_the_surface() -> None:
     """Views of a textured plane z = 0: what is triangulated lies in it."""
-    from fprf.rendering.cameras import Cameras
-
     draw = np.random.default_rng(1)
     texture = np.kron(draw.integers(0, 256, (60, 60, 3)), np.ones((8, 8, 1))).astype(np.uint8)
     count, width, height, focal = 4, 200, 160, 180.0
     pose = torch.eye(4, dtype=torch.float64)[:3].repeat(count, 1, 1)
     pose[:, 0, 3], pose[:, 2, 3] = torch.linspace(-0.3, 0.3, count, dtype=torch.float64), 3.0
-    cameras = Cameras(
-        pose=pose,
-        focal=torch.full((count, 2), focal, dtype=torch.float64),
-        centre=torch.tensor([[width / 2, height / 2]], dtype=torch.float64).repeat(count, 1),
-        size=torch.tensor([[width, height]]).repeat(count, 1),
-        distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.zeros(count, dtype=torch.int64),
-    )
+    cameras = pinhole(pose, width=width, height=height, fov=math.degrees(2 * math.atan(height / 2 / focal)))
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     images = []
     for view in range(count):
