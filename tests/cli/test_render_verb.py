@@ -1,4 +1,3 @@
-import json
 from pathlib import Path
 
 import cv2
@@ -7,8 +6,6 @@ import pytest
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.cli.progress import Display
-from fprf.cli.render import RenderVerbConfig, camera_path, frames_of
 
 
 def pictures(folder: Path) -> dict[str, np.ndarray]:
@@ -24,17 +21,6 @@ def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_pa
     assert all(np.array_equal(frames[name], plain[name]) for name in frames)
 
 
-@pytest.mark.parametrize("path", ["spiral", "orbit", "interpolate"])
-def test_paths_have_about_the_frames_asked_for(world: World, path: str) -> None:
-    trained = world.load()
-    cameras, names = camera_path(trained.known, RenderVerbConfig(path=path, frames=19))
-    assert abs(len(cameras) - 19) <= 9 and len(names) == len(cameras)
-    assert names == sorted(set(names))
-    with Display(quiet=True) as display:
-        first = next(iter(frames_of(trained, cameras, lambda _: None, display)))
-    assert first.shape == (24, 32, 3) and first.dtype == np.uint8
-
-
 def test_a_gif_is_a_file_and_other_films_are_refused(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["render", str(run), "--path", "spiral", "--frames", "2", "--output"]
     assert cli.main([*args, str(tmp_path / "a.gif")]) == 0
@@ -42,18 +28,6 @@ def test_a_gif_is_a_file_and_other_films_are_refused(run: Path, tmp_path: Path, 
     capsys.readouterr()
     assert cli.main([*args, str(tmp_path / "a.mov")]) == 2
     assert "films end in .mp4 .gif .webp .apng" in capsys.readouterr().err and not (tmp_path / "a.mov").exists()
-
-
-def test_a_camera_path_file(run: Path, tmp_path: Path) -> None:
-    pose = [1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 2.0, 0, 0, 0, 1.0]
-    path = tmp_path / "path.json"
-    camera = {"camera_to_world": pose, "fov": 60.0, "aspect": 1.5}
-    path.write_text(
-        json.dumps({"camera_type": "perspective", "render_height": 10, "render_width": 15, "fps": 24, "seconds": 1,
-                    "camera_path": [camera, camera]})
-    )  # fmt: skip
-    assert cli.main(["render", str(run), "--path", str(path), "--output", str(tmp_path / "frames")]) == 0
-    assert [image.shape for image in pictures(tmp_path / "frames").values()] == [(10, 15, 3)] * 2
 
 
 def test_several_looks_and_channels_lie_beside_each_other(run: Path, world: World, tmp_path: Path) -> None:

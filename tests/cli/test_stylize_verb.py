@@ -18,19 +18,6 @@ def stylize(run: Path, world: World, *args: str) -> int:
     return cli.main(["stylize", str(run), "--split", "test", "--references", *map(str, world.references), *args])
 
 
-def test_pictures_pair_up_by_stem(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
-    assert stylize(run, world) == 0
-    folder = run / "styles" / "dusk+snow"
-    names = {p.name for p in folder.iterdir()}
-    assert names == {
-        "0000.png", "0008.png", "0000-match.png", "0008-match.png", "dictionary.safetensors", "style.json"
-    }  # fmt: skip
-    stems = {p.stem for p in (world.town / "images").iterdir()}
-    assert {name.removesuffix(".png") for name in names if name.endswith(".png") and "match" not in name} <= stems
-    assert all(cv2.imread(str(folder / name)).shape == (24, 32, 3) for name in ("0000.png", "0008.png"))
-    assert capsys.readouterr().out.startswith(f"2 views in {folder}  (")
-
-
 def test_folders_stand_for_their_photographs_and_views_are_the_covered_ones(
     run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

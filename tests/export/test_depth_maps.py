@@ -58,18 +58,6 @@ def test_the_gap_is_how_far_in_front_of_the_surface_a_point_is(offset: float) ->
     assert torch.allclose(distance, there - offset, atol=1e-9)
 
 
-def test_lookups_do_not_mix_two_surfaces() -> None:
-    cameras = ring(1, size=(8, 6))
-    depth = torch.full((6, 8), 2.0)
-    depth[:, 4:] = 5.0
-    pixel = torch.stack([torch.linspace(0.5, 7.5, 57, dtype=torch.float64), torch.full((57,), 3.2, dtype=torch.float64)], 1)
-    origin, direction = rays_through(cameras, torch.zeros(57, dtype=torch.int64), pixel)
-    gap, distance = depth_gaps(DepthMaps(cameras, (depth,)), 0, origin + direction)
-    found = gap + distance
-    assert bool(((found - 2).abs() < 1e-6).logical_or((found - 5).abs() < 1e-6).all())
-    assert torch.equal(found < 3, pixel[:, 0] <= 4)
-
-
 @settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**31), share=st.floats(0.05, 0.95))
 def test_half_way_is_where_that_much_weight_has_been_met(seed: int, share: float) -> None:

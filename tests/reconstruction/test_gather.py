@@ -81,13 +81,6 @@ def test_model_and_focal_length_in_both_byte_orders(order: str, tmp_path: Path) 
     assert cv2.imread(str(path)).shape == (8, 8, 3), "still a photograph"
 
 
-def test_files_that_say_nothing(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
-    assert (
-        read_lens(tmp_path / "a.png") == read_lens(photo_of(tmp_path / "a.jpg", None)) == read_lens(tmp_path / "gone") == Lens()
-    )
-
-
 @settings(deadline=None)
 @given(st.binary(max_size=200))
 def test_no_damage_makes_it_fail(noise: bytes) -> None:
@@ -272,3 +265,10 @@ def test_every_image_has_its_reason() -> None:
     assert reasons["broken.jpg"] == "the JPEG is truncated" and "no other image" in reasons["lonely"]
     assert reasons["apart"] == "in part 2 (2 images), apart from the rest; take views in between"
     assert reasons["odd"] == "fits 4 images, but no pose was found for it"
+
+
+def test_files_that_say_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    assert (
+        read_lens(tmp_path / "a.png") == read_lens(photo_of(tmp_path / "a.jpg", None)) == read_lens(tmp_path / "gone") == Lens()
+    )

@@ -130,14 +130,6 @@ def test_what_is_shown(room: Room) -> None:
     assert room.drawn == drawn + 2 and room.panel.cameras and room.panel.blocks
 
 
-def test_the_camera_flies_to_captured_views(room: Room) -> None:
-    room.move("fly to view", 4)
-    assert room.camera == room.session.transform.camera_state(room.session.viewed.scene.cameras, 4)
-    room.move("fly to view", 999)
-    room.gui["fly to view"].moved(3, None)  # nobody's
-    assert len(room.client.cameras) == 2
-
-
 def test_what_others_change_comes_back_to_the_controls(room: Room, world: World) -> None:
     from dataclasses import replace
 

@@ -20,7 +20,6 @@ from fprf.viewer.state import (
     add_photograph,
     interpolate_looks,
     move_key,
-    only,
     remove_key,
     remove_photograph,
     replace_key,
@@ -28,7 +27,6 @@ from fprf.viewer.state import (
     save_look,
     select_key,
     set_rule,
-    set_weight,
     simplified,
     style_config,
 )
@@ -40,15 +38,6 @@ def card(number: int) -> Photograph:
 
 
 A, B, C = (card(i) for i in range(3))
-
-
-def test_weights_order_and_void_wishes() -> None:
-    look = set_weight(set_weight(Look(), B, 2.0, (A, B)), A, 1.0, (A, B))
-    assert look.mix == ((A, 1.0), (B, 2.0))
-    look = set_rule(set_rule(look, 3, "pin", B), 4, "keep")
-    alone = only(look, A)
-    assert alone.mix == ((A, 1.0),) and {order.region for order in alone.rules} == {4}
-    assert set_weight(look, B, 0.0, (A, B)).rules == alone.rules
 
 
 def test_wishes_replace_each_other_but_bans_add_up() -> None:
@@ -181,14 +170,14 @@ def test_looks_fade_from_key_to_key_as_in_the_film() -> None:
     assert interpolate_looks((key(0, ONE),), 0.0) == ONE
 
 
-def test_looks_that_are_fades_themselves_hold_for_half_the_way() -> None:
-    between = replace(ONE, towards=TWO, at=0.3)
-    keys = (key(0, between), key(1, PLAIN))
-    assert interpolate_looks(keys, 0.4) == between and interpolate_looks(keys, 0.6) == PLAIN
-
-
 def test_a_shelf_full_of_photographs_in_use_still_takes_one() -> None:
     state = State(drop_mode="in the mix")
     for number in range(SHELF + 5):
         state = add_photograph(state, card(number))
     assert len(state.shelf) == SHELF and state.shelf[-1].number == SHELF + 4
+
+
+def test_looks_that_are_fades_themselves_hold_for_half_the_way() -> None:
+    between = replace(ONE, towards=TWO, at=0.3)
+    keys = (key(0, between), key(1, PLAIN))
+    assert interpolate_looks(keys, 0.4) == between and interpolate_looks(keys, 0.6) == PLAIN

@@ -212,17 +212,5 @@ def test_a_slow_machine_begins_coarse_and_a_fast_one_sharp() -> None:
     assert sizes[middle] == (80, 60)
 
 
-def test_speed_learns_and_forgets() -> None:
-    speed = Speed(1e-5)
-    for _ in range(40):
-        speed.update(1000, 1.0)
-    assert abs(speed.seconds - 1e-3) < 1e-6
-    speed.update(0, 5.0)
-    assert abs(speed.seconds - 1e-3) < 1e-6
-    for _ in range(40):
-        speed.update(1000, 0.001)
-    assert speed.seconds < 2e-6
-
-
 def test_without_a_style_the_match_map_is_grey(restyler: Restyler) -> None:
     assert (painted(restyler, ViewSettings(Look(), "matches")).pictures["matches"] == 128).all()

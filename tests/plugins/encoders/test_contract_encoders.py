@@ -107,14 +107,6 @@ def test_identities_differ_with_settings(tmp_path: Path) -> None:
     assert identities == [config.build().identity for config in configs]
 
 
-def test_an_identity_names_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    one, two = (Vgg19Config(weights=vgg_file(tmp_path / name)).build().identity for name in "ab")
-    assert one == two
-    assert str(tmp_path) not in one
-
-
 def test_parts_default_to_what_ships() -> None:
     """Composed encoders build without a file or a network."""
     for kind in (AveragedConfig, ConcatConfig):

@@ -8,10 +8,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 from network_files import CLASSES, espnet_file, espnet_tensors
-from safetensors.torch import save_file
 from torch import Tensor
 
-from fprf.errors import WeightsError
 from fprf.plugins.encoders.config import EspNetConfig
 
 STRIDES = {"level1": 2, "level2": 4, "level3": 8, "level4": 16}
@@ -129,17 +127,6 @@ def test_scores(tmp_path: Path) -> None:
     image = torch.rand(2, 3, 48, 80)
     assert encoder.channels == CLASSES
     torch.testing.assert_close(encoder(image).double(), Oracle(espnet_tensors()).scores(image), rtol=1e-4, atol=1e-4)
-
-
-def test_a_level_needs_no_more_of_the_file(tmp_path: Path) -> None:
-    tensors = {
-        name: value for name, value in espnet_tensors().items() if name.startswith(("base_net.level1", "base_net.level2"))
-    }
-    save_file(tensors, tmp_path / "short.safetensors")
-    short = EspNetConfig(layer="level2", weights=tmp_path / "short.safetensors").build()
-    assert short.identity == EspNetConfig(layer="level2", weights=espnet_file(tmp_path)).build().identity
-    with pytest.raises(WeightsError, match=r"does not hold ESPNetv2 level3 \(base_net.*is missing"):
-        EspNetConfig(layer="level3", weights=tmp_path / "short.safetensors").build()
 
 
 @pytest.mark.slow
