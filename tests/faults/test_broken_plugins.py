@@ -12,7 +12,6 @@ from fake_packages import Packages, packages_in
 from tiny_world import World
 from torch import Tensor, nn
 
-from fprf.cli import main as cli
 from fprf.errors import PluginError
 from fprf.interfaces import Stylizer
 from fprf.plugins.stylizers.config import StylizerConfig
@@ -62,20 +61,6 @@ def run(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     words = [sys.executable, "-m", "fprf", *args]
     return subprocess.run(words, env=environment, capture_output=True, text=True, timeout=240)
-
-
-@pytest.mark.parametrize("name", [name for name in BROKEN if name not in ("dies", "slow", "unbuilt", "prints")])
-def test_one_that_is_asked_for_is_named_with_its_package(
-    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with packages_in(tmp_path) as packages:
-        install(packages)
-        assert cli.main(["train", "fprf-lite", "--content.encoder", name]) == 2
-        assert cli.main(["train", "fprf-lite", "--content.encoder", "clash"]) == 2
-    first, second = capsys.readouterr().err.splitlines()
-    assert first.startswith("error: ") and name in first and f"acme-{name} 1" in first
-    assert "acme-clash-1" in second and "acme-clash-2" in second
 
 
 @pytest.mark.fault

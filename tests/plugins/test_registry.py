@@ -48,6 +48,8 @@ def test_two_packages_of_one_name_are_named_and_hurt_only_that_name(packages: Pa
         ("raise SystemExit(3)", "SystemExit: 3"),
         ("class Odd(BaseException): ...\nraise Odd('odd')", "Odd: odd"),
         ("def f(:", "SyntaxError"),
+        ("def f(): f()\nf()", "RecursionError"),
+        ("raise Warning('as an error')", "Warning: as an error"),
         ("x = 1", "AttributeError"),
     ],
 )
