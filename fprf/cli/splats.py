@@ -172,7 +172,10 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
             for process in compiling:
                 process.wait()
             spent = time.perf_counter() - start
-        train(config, prepared, folder, report, spent=spent)
+        most = config.passes * len(scene.train)
+        if most < config.steps:
+            display.say(f"at most {most} steps: {config.passes} passes over {len(scene.train)} photographs (--passes)")
+        train(replace(config, steps=min(config.steps, most)), prepared, folder, report, spent=spent)
         display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
     return output
 

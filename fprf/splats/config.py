@@ -26,6 +26,9 @@ class GaussiansConfig(RunConfig):
 
     steps: int = 10_000
     """Optimiser steps: one view each."""
+    passes: int = 280
+    """Passes over the training views at most, whatever `steps` and `minutes` say: more of them learn few photographs by heart.
+    Not in cells."""
     parser: DataParserConfig | None = None
     """Format of the scene folder; none = recognised from what lies in it."""
     masks: bool = True
@@ -35,8 +38,13 @@ class GaussiansConfig(RunConfig):
     none = where exposures differ, as the capture says or as its sparse points show. Not in cells."""
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
+    surroundings: int = 500
+    """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. None is split.
+    At most a tenth of `cap`; 0 = none. Not in cells."""
     cap: int = 60_000
     """Gaussians at the end, at most."""
+    pixels_per_gaussian: int = 20
+    """Pixels of all training views for each Gaussian, at least: few photographs get fewer Gaussians. Not in cells."""
     degree: int = 1
     """Degree of the harmonics of view-dependent colours, 0 to 3."""
     ssim: float = 0.2
@@ -64,7 +72,10 @@ class GaussiansConfig(RunConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least("initial", self.initial, 1)
+        at_least("surroundings", self.surroundings, 0)
+        at_least("passes", self.passes, 1)
         at_least("cap", self.cap, 1)
+        at_least("pixels_per_gaussian", self.pixels_per_gaussian, 1)
         at_least("cells", self.cells, 1)
         at_least("rounds", self.rounds, 1)
         if self.degree not in range(4):

@@ -14,7 +14,7 @@ from ..datamanagers.scene import Scene
 from ..rendering.cameras import project
 from .photographs import cover, undistorted
 
-__all__ = ["Points", "initial_points", "spacing", "spatial_order"]
+__all__ = ["Points", "initial_points", "spacing", "spatial_order", "surroundings"]
 
 Doubles = NDArray[np.float64]
 _ENOUGH = 100
@@ -23,6 +23,13 @@ _WINDOW = 100
 """Points to either side on the curve among which the nearest are looked for."""
 _FEATURES, _NEIGHBOURS, _PIXELS, _ANGLE = 1500, 4, 1.5, math.radians(1.5)
 """SIFT features of a view, views that it is matched with, largest error in pixels and least angle between the rays."""
+
+_FAR = 10.0
+"""Radius of the surroundings, in that of the cameras and of 95 % of the points."""
+_BLUR = 8
+"""Pixels of a photograph's shorter side once its colours are blurred for the surroundings."""
+_NEIGHBOURING = 8
+"""Seen directions around one that no view shows, whose mean colour it gets."""
 
 
 class Points(NamedTuple):
@@ -46,6 +53,34 @@ def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: n
         chosen = np.sort(rng.permutation(len(found.position))[:count])
         found = Points(found.position[chosen], found.colour[chosen])
     return found, kind
+
+
+def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, count: int) -> Points:
+    """`count` points spread evenly over a distant sphere, in the blurred colours of the photographs that show their directions.
+
+    Where no view looks, the colours of the nearest seen directions go on.
+    """
+    centres = scene.cameras.pose[scene.train][:, :, 3].numpy()
+    centre = centres.mean(0)
+    away = np.linalg.norm(points.position - centre, axis=1)
+    radius = max(np.linalg.norm(centres - centre, axis=1).max(), np.quantile(away, 0.95), 1e-6)
+    # Fibonacci's spiral.
+    height = 1 - (2 * np.arange(count) + 1) / count
+    turn, level = np.arange(count) * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - height**2)
+    direction = np.stack([level * np.cos(turn), level * np.sin(turn), height], 1)
+    position = centre + _FAR * float(radius) * direction
+    small: dict[int, Image] = {}
+    for view in scene.train.tolist():
+        tall, wide = images[view].shape[:2]
+        shrink = _BLUR / min(tall, wide)
+        reduced = cv2.resize(images[view], (round(wide * shrink), round(tall * shrink)), interpolation=cv2.INTER_AREA)
+        small[view] = np.asarray(cv2.resize(reduced, (wide, tall), interpolation=cv2.INTER_LINEAR), np.uint8)
+    colour, seen = _mean_colours(scene, small, position)
+    if seen.any():
+        alike = direction[~seen] @ direction[seen].T
+        nearest = np.argsort(-alike, axis=1)[:, :_NEIGHBOURING]
+        colour[~seen] = colour[seen][nearest].mean(1)
+    return Points(position, colour)
 
 
 def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
@@ -81,6 +116,13 @@ def spatial_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[n
 
 def _coloured(scene: Scene, images: Mapping[int, Image], position: Doubles) -> Points:
     """Points with the mean colour of the training views that have them in the picture."""
+    return Points(position, _mean_colours(scene, images, position)[0])
+
+
+def _mean_colours(
+    scene: Scene, images: Mapping[int, Image], position: Doubles
+) -> tuple[Annotated[NDArray[np.float32], "P 3"], Annotated[NDArray[np.bool_], "P"]]:
+    """Mean colours over the training views that have points in the picture, grey where none has; and where one has."""
     total, count = np.zeros((len(position), 3)), np.zeros(len(position))
     points = torch.from_numpy(position)
     for view in scene.train.tolist():
@@ -91,7 +133,7 @@ def _coloured(scene: Scene, images: Mapping[int, Image], position: Doubles) -> P
         total[inside] += images[view][y.numpy()[inside], x.numpy()[inside]]
         count[inside] += 1
     colour = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None] / 255, 0.5)
-    return Points(position, colour.astype(np.float32))
+    return colour.astype(np.float32), count > 0
 
 
 def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:

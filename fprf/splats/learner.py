@@ -33,7 +33,7 @@ _JUDGES = 8
 """Views whose errors say where Gaussians are split."""
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
-_START_OPACITY, _START_SCALE = 0.3, 0.7
+_START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
 _TONES = 2e-3
 """Learning rate of the logarithms of factors. It falls to a tenth."""
 
@@ -82,17 +82,24 @@ class Learner:
         """Parameters of a Gaussian."""
         return FIXED + 3 * self.bands
 
-    def begin(self, points: Points, rng: np.random.Generator) -> None:
-        """Put a Gaussian at each point: as wide as the points lie apart, in any direction."""
+    def begin(self, points: Points, rng: np.random.Generator, surroundings: Points | None = None) -> None:
+        """Put a Gaussian at each point: as wide as the points lie apart, in any direction; those of surroundings are opaque."""
         order = spatial_order(points.position)
         position, colour = points.position[order], points.colour[order]
+        size = spacing(position) * _START_SCALE
+        logit = np.full(len(position), math.log(_START_OPACITY / (1 - _START_OPACITY)))
+        if surroundings is not None:
+            far = surroundings.position
+            position, colour = np.concatenate([position, far]), np.concatenate([colour, surroundings.colour])
+            size = np.concatenate([size, spacing(far) * _START_SCALE])
+            logit = np.concatenate([logit, np.full(len(far), math.log(_FAR_OPACITY / (1 - _FAR_OPACITY)))])
         count = self.count = self.begun = len(position)
         rows = np.zeros((self.rows, self.room), np.float32)
         rows[6], rows[10] = 1, -20
         rows[0:3, :count] = position.T
-        rows[3:6, :count] = np.log(spacing(position) * _START_SCALE)
+        rows[3:6, :count] = np.log(size)
         rows[6:10, :count] = rng.normal(size=(4, count))
-        rows[10, :count] = math.log(_START_OPACITY / (1 - _START_OPACITY))
+        rows[10, :count] = logit
         rows[11:14, :count] = (colour.T - 0.5) / HARMONIC
         self.blocks = _blocks(rows)
 

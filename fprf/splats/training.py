@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from ..training.run import Known, Run
 from ..training.trainer import REPORT_SECONDS, Report
 from .config import GaussiansConfig
 from .gaussians import Gaussians
-from .initial import Points, initial_points
+from .initial import Points, initial_points, surroundings
 from .learner import Learner, Step
 from .photographs import make_levels
 from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
@@ -60,6 +60,8 @@ _VIEWS, _SEEN = 32, 400
 """Training views that semantics are found in, at most, and their longest side in pixels."""
 _PIXELS = 640 * 360
 """Of an image, where nobody says how far to reduce them."""
+_SURROUNDINGS = 10
+"""Gaussians, at most, for one of the surroundings."""
 _SOME = 4000
 """Points whose depths say how near to a camera things are."""
 _NEAR = 0.25
@@ -97,11 +99,20 @@ def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
     return replace(config, downscale=max(1, math.ceil(math.sqrt(pixels / _PIXELS))))
 
 
+def _bounded(config: GaussiansConfig, scene: Scene) -> GaussiansConfig:
+    """The config with no more Gaussians than there are photographed pixels for, in the same proportions."""
+    pixels = int(scene.cameras.size[scene.train].prod(1).sum())
+    cap = max(1, min(config.cap, pixels // config.pixels_per_gaussian))
+    initial = max(1, config.initial * cap // config.cap)
+    return replace(config, cap=cap, initial=initial, surroundings=min(config.surroundings, cap // _SURROUNDINGS))
+
+
 def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -> Prepared:
     """Load photographs and find the first points.
 
     `saved` are the facts of a run that goes on: its exposures are not measured again.
     """
+    config = replace(config, surroundings=0) if config.cells > 1 else _bounded(config, scene)
     images, masks = load_photographs(config, scene, scene.train.tolist())
     tones = config.tones if config.cells == 1 else False
     exposure = exposure_of(tones, scene, lambda view: torch.from_numpy(images[view]).float() / 255, saved)
@@ -111,10 +122,18 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     points, origin = initial_points(scene, images, config.initial, draw)
     near = find_near(scene, points)
     levels = make_levels(scene, images, masks, near)
-    room = max(config.cap, len(points.position))
-    learner = Learner(config, levels, reach_of(scene), room, tones=tones_of(facts))
-    learner.begin(points, draw)
+    far = surroundings(scene, images, points, config.surroundings) if config.surroundings else None
+    room = max(config.cap, len(points.position) + config.surroundings)
+    learner = Learner(config, levels, reach_of(scene), room, None if far is None else _before(far), tones=tones_of(facts))
+    learner.begin(points, draw, far)
     return Prepared(scene, learner, near, origin, facts=facts)
+
+
+def _before(far: Points) -> Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]]:
+    """Whether means lie well within the surroundings, which stay coarse: else they would take on what stands before them."""
+    centre = torch.from_numpy(far.position.mean(0)).float()
+    limit = 0.5 * float((torch.from_numpy(far.position).float() - centre).norm(dim=1).min())
+    return lambda means: (means - centre).norm(dim=1) < limit
 
 
 def load_photographs(
