@@ -97,11 +97,7 @@ def test_every_field_changes_something(config: GaussiansConfig, scene: Scene, tm
         width, height = scene.cameras.size[0].tolist()
         write_image(tmp_path / "mask.png", np.zeros((height, width, 3), np.uint8))
         scene = replace(scene, masks=(tmp_path / "mask.png",) * len(scene.paths))
-    end = (
-        3
-        if name in ("initial", "surroundings", "degree", "ssim", "coarse", "rate", "background", "seed", "masks", "tones")
-        else STEPS
-    )
+    end = STEPS if name in ("cap", "grow", "relocate_every", "pixels_per_gaussian") else 3
     first, second = (learnt(each, scene, 0, end) for each in (config, replace(config, **{name: SECOND[name]})))
     assert not equal(first.gaussians(), second.gaussians())
 
