@@ -125,8 +125,10 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
     from ..ops.rasterise_training import compile_beside
 
     compiling = compile_beside((config.degree + 1) ** 2)  # while torch is imported and images are read
+    from ..datamanagers.images import load_images
     from ..io.atomic import remove_unfinished
-    from ..splats.training import facts_of, prepare, scene_of, train, with_downscale
+    from ..splats.cell_training import OVERVIEW
+    from ..splats.training import facts_of, lit, prepare, scene_of, train, with_downscale
     from ..training.run import Run, check_images, held, image_hashes, save_image_hashes
     from .progress import EventLog
     from .train import check_same, default_output
@@ -146,12 +148,15 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
         marks = image_hashes(scene)
         if folder.exists and not others:
             check_images(output, scene, marks)
-        saved = folder.load_known().facts if folder.checkpoints.is_dir() else None
+        saved = folder.load_known().facts if folder.checkpoints.is_dir() or (output / OVERVIEW).is_dir() else None
         prepared = prepare(config, scene, saved=saved) if config.cells == 1 else None
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved
         save_image_hashes(output, marks)
-        folder.save_known(scene, config.data, (prepared and prepared.facts) or facts_of(config, scene))
+        facts = saved if prepared is None else prepared.facts
+        if facts is None:
+            facts = lit(facts_of(config, scene), config, scene, lambda view: load_images(scene, config.background, [view])[0])
+        folder.save_known(scene, config.data, facts)
         if prepared is None:
             for process in compiling:
                 process.wait()

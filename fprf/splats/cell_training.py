@@ -31,6 +31,7 @@ from ..errors import CheckpointError
 from ..io.atomic import write_json
 from ..plugins.codec import to_json
 from ..training import checkpoint
+from ..training.model import Facts, tones_of
 from ..training.run import Run, held
 from ..training.trainer import Report
 from .cells import Cell, cut
@@ -40,10 +41,13 @@ from .learner import Learner
 from .photographs import make_levels
 from .training import Prepared, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
-__all__ = ["CellTask", "folder_of", "read_cells", "train_cell", "train_overview", "unite", "write_cells"]
+__all__ = ["OVERVIEW", "CellTask", "folder_of", "read_cells", "train_cell", "train_overview", "unite", "write_cells"]
 
 _FORMAT = 2
-_OVERVIEW = "overview"
+OVERVIEW = "overview"
+"""Folder of the whole scene in a run."""
+_PIXELS, _SMALLEST = 24_000_000, 4
+"""Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +73,7 @@ def folder_of(root: Path, round: int, cell: int) -> Path:
 
 def _start_of(root: Path, round: int) -> Path:
     """Folder of the checkpoints that the cells of a round start from."""
-    return (root / "cells" / str(round - 1) if round else root / _OVERVIEW) / "checkpoints"
+    return (root / "cells" / str(round - 1) if round else root / OVERVIEW) / "checkpoints"
 
 
 def write_cells(root: Path, scene: Scene, count: int) -> list[Cell]:
@@ -131,20 +135,27 @@ def train_overview(
 
     What is finished stays when a run is gone on with for more steps or minutes.
     """
-    folder = root / _OVERVIEW
+    folder = root / OVERVIEW
     task = _task(config, scene, scene.train.tolist())
     done = _read_done(folder)
     if done is not None and done["task"] == task:
         return False
     _begin(folder, task)
+    # Smaller images, then fewer, where memory would not be bounded: at most as many pixels of all together.
+    pixels, factor = int(scene.cameras.size[scene.train].prod(1).sum()), 2
+    while factor < _SMALLEST and pixels > factor**2 * _PIXELS:
+        factor += 1
     own = replace(
         config,
-        downscale=2 * (config.downscale or 1),
-        coarse=config.coarse / 3,  # the levels that one piece would be trained on, of images which are half as large already
+        downscale=factor * (config.downscale or 1),
+        # The levels that one piece would be trained on, of images which are smaller already.
+        coarse=config.coarse / 3 ** math.log2(factor),
         steps=max(1, round(config.overview * config.steps)),
         minutes=None if config.minutes is None else config.overview * config.minutes,
     )
-    prepared = prepare(own, scene_of(own))._replace(shares=(0.0, config.overview))
+    small = scene_of(own)
+    small = replace(small, train=small.train[:: -(-pixels // (factor**2 * _PIXELS))])
+    prepared = prepare(own, small, saved=Run(root).load_known().facts)._replace(shares=(0.0, config.overview))
     train(own, prepared, Run(folder), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})
     return True
@@ -174,30 +185,34 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
         each = (1 - config.overview) / config.rounds
         own = replace(config, steps=max(1, round(each * config.steps)), minutes=task.minutes)
         first = config.overview + each * task.round
-        train(own, _prepared(own, scene, cell, start, (first, first + each)), Run(folder), report, spent=0.0)
+        facts = Run(root).load_known().facts
+        train(own, _prepared(own, scene, facts, cell, start, (first, first + each)), Run(folder), report, spent=0.0)
         write_json(folder / "done.json", asked)
     return True
 
 
 def _prepared(
-    config: GaussiansConfig, scene: Scene, cell: Cell, start: checkpoint.Saved, shares: tuple[float, float]
+    config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved, shares: tuple[float, float]
 ) -> Prepared:
     """A cell's windows, and the Gaussians of the whole scene that they show."""
     images, masks = load_photographs(config, scene, list(cell.windows))
     images = {view: cell.cut(view, image) for view, image in images.items()}
     masks = {view: cell.cut(view, mask) for view, mask in masks.items()}
     near, whole = float(start.model["near"]), gaussians_of(start)
-    shown = cell.shown(scene, whole)
+    shown = cell.shown(scene, whole, near)
     gaussians = whole.select(shown)
     own = cell.scene(scene)
     # Only what lies inside and in the border becomes more: its share of all that may be added.
     around = int(cell.around(gaussians.means).sum())
     cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
-    learner = Learner(replace(config, cap=cap), make_levels(own, images, masks, near), reach_of(own), cap, cell.around)
+    tones = tones_of(facts) if any(name.startswith("tones.") for name in start.optimizer) else None
+    levels = make_levels(own, images, masks, near)
+    learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, tones=tones)
     # As if the number had grown from the beginning of the schedule.
     passed = min(shares[0] / config.grow, 0.99)
     begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
     moments = {name: start.optimizer[name][shown] for name in ("first", "second")}
+    moments |= {name: tensor for name, tensor in start.optimizer.items() if name.startswith("tones.")}
     learner.restore(gaussians, {**moments, "begun": torch.tensor(begun)})
     return Prepared(own, learner, near, "the whole scene", start.step, shares)
 
@@ -251,6 +266,7 @@ def unite(root: Path, round: int, cells: Sequence[Cell], to: Path | None = None)
     assert start is not None  # the cells were trained from it
     parts: list[tuple[Tensor, ...]] = []
     step, seconds = start.step, start.seconds
+    lights: list[dict[str, Tensor]] = []
     for number, cell in enumerate(cells):
         folder = folder_of(root, round, number)
         saved, _ = checkpoint.load_latest(folder / "checkpoints")
@@ -259,10 +275,29 @@ def unite(root: Path, round: int, cells: Sequence[Cell], to: Path | None = None)
         own = cell.holds(saved.model["means"])
         gaussians = gaussians_of(saved).select(own)
         parts.append((*vars(gaussians).values(), saved.optimizer["first"][own], saved.optimizer["second"][own]))
+        lights.append(saved.optimizer)
         step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
     *united, first, second = (torch.cat(columns) for columns in zip(*parts, strict=True))
     gaussians = Gaussians(*united)
     moments = {"first": first, "second": second, "begun": torch.tensor(len(gaussians))}
+    moments |= _mean_tones(start, lights, cells)
     state = state_of(gaussians, float(start.model["near"]))
     checkpoint.write(to or _start_of(root, round + 1), state, moments, step=step, seconds=seconds)
     return len(gaussians)
+
+
+def _mean_tones(start: checkpoint.Saved, found: list[dict[str, Tensor]], cells: Sequence[Cell]) -> dict[str, Tensor]:
+    """What cells learnt of the light of photographs: the mean of those that have a window of it."""
+    named = {}
+    for name, before in start.optimizer.items():
+        if not name.startswith("tones."):
+            continue
+        every = torch.stack([each[name] for each in found])
+        if before.dim() == 2:  # a row a view
+            used = torch.zeros(len(cells), len(before), 1, dtype=every.dtype)
+            for number, cell in enumerate(cells):
+                used[number, list(cell.windows)] = 1
+            named[name] = torch.where(used.sum(0) > 0, (used * every).sum(0) / used.sum(0).clamp_min(1), before)
+        else:
+            named[name] = every.mean(0)
+    return named

@@ -18,8 +18,11 @@ from torch import Tensor
 
 from ..datamanagers.scene import Scene, find_sightings
 from ..errors import ConfigError
-from ..rendering.cameras import project
+from ..ops.rasterise import lift
 from .gaussians import Gaussians
+from .initial import spatial_order
+from .levels import in_view
+from .photographs import cover
 
 __all__ = ["Cell", "cut"]
 
@@ -37,6 +40,9 @@ _LEAST, _ROOM = 64, 16
 _OUTLIERS = 0.01
 _DEVIATIONS = 3.0
 """A Gaussian is shown as far as so many standard deviations from its mean."""
+_RUN, _COARSER, _WEIGHT = 256, 2, 0.01
+"""Gaussians that are looked for together; windows are drawn at this part of their size to see what they show; the least that
+the weights of a Gaussian in all pixels of one sum to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,22 +78,40 @@ class Cell:
         cameras = replace(scene.cameras, centre=centre, size=size)
         return replace(scene, cameras=cameras, train=views)
 
-    def shown(self, scene: Scene, gaussians: Gaussians) -> Annotated[Tensor, "N"]:
-        """True for Gaussians that a window may show, and for all in the cell and its border."""
+    def shown(self, scene: Scene, gaussians: Gaussians, near: float) -> Annotated[Tensor, "N"]:
+        """True for Gaussians that a window shows, and for all in the cell and its border.
+
+        What others hide, and what covers next to nothing, is not shown, so their number does not grow with the scene.
+        """
         cameras = self.scene(scene).cameras
         found = self.around(gaussians.means)
-        radius = _DEVIATIONS * gaussians.log_scales.amax(1).double().exp()
+        order, centre, radius = _runs(gaussians)
         for view in self.windows:
-            pixel, depth = project(cameras, torch.full((len(gaussians),), view), gaussians.means)
-            across = (radius / depth.clamp_min(1e-9))[:, None] * cameras.focal[view]
-            inside = (pixel > -across) & (pixel < cameras.size[view] + across)
-            found |= (depth > 0) & inside.all(1)
+            camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
+            some = torch.unique(order[torch.from_numpy(in_view(camera, centre, radius)[1])])
+            part = gaussians.select(some)
+            shape = part.means, part.quaternions, part.log_scales, part.logits
+            weights = lift(*shape, camera, torch.zeros(camera.height, camera.width, 1), antialiased=True).weights
+            found[some[weights > _WEIGHT]] = True
         return found
 
     def cut(self, view: int, image: NDArray[Number]) -> NDArray[Number]:
         """The window of an image [H W ...] of a view."""
         left, top, width, height = self.windows[view]
         return image[top : top + height, left : left + width]
+
+
+def _runs(
+    gaussians: Gaussians,
+) -> tuple[Annotated[Tensor, "B R"], Annotated[NDArray[np.float64], "B 3"], Annotated[NDArray[np.float64], "B"]]:
+    """Indices of Gaussians near to each other, the last ones repeated, with balls around what they show."""
+    order = torch.from_numpy(spatial_order(gaussians.means.double().numpy()))
+    order = torch.nn.functional.pad(order[None], (0, -len(order) % _RUN), mode="replicate").view(-1, _RUN)
+    means = gaussians.means.double()[order]
+    centre = (means.amin(1) + means.amax(1)) / 2
+    reach = _DEVIATIONS * gaussians.log_scales.amax(1).double().exp()
+    radius = ((means - centre[:, None]).norm(dim=2) + reach[order]).amax(1)
+    return order, centre.numpy(), radius.numpy()
 
 
 def cut(scene: Scene, count: int) -> list[Cell]:

@@ -35,7 +35,7 @@ class GaussiansConfig(RunConfig):
     """Leave out, in training and metrics, what the capture's masks name (`masks/` beside the images, or `mask_path`)."""
     tones: bool | None = None
     """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what they have in common.
-    none = where exposures differ, as the capture says or as its sparse points show. Not in cells."""
+    none = where exposures differ, as the capture says or as its sparse points show."""
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
     surroundings: int = 500

@@ -7,20 +7,23 @@ which what was merged lies within a given number of pixels; the others cost it n
 """
 
 import math
+import mmap
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..io.atomic import atomic_path
 from ..ops.rasterise import Pinhole
 from ..rendering.splines import rotations
 from .gaussians import Gaussians
 from .initial import spatial_order
 
-__all__ = ["Levels", "make_levels_of_detail"]
+__all__ = ["Levels", "in_view", "make_levels_of_detail", "open_levels", "write_levels"]
 
 _CHUNK, _GROUP, _LEVELS = 512, 4, 4
 """Gaussians of a chunk; those merged into one of the next level; levels, the finest included."""
@@ -31,6 +34,9 @@ _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""
 _SPREAD = 0.9
 """Quantile that says how wide a chunk is, and how far apart is what a level merges."""
+_PART = 1 << 17
+"""Gaussians that are in memory at a time while levels are written."""
+_ROWS, _TABLES = "rows.bin", "chunks.npz"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,24 +54,38 @@ class Levels:
     """Of a ball around all that a chunk shows."""
     core: Annotated[NDArray[np.float64], "B"]
     """Of a ball around nearly all means of a chunk."""
+    mapped: mmap.mmap | None = None
+    """The file that the rows lie in: of its pages none stays in memory."""
 
     def select(self, camera: Pinhole, pixels: float) -> Gaussians:
         """What a camera sees, merged where that lies within `pixels`; 0 = nothing is merged."""
-        pose = camera.world_to_camera.double().numpy()
-        fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        local = self.centre @ pose[:3, :3].T + pose[:3, 3]
-        x, y, z = local.T
-        seen = z + self.radius > camera.near
-        # Distance from the planes through the camera and the image's sides; normals point outwards.
-        for along, slope in ((-x, cx / fx), (x, (camera.width - cx) / fx), (-y, cy / fy), (y, (camera.height - cy) / fy)):
-            seen &= (along - slope * z) / math.hypot(1, slope) < self.radius
+        local, seen = in_view(camera, self.centre, self.radius)
+        fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
         distance = np.maximum(np.linalg.norm(local, axis=1) - self.core, camera.near)
         fine = self.spread * max(fx, fy) <= pixels * distance[:, None]
         level = np.minimum.accumulate(fine, axis=1).sum(1) - 1
         chunks = np.flatnonzero(seen)
         first, last = self.begin[chunks, level[chunks]], self.begin[chunks, level[chunks] + 1]
         parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
-        return _gaussians(torch.from_numpy(np.concatenate(parts)))
+        found = np.concatenate(parts)
+        if self.mapped is not None:
+            self.mapped.madvise(mmap.MADV_DONTNEED)
+        return _gaussians(torch.from_numpy(found))
+
+
+def in_view(
+    camera: Pinhole, centre: Annotated[NDArray[np.float64], "B 3"], radius: Annotated[NDArray[np.float64], "B"]
+) -> tuple[Annotated[NDArray[np.float64], "B 3"], Annotated[NDArray[np.bool_], "B"]]:
+    """Centres of balls as the camera sees them, and whether it may see a part of each."""
+    pose = camera.world_to_camera.double().numpy()
+    fx, fy, cx, cy = (float(camera.intrinsics[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    local = centre @ pose[:3, :3].T + pose[:3, 3]
+    x, y, z = local.T
+    seen = z + radius > camera.near
+    # Distance from the planes through the camera and the image's sides; normals point outwards.
+    for along, slope in ((-x, cx / fx), (x, (camera.width - cx) / fx), (-y, cy / fy), (y, (camera.height - cy) / fy)):
+        seen &= (along - slope * z) / math.hypot(1, slope) < radius
+    return local, seen
 
 
 def make_levels_of_detail(gaussians: Gaussians) -> Levels:
@@ -101,6 +121,42 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
         away = np.linalg.norm(means[own] - centre[chunk], axis=1)
         radius[chunk], core[chunk] = (away + reach[own]).max(), np.quantile(away, _SPREAD)
     return Levels(np.concatenate(parts), begin, spread, centre, radius, core)
+
+
+def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
+    """Write levels of detail that `open_levels` maps, in bounded memory where the Gaussians are mapped from a file themselves.
+
+    Neighbours in memory should be neighbours in space, as the cells of a union are. Raises DataError where the system refuses.
+    """
+    tables: list[tuple[NDArray[Any], ...]] = []
+    written = 0
+    with atomic_path(folder / _ROWS) as temporary, temporary.open("wb") as file:
+        for first in range(0, len(gaussians), _PART):
+            levels = make_levels_of_detail(gaussians.select(torch.arange(first, min(first + _PART, len(gaussians)))))
+            file.write(levels.rows.tobytes())
+            tables.append((levels.begin + written, levels.spread, levels.centre, levels.radius, levels.core))
+            written += len(levels.rows)
+        width = levels.rows.shape[1]
+    begin, spread, centre, radius, core = (np.concatenate(columns) for columns in zip(*tables, strict=True))
+    parts = {"begin": begin, "spread": spread, "centre": centre, "radius": radius, "core": core}
+    with atomic_path(folder / _TABLES) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, key=np.array(key), width=np.array(width), **parts)
+
+
+def open_levels(folder: Path, key: str) -> Levels | None:
+    """Levels mapped from files; None where there are none of this key."""
+    try:
+        with np.load(folder / _TABLES) as tables:
+            if str(tables["key"]) != key:
+                return None
+            parts = {name: tables[name] for name in ("begin", "spread", "centre", "radius", "core")}
+            width = int(tables["width"])
+        with (folder / _ROWS).open("rb") as file:
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        rows = np.frombuffer(mapped, np.float32).reshape(-1, width)
+    except (OSError, ValueError, KeyError):
+        return None
+    return Levels(rows=rows, **parts, mapped=mapped) if len(rows) == parts["begin"][-1, -1] else None
 
 
 def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]) -> list[NDArray[np.int64]]:

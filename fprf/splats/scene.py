@@ -103,6 +103,8 @@ class SplatScene(Scene):
     """What rendered colours are multiplied by at last."""
     merged: float | None = None
     """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are drawn."""
+    stored: Callable[[], Levels] | None = None
+    """Levels of detail of the Gaussians as captured, from files; None = they are made in memory."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -132,6 +134,8 @@ class SplatScene(Scene):
     @cached_property
     def levels(self) -> Levels:
         """Levels of detail in the scene's look."""
+        if self.stored is not None and self.harmonics is None:
+            return self.stored()
         return make_levels_of_detail(self.shown)
 
     @torch.inference_mode()

@@ -34,6 +34,7 @@ from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points, surroundings
 from .learner import Learner, Step
+from .levels import Levels, open_levels, write_levels
 from .photographs import make_levels
 from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
 
@@ -42,6 +43,7 @@ __all__ = [
     "facts_of",
     "find_near",
     "gaussians_of",
+    "lit",
     "load_photographs",
     "load_tones",
     "open_gaussians",
@@ -64,6 +66,8 @@ _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
 _SOME = 4000
 """Points whose depths say how near to a camera things are."""
+_LEVELS, _MANY = "levels", 400_000
+"""Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 _NEAR = 0.25
 """Of the distance that all but 1 % of the points in view have: nothing is drawn nearer to a camera."""
 
@@ -114,10 +118,7 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     """
     config = replace(config, surroundings=0) if config.cells > 1 else _bounded(config, scene)
     images, masks = load_photographs(config, scene, scene.train.tolist())
-    tones = config.tones if config.cells == 1 else False
-    exposure = exposure_of(tones, scene, lambda view: torch.from_numpy(images[view]).float() / 255, saved)
-    held = set(range(len(scene.paths))) - set(scene.train.tolist()) if exposure else ()
-    facts = replace(facts_of(config, scene), exposure=exposure, held=tuple(sorted(held)))
+    facts = saved or lit(facts_of(config, scene), config, scene, lambda view: images[view])
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
     near = find_near(scene, points)
@@ -153,6 +154,13 @@ def reach_of(scene: Scene) -> float:
     """Radius of the training cameras' positions, the unit of the means' learning rate."""
     centre = scene.cameras.pose[scene.train][:, :, 3]
     return 1.1 * float((centre - centre.mean(0)).norm(dim=1).max()) or 1.0
+
+
+def lit(facts: Facts, config: GaussiansConfig, scene: Scene, image: Callable[[int], Image]) -> Facts:
+    """Facts with the exposures of the views, where they are learnt; `image(view)` is a training view."""
+    exposure = exposure_of(config.tones, scene, lambda view: torch.from_numpy(image(view)).float() / 255)
+    held = set(range(len(scene.paths))) - set(scene.train.tolist()) if exposure else ()
+    return replace(facts, exposure=exposure, held=tuple(sorted(held)))
 
 
 def facts_of(config: GaussiansConfig, scene: Scene) -> Facts:
@@ -276,12 +284,15 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         if getattr(quality, name):
             raise UsageError(f"--{name.replace('_', '-')}: is for runs of fields; leave it out")
     run = Run(root)
-    saved, _ = checkpoint.load_latest(run.checkpoints)
+    preset = None if quality.quality is None else PRESETS[quality.quality]
+    merged = None if preset is None else preset.merged
+    # Levels of detail were written from what was verified.
+    key = "" if merged is None else checkpoint.digest(run.checkpoints)
+    saved, _ = checkpoint.load_latest(run.checkpoints, verify=not key or open_levels(root / _LEVELS, key) is None)
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
     known, gaussians = run.load_known(), gaussians_of(saved)
     near = float(saved.model.get("near", torch.tensor(0.01)))
-    preset = None if quality.quality is None else PRESETS[quality.quality]
     resolution = preset.resolution if preset is not None else 1.0
     scene = SplatScene(
         gaussians,
@@ -294,9 +305,20 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         config.background,
         resolution if quality.resolution is None else quality.resolution,
         tone=mixed_tone(_tones(saved, known.facts), known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
-        merged=None if preset is None else preset.merged,
+        merged=merged,
+        stored=cache(lambda: _stored(root / _LEVELS, gaussians, key)) if key and len(gaussians) >= _MANY else None,
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
+
+
+def _stored(folder: Path, gaussians: Gaussians, key: str) -> Levels:
+    """Levels of detail of a run, written where there are none of its checkpoint."""
+    found = open_levels(folder, key)
+    if found is None:
+        write_levels(folder, gaussians, key)
+        found = open_levels(folder, key)
+    assert found is not None  # it was just written
+    return found
 
 
 def load_tones(run: Run) -> Tones | None:

@@ -20,7 +20,7 @@ from ..io.atomic import remove_unfinished, write_json
 from . import tensorfiles
 from .model import Model
 
-__all__ = ["Saved", "load_latest", "reached", "restore", "save", "steps", "tidy", "write"]
+__all__ = ["Saved", "digest", "load_latest", "reached", "restore", "save", "steps", "tidy", "write"]
 
 KEEP = 2
 """Checkpoints that stay on disk."""
@@ -88,8 +88,8 @@ def tidy(root: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def load(root: Path, step: int) -> Saved:
-    """One checkpoint, verified. Raises CheckpointError."""
+def load(root: Path, step: int, *, verify: bool = True) -> Saved:
+    """One checkpoint. Its tensors are mapped from files: only to `verify` them they are read. Raises CheckpointError."""
     folder = _folder(root, step)
     try:
         manifest = _read(folder / "manifest.json")
@@ -99,7 +99,8 @@ def load(root: Path, step: int) -> Saved:
         raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
     if at != step or not math.isfinite(seconds):
         raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
-    model, optimizer = (tensorfiles.load(folder / f"{name}.safetensors", entries[name]) for name in entries)
+    files = [(folder / f"{name}.safetensors", entries[name]) for name in entries]
+    model, optimizer = (tensorfiles.load(*each) if verify else tensorfiles.read(each[0]) for each in files)
     return Saved(at, seconds, model, optimizer)
 
 
@@ -115,6 +116,15 @@ def reached(root: Path) -> tuple[int, float]:
         raise CheckpointError(f"{manifest}: cannot be read ({e!r})") from e
 
 
+def digest(root: Path) -> str:
+    """What the newest checkpoint's manifest says of its tensors, short; empty without one."""
+    kept = steps(root)
+    try:
+        return f"{_checksum(_read(_folder(root, kept[-1]) / 'manifest.json')):08x}" if kept else ""
+    except (OSError, ValueError):
+        return ""
+
+
 def _checksum(manifest: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(manifest, sort_keys=True).encode())
 
@@ -127,12 +137,12 @@ def _read(path: Path) -> dict[str, Any]:
     return manifest
 
 
-def load_latest(root: Path) -> tuple[Saved | None, list[str]]:
+def load_latest(root: Path, *, verify: bool = True) -> tuple[Saved | None, list[str]]:
     """The newest intact checkpoint, and a line for every newer one that was damaged. Raises where all are damaged."""
     damaged: list[str] = []
     for step in reversed(steps(root)):
         try:
-            return load(root, step), damaged
+            return load(root, step, verify=verify), damaged
         except CheckpointError as e:
             damaged.append(str(e))
     if damaged:

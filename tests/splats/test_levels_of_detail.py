@@ -1,13 +1,14 @@
 """Levels of detail: nothing that is seen is left out, moments are kept, and what is merged does not show."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from splat_ball import ball
 
 from fprf.ops.rasterise import Pinhole
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.levels import make_levels_of_detail
+from fprf.splats.levels import make_levels_of_detail, open_levels, write_levels
 from fprf.splats.views import draw
 
 
@@ -50,3 +51,16 @@ def test_equal_gaussians_merge_into_one_of_them() -> None:
     assert len(found) == 1
     assert torch.allclose(found.means, one.means, atol=1e-5) and torch.allclose(found.harmonics, one.harmonics, atol=1e-5)
     assert torch.allclose(found.log_scales.sort().values, one.log_scales.sort().values, atol=1e-4)
+
+
+def test_levels_in_files_show_the_same(tmp_path: Path) -> None:
+    gaussians = _scattered(20_000)
+    write_levels(tmp_path, gaussians, "key")
+    stored = open_levels(tmp_path, "key")
+    assert stored is not None and open_levels(tmp_path, "other") is None
+    for pixels in (0.0, 1.0, 0.0):  # pages that were given back are read again
+        made = make_levels_of_detail(gaussians).select(_camera(100.0, 300.0), pixels)
+        found = stored.select(_camera(100.0, 300.0), pixels)
+        assert all(map(torch.equal, vars(made).values(), vars(found).values()))
+    (tmp_path / "rows.bin").write_bytes(b"")
+    assert open_levels(tmp_path, "key") is None
