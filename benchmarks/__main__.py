@@ -7,7 +7,9 @@ from fprf.errors import FprfError
 
 BENCHMARKS = {
     "blocks_scenes": "a capture in blocks against one field, for the same seconds",
+    "cells": "captures in cells of Gaussians against one piece and blocks of fields",
     "decoders": "fidelity of decoders, and what a style loss buys",
+    "district": "a district of 2000 images in cells: seconds, memory and killed workers",
     "evidence": "all pages of docs/evidence",
     "executors": "blocks on workers of Ray against one after the other",
     "exports": "exported files drawn again, against the field's own renders",

@@ -1,0 +1,172 @@
+"""A district of thousands of images, written and trained in cells: seconds and memory of a cell against the number of cells.
+
+    python -m benchmarks district WORK [--images 2000] [--towns 16] [--parts 1 4 16] [--output FILE.json]
+
+Images and cameras are those of `district_scene.py`; they are kept in WORK. Each part is the district's first towns with four
+cells a town: the whole is trained coarsely, then `--sampled` of its cells, each in a process of its own. All parts have as many
+steps a town and a cell, at full size. Seconds are those of the processor; set-up is what a cell takes before its first step.
+One cell is killed half-way and gone on with; its Gaussians are compared with those of an undisturbed one.
+"""
+
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from .common import RESULTS, add_entry, arguments
+from .district_scene import SKY, write_district
+
+CELLS, STEPS, COARSE_STEPS, GAUSSIANS, POINTS = 4, 200, 300, 8000, 3000
+"""Cells of a town; steps of a cell; steps of the whole for each town; Gaussians of a cell at the end and at the start."""
+Result = TypeVar("Result")
+
+
+def part(district: Path, folder: Path, towns: int) -> None:
+    """The first towns of a district as a scene folder of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    document = json.loads((district / "transforms.json").read_text())
+    count = towns * -(-len(document["frames"]) // document["towns"][1])
+    names = {frame["file_path"] for frame in document["frames"][:count]}
+    document["frames"] = document["frames"][:count]
+    for split in ("train_filenames", "test_filenames"):
+        document[split] = [name for name in document[split] if name in names]
+    (folder / "transforms.json").write_text(json.dumps(document))
+    if not (folder / "images").exists():
+        (folder / "images").symlink_to((district / "images").resolve())
+    with np.load(district / "points.npz") as found:
+        seen = found["seen"][found["seen"][:, 0] < count]
+        used, number = np.unique(seen[:, 1], return_inverse=True)
+        seen = np.stack([seen[:, 0], number], 1)
+        with (folder / "points.npz").open("wb") as file:
+            np.savez(file, xyz=found["xyz"][used], rgb=found["rgb"][used], seen=seen)
+
+
+def apart(function: Callable[..., Result], *args: Any) -> Result:
+    """Call in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *args).result()
+
+
+def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
+    """Cut the scene and train the whole of it coarsely."""
+    import torch
+
+    from fprf.datamanagers.images import load_images
+    from fprf.splats.cell_training import train_overview, write_cells
+    from fprf.splats.config import GaussiansConfig
+    from fprf.splats.training import facts_of, lit, scene_of
+    from fprf.training.run import Run
+
+    from .blocks import peak_mib
+
+    torch.set_num_threads(1)
+    cells, coarse = CELLS * towns, COARSE_STEPS * towns
+    # One round: `--steps` covers the whole, then one cell.
+    config = GaussiansConfig(
+        data=data, downscale=1, cells=cells, rounds=1, steps=coarse + STEPS, overview=coarse / (coarse + STEPS), coarse=0.0,
+        initial=POINTS * cells, cap=GAUSSIANS * cells, background=SKY, checkpoint_minutes=0.03,
+    )  # fmt: skip
+    start = time.process_time()
+    scene, folder = scene_of(config), Run(run)
+    run.mkdir(parents=True, exist_ok=True)
+    facts = lit(facts_of(config, scene), config, scene, lambda view: load_images(scene, config.background, [view])[0])
+    folder.save_config(config, "fprf-splats")
+    folder.save_known(scene, data, facts)
+    lit_after = time.process_time() - start
+    found = write_cells(run, scene, cells)
+    cut_after = time.process_time() - start
+    train_overview(run, config, scene, lambda event: None, spent=0.0)
+    return {
+        "images": len(scene.paths),
+        "tones": bool(facts.exposure),
+        "exposures_seconds": lit_after,
+        "cut_seconds": cut_after - lit_after,
+        "whole_seconds": time.process_time() - start - cut_after,
+        "peak_rss_mib": peak_mib(),
+        "windows": [len(cell.windows) for cell in found],
+        "pixels": [sum(width * height for _, _, width, height in cell.windows.values()) for cell in found],
+    }
+
+
+def one_cell(data: Path, run: Path, cell: int) -> dict[str, Any]:
+    """Train one cell to its end; its seconds of set-up and of each step."""
+    import torch
+
+    from fprf.splats import training
+    from fprf.splats.cell_training import CellTask, folder_of, train_cell
+    from fprf.training import checkpoint
+
+    from .blocks import peak_mib
+
+    torch.set_num_threads(1)
+    vars(training)["time"] = SimpleNamespace(perf_counter=time.process_time)
+    start = time.process_time()
+    train_cell(CellTask(root=str(run), data=str(data), round=0, cell=cell, minutes=None, quiet=True), lambda event: None)
+    seconds = time.process_time() - start
+    saved, _ = checkpoint.load_latest(folder_of(run, 0, cell) / "checkpoints")
+    assert saved is not None
+    digest = hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in saved.model.values())).hexdigest()
+    return {
+        "cell": cell,
+        "seconds": seconds,
+        "setup_seconds": seconds - saved.seconds,
+        "seconds_per_step": saved.seconds / max(saved.step, 1),
+        "gaussians": len(saved.model["means"]),
+        "peak_rss_mib": peak_mib(),
+        "digest": digest,
+    }
+
+
+def killed(data: Path, run: Path, cell: int) -> str:
+    """Train a cell that is killed once it has a checkpoint; the digest of what it is in the end."""
+    from fprf.splats.cell_training import folder_of
+
+    shutil.rmtree(folder_of(run, 0, cell))
+    process = multiprocessing.get_context("spawn").Process(target=one_cell, args=(data, run, cell))
+    process.start()
+    while process.is_alive() and not [*folder_of(run, 0, cell).glob("checkpoints/step-*/manifest.json")]:
+        time.sleep(0.05)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert not (folder_of(run, 0, cell) / "done.json").exists(), "the cell was finished before it could be killed"
+    digest: str = apart(one_cell, data, run, cell)["digest"]
+    return digest
+
+
+def main(argv: list[str]) -> None:
+    parser = arguments("district", __doc__)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--images", type=int, default=2000)
+    parser.add_argument("--towns", type=int, default=16)
+    parser.add_argument("--size", type=int, nargs=2, default=(480, 360))
+    parser.add_argument("--workers", type=int, default=2, help="processes that write images")
+    parser.add_argument("--parts", type=int, nargs="+", default=(1, 4, 16), help="towns that are trained")
+    parser.add_argument("--sampled", type=int, default=4, help="cells that are trained, spread over all")
+    parser.add_argument("--output", type=Path, default=RESULTS / "district.json")
+    args = parser.parse_args(argv)
+    district, (width, height) = args.work.resolve() / "scene", args.size
+    write_district(district, images=args.images, tiles=args.towns, width=width, height=height, workers=args.workers)
+    for towns in args.parts:
+        data, run = args.work.resolve() / f"towns{towns}", args.work.resolve() / f"run{towns}"
+        part(district, data, towns)
+        shutil.rmtree(run, ignore_errors=True)
+        row: dict[str, Any] = {"towns": towns, "cells": CELLS * towns, "whole": apart(begin, data, run, towns)}
+        cells = np.linspace(0, CELLS * towns - 1, min(args.sampled, CELLS * towns)).round().astype(int).tolist()
+        row["sampled"] = [apart(one_cell, data, run, cell) for cell in cells]
+        for name in ("seconds", "setup_seconds", "seconds_per_step", "peak_rss_mib", "gaussians"):
+            row[f"mean_{name}"] = float(np.mean([each[name] for each in row["sampled"]]))
+        row["killed_is_the_same"] = killed(data, run, cells[0]) == row["sampled"][0]["digest"]
+        row["load_average"] = os.getloadavg()[0]
+        print(json.dumps(row), flush=True)
+        add_entry(args.output, f"{CELLS * towns} cells", row)
