@@ -28,6 +28,8 @@ __all__ = ["Colours", "as_drawn", "region_maps", "restyled_harmonics"]
 
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""
+_TINY = 1e-5
+"""Colours below this may be rounded to less than 0."""
 _ROWS = 1 << 15
 """Gaussians at a time: bounds the memory."""
 
@@ -84,16 +86,25 @@ def as_drawn(harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N K 3"
     Where some direction is cut, the cut colours of directions all around are fitted again, in least squares, by the harmonics
     up to degree 3.
     """
+    count = min(harmonics.shape[1], 16)
+    bands = math.isqrt(count)
+    # In no direction harmonics of degree l are further from 0 than their norm times sqrt((2 l + 1) / 4 pi) (addition theorem).
+    square = harmonics[:, :count].square()
+    low = 0.5 + HARMONIC * harmonics[:, 0]
+    for k in range(1, bands):
+        # Sums of slices: vectorised over rows, as reductions of a few numbers are not.
+        low -= math.sqrt((2 * k + 1) / (4 * math.pi)) * sum(square[:, i] for i in range(k * k, (k + 1) ** 2)).sqrt()
+    some = (low.amin(1) < _TINY).nonzero()[:, 0]
     at = torch.arange(_DIRECTIONS) + 0.5
     height, turn = 1 - 2 * at / _DIRECTIONS, at * (math.pi * (5**0.5 - 1))
     flat = (1 - height.square()).sqrt()
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
-    count = min(harmonics.shape[1], 16)
-    basis = harmonic_functions(around, math.isqrt(count))
-    colour = 0.5 + torch.einsum("db,nbc->ndc", basis, harmonics[:, :count])
-    cut = (colour < 0).any(1).any(1)
+    basis = harmonic_functions(around, bands)
+    colour = 0.5 + torch.einsum("db,nbc->ndc", basis, harmonics[some, :count])
+    dark = colour.amin((1, 2)) < 0
     out = harmonics.clone()
-    out[cut, :count] = torch.einsum("bd,ndc->nbc", torch.linalg.pinv(basis), colour[cut].clamp_min(0) - 0.5)
+    fitted = torch.einsum("bd,ndc->nbc", torch.linalg.pinv(basis), colour[dark].clamp_min(0) - 0.5)
+    out[some[dark], :count] = fitted
     return out
 
 
