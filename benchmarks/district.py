@@ -5,7 +5,8 @@
 Images and cameras are those of `district_scene.py`; they are kept in WORK. Each part is the district's first towns with four
 cells a town: the whole is trained coarsely, then `--sampled` of its cells, each in a process of its own. All parts have as many
 steps a town and a cell, at full size. Seconds are those of the processor; set-up is what a cell takes before its first step.
-One cell is killed half-way and gone on with; its Gaussians are compared with those of an undisturbed one.
+One cell is killed half-way and gone on with; its Gaussians are compared with those of an undisturbed one. The flight draws
+views all over the coarse scene from levels of detail in files; its error is that against all Gaussians.
 """
 
 import hashlib
@@ -144,6 +145,73 @@ def killed(data: Path, run: Path, cell: int) -> str:
     return digest
 
 
+def write_for_flight(run: Path) -> dict[str, Any]:
+    """Write levels of detail of the whole scene."""
+    from fprf.splats.cell_training import OVERVIEW
+    from fprf.splats.levels import write_levels
+    from fprf.splats.training import gaussians_of
+    from fprf.training import checkpoint
+
+    from .blocks import peak_mib
+
+    saved, _ = checkpoint.load_latest(run / OVERVIEW / "checkpoints", verify=False)
+    assert saved is not None
+    start = time.process_time()
+    write_levels(run / "levels", gaussians_of(saved), "flight")
+    count = len(saved.model["means"])
+    return {
+        "gaussians": count,
+        "microseconds_a_gaussian": 1e6 * (time.process_time() - start) / count,
+        "peak_rss_mib": peak_mib(),
+    }
+
+
+def flight(run: Path, frames: int, pixels: float, everything: bool) -> dict[str, Any]:
+    """Draw views all over the scene; with `everything` all Gaussians as well, for the error."""
+    import torch
+
+    from fprf.splats.cell_training import OVERVIEW
+    from fprf.splats.levels import open_levels
+    from fprf.splats.photographs import cover
+    from fprf.splats.training import gaussians_of
+    from fprf.splats.views import draw
+    from fprf.training import checkpoint
+    from fprf.training.run import Run
+
+    from .blocks import peak_mib
+
+    saved, _ = checkpoint.load_latest(run / OVERVIEW / "checkpoints", verify=False)
+    levels = open_levels(run / "levels", "flight")
+    assert saved is not None and levels is not None
+    cameras, near = Run(run).load_known().cameras, float(saved.model["near"])
+    before, wall, processor, counts, errors = peak_mib(), [], [], [], []
+    for turn, view in enumerate(np.linspace(0, len(cameras) - 1, frames).round().astype(int).tolist()):
+        camera = cover(cameras, view, near)[0]
+        start = time.perf_counter(), time.process_time()
+        shown = levels.select(camera, pixels)
+        image = draw(shown, camera, antialiased=True, background=SKY).image.clamp(0, 1)
+        if turn:  # kernels are loaded with the first
+            wall.append(time.perf_counter() - start[0])
+            processor.append(time.process_time() - start[1])
+            counts.append(len(shown))
+        if everything:
+            full = draw(gaussians_of(saved), camera, antialiased=True, background=SKY).image.clamp(0, 1)
+            errors.append(float((full - image).square().mean()))
+    if everything:
+        return {"rms_error_255": 255 * float(np.mean(errors)) ** 0.5, "worst_rms_error_255": 255 * max(errors) ** 0.5}
+    return {
+        "pixels": pixels,
+        "frames": frames,
+        "threads": torch.get_num_threads(),
+        "median_seconds": float(np.median(wall)),
+        "median_processor_seconds": float(np.median(processor)),
+        "largest_processor_seconds": max(processor),
+        "mean_gaussians": float(np.mean(counts)),
+        "rss_before_mib": before,
+        "peak_rss_mib": peak_mib(),
+    }
+
+
 def main(argv: list[str]) -> None:
     parser = arguments("district", __doc__)
     parser.add_argument("work", type=Path)
@@ -153,6 +221,8 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes that write images")
     parser.add_argument("--parts", type=int, nargs="+", default=(1, 4, 16), help="towns that are trained")
     parser.add_argument("--sampled", type=int, default=4, help="cells that are trained, spread over all")
+    parser.add_argument("--frames", type=int, default=60, help="of the flight")
+    parser.add_argument("--merged", type=float, default=1.0, help="pixels within which the flight merges Gaussians")
     parser.add_argument("--output", type=Path, default=RESULTS / "district.json")
     args = parser.parse_args(argv)
     district, (width, height) = args.work.resolve() / "scene", args.size
@@ -167,6 +237,9 @@ def main(argv: list[str]) -> None:
         for name in ("seconds", "setup_seconds", "seconds_per_step", "peak_rss_mib", "gaussians"):
             row[f"mean_{name}"] = float(np.mean([each[name] for each in row["sampled"]]))
         row["killed_is_the_same"] = killed(data, run, cells[0]) == row["sampled"][0]["digest"]
+        row["levels"] = apart(write_for_flight, run)
+        row["flight"] = apart(flight, run, args.frames, args.merged, False)
+        row["flight"] |= apart(flight, run, min(args.frames, 20), args.merged, True)
         row["load_average"] = os.getloadavg()[0]
         print(json.dumps(row), flush=True)
         add_entry(args.output, f"{CELLS * towns} cells", row)

@@ -35,12 +35,12 @@ _SEEN = 8
 """Points of a cell that a view shows, at least, where the cell learns from it."""
 _OWN = 0.15
 """Share of the points in a window that are the cell's own, at least."""
-_LEAST, _ROOM = 64, 16
+_LEAST, _ROOM = 64, 6
 """Least width and height of a window; pixels around the points in it."""
 _OUTLIERS = 0.01
 _DEVIATIONS = 3.0
 """A Gaussian is shown as far as so many standard deviations from its mean."""
-_RUN, _COARSER, _WEIGHT = 256, 2, 0.01
+_RUN, _COARSER, _WEIGHT = 256, 4, 0.003
 """Gaussians that are looked for together; windows are drawn at this part of their size to see what they show; the least that
 the weights of a Gaussian in all pixels of one sum to."""
 
