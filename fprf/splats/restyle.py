@@ -7,6 +7,7 @@ region over as a whole, and nothing else: content features and a decoder would a
 colours that no photograph has. Others move the colours in the place of features. Luminance is kept as an affine map too.
 """
 
+import functools
 import math
 from typing import Annotated
 
@@ -93,7 +94,8 @@ def as_drawn(harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N K 3"
     low = 0.5 + HARMONIC * harmonics[:, 0]
     for k in range(1, bands):
         # Sums of slices: vectorised over rows, as reductions of a few numbers are not.
-        low -= math.sqrt((2 * k + 1) / (4 * math.pi)) * sum(square[:, i] for i in range(k * k, (k + 1) ** 2)).sqrt()
+        norm = functools.reduce(torch.add, square[:, k * k : (k + 1) ** 2].unbind(1)).sqrt()
+        low -= math.sqrt((2 * k + 1) / (4 * math.pi)) * norm
     some = (low.amin(1) < _TINY).nonzero()[:, 0]
     at = torch.arange(_DIRECTIONS) + 0.5
     height, turn = 1 - 2 * at / _DIRECTIONS, at * (math.pi * (5**0.5 - 1))
