@@ -26,9 +26,17 @@ from fprf.plugins.decoders.config import MlpDecoderConfig, Objective
 from fprf.plugins.decoders.decoders import MlpDecoder
 from fprf.plugins.encoders.config import BundledContentConfig, EncoderConfig, Vgg19Config
 from fprf.pretraining.config import PretrainDecoderConfig
-from fprf.pretraining.decoder import LONGEST, decoder_report, pretrain_decoder, restyling_report
+from fprf.pretraining.decoder import (
+    LONGEST,
+    Crops,
+    StyleNetwork,
+    decoder_report,
+    load_style_network,
+    prepare_crops,
+    pretrain_decoder,
+    restyling_report,
+)
 from fprf.pretraining.photos import find_photos
-from fprf.pretraining.restyling import Crops, StyleNetwork, load_style_network, prepare_crops
 
 from .common import RESULTS, SHARED, arguments, report
 

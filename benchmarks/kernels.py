@@ -23,7 +23,7 @@ from fprf.evaluation.config import SpeedConfig
 from fprf.evaluation.report import Watch
 from fprf.evaluation.speed import STYLES
 from fprf.evaluation.subject import Subject, find, fresh_model, loop_of, stepper, test_view
-from fprf.fields import fields
+from fprf.fields import planes
 from fprf.ops import backend, dense, march, mixture, triplane, triplane_numba
 from fprf.rendering import renderer, space
 from fprf.rendering.cameras import Cameras
@@ -57,7 +57,7 @@ SWITCHES: dict[str, Patches] = {
     "tri-planes: total variation": [(triplane, "variation", triplane.variation_reference)],
     "networks": [(dense, "network", dense.network_reference)],
     "marching": [(march, "usable", never)],
-    "marching: proposals": [(fields, "march", no_march)],
+    "marching: proposals": [(planes, "march", no_march)],
     "marching: weights and sums": [(renderer, "compiled", no_march), (space, "march", no_march)],
     "styles at points": [(mixture, "usable", never), (matching, "usable", never)],
     "styles at points: matching": [(matching, "usable", never)],

@@ -18,10 +18,9 @@ from fprf.datamanagers.images import load_image
 from fprf.errors import DataError
 from fprf.evaluation.config import ReportConfig
 from fprf.evaluation.consistency import steadiness
-from fprf.evaluation.metrics import structure
+from fprf.evaluation.metrics import matched_regions, structure
 from fprf.evaluation.restyle import Shown, dictionary_of, in_scene, nothing, one_by_one
 from fprf.evaluation.single_image import encoded
-from fprf.evaluation.style_distance import matched_regions
 from fprf.evaluation.town_truth import (
     Reference,
     Row,

@@ -20,9 +20,9 @@ from fprf.errors import FprfError, UsageError
 from fprf.evaluation.config import BenchConfig
 from fprf.evaluation.report import Outcome, Watch, document, table
 from fprf.evaluation.subject import Subject, count, exact, find, settings, size_of, small_view, view_rays, watch_of
-from fprf.io.figures import number
 from fprf.io.images import Picture, write_image
 from fprf.io.maps import palette
+from fprf.io.report import number
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.rendering.cameras import Cameras
 from fprf.style.look import Restyle

@@ -13,7 +13,7 @@ from fprf.evaluation.config import BenchConfig
 from fprf.evaluation.report import Outcome, Spread, document, spread, table
 from fprf.evaluation.speed import draw_points, forward_backward, largest_planes
 from fprf.evaluation.subject import Subject, attempt, find, settings, test_view, watch_of
-from fprf.io.figures import number
+from fprf.io.report import number
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import RegionOtConfig
 from fprf.style.restyle import restyle

@@ -22,7 +22,7 @@ from torch import Tensor
 from fprf.cli.parsing import parse
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError, FprfError
-from fprf.evaluation.style_distance import MIXED, whole_cells
+from fprf.evaluation.metrics import MIXED, whole_cells
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import BundledSemanticConfig, EncoderConfig
 from fprf.town.layout import build_town

@@ -18,10 +18,9 @@ from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 from fprf.evaluation.consistency import consistency
-from fprf.evaluation.metrics import luminance_ssim, structure
+from fprf.evaluation.metrics import luminance_ssim, matched_regions, structure, style_distances
 from fprf.evaluation.restyle import STYLIZERS
 from fprf.evaluation.single_image import histogram_matching, reinhard
-from fprf.evaluation.style_distance import matched_regions, style_distances
 from fprf.interfaces import Encoder
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.style.config import StyleConfig

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from fprf.cli.flags import flags_of
-from fprf.cli.parsing import load_method, parse
+from fprf.cli.parsing import flags_of, load_method, parse
 from fprf.cli.plugins import KINDS
 from fprf.fields.config import PlanesConfig
 from fprf.methods import fprf

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 from ..checks import at_least, positive
 from ..errors import ConfigError, UsageError
 from ..style.config import StyleConfig
+from ..style.keyframes import keyed_looks, read_keyframes
 from ..training.quality import QualityConfig
-from .keyframes import keyed_looks, read_keyframes
 from .progress import Display
 from .style_flags import read_flags, say
 

@@ -117,8 +117,7 @@ def _parts(run: Path, histories: "Sequence[History]") -> list[tuple[str, float]]
 
 
 def _print(histories: "Sequence[History]", parts: list[tuple[str, float]], notes: list[str]) -> None:
-    from ..io.figures import number
-    from ..io.report import sparkline
+    from ..io.report import number, sparkline
 
     table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 3, 0, 0))
     for history in histories:

@@ -1,14 +1,16 @@
 """`fprf train [METHOD|CONFIG.json]`: train a scene, or go on where a run stopped."""
 
+import contextlib
+import importlib.util
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UsageError
 from .blocks import train_blocks
-from .live_view import VIEW, finish_view, open_view, take_view
 from .parsing import LIST_FLAGS, load_method, methods, parse
 from .progress import EventLog
 
@@ -21,10 +23,68 @@ if TYPE_CHECKING:
     from ..training.prepare import Prepared
     from ..training.run import Run
     from ..training.trainer import Report
-    from ..viewer.live import LiveViewer
+    from ..viewer.live import LiveViewer, ViewAddress
     from .progress import Display
 
-__all__ = ["DEFAULT_METHOD", "check_same", "default_output", "run", "train_scene"]
+__all__ = [
+    "DEFAULT_METHOD",
+    "VIEW",
+    "check_same",
+    "default_output",
+    "finish_view",
+    "open_view",
+    "run",
+    "take_view",
+    "train_scene",
+]
+
+
+VIEW = "--view"
+
+
+def take_view(args: Sequence[str]) -> "tuple[list[str], ViewAddress | None]":
+    """Split `--view [[HOST:]PORT]` from the other arguments; None where it is absent. Raises UsageError for no port."""
+    from ..viewer.live import ViewAddress
+
+    rest: list[str] = []
+    address: ViewAddress | None = None
+    words = iter(range(len(args)))
+    for i in words:
+        name, equals, value = args[i].partition("=")
+        if name != VIEW:
+            rest.append(args[i])
+            continue
+        if not equals and i + 1 < len(args) and not args[i + 1].startswith("-"):
+            value = args[next(words)]
+        address = ViewAddress()
+        if value or equals:
+            host, _, port = value.rpartition(":")
+            if not (port.isascii() and port.isdigit() and int(port) < 65536):
+                raise UsageError(f"{VIEW} {value}: it takes a port from 0 to 65535, or HOST:PORT, or nothing")
+            address = ViewAddress(host.strip("[]") or address.host, int(port), strict=True)
+    return rest, address
+
+
+def open_view(address: "ViewAddress") -> "LiveViewer":
+    """Start the viewer's process. Raises UsageError where it cannot listen."""
+    from ..viewer.live import LiveViewer
+
+    if importlib.util.find_spec("viser") is None:
+        raise UsageError(f"{VIEW}: needs viser; install it with pip install 'fprf[viewer]', or train without {VIEW}")
+    return LiveViewer(address)
+
+
+def finish_view(view: "LiveViewer | None", display: "Display") -> None:
+    """After training, keep the view on a terminal as long as somebody looks. Ctrl-C is then no failure."""
+    if view is None:
+        return
+    if view.fault is not None:
+        display.say(f"{VIEW}: the viewer has ended ({view.fault}); training did not need it")
+    if display.live and view.looked_at:
+        display.say("somebody is looking; Ctrl-C ends the view as well")
+    with contextlib.suppress(KeyboardInterrupt):
+        view.finish(stay=display.live)
+
 
 DEFAULT_METHOD = "fprf-splats"
 """Where none is named: the best quality for the time on every capture that was measured (docs/photographs.md)."""

@@ -18,9 +18,8 @@ from ..training.loading import load_run
 from ..training.views import render_view
 from .config import PeerConfig
 from .consistency import published, steadiness
-from .metrics import delta_e, image_metrics, mean_metrics, structure
+from .metrics import delta_e, image_metrics, matched_regions, mean_metrics, structure, style_distances
 from .report import words
-from .style_distance import matched_regions, style_distances
 
 __all__ = ["peer", "peer_page", "read_cameras", "read_depths", "read_pictures"]
 

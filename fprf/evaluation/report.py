@@ -22,8 +22,8 @@ from rich.table import Table
 from torch import Tensor
 
 from .. import __version__
-from ..io.figures import number
 from ..io.images import Picture, to_uint8
+from ..io.report import number
 from ..training.prepare import device_of
 
 __all__ = [

@@ -58,7 +58,7 @@ class PlanesConfig(ContentFieldConfig):
         between("content.field.degree", self.degree, 1, 4)
 
     def build(self, *, channels: int, seed: int) -> ContentField:
-        from .fields import PlanesField
+        from .planes import PlanesField
 
         return PlanesField(self, channels=channels, seed=seed)
 
@@ -81,7 +81,7 @@ class SemanticPlanesConfig(SemanticFieldConfig):
         _check_network("semantic.field", self.hidden, self.layers)
 
     def build(self, *, channels: int, seed: int) -> SemanticField:
-        from .fields import SemanticPlanes
+        from .planes import SemanticPlanes
 
         return SemanticPlanes(self, channels=channels, seed=seed)
 

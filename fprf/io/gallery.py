@@ -14,9 +14,9 @@ from urllib.parse import quote
 
 from ..errors import DataError
 from .atomic import write_text
-from .figures import Metrics, figures, number
 from .images import Picture, data_uri, shrink, to_uint8
 from .maps import palette
+from .report import Metrics, figures, number
 
 __all__ = ["Reference", "Style", "write_gallery"]
 

@@ -9,9 +9,8 @@ distances of a contraction with points as they are, then what a box subtracts an
 import numba
 import numpy as np
 
-from .lanes import BLOCK, WIDE, copy_lanes, exp_lanes, opaque_lanes
+from .lanes import BLOCK, LANES, WIDE, copy_lanes, dot, exp_lanes, opaque_lanes, product_forward
 from .triplane_kernels import cells
-from .vector import LANES, dot, product_forward
 
 __all__ = ["composite", "distances", "gather", "place", "propose", "weigh"]
 

@@ -9,7 +9,8 @@ import numba
 import numpy as np
 
 from .dense_kernels import product
-from .lanes import BLOCK, WIDE, copy_lanes, exp_lanes
+from .lanes import BLOCK, LANES, WIDE, copy_lanes, dot, exp_lanes
+from .lanes import scaled as scaled_lanes
 from .tile import (
     ROWS_1,
     ROWS_2,
@@ -20,8 +21,6 @@ from .tile import (
     accumulate_3,
     accumulate_4,
 )
-from .vector import LANES, dot
-from .vector import scaled as scaled_lanes
 
 __all__ = ["affine", "attention", "scaled"]
 

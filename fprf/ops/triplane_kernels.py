@@ -6,9 +6,10 @@
 import numba
 import numpy as np
 
-from .lanes import BLOCK, WIDE
-from .vector import (
+from .lanes import (
+    BLOCK,
     LANES,
+    WIDE,
     product_backward,
     product_backward_wide,
     product_forward,

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ..config import TrainConfig
 from ..errors import WeightsError
 from ..interfaces import Decoder
-from ..plugins.decoders.remedy import pretrain_line
+from ..plugins.decoders.config import pretrain_line
 from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
 from ..rendering.space import Space

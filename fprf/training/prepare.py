@@ -21,7 +21,7 @@ from ..datamanagers.scene import Scene, exposures_differ, find_sightings, with_e
 from ..errors import CheckpointError, DataError, PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..plugins.config import Need
-from ..plugins.decoders.remedy import pretrain_line
+from ..plugins.decoders.config import pretrain_line
 from ..plugins.slots import slots
 from ..rendering.space import Space
 from .camera_optimizers import relative

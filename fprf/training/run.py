@@ -35,7 +35,7 @@ from ..errors import CheckpointError, DataError, UsageError
 from ..io.atomic import unwritable, write_json
 from ..plugins.codec import load_config, save_config
 from ..rendering.cameras import Cameras
-from ..rendering.coverage import well_covered
+from ..rendering.paths import well_covered
 from ..rendering.space import Space
 from . import tensorfiles
 from .model import Facts

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from ..checks import between
-from ..cli.keyframes import keyed_looks, read_keyframes
 from ..errors import FprfError, UsageError
 from ..interfaces import Scene
 from ..io.atomic import write_json
@@ -27,6 +26,7 @@ from ..rendering.camera_path import read_camera_path, write_camera_path
 from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
+from ..style.keyframes import keyed_looks, read_keyframes
 from .cameras import CameraState, PageTransform
 from .render_worker import RenderWorker
 from .renderer import RenderRequest, SceneRenderer

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from benchmarks.semantic_matching import Triplet, matching_rate, semantic_matching
 from fprf.errors import DataError
-from fprf.evaluation.style_distance import MIXED, whole_cells
+from fprf.evaluation.metrics import MIXED, whole_cells
 from fprf.interfaces import Encoder
 
 

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.cli.keyframes import Key, fade, keyed_looks, read_keyframes
 from fprf.errors import ConfigError
 from fprf.plugins.stylizers.config import AdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile, write_style
+from fprf.style.keyframes import Key, fade, keyed_looks, read_keyframes
 
 
 def write(path: Path, *rows: object, **rest: object) -> Path:

@@ -7,7 +7,7 @@ from tiny_world import World, flags, parameters
 
 from fprf.cli import main as cli
 from fprf.cli import train
-from fprf.cli.live_view import take_view
+from fprf.cli.train import take_view
 from fprf.errors import UsageError
 from fprf.training import trainer
 from fprf.training.run import Run

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from benchmarks.styles import cells_basis, flat_reference, painted
 from fprf.datamanagers.config import GuidedConfig
-from fprf.evaluation.metrics import psnr
+from fprf.evaluation.metrics import matched_regions, psnr
 from fprf.evaluation.single_image import Flat, encoded, flat_scene, histogram_matching, reinhard, render_flat
-from fprf.evaluation.style_distance import matched_regions
 from fprf.interfaces import Decoder, Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import BundledContentConfig, RandomConfig

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.evaluation.style_distance import RegionStatistics, gaussian_distance, relative_distance, style_distances
+from fprf.evaluation.metrics import RegionStatistics, gaussian_distance, relative_distance, style_distances
 from fprf.interfaces import Encoder
 
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from fprf.errors import ConfigError
 from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
-from fprf.fields.fields import PlanesField, ProposalField
-from fprf.fields.planes import LIMIT, MAX_DEGREE, count, density, harmonics
+from fprf.fields.planes import LIMIT, MAX_DEGREE, PlanesField, ProposalField, count, density, harmonics
 from fprf.testing import check_content_field, check_semantic_field
 
 SMALL = PlanesConfig(resolutions=(4, 9), channels=8, hidden=16)

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.io.figures import figures, number
-from fprf.io.report import Series, axis_ticks, line_chart, write_scalars
+from fprf.io.report import Series, axis_ticks, figures, line_chart, number, write_scalars
 from fprf.training.run import History
 
 

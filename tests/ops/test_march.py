@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.fields.fields import ProposalField
+from fprf.fields.planes import ProposalField
 from fprf.ops import march
 from fprf.rendering.space import Kind, Space
 from fprf.rendering.stepfun import keep_heaviest, midpoints, resample, shifts, transmittance_weights

@@ -10,8 +10,7 @@ from safetensors.torch import save_file
 
 from fprf.errors import WeightsError
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.pretraining.photos import find_photos, load_photo
-from fprf.pretraining.restyling import (
+from fprf.pretraining.decoder import (
     CONTENT,
     StyleNetwork,
     load_style_network,
@@ -19,6 +18,7 @@ from fprf.pretraining.restyling import (
     restyling_losses,
     style_statistics,
 )
+from fprf.pretraining.photos import find_photos, load_photo
 
 WIDTHS = (3, 4, 4, 6, 6, 8, 8, 8, 8, 10)
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from fprf.errors import DataError, UsageError
 from fprf.rendering.camera_path import write_camera_path
 from fprf.rendering.cameras import Cameras, project
-from fprf.rendering.coverage import coverage, well_covered
-from fprf.rendering.paths import interpolate, look_at, make_path, orbit, pinhole, spiral, upwards
+from fprf.rendering.paths import coverage, interpolate, look_at, make_path, orbit, pinhole, spiral, upwards, well_covered
 from fprf.rendering.space import Space
 
 UP = torch.tensor([0.0, 0, 1], dtype=torch.float64)

@@ -1,18 +1,26 @@
-"""Decoder configs. `build` imports the implementation."""
+"""Decoder configs, and the command line that trains the decoder of an encoder. `build` imports the implementation."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from ...checks import at_least, positive
 from ..config import Need, PluginConfig, absent_file
+from ..encoders.config import EncoderConfig
+from ..registry import name_of
+from ..slots import hints_of, is_slot, members
+from ..typed_json import Missing
 
 if TYPE_CHECKING:
     from ...interfaces import Decoder
 
-__all__ = ["DecoderConfig", "MlpDecoderConfig", "Objective", "ResidualDecoderConfig"]
+__all__ = ["DecoderConfig", "MlpDecoderConfig", "Objective", "ResidualDecoderConfig", "pretrain_line"]
+
 
 Objective = Literal["identity", "paper"]
 """Training objective of a decoder: returning photographs alone, or the paper's content and style losses as well."""
@@ -79,3 +87,47 @@ class ResidualDecoderConfig(DecoderConfig):
         frozen = load_decoder(self.weights, encoder=encoder, channels=channels)
         generator = torch.Generator().manual_seed(seed)
         return ResidualDecoder(frozen, hidden=self.hidden, fade=self.fade, generator=generator)
+
+
+def pretrain_line(encoder: EncoderConfig | Missing, output: Path = Path("decoder.safetensors")) -> str:
+    """`fprf pretrain decoder ...` with the encoder's name and every field that is not its default, quoted for a shell.
+
+    DIR stands for folders of photographs, which nobody else can know.
+    """
+    flags = _chosen(encoder, EncoderConfig.group, "--encoder")
+    return f"fprf pretrain decoder {shlex.join(flags)} --images DIR --output {shlex.quote(str(output))}"
+
+
+def _chosen(config: PluginConfig, group: str, path: str) -> list[str]:
+    if isinstance(config, Missing):
+        return [path, config.name, *_unread(json.loads(config.data), path)]
+    kind = type(config)
+    plain, hints = kind(), hints_of(kind)
+    flags = [path, name_of(group, kind)]
+    for field in dataclasses.fields(config):
+        value, flag = getattr(config, field.name), f"{path}.{field.name.replace('_', '-')}"
+        slot = next(filter(is_slot, members(hints[field.name])), None)
+        if value == getattr(plain, field.name):
+            continue
+        if slot is not None and value is not None:
+            flags += _chosen(value, slot.group, flag)
+        else:
+            flags += _spelled(flag, value)
+    return flags
+
+
+def _unread(data: dict[str, Any], path: str) -> list[str]:
+    """The fields of a plug-in that is not installed here, as far as they are plain."""
+    plain = {name: value for name, value in data.items() if not isinstance(value, dict)}
+    return [word for name, value in plain.items() for word in _spelled(f"{path}.{name.replace('_', '-')}", value)]
+
+
+def _spelled(flag: str, value: Any) -> list[str]:
+    if isinstance(value, bool):
+        head, _, name = flag.rpartition(".")
+        return [flag if value else f"{head}.no-{name}"]
+    if value is None:
+        return [flag, "none"]
+    if isinstance(value, tuple | list):
+        return [flag, *map(str, value)]
+    return [flag, str(value)]

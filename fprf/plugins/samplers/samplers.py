@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from ...fields.fields import ProposalField
-from ...fields.planes import LIMIT
+from ...fields.planes import LIMIT, ProposalField
 from ...interfaces import Sampler
 from ...ops import march
 from ...rendering.space import Space

@@ -11,9 +11,8 @@ from fprf.cli.parsing import parse
 from fprf.config import TrainConfig
 from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
-from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig
+from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig, pretrain_line
 from fprf.plugins.decoders.decoders import DECODER_KIND, MlpDecoder
-from fprf.plugins.decoders.remedy import pretrain_line
 from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, EncoderConfig, RandomConfig, Vgg19Config
 from fprf.plugins.weights import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig

@@ -15,7 +15,7 @@ from ..plugins.codec import from_json, read_json
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
-    from ..style.look import Restyle
+    from .look import Restyle
 
 __all__ = ["Key", "fade", "keyed_looks", "read_keyframes"]
 
@@ -57,8 +57,8 @@ def fade(frames: Sequence[int], at: int) -> tuple[int, int, float]:
 
 def keyed_looks(scene: "Scene", keys: Sequence[Key]) -> "Callable[[int], Restyle | None]":
     """The look of each frame; every style is built once, before the first frame."""
-    from ..style.files import check_photographs, read_style
-    from ..style.restyle import apply_style
+    from .files import check_photographs, read_style
+    from .restyle import apply_style
 
     encoders = scene.encoders()
     looks: dict[Path | None, Restyle | None] = {None: None}
