@@ -111,7 +111,11 @@ PUBLISHED = """
 6.7747 -0.2908 -2.4247 5.8714 -0.0985 -2.2286 0.6377
 2.0776 0.0795 -1.1350 0.9033 -0.0636 -0.5514 0.9082
 """
+
+
 ROWS = torch.tensor([[float(x) for x in line.split()] for line in PUBLISHED.strip().splitlines()], dtype=torch.float64)
+
+
 colours = st.tuples(*[st.floats(0, 1) for _ in range(3)])
 
 
@@ -176,3 +180,9 @@ def test_luminance_ssim_sees_light_but_no_hue() -> None:
     assert luminance_ssim(a, grey) == pytest.approx(1.0, abs=1e-5)
     assert luminance_ssim(a, a * 0.3) < 0.8 < structure(a, a * 0.3)
     assert luminance_ssim(grey, grey * 0.5) == pytest.approx(ssim(grey, grey * 0.5), abs=1e-5)
+
+
+@pytest.mark.parametrize(("a", "b"), [((16, 16, 3), (16, 17, 3)), ((10, 30, 3), (10, 30, 3)), ((16, 16), (16, 16))])
+def test_sizes_that_cannot_be_compared_are_refused(a: tuple[int, ...], b: tuple[int, ...]) -> None:
+    with pytest.raises(DataError):
+        structure(torch.rand(a), torch.rand(b))

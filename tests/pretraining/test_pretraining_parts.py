@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from photo_folder import photo_folder
 
 from fprf.datamanagers.config import GuidedConfig
+from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
 from tools.distil.config import DistilConfig
@@ -103,3 +104,10 @@ def test_crops_are_prepared_once_per_config(tmp_path: Path) -> None:
     prepared(make, DistilConfig(seed=1), output)
     assert len(made) == 2
     assert prepared_path(output).is_file()
+
+
+def test_missing_folders_and_photographs_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError):
+        find_photos([tmp_path / "absent"])
+    with pytest.raises(DataError):
+        find_photos([tmp_path])

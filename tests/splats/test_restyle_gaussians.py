@@ -27,6 +27,8 @@ from fprf.style.files import StyleFile, write_style
 from fprf.style.restyle import apply_style
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
+
+
 TONE = RegionToneConfig(centred=False)
 
 
@@ -207,3 +209,22 @@ def test_the_verb_writes_capture_sheet_page_and_style(
     kept = next((tmp_path / "cache").iterdir())
     kept.write_bytes(kept.read_bytes()[:-9])
     assert cli.main([*words, *same]) == 0, "what is damaged is made again"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--references", "x.jpg"], "name what to write"),
+        (["--output", "out.ply"], "at least one photograph"),
+        (["--references", "x.jpg", "--output", "out.obj"], "known endings"),
+        (["--references", "x.jpg", "--page", "out.png"], "html"),
+        (["--references", "x.jpg", "--output", "out.ply", "--up", "0", "0", "0"], "no direction"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_gaussians(tmp_path / "in.ply", ball(20))
+    cv2.imwrite(str(tmp_path / "x.jpg"), np.full((64, 64, 3), 90, np.uint8))
+    words = [str(tmp_path / word) if word == "x.jpg" else word for word in words]
+    assert cli.main(["restyle", str(tmp_path / "in.ply"), "--cache", str(tmp_path), *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1

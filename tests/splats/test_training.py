@@ -276,3 +276,10 @@ def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
     direction = (far.position - centre) / np.linalg.norm(far.position - centre, axis=1, keepdims=True)
     assert np.abs(direction.mean(0)).max() < 0.02 and np.allclose(far.colour, 0.4)
     assert (np.linalg.norm(far.position - centre, axis=1) > 5 * np.linalg.norm(centre)).all()
+
+
+def test_points_begin_where_there_are_none(scene: Scene) -> None:
+    bare = replace(scene, points=None, seen=None)
+    found, origin = initial.initial_points(bare, dict(enumerate(load_images(bare))), 500, np.random.default_rng(0))
+    assert origin == "random points" and len(found.position) == 500 and np.isfinite(found.position).all()
+    assert found.colour.min() >= 0 and found.colour.max() <= 1

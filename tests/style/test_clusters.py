@@ -67,3 +67,9 @@ def test_of_many_rows_a_sample_is_clustered_and_all_are_labelled() -> None:
     only = torch.zeros(60_000)
     only[[5, 59_999]] = 1.0
     torch.testing.assert_close(kmeans(x, 3, seed=0, weights=only).centres.sum(0), x[5] + x[59_999])
+
+
+@pytest.mark.parametrize(("rows", "k"), [(0, 3), (4, 0), (0, 0)])
+def test_no_rows_or_no_clusters(rows: int, k: int) -> None:
+    found = kmeans(torch.ones(rows, 2), k, seed=0)
+    assert found.centres.shape == (0, 2) and found.label.tolist() == [0] * rows

@@ -7,7 +7,8 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fprf.style.config import RegionValue, find_reference, labels, parse_region_value
+from fprf.errors import ConfigError, UsageError
+from fprf.style.config import RegionValue, find_reference, labels, parse_region_value, parse_strength
 from fprf.style.controls import allowed_references, blend_strength, keep_luminance, luma
 
 COLOUR = st.tuples(
@@ -90,3 +91,34 @@ def test_references_are_found_by_path_name_number_and_stem(text: str, index: int
 )
 def test_labels_are_short_and_different(paths: list[str], names: tuple[str, ...]) -> None:
     assert labels([Path(p) for p in paths]) == names and len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("strength", [-0.1, 1.1, float("nan"), float("inf")])
+def test_strength_has_a_range(strength: float) -> None:
+    with pytest.raises(UsageError):
+        blend_strength(torch.zeros(1, 1), torch.zeros(1, 1), strength)
+
+
+@pytest.mark.parametrize("wish", [{"pin": {2: {0}}}, {"pin": {0: {2}}}, {"forbid": [(0, -1)]}])
+def test_unknown_numbers_are_named(wish: dict[str, object]) -> None:
+    with pytest.raises(UsageError):
+        allowed_references(2, 2, **wish)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wish", [{"forbid": [(1, 0), (1, 1)]}, {"pin": {1: {0}}, "forbid": [(1, 0)]}])
+def test_a_region_left_with_nothing_is_named(wish: dict[str, object]) -> None:
+    with pytest.raises(UsageError):
+        allowed_references(2, 2, **wish)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("text", ["3=1.5", "3=nan", "3=much"])
+def test_strengths_are_numbers_in_a_range(text: str) -> None:
+    assert parse_strength("region_strength", "sky=0.5") == ("sky", 0.5)
+    with pytest.raises(ConfigError):
+        parse_strength("region_strength", text)
+
+
+@pytest.mark.parametrize("text", ["x", "night"])
+def test_references_that_are_unknown_or_not_clear_are_refused(text: str) -> None:
+    with pytest.raises(UsageError):
+        find_reference(text, PHOTOS)

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from fprf.errors import CheckpointError, DataError
+from fprf.errors import CheckpointError, ConfigError, DataError
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, load_dictionary, save_dictionary, whole_style
 
 
@@ -136,3 +136,19 @@ def test_degenerate_photographs_have_codes(kind: str, clusters: int) -> None:
     if distinct <= 3:
         assert len(d.keys) == min(clusters, distinct), "a code for each kind, where there may be so many"
         torch.testing.assert_close(d.share @ d.mean, content.mean(0), rtol=1e-5, atol=1e-5)
+
+
+def test_knobs_have_ranges() -> None:
+    for knob in ({"clusters": 0}, {"blend": 1.5}, {"blend": float("nan")}, {"min_members": 0}):
+        with pytest.raises(ConfigError):
+            build_dictionary([reference("a")], **knob)
+
+
+def test_absent_and_foreign_files_are_named(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    with pytest.raises(CheckpointError):
+        load_dictionary(tmp_path / "none")
+    save_file({"keys": torch.zeros(1, 1)}, tmp_path / "other")
+    with pytest.raises(CheckpointError):
+        load_dictionary(tmp_path / "other")

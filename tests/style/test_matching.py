@@ -5,6 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import ConfigError
 from fprf.style.matching import (
     Keys,
     Matching,
@@ -191,3 +192,19 @@ def test_zero_queries_and_keys_match_everything_alike() -> None:
 def test_spread_within_rounding_of_the_largest_score_is_none() -> None:
     keys = torch.tensor([[1.0], [1.0 + 1e-9]], dtype=torch.float64)
     assert score_spread(torch.tensor([[1e6], [0.0]]), keys) == score_spread(torch.tensor([[-1e6]]), keys) == 1.0
+
+
+def test_dot_products_know_no_frame_and_weights_count() -> None:
+    here, there = side(4, 3, 7), side(5, 3, 8)
+    plain = table(here, there, Matching(0.3, "dot"))
+    assert torch.equal(table(here, there, Matching(0.3, "dot", 1.0, 5)), plain)
+    favoured = torch.tensor([5.0, 1.0, 1.0, 1.0, 1.0])
+    for matching in (Matching(0.3, "dot"), FRAMES[1]):
+        more, before = match_keys(here, there, matching, favoured), table(here, there, matching)
+        torch.testing.assert_close(more[:, 0] / more[:, 1], 5 * before[:, 0] / before[:, 1])
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan")])
+def test_temperatures_that_are_not_above_zero_are_refused(temperature: float) -> None:
+    with pytest.raises(ConfigError):
+        attention(torch.ones(1, 2), torch.ones(1, 2), temperature)

@@ -7,13 +7,18 @@ import torch
 from photo_files import turned_jpeg
 
 from fprf.datamanagers.basis import Basis
+from fprf.errors import ConfigError, DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.style.dictionary import build_dictionary
 from fprf.style.references import read_reference
 
 CONTENT = RandomConfig(channels=6, stride=2).build()
+
+
 SEMANTIC = RandomConfig(channels=9, stride=8, seed=1).build()
+
+
 BASIS = Basis(torch.randn(9, generator=torch.Generator().manual_seed(0)), torch.linalg.qr(torch.randn(9, 4))[0])
 
 
@@ -90,3 +95,22 @@ def test_a_mask_leaves_only_what_is_white(tmp_path: Path) -> None:
     assert len(some.content) == len(some.semantic) == len(whole.content) // 2
     grid = whole.content.view(80, 120, -1)
     assert torch.equal(some.content, grid[:, 60:].reshape(-1, grid.shape[-1])), "the same features, of fewer pixels"
+
+
+def test_unreadable_files_and_sizes_are_named(tmp_path: Path) -> None:
+    (tmp_path / "x.jpg").write_bytes(b"no image")
+    with pytest.raises(DataError):
+        read_reference(tmp_path / "x.jpg", content=CONTENT, semantic=None, basis=None)
+    with pytest.raises(ConfigError):
+        read_reference(photo(tmp_path, 9, 9), content=CONTENT, semantic=None, basis=None, longest=8)
+
+
+def test_masks_that_cannot_be_are_named(tmp_path: Path) -> None:
+    path, mask = two_halves(tmp_path, white=0)
+    with pytest.raises(DataError):
+        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
+    path, mask = two_halves(tmp_path, mask_size=(120, 80))
+    with pytest.raises(DataError):
+        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
+    with pytest.raises(DataError):
+        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=tmp_path / "absent.png")

@@ -3,8 +3,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.errors import CheckpointError
-from fprf.style.scene import from_tensors, membership, region_smoothing, region_units, scene_style, to_tensors
+from fprf.errors import CheckpointError, DataError
+from fprf.style.dictionary import Reference, build_dictionary
+from fprf.style.scene import check_fit, from_tensors, membership, region_smoothing, region_units, scene_style, to_tensors
 
 
 def points(n: int = 1200, c: int = 5, d: int = 4) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -93,3 +94,16 @@ def test_smoothing_mixes_and_keeps_the_mean_over_the_scene(regions: int, smoothn
     torch.testing.assert_close(scene.share.double() @ smooth, scene.share.double())
     far = region_smoothing(scene, 1e9)
     torch.testing.assert_close(far, scene.share.double().expand(regions, -1), rtol=0.0, atol=1e-5)
+
+
+def test_an_empty_scene_is_an_error() -> None:
+    with pytest.raises(DataError):
+        scene_style(torch.ones(3, 2), None, torch.zeros(3), None, 1, 0)
+
+
+def test_a_dictionary_of_other_encoders_does_not_fit() -> None:
+    content, semantic, weights = points()
+    scene = scene_style(content, semantic, weights, None, 3, 0)
+    other = build_dictionary([Reference("a", torch.randn(50, 6), torch.randn(50, 4))])
+    with pytest.raises(DataError):
+        check_fit(other, scene)

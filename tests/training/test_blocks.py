@@ -408,3 +408,25 @@ def test_a_killed_block_is_resumed_to_the_same_bits(block_world: BlockWorld, tmp
     for name in NAMES:
         assert done_of(root, name)["step"] == steps
         assert same(root, calm, name), name
+
+
+def test_what_does_not_fit_is_named(parts) -> None:  # type: ignore[no-untyped-def]
+    config, facts, boxes = parts
+    member = surroundings(config, facts, boxes).member
+    tensors = {f"member.{name}": t for name, t in member.state_dict().items()}
+    first = next(iter(tensors))
+    for wrong in (
+        {k: v for k, v in tensors.items() if k != first},
+        tensors | {first: tensors[first][:1]},
+        tensors | {"member.more": torch.zeros(1)},
+    ):
+        with pytest.raises(CheckpointError):
+            restore(member, "member", wrong)
+    restore(member, "member", tensors | {"decoder.other": torch.zeros(1)})
+
+
+@pytest.mark.parametrize("text", ["", '{"format": 2, "boxes": {}}'])
+def test_a_cut_that_cannot_be_read_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "blocks.json").write_text(text)
+    with pytest.raises(CheckpointError):
+        load_boxes(tmp_path)

@@ -10,10 +10,22 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.datamanagers.scene import Scene
-from fprf.errors import UsageError
-from fprf.methods import fprf_lite
+from fprf.errors import PluginError, UsageError
+from fprf.methods import fprf, fprf_lite
 from fprf.training.model import build_model
-from fprf.training.prepare import Outcome, cache_folder, exposure_of, find_downscale, outcome, prepare, scene_of, with_downscale
+from fprf.training.prepare import (
+    Forecast,
+    Outcome,
+    cache_folder,
+    device_of,
+    exposure_of,
+    find_downscale,
+    outcome,
+    prepare,
+    scene_of,
+    with_downscale,
+)
+from fprf.training.trainer import Report
 
 
 def test_features_are_computed_once(world: World) -> None:
@@ -120,3 +132,26 @@ def test_what_training_came_to(world: World, tmp_path: Path) -> None:
     assert not long.too_short and "--minutes 16" in timed and "--downscale" not in timed
     assert "--steps 24000" in reduced and "--downscale 4" in reduced
     assert outcome(tmp_path, config, scene) is None
+
+
+def event(step: int, seconds: float) -> Report:
+    return Report(step, 0.0, seconds, 20.0, 1.0, 1.0, {}, 0)
+
+
+def test_hours_are_told_once_from_the_first_steps() -> None:
+    slow = Forecast(fprf(), "fprf", "cpu")
+    assert slow(event(1, 100.0)) == "" and slow(event(2, 103.0)) == "", "the first step compiles"
+    assert "30,000 steps at 3 s a step take 25 hours" in slow(event(3, 106.0)) and slow(event(9, 124.0)) == ""
+    quick = (
+        Forecast(fprf_lite(), "fprf-lite", "cpu"),
+        Forecast(replace(fprf(), minutes=9), "fprf", "cpu"),
+        Forecast(fprf(), "fprf", "cuda"),
+    )
+    for each, pace in zip(quick, (0.1, 3.0, 3.0), strict=True):
+        assert not any(each(event(step, 5 + pace * step)) for step in range(1, 200))
+
+
+@pytest.mark.parametrize("name", ["gpu", "", "cuda:99"])
+def test_devices_that_are_not_there_are_refused(name: str) -> None:
+    with pytest.raises(PluginError):
+        device_of(name)

@@ -10,8 +10,8 @@ import torch
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.errors import PluginError
-from fprf.plugins.samplers.config import SamplerConfig
+from fprf.errors import PluginError, UsageError
+from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig
 from fprf.training.camera_optimizers import Tones
 from fprf.training.loading import Trained
 from fprf.training.model import Model
@@ -109,3 +109,17 @@ def test_between_two_views_means_of_logarithms_are_taken(world: World) -> None:
     for texts, share in (((str(a), str(b)), 0.5), ((f"{a}=1", f"{b}=3"), 0.25), ((f"{a}=0.5", f"{b}=0"), 1.0)):
         wanted = plain * (share * log[0] + (1 - share) * log[1]).exp()
         torch.testing.assert_close(shown(trained, *texts)[0], wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)
+
+
+def test_a_sampler_that_learns_for_its_number_of_samples(world: World) -> None:
+    trained = world.load()
+    config = replace(trained.config, sampler=ProposalConfig(samples=(16,), final=8, resolutions=(4,)))
+    with pytest.raises(UsageError):
+        at_quality(replace(trained, config=config), QualityConfig(samples=2.0))
+
+
+@pytest.mark.parametrize("tone", ["nowhere", "0=x", "99", "1=-2", "0", "1=0"])
+def test_what_is_no_light_of_a_training_view_is_refused(world: World, tone: str) -> None:
+    for trained in (lit(world), world.load()):
+        with pytest.raises(UsageError):
+            shown(trained, tone)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.errors import UsageError
+from fprf.errors import DataError, UsageError
 from fprf.plugins.stylizers.config import AdainConfig, RegionAdainConfig
 from fprf.style.config import StyleConfig
 from fprf.style.files import Key, StyleFile
@@ -193,3 +193,25 @@ def test_what_regions_take_is_the_stylizers_match_at_their_keys(world: World, st
     assert sum(region_tile(found[0], styled.dictionary.names).shares) == pytest.approx(1, abs=1e-4)
     row = region_row(found[0])
     assert {"references", "entropy_bits", "strength", "restricted"} < row.keys() and len(row["references"]) == 2
+
+
+def test_a_pixel_that_sees_nothing_is_refused(world: World) -> None:
+    regions = regions_of(world)
+    with torch.no_grad():
+        regions.views.model.get_parameter("field.to_density.weight").fill_(-1e6)
+    with pytest.raises(UsageError):
+        find_regions(regions, "0002:5,5")
+
+
+def test_masks_that_say_nothing_are_named(world: World, tmp_path: Path) -> None:
+    with pytest.raises(UsageError):
+        find_regions(regions_of(world), f"0002:{draw(tmp_path, np.zeros((24, 32)))}")
+    with pytest.raises(DataError):
+        find_regions(regions_of(world), f"0002:{tmp_path / 'absent.png'}")
+
+
+@pytest.mark.parametrize("text", ["sky", "0099:1,1", "²"])
+def test_what_names_nothing_is_refused(world: World, text: str) -> None:
+    for keys in ({}, {"sky": (1.0, 2.0)}):  # of another encoder
+        with pytest.raises(UsageError):
+            find_regions(regions_of(world, keys), text)

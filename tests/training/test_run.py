@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.cli.train import train_scene
+from fprf.datamanagers.scene import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
 from fprf.training import checkpoint
-from fprf.training.run import IMAGES, LOCK, Run, held, read_history, view_names
+from fprf.training.run import IMAGES, LOCK, Run, check_images, held, image_hashes, read_history, save_image_hashes, view_names
 
 
 @pytest.fixture
@@ -237,3 +238,25 @@ def test_blocks_have_histories_of_their_own(tmp_path: Path) -> None:
     write(tmp_path / "blocks" / "00", step(2, 1))
     write(tmp_path / "blocks" / "surroundings", "")
     assert [(history.name, history.step) for history in read_history(tmp_path)] == [("00", [2]), ("01", [3])]
+
+
+def test_a_file_in_its_place_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(DataError), held(folder):
+            pass
+
+
+def test_what_is_absent_or_damaged_is_refused(world: World, run: Run) -> None:
+    (run.root / "style.safetensors").unlink()
+    with pytest.raises(CheckpointError):
+        run.load_tensors("style")
+    scene = parse_scene(world.town, 1, None)
+    (run.root / IMAGES).write_text("[]")
+    with pytest.raises(CheckpointError):
+        check_images(run.root, scene, {})
+    save_image_hashes(run.root, {"old": "0" * 64})
+    with pytest.raises(UsageError):
+        check_images(run.root, scene, image_hashes(scene))
+    with pytest.raises(DataError):
+        image_hashes(replace(scene, paths=(run.root / "gone.png",)))
