@@ -327,7 +327,8 @@ def test_more_steps_go_on_from_where_it_stopped(block_world: BlockWorld, tmp_pat
     train_scene(replace(small(block_world.config.data, root), steps=8), "fprf-lite", quiet=True)
     for name in NAMES:
         assert done_of(root, name)["step"] == 8
-        assert steps_of(root, name)[-2:] == [6, 8], "the log goes on"
+        steps = steps_of(root, name)  # as many as there were reports on a slow machine
+        assert steps == sorted(steps) and steps[-1] == 8 and 6 in steps, "the log goes on"
     assert digests(root, NAMES) == digests(block_world.root, NAMES)
 
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.cli.train import train_scene
-from fprf.datamanagers.scene import parse_scene
+from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import CheckpointError, DataError, UsageError
 from fprf.training import checkpoint
 from fprf.training.run import IMAGES, LOCK, Run, check_images, held, image_hashes, read_history, save_image_hashes, view_names
