@@ -1,4 +1,7 @@
-"""Encoded photographs and viewed runs for tests."""
+"""Encoded photographs, viewed runs and waiting for tests."""
+
+import time
+from collections.abc import Callable
 
 from tiny_world import World
 
@@ -7,7 +10,7 @@ from fprf.viewer.restyler import Restyler
 from fprf.viewer.session import Viewed, view_of_run
 from fprf.viewer.state import Photograph
 
-__all__ = ["encoded", "viewed"]
+__all__ = ["encoded", "until", "viewed"]
 
 
 def encoded(restyler: Restyler, world: World) -> tuple[Photograph, Photograph]:
@@ -17,3 +20,12 @@ def encoded(restyler: Restyler, world: World) -> tuple[Photograph, Photograph]:
 
 def viewed(trained: Trained) -> Viewed:
     return view_of_run(trained, trained.run, trained.known)
+
+
+def until(true: Callable[[], bool], act: Callable[[], object] = lambda: None) -> None:
+    """Wait for something to hold, and act meanwhile; fail after two minutes."""
+    end = time.monotonic() + 120
+    while not true():
+        assert time.monotonic() < end
+        act()
+        time.sleep(0.01)

@@ -1,14 +1,13 @@
 import json
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from queue import Queue
 
 import cv2
 import numpy as np
 import pytest
-from photographs import encoded, viewed
+from photographs import encoded, until, viewed
 from test_session import Listener
 from tiny_world import World
 
@@ -124,13 +123,6 @@ def flight(session: Session, looks: list[Look], seconds: float = 0.2) -> FilmPla
         24.0,
         (32, 24),
     )
-
-
-def until(true: Callable[[], bool]) -> None:
-    end = time.monotonic() + 120
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def test_a_flight_goes_from_the_first_key_to_the_last_for_one_client_alone(

@@ -4,13 +4,13 @@ import io
 import json
 import shutil
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from photographs import until
 from safetensors.torch import save_file
 from stand_in_viewers import DEAD, DEAF, GREEDY, NONSENSE, QUIET, REFUSED, viewer
 from tiny_world import World
@@ -149,14 +149,6 @@ def test_a_port_that_is_taken_is_an_error_or_another_port() -> None:
 
 def event(step: int) -> Report:
     return Report(step, step / 100, 1.0, 20.0, 1000.0, 1.0, {"rgb": 0.01}, 0)
-
-
-def until(true: Callable[[], bool], act: Callable[[], object] = lambda: None) -> None:
-    end = time.monotonic() + 60
-    while not true():
-        assert time.monotonic() < end
-        act()
-        time.sleep(0.01)
 
 
 @pytest.mark.parametrize("script", [REFUSED, "", "print('[]')"])

@@ -1,14 +1,13 @@
 """Every control of the panel on a real session, moved as a browser would move it."""
 
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from fake_gui import Client, Gui
-from photographs import viewed
+from photographs import until, viewed
 from test_session import Listener
 from tiny_world import World
 
@@ -65,12 +64,6 @@ class Room:
 
     def press(self, label: str) -> None:
         self.gui[label].pressed(self.client)
-
-    def until(self, true: Callable[[], bool]) -> None:
-        end = time.monotonic() + 120
-        while not true():
-            assert time.monotonic() < end
-            time.sleep(0.01)
 
 
 @pytest.fixture
@@ -160,7 +153,7 @@ def test_keys_are_set_replaced_and_gone_to(room: Room, world: World) -> None:
     room.press("Go to the chosen key")
     assert any("no key is chosen" in text for text in room.face.said)
     start = room.camera
-    room.until(lambda: room.session.thumbnail(1) is not None)
+    until(lambda: room.session.thumbnail(1) is not None)
     room.press("Add a key here")
     room.session.upload(world.references[0].read_bytes(), "dusk.png")
     room.move("fly to view", 4)
@@ -183,9 +176,9 @@ def test_a_flight_is_played_and_ended_by_the_same_button(room: Room) -> None:
     assert room.camera.position == pytest.approx(room.state.keys[0].camera.position, abs=1e-6)
     room.gui["seconds between keys"].value = 60.0
     room.press("Play the flight")
-    room.until(lambda: room.state.playing)
+    until(lambda: room.state.playing)
     room.press("Play the flight")
-    room.until(lambda: not room.state.playing)
+    until(lambda: not room.state.playing)
 
 
 def test_the_film_is_what_the_controls_say(room: Room) -> None:
@@ -195,5 +188,5 @@ def test_the_film_is_what_the_controls_say(room: Room) -> None:
     plan = room.panel.plan
     assert plan.size == (480, 360) and plan.fps == 12.0 and plan.seconds == 2.0 and len(plan.keys) == 1
     room.press("Make the film")
-    room.until(lambda: room.state.film.path is not None)
+    until(lambda: room.state.film.path is not None)
     assert "film.mp4" in room.gui["about"].content and not room.gui["Make the film"].disabled

@@ -1,8 +1,9 @@
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Hashable, Iterator
 
 import pytest
+from photographs import until
 
 from fprf.viewer.render_worker import RenderWorker
 
@@ -44,14 +45,6 @@ def bench() -> Iterator[Bench]:
     yield bench
     bench.let(10_000)
     bench.worker.close()
-
-
-def until(true: Callable[[], bool]) -> None:
-    for _ in range(2000):
-        if true():
-            return
-        time.sleep(0.005)
-    raise AssertionError("it never came")
 
 
 def test_a_newer_request_takes_over_between_steps_and_those_between_are_never_begun(bench: Bench) -> None:
