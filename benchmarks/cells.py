@@ -90,7 +90,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--side", type=int, default=250, help="longest side of the images at most, in pixels")
     parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--share", type=float, default=0.5, help="of the steps, for the cells")
+    parser.add_argument("--share", type=float, default=0.55, help="of the steps, for the cells")
     parser.add_argument("--cap", type=int, default=30_000)
     parser.add_argument("--cells", type=int, default=4)
     parser.add_argument("--only", nargs="+", choices=("piece", "cells", "blocks"), default=("piece", "cells", "blocks"))

@@ -27,7 +27,7 @@ import numpy as np
 from .common import RESULTS, add_entry, arguments
 from .district_scene import SKY, write_district
 
-CELLS, STEPS, COARSE_STEPS, GAUSSIANS, POINTS = 4, 200, 300, 8000, 3000
+CELLS, STEPS, COARSE_STEPS, GAUSSIANS, POINTS = 4, 200, 100, 8000, 3000
 """Cells of a town; steps of a cell; steps of the whole for each town; Gaussians of a cell at the end and at the start."""
 Result = TypeVar("Result")
 

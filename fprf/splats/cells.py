@@ -121,6 +121,7 @@ def cut(scene: Scene, count: int) -> list[Cell]:
         raise ConfigError(
             f"cells: {scene.name} has too few points of a reconstruction for {count} cells; train it in one piece"
         )
+    ends = torch.searchsorted(sightings.view, torch.arange(len(scene.cameras) + 1))
     centred = sightings.point - sightings.point.mean(0)
     frame = torch.linalg.eigh(centred.T @ centred).eigenvectors.T.flip(0).contiguous()
     local = sightings.point @ frame.T
@@ -133,17 +134,17 @@ def cut(scene: Scene, count: int) -> list[Cell]:
         near = ((local >= low - border) & (local < high + border)).all(1)
         windows: dict[int, Window] = {}
         for view in torch.unique(sightings.view[near]).tolist():
-            of_view = sightings.view == view
-            pixel = sightings.pixel[of_view & near]
+            of_view = slice(int(ends[view]), int(ends[view + 1]))
+            pixel = sightings.pixel[of_view][near[of_view]]
             if len(pixel) < _SEEN:
                 continue
             width, height = scene.cameras.size[view].tolist()
             first, last = _extent(pixel)
             left, wide = _interval(float(first[0]), float(last[0]), width)
             top, tall = _interval(float(first[1]), float(last[1]), height)
-            x, y = sightings.pixel.unbind(1)
-            shown = of_view & (x >= left) & (x < left + wide) & (y >= top) & (y < top + tall)
-            if int((inside & shown).sum()) >= _OWN * int(shown.sum()):
+            x, y = sightings.pixel[of_view].unbind(1)
+            shown = (x >= left) & (x < left + wide) & (y >= top) & (y < top + tall)
+            if int((inside[of_view] & shown).sum()) >= _OWN * int(shown.sum()):
                 windows[view] = (left, top, wide, tall)
         if not windows:
             raise ConfigError(f"cells: no view shows {_SEEN} points of one of {count} cells; take fewer")
