@@ -46,7 +46,7 @@ __all__ = ["OVERVIEW", "CellTask", "folder_of", "read_cells", "train_cell", "tra
 _FORMAT = 2
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
-_PIXELS, _SMALLEST = 24_000_000, 4
+_PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
 
 
