@@ -62,7 +62,8 @@ class RayExecutor(Executor):
         try:
             return [ray.get(reference) for reference in waiting]
         except BaseException as error:
-            for reference in waiting:
+            # Ray aborts this process if it cancels a task whose completion it is just taking in (ray-project/ray#54798).
+            for reference in ray.wait(waiting, num_returns=len(waiting), timeout=0)[1]:
                 ray.cancel(reference)
             if isinstance(error, ray.exceptions.RayTaskError) and isinstance(error.cause, Exception):
                 raise error.cause from None
