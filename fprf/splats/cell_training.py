@@ -287,7 +287,7 @@ def unite(root: Path, round: int, cells: Sequence[Cell], to: Path | None = None)
 
 
 def _mean_tones(start: checkpoint.Saved, found: list[dict[str, Tensor]], cells: Sequence[Cell]) -> dict[str, Tensor]:
-    """What cells learnt of the light of photographs: the mean of those that have a window of it."""
+    """Average the exposure parameters of cells: for each view, over the cells that have a window of it."""
     named = {}
     for name, before in start.optimizer.items():
         if not name.startswith("tones."):

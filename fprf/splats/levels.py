@@ -68,7 +68,7 @@ class Levels:
         first, last = self.begin[chunks, level[chunks]], self.begin[chunks, level[chunks] + 1]
         parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
         found = np.concatenate(parts)
-        if self.mapped is not None:
+        if self.mapped is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
             self.mapped.madvise(mmap.MADV_DONTNEED)
         return _gaussians(torch.from_numpy(found))
 

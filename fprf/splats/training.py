@@ -131,7 +131,7 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
 
 
 def _before(far: Points) -> Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]]:
-    """Whether means lie well within the surroundings, which stay coarse: else they would take on what stands before them."""
+    """Return the test for means well within the surroundings; only these are split, so that the surroundings stay coarse."""
     centre = torch.from_numpy(far.position.mean(0)).float()
     limit = 0.5 * float((torch.from_numpy(far.position).float() - centre).norm(dim=1).min())
     return lambda means: (means - centre).norm(dim=1) < limit

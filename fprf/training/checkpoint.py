@@ -117,7 +117,7 @@ def reached(root: Path) -> tuple[int, float]:
 
 
 def digest(root: Path) -> str:
-    """What the newest checkpoint's manifest says of its tensors, short; empty without one."""
+    """Return a short key of the tensors in the newest checkpoint's manifest; empty without one."""
     kept = steps(root)
     try:
         return f"{_checksum(_read(_folder(root, kept[-1]) / 'manifest.json')):08x}" if kept else ""
