@@ -47,7 +47,7 @@ class DemoConfig:
 
     output: Path = Path("demo")
     """Folder for everything that the demo makes."""
-    minutes: float = 1.3
+    minutes: float = 1.2
     """Training time."""
     frames: int = 60
     """Frames of the film, about."""

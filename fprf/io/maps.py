@@ -12,7 +12,7 @@ from torch import Tensor
 from ..errors import DataError
 from .images import Picture, to_uint8
 
-__all__ = ["depth_image", "depth_limits", "match_image", "match_summary", "palette", "scale_image"]
+__all__ = ["depth_image", "depth_limits", "match_image", "match_summary", "palette", "scale_image", "weighted_sum"]
 
 _EMPTY = (0.50, 0.51, 0.53)
 """Colour of pixels that hit nothing: a grey that neither map uses."""
@@ -122,18 +122,23 @@ def match_summary(
     (`mean_score`, 1 = certain) and the mean `entropy` in bits (0 = certain). Pixels count by their opacity.
     """
     _fitting(attention, reference, names)
-    weights = attention.detach().cpu().double()
+    weights = attention.detach().cpu()
     cover = torch.ones(weights.shape[:2]) if opacity is None else opacity.detach().cpu()
     each = cover.double().clamp(min=0)
     # An empty view has no shares to speak of; dividing by 1 leaves them at 0.
     total = float(each.sum()) or 1.0
-    codes = (weights * each[..., None]).sum(dim=(0, 1)) / total
+    codes = weighted_sum(weights, each) / total
     shares = torch.zeros(len(names), dtype=torch.float64).index_add_(0, reference.cpu(), codes)
     return {
         "references": [{"name": name, "share": float(share)} for name, share in zip(names, shares, strict=True)],
         "mean_score": float((weights.amax(dim=-1) * each).sum()) / total,
         "entropy_bits": float((_entropy(weights) * each).sum()) / total / math.log(2),
     }
+
+
+def weighted_sum(values: Annotated[Tensor, "H W T"], weight: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "T"]:
+    """Sum over the pixels, in float64; the products of a row are summed in the precision of `values`."""
+    return torch.bmm(weight.to(values.dtype)[:, None], values)[:, 0].double().sum(0)
 
 
 def _solid(depth: Tensor, opacity: Tensor, least: float = 0.5) -> Tensor:

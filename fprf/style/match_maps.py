@@ -17,7 +17,7 @@ from torch import Tensor
 from ..interfaces import Scene
 from ..io.atomic import write_bytes
 from ..io.images import Picture, to_uint8
-from ..io.maps import match_image, match_summary, scale_image
+from ..io.maps import match_image, match_summary, scale_image, weighted_sum
 from ..io.sheet import Tile, highlight
 from ..rendering.cameras import Cameras, pixel_grid
 from .matching import unit
@@ -114,8 +114,7 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     total = float(each.sum()) or 1.0
     weight = each * (1 - kept)
     styled = float(weight.sum()) or 1.0
-    of_code = (matched.taken.double() * each[..., None]).sum((0, 1)) / total
-    of_region = (matched.region.double() * each[..., None]).sum((0, 1)) / total
+    of_code, of_region = weighted_sum(matched.taken, each) / total, weighted_sum(matched.region, each) / total
     cluster = clusters(codes)
     return {
         **match_summary(matched.attention, codes.reference, codes.names, weight),
