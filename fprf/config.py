@@ -47,7 +47,7 @@ class ContentConfig:
     decoder: DecoderConfig = MlpDecoderConfig()
     """Frozen decoder from content features to colour."""
     moves_density: bool = True
-    """Whether the feature loss also moves density, as in the paper; without, colour alone decides the geometry."""
+    """Let the feature loss also move density, as in the paper; without, colour alone decides the geometry."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +152,7 @@ class OptimizerConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig:
-    """How samples become pixels, and what may be skipped."""
+    """Rendering: from samples to pixels, and what may be skipped."""
 
     budget: float = 1 / 512
     """Largest weight per ray that may be dropped when rendering; bounds the colour error (0 = exact)."""
@@ -196,7 +196,7 @@ class StatisticsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """What every run has, whatever its scene is made of."""
+    """Fields of every run, whatever its scene is made of."""
 
     data: Path | None = None
     """Scene folder, which must be named; `town` is the embedded one."""
@@ -224,7 +224,7 @@ class RunConfig:
         positive("checkpoint_minutes", self.checkpoint_minutes)
 
     def verbs(self) -> "Verbs":
-        """How a run of this kind is trained, judged, filmed and exported; imports its implementation."""
+        """Return the verbs that train, judge, film and export such a run; imports its implementation."""
         raise ConfigError(f"{type(self).__name__} does not say how it is trained; its method has to give a config that does")
 
     def load(self, run: Path, device: str, quality: "QualityConfig") -> "LoadedRun[Scene]":
@@ -266,13 +266,13 @@ class TrainConfig(RunConfig):
     semantic: SemanticConfig = SemanticConfig()
     """Semantics."""
     blocks: LayoutConfig = SingleConfig()
-    """How the scene is cut into blocks."""
+    """Layout of the blocks that the scene is cut into."""
     executor: ExecutorConfig = SerialConfig()
-    """Where blocks are trained."""
+    """Executor that trains the blocks."""
     loss: LossConfig = LossConfig()
     """Weights of the training terms."""
     optimizer: OptimizerConfig = OptimizerConfig()
-    """How parameters move."""
+    """Optimiser and learning rates."""
     tones: bool | None = None
     """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what they have in common.
     none = where exposures differ, as the capture says or as its sparse points show."""
@@ -290,7 +290,7 @@ class TrainConfig(RunConfig):
         between("poses", self.poses, 0.0, 1.0)
 
     def verbs(self) -> "Verbs":
-        """How a run of fields is trained, judged, filmed and exported."""
+        """Return the verbs that train, judge, film and export a run of fields."""
         from .cli.verbs import FieldVerbs
 
         return FieldVerbs(self)

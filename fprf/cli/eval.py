@@ -23,7 +23,7 @@ __all__ = ["EvalConfig", "evaluate_fields", "run", "store"]
 
 @dataclass(frozen=True, kw_only=True)
 class EvalConfig(QualityConfig):
-    """What to measure."""
+    """The run and the measurements."""
 
     run: Path = Path()
     """Run folder."""

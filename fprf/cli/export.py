@@ -92,7 +92,7 @@ def _coverage(made: dict[str, Any]) -> list[str]:
 
 
 class _Place(NamedTuple):
-    """What every file of surfaces needs."""
+    """Inputs of every file of surfaces."""
 
     trained: "Trained"
     what: Plan
@@ -102,7 +102,7 @@ class _Place(NamedTuple):
     display: Display
 
     def paths(self, base: str, look: Look, ending: str) -> list[Path]:
-        """Where the file of a look goes; nowhere if a single file of another ending is wanted."""
+        """Return the path of a look's file; None if a single file of another ending is wanted."""
         if self.what.single is None:
             return [self.what.folder / look_file(base, look.name, ending)]
         return [self.what.single] if self.what.single.suffix.lower() == ending else []

@@ -30,7 +30,7 @@ Each reference is a style of its own; with several of them all together are one 
 
 @dataclass(frozen=True, kw_only=True)
 class GalleryConfig(QualityConfig):
-    """What the page shows."""
+    """Views and styles of the page."""
 
     run: Path = Path()
     """Run folder."""
@@ -43,13 +43,13 @@ class GalleryConfig(QualityConfig):
     strength: float = 1.0
     """0 leaves the scene as it is, 1 is the full style; of photographs."""
     luminance: float = 0.0
-    """How much of the scene's own luminance is kept, in [0, 1]; of photographs."""
+    """Share of the scene's own luminance that is kept, in [0, 1]; of photographs."""
     clusters: int = StyleConfig().clusters
     """Local styles per photograph, at least 1."""
     blend: float = StyleConfig().blend
     """Share of the overall style in each local one, in [0, 1]; of photographs."""
     stylizer: StylizerConfig = StyleConfig().stylizer
-    """What moves the scene's features; of photographs."""
+    """Method that moves the scene's features; of photographs."""
     split: Literal["covered", "test", "train", "all"] = "covered"
     """Views to choose from. covered: at most 8, those that training views surround; test: those held out from training."""
     most: int = 6

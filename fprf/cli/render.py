@@ -57,7 +57,7 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
     styles: tuple[str, ...] = ()
     """Further looks beside it: NAME=PHOTO,PHOTO, NAME=STYLE.json, or the word plain for the scene as it is."""
     show: tuple[Literal["colour", "depth", "normals", "match"], ...] = ("colour",)
-    """What is shown of each frame, from left to right."""
+    """Layers of each frame, from left to right."""
     layout: Literal["beside", "wipe"] = "beside"
     """Several pictures of a frame lie beside each other, or share one in strips whose seams swing to and fro."""
     format: Literal["png", "jpg", "exr"] = "png"

@@ -28,12 +28,12 @@ class Shown(NamedTuple):
     sources: list[Path]
     """Its photographs, in the order of its match maps' colours."""
     shares: list[float]
-    """How much of what was seen took its style from each of them."""
+    """Share of what was seen that took its style from each of them."""
     dictionary_seconds: float
     view_seconds: float
     """For all views."""
     metrics: dict[str, Any]
-    """What is shown beside the style."""
+    """Figures beside the style."""
 
 
 def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: Sequence[int], display: Display) -> list[Shown]:

@@ -38,7 +38,7 @@ REGION is a region's number (--explain lists them), its name in a style file, VI
 
 @dataclass(frozen=True, kw_only=True)
 class StylizeConfig(StyleConfig, QualityConfig):
-    """Which views to restyle, and with what."""
+    """Views to restyle, and their style."""
 
     run: Path = Path()
     """Run folder."""

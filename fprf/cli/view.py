@@ -28,7 +28,7 @@ _EXIT_TIMEOUT = 15.0
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig(QualityConfig):
-    """Which run to show, and to whom."""
+    """The run to show, and access to it."""
 
     run: Path | None = None
     """Run folder, or a capture of 3D Gaussians: .ply .compressed.ply .splat .spz .sog, or a SOG folder; none = a start page in
@@ -46,7 +46,7 @@ class ViewConfig(QualityConfig):
     port: int = 8080
     """Port to listen on; 0 = any that is free."""
     token: str | None = None
-    """What the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
+    """Secret that the address must carry (?token=...), at least 16 characters; none = made where one is needed."""
     pixels: int = 640
     """Longest side of the sharpest picture, 64 to 2048."""
     max_memory: float | None = None

@@ -13,7 +13,7 @@ __all__ = ["BenchConfig", "PeerConfig", "ReportConfig", "RestyleConfig", "SpeedC
 
 @dataclass(frozen=True, kw_only=True)
 class BenchConfig:
-    """What is measured, and how often."""
+    """Measurements and their repetitions."""
 
     run: Path | None = None
     """Run folder; none = --method is trained on --data for --steps first, in a folder that is thrown away."""
@@ -63,7 +63,7 @@ class SpeedConfig(BenchConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig:
-    """What every report shares."""
+    """Fields that every report shares."""
 
     output: Path | None = None
     """JSON file for the figures; none = only the table."""
@@ -78,7 +78,7 @@ class RestyleConfig(ReportConfig):
     run: Path | None = None
     """Run folder, trained on the embedded town; none = fprf-lite is trained on it first, in a folder that is thrown away."""
     minutes: float = 2.0
-    """How long it is trained, where no run is given."""
+    """Training time, where no run is given."""
     palettes: tuple[str, ...] = ("autumn", "winter", "sunset", "night")
     """Lights that are asked for."""
     seeds: tuple[int, ...] = (7, 11, 13)
@@ -124,7 +124,7 @@ class PeerConfig(ReportConfig):
     depth: Path | None = None
     """Folder of NAME.npz (array `depth`) or NAME.npy: [H W], in the unit of the poses; 0 or infinite = nothing there."""
     depth_along: Literal["ray", "axis"] = "ray"
-    """What the depths are: distances along each pixel's ray, or along the camera's axis."""
+    """Kind of depth: distances along each pixel's ray, or along the camera's axis."""
     run: Path | None = None
     """A run of ours on the same scene: renders the plain frames and depths that are not given."""
     truth: Path | None = None

@@ -297,7 +297,7 @@ def cases(config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path,
 
 
 def verdict(rows: Mapping[str, Row], best: str) -> dict[str, Any]:
-    """What the recommended stylizer reaches of GOALS."""
+    """Figures of the recommended stylizer beside GOALS."""
     ours = rows[best]
     baseline = max(GLOBAL, key=lambda name: rows[name]["psnr"] or -math.inf)
     reached = {

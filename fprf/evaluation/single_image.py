@@ -98,7 +98,7 @@ class _Colours(Decoder):
 
 
 def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, decoder: Decoder | None) -> Restyle:
-    """What `fprf stylize` would do to the photograph. Without a decoder its content is its colours, as in `splats.restyle`."""
+    """Restyle the photograph as `fprf stylize` would. Without a decoder its content is its colours, as in `splats.restyle`."""
     device = flat.content.device
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
     if decoder is None:

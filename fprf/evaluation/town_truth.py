@@ -75,7 +75,7 @@ _OFF = 0.01
 
 
 class Truth(NamedTuple):
-    """What is there; palettes change none of it."""
+    """Class of what a pixel shows; palettes change none of it."""
 
     depth: Annotated[Tensor, "H W"]
     """Metres along the unit ray, inf = sky."""
@@ -122,13 +122,13 @@ def set_stage(
 
 
 def town_folder(config: RunConfig) -> Path | None:
-    """Where the town lies that a run was trained on; None where it was another scene."""
+    """Folder of the town that a run was trained on; None where it was another scene."""
     folder = config.read_scene().paths[0].parents[1]
     return folder if is_town(folder) else None
 
 
 def town_settings(config: RunConfig) -> TownSettings:
-    """Which town a run was trained on. Raises UsageError where it was none, DataError where its record cannot be read."""
+    """Return the town that a run was trained on. Raises UsageError where there is none, DataError for a bad record."""
     folder = town_folder(config)
     if folder is None:
         raise UsageError(
@@ -191,7 +191,7 @@ _SEARCHED = 40
 
 
 class Place(NamedTuple):
-    """Where a reference is photographed."""
+    """Return the viewpoint of a reference."""
 
     name: str
     seed: int

@@ -22,12 +22,12 @@ __all__ = ["KINDS", "ExportConfig", "Look", "Plan", "look_file", "make_looks", "
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(StyleConfig):
-    """What to export, how finely, and in which styles."""
+    """Kinds of files, their resolution, and the styles."""
 
     run: Path = Path()
     """Run folder."""
     kinds: tuple[str, ...] = ()
-    """What to export; the same as words behind the run. None = everything."""
+    """Kinds of files; the same as words behind the run. None = everything."""
     output: Path | None = None
     """A folder, or a single file (.ply .splat .glb .json .cube); by default RUN/exports."""
     style: Path | None = None
@@ -51,7 +51,7 @@ class ExportConfig(StyleConfig):
     presence: float = 0.6
     """Share of the light that a surface there would send which must come from a point, in [0, 1]: less, and it floats."""
     reach: float | None = None
-    """What is farther from its view, in world units, is sky; none = 20 times the scene's inner radius."""
+    """Distance from a view, in world units, beyond which everything is sky; none = 20 times the scene's inner radius."""
     sky: bool = True
     """Put a dome round splats where views see nothing within reach."""
     fit: float = 0.0

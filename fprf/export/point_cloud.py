@@ -269,7 +269,7 @@ _FINE = 1 / 16
 
 
 def origin_of(cloud: Cloud) -> Annotated[Tensor, "3"]:
-    """What is taken off coordinates so that float32 holds them: nothing, unless the capture lies far from its origin."""
+    """Return the offset of coordinates, so that float32 holds them: 0 unless the capture lies far from its origin."""
     finest = float(cloud.edge.amin())
     if float(cloud.point.abs().amax()) * 2**-24 <= _FINE * finest:
         return torch.zeros(3, dtype=torch.float64)

@@ -51,7 +51,7 @@ class GridConfig(LayoutConfig):
     size: float | None = None
     """Side of a cell instead, world units; the nearest whole numbers of cells are taken."""
     margin: float = 0.1
-    """How far a block reaches into its neighbours, as a share of the shorter side of a cell; in (0, 0.5]."""
+    """Overlap of a block with its neighbours, as a share of the shorter side of a cell; in (0, 0.5]."""
 
     def __post_init__(self) -> None:
         for count in self.cells:
@@ -75,7 +75,7 @@ class AdaptiveConfig(LayoutConfig):
     smallest: float | None = None
     """No side of a block falls below this, world units; none = a tenth of the scene's."""
     margin: float = 0.25
-    """How far a block reaches into its neighbours, as a share of the smallest side; in (0, 0.5]."""
+    """Overlap of a block with its neighbours, as a share of the smallest side; in (0, 0.5]."""
 
     def __post_init__(self) -> None:
         at_least("blocks.rays", self.rays, 1)
@@ -98,7 +98,7 @@ class StreetConfig(LayoutConfig):
     length: float | None = None
     """Length of a segment instead, world units; the path is halved until none is longer."""
     margin: float = 0.1
-    """How far a block reaches into its neighbours, as a share of the shortest segment; in (0, 0.5]."""
+    """Overlap of a block with its neighbours, as a share of the shortest segment; in (0, 0.5]."""
 
     def __post_init__(self) -> None:
         at_least("blocks.segments", self.segments, 1)

@@ -40,11 +40,11 @@ class Style(NamedTuple):
     references: Sequence[str] = ()
     """Names of its references, in dictionary order."""
     shares: Sequence[float] = ()
-    """How much of the scene each of them styled (`maps.match_summary`); none where that was not measured."""
+    """Share of the scene that each of them styled (`maps.match_summary`); none where that was not measured."""
     matches: Sequence[Picture] = ()
     """Match maps (`maps.match_image`), one per view or fewer."""
     metrics: "Metrics" = MappingProxyType({})
-    """What was measured of this style alone."""
+    """Figures of this style alone."""
 
 
 def _img(picture: Picture, side: int, alt: str, *, eager: bool = False, of: str = "") -> str:
@@ -133,7 +133,7 @@ def _compare(
 
 
 def _left(styles: Sequence[Style]) -> str:
-    """What the restyled view can be compared with."""
+    """Pictures that the restyled view can be compared with."""
     options = [("original", "Original")]
     if any(style.matches for style in styles):
         options.append(("match", "Which reference is where"))

@@ -41,7 +41,7 @@ class Rasterised(NamedTuple):
 
 
 class Lifted(NamedTuple):
-    """What the pixels of a view tell N Gaussians; add up over views, then divide: features / weights."""
+    """Features of the pixels of a view, carried to N Gaussians; add up over views, then divide: features / weights."""
 
     features: Annotated[Tensor, "N C"]
     """Sum over pixels of weight times feature."""

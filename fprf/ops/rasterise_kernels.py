@@ -281,15 +281,15 @@ class Entries(NamedTuple):
     """
 
     start: Annotated[_Ints, "tiles+1"]
-    """Where each tile starts."""
+    """Start of each tile."""
     ids: _Ints
     """Gaussian of each entry."""
     slots: _Ints
     blocks: _Ints
     first_slot: Annotated[_Ints, "N+1+LANES"]
-    """Where the slots of each Gaussian start."""
+    """Start of the slots of each Gaussian."""
     skipped: _Ints
-    """How many Gaussians were left out as FAINT, BEHIND, OUTSIDE, INVALID."""
+    """Counts of Gaussians that were left out as FAINT, BEHIND, OUTSIDE, INVALID."""
 
 
 @traced
@@ -458,7 +458,7 @@ def from_first_block(splats_in, o, bx, by):
 
 
 def alpha_of(power):
-    """What log2 alpha, not more than 0, means."""
+    """Alpha from its log2, which is at most 0."""
     return where_greater(power, LOG_MIN, minimum(exp2_rough(power), MAX_ALPHA), 0)
 
 

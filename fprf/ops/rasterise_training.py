@@ -32,13 +32,13 @@ class Target(NamedTuple):
     planes: Floats
     """Colours in [0, 1], [3, H16, W16] flat with `photometric.slack`."""
     blurred: Floats
-    """What SSIM needs of them (`photometric.blurred`)."""
+    """Blurred photographs, as SSIM needs them (`photometric.blurred`)."""
     valid: Floats | None
     """1 where the photograph counts, 0 elsewhere, in the shape of the gradient; None = everywhere."""
 
 
 class Learnt(NamedTuple):
-    """What a step measured before it moved anything."""
+    """Measurements of a step, taken before it moved anything."""
 
     l1: float
     ssim: float
@@ -97,7 +97,7 @@ def errors(
     background: tuple[float, float, float],
     factors: Annotated[Floats, "3"] | None = None,
 ) -> Annotated[Floats, "count"]:
-    """What each Gaussian has to do with the errors of a view: the sum over pixels of its weight times |render - photograph|."""
+    """Errors of a view by Gaussian: the sum over pixels of its weight times |render - photograph|."""
     entries, out, _ = _render(blocks, count, bands, splats, target, background)
     area = _area(target)
     apart = np.abs(_exposed(out, target, factors) - target.planes)[: 3 * area]

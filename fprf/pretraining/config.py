@@ -13,7 +13,7 @@ __all__ = ["PretrainConfig", "PretrainDecoderConfig"]
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig:
-    """What every pretraining needs."""
+    """Fields of every pretraining."""
 
     images: tuple[Path, ...] = ()
     """Folders of photographs, searched at every depth; one in twelve is held out for the report."""

@@ -12,7 +12,7 @@ Lens = Literal["simple-pinhole", "pinhole", "simple-radial", "radial", "opencv",
 
 @dataclass(frozen=True, kw_only=True)
 class SfmConfig:
-    """Which frames, features, pairs and lenses."""
+    """Frames, features, pairs and lenses of a reconstruction."""
 
     frames: int = 150
     """Sharp frames taken from a video, at most; images of a folder are all used."""

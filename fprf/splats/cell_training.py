@@ -52,7 +52,7 @@ _PIXELS, _SMALLEST = 16_000_000, 4
 
 @dataclass(frozen=True, kw_only=True)
 class CellTask:
-    """What a worker is told; the rest lies in the run folder."""
+    """Instructions for a worker; the rest lies in the run folder."""
 
     root: str
     """Run folder."""

@@ -56,7 +56,7 @@ class Cell:
     border: Annotated[Tensor, "3"]
     """Width of what it learns around it."""
     windows: dict[int, Window]
-    """What it learns from, by view."""
+    """Photographs that it learns from, by view."""
 
     def holds(self, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         """True for points inside."""

@@ -63,9 +63,9 @@ class GaussiansConfig(RunConfig):
     overview: float = 0.6
     """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on from there."""
     rounds: int = 2
-    """How often cells are trained, each time from the union of all after the time before."""
+    """Times that cells are trained, each time from the union of all after the time before."""
     executor: ExecutorConfig = SerialConfig()
-    """Where cells are trained: one after the other, or several at a time."""
+    """Executor that trains cells: one after the other, or several at a time."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind everything, also where images have transparency."""
 
@@ -104,7 +104,7 @@ class GaussiansConfig(RunConfig):
         return scene_of(self)
 
     def verbs(self) -> "Verbs":
-        """How such a run is trained, judged, filmed and exported."""
+        """Return the verbs that train, judge, film and export such a run."""
         from ..cli.splats import SplatVerbs
 
         return SplatVerbs(self)

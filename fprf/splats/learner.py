@@ -39,7 +39,7 @@ _TONES = 2e-3
 
 
 class Step(NamedTuple):
-    """What a step measured before it moved anything."""
+    """Measurements of a step, taken before it moved anything."""
 
     l1: float
     ssim: float
@@ -146,7 +146,7 @@ class Learner:
         return found
 
     def _factors(self, view: int) -> Floats | None:
-        """What renders of a view are multiplied by."""
+        """Return the factors of renders of a view."""
         if self.tones is None:
             return None
         found: Floats = self.tones(torch.tensor([view]))[0].detach().numpy()
@@ -206,7 +206,7 @@ class Learner:
         return Gaussians(*(part.contiguous() for part in parts))
 
     def moments(self) -> dict[str, Tensor]:
-        """What else a checkpoint holds: Adam's moments, and how many Gaussians training began with."""
+        """Return the rest of a checkpoint: Adam's moments, and the number of Gaussians that training began with."""
         first, second = (torch.from_numpy(_rows(x, self.rows)[:, : self.count].T.copy()) for x in (self.first, self.second))
         found = {"first": first, "second": second, "begun": torch.tensor(self.begun)}
         if self.tones is not None and self.adam is not None:

@@ -58,7 +58,7 @@ class Levels:
     """The file that the rows lie in: of its pages none stays in memory."""
 
     def select(self, camera: Pinhole, pixels: float) -> Gaussians:
-        """What a camera sees, merged where that lies within `pixels`; 0 = nothing is merged."""
+        """Return the Gaussians that a camera sees, merged where they lie within `pixels`; 0 = nothing is merged."""
         local, seen = in_view(camera, self.centre, self.radius)
         fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
         distance = np.maximum(np.linalg.norm(local, axis=1) - self.core, camera.near)

@@ -9,7 +9,7 @@ __all__ = ["LookConfig"]
 
 @dataclass(frozen=True, kw_only=True)
 class LookConfig:
-    """How a capture is looked at before it is restyled."""
+    """Views of a capture, from which its regions and statistics are found."""
 
     up: tuple[float, float, float] = (0.0, -1.0, 0.0)
     """Direction that points up in the capture's own axes; most captures have y down."""

@@ -39,7 +39,7 @@ def pinhole(cameras: Cameras, view: int, near: float) -> Pinhole:
 
 
 def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> tuple[Image, NDArray[np.bool_] | None]:
-    """What a pinhole camera at a view's place sees of its image, and where that lies within it; None = everywhere.
+    """Return the image of a pinhole camera at a view's place, and the part of it that the view shows; None = everywhere.
 
     The image is returned as it is where the view is a pinhole, which `camera` is then taken to be.
     """

@@ -113,7 +113,7 @@ def as_drawn(harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N K 3"
 def _change(
     look: Restyle, semantic: Annotated[Tensor, "N D"]
 ) -> tuple[Annotated[Tensor, "N 3 3"], Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
-    """What a look adds to the identity: A and b of each Gaussian, c' = c + c A + b, and how strongly it acts."""
+    """The change of a look against the identity: A and b of each Gaussian, c' = c + c A + b, and its strength."""
     matrix, bias, weight = semantic.new_zeros(len(semantic), 3, 3), semantic.new_zeros(len(semantic), 3), semantic.new_zeros(())
     for part in look.parts:
         if part.share == 0 or part.strength == 0:

@@ -70,7 +70,7 @@ nearest one, as a share of the spread of the positions."""
 
 
 class Semantics(NamedTuple):
-    """What views of N Gaussians showed."""
+    """Semantics of N Gaussians, gathered from views."""
 
     style: SceneStyle
     basis: Basis
@@ -89,7 +89,7 @@ class SplatScene(Scene):
     views: Cameras
     view_names: tuple[str, ...]
     found: Callable[[], Semantics]
-    """What the views showed: asked when it is first needed."""
+    """Semantics from the views: asked for when first needed."""
     longest: int
     """Longest side in pixels at which that was looked at."""
     near: float = 0.01
@@ -100,7 +100,7 @@ class SplatScene(Scene):
     harmonics: Annotated[Tensor, "N K 3"] | None = None
     """Those of a look; None = as captured."""
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """What rendered colours are multiplied by at last."""
+    """Factors of rendered colours, applied last."""
     merged: float | None = None
     """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are drawn."""
     stored: Callable[[], Levels] | None = None
@@ -327,14 +327,14 @@ def find_semantics(
 
 
 def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
-    """What views showed, for a file of tensors."""
+    """Return semantics for a file of tensors."""
     parts = {"style": style_tensors(found.style), "basis": found.basis.tensors()}
     named = {f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()}
     return {**named, "semantic": found.features.half(), "encoder": torch.tensor([*found.encoder.encode()], dtype=torch.uint8)}
 
 
 def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
-    """What `semantics_tensors` holds. Raises CheckpointError where it is not of as many Gaussians."""
+    """Read the tensors of `semantics_tensors`. Raises CheckpointError where they are not of as many Gaussians."""
     features = tensors.get("semantic", torch.zeros(0, 0))
     try:
         basis = Basis.from_tensors(_group(tensors, "basis"))
@@ -347,7 +347,7 @@ def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
 
 
 def scene_tensors(scene: SplatScene) -> dict[str, Tensor]:
-    """What was found out about a capture, without its Gaussians: for a file of tensors."""
+    """Return everything found out about a capture, without its Gaussians: for a file of tensors."""
     cameras = {f"camera.{field.name}": getattr(scene.views, field.name) for field in fields(Cameras)}
     return {**cameras, **semantics_tensors(scene.found())}
 

@@ -79,13 +79,13 @@ class Prepared(NamedTuple):
     learner: Learner
     near: float
     origin: str
-    """Where the first Gaussians are from."""
+    """Origin of the first Gaussians."""
     before: int = 0
     """Steps that the Gaussians were trained for elsewhere."""
     shares: tuple[float, float] = (0.0, 1.0)
     """The part of the schedule that is trained here."""
     facts: Facts | None = None
-    """What is known of the scene, where it is whole."""
+    """Facts of the whole scene, where it is whole."""
 
 
 def scene_of(config: GaussiansConfig) -> Scene:
@@ -164,7 +164,7 @@ def lit(facts: Facts, config: GaussiansConfig, scene: Scene, image: Callable[[in
 
 
 def facts_of(config: GaussiansConfig, scene: Scene) -> Facts:
-    """What scene.json says of a scene without fields."""
+    """Return the facts in scene.json of a scene without fields."""
     return Facts(
         space=find_space(scene),
         channels=0,
@@ -253,7 +253,7 @@ class _Meter:
             self.means[name] = keep * self.means.get(name, value) + (1 - keep) * value
 
     def report(self, step: int, share: float, seconds: float) -> Report:
-        """How it goes."""
+        """Return the progress."""
         rgb = max(self.means.get("rgb", 1.0), 1e-10)
         speed = self.pixels / max(time.perf_counter() - self.begun, 1e-9)
         return Report(step, share, seconds, -10 * math.log10(rgb), speed, 1.0, dict(self.means), self.skipped)
@@ -322,7 +322,7 @@ def _stored(folder: Path, gaussians: Gaussians, key: str) -> Levels:
 
 
 def load_tones(run: Run) -> Tones | None:
-    """How each view of a run was taken; None where that was not learnt."""
+    """Return the exposure of each view of a run; None where that was not learnt."""
     saved, _ = checkpoint.load_latest(run.checkpoints)
     return None if saved is None else _tones(saved, run.load_known().facts)
 
@@ -338,7 +338,7 @@ def _tones(saved: checkpoint.Saved, facts: Facts) -> Tones | None:
 
 
 def _semantics(run: Run, step: int, known: Known, gaussians: Gaussians, near: float) -> Semantics:
-    """What training views show, from the run folder; found out and kept there where training has gone on since."""
+    """Return the semantics, from the run folder; found anew and kept there where training has gone on since."""
     encoder = BundledSemanticConfig().build()
     if (run.root / "style.safetensors").is_file():
         tensors = run.load_tensors("style")

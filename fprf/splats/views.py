@@ -124,7 +124,7 @@ def _rings(
 
 
 def _from_within(gaussians: Gaussians) -> bool:
-    """Whether what lies far out is coarser than the rest, or reaches far beyond it."""
+    """True where what lies far out is coarser than the rest, or reaches far beyond it."""
     seen = gaussians.opacities > 0.3
     if int(seen.sum()) < 100:
         return False

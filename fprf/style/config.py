@@ -110,16 +110,16 @@ NO_MASK = Path("none")
 
 @dataclass(frozen=True, kw_only=True)
 class StyleConfig:
-    """How photographs become the style of a scene. REGION and REFERENCE are explained above."""
+    """Controls of the style. REGION and REFERENCE are explained above."""
 
     references: tuple[Path, ...] = ()
     """Photographs whose style the scene takes, or folders of them."""
     weights: tuple[float, ...] = ()
-    """How much each reference counts, in their order, above 0; none = all alike."""
+    """Weight of each reference, in their order, above 0; none = all alike."""
     masks: tuple[Path, ...] = ()
     """A picture for each reference, in their order: only what is white there makes style codes; `none` = all of it."""
     stylizer: StylizerConfig = RegionToneConfig()
-    """What moves the scene's features."""
+    """Method that moves the scene's features."""
     clusters: int = 20
     """Local styles (codes) per reference, at least 1."""
     blend: float = 0.1
@@ -127,7 +127,7 @@ class StyleConfig:
     strength: float = 1.0
     """0 leaves the scene bit for bit as it is, 1 is the full style."""
     luminance: float = 0.0
-    """How much of the scene's own luminance is kept, in [0, 1]; at 1 the references give their tints alone."""
+    """Share of the scene's own luminance that is kept, in [0, 1]; at 1 the references give their tints alone."""
     pin: tuple[str, ...] = ()
     """REGION=REFERENCE: the region takes its style from this reference (from any of them, if pinned to several)."""
     forbid: tuple[str, ...] = ()
@@ -141,7 +141,7 @@ class StyleConfig:
     between: Path | None = None
     """Another style file: the result lies between this style and that one, feature by feature."""
     at: float = 0.5
-    """Where between the two styles, in [0, 1]: 0 = this one, 1 = the other."""
+    """Place between the two styles, in [0, 1]: 0 = this one, 1 = the other."""
 
     def __post_init__(self) -> None:
         for name in ("blend", "strength", "luminance", "at"):

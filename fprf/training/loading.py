@@ -98,7 +98,7 @@ class LoadedRun(NamedTuple, Generic[S]):
     known: Known
     step: int
     seconds: float
-    """How long it was trained."""
+    """Training time."""
     scene: S
 
 
@@ -113,7 +113,7 @@ class Trained(Scene):
     model: Model
     step: int
     seconds: float
-    """How long it was trained."""
+    """Training time."""
     damaged: tuple[str, ...] = ()
     """A line for each newer checkpoint that could not be used."""
     look: Restyle | None = None

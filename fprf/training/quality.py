@@ -44,7 +44,7 @@ PRESETS: dict[Name, Preset] = {
 
 @dataclass(frozen=True, kw_only=True)
 class QualityConfig:
-    """How much time an image may take."""
+    """Limit of the time for an image."""
 
     quality: Name | None = None
     """draft, standard or best; none = as the run's own config says."""

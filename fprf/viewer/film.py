@@ -153,7 +153,7 @@ class FilmRecorder:
         threading.Thread(target=self._play, args=(client, plan, move, over), name="fprf-flight", daemon=True).start()
 
     def playing(self, client: Hashable) -> bool:
-        """Whether a flight is shown to a client."""
+        """True while a flight is shown to a client."""
         return client in self._flights
 
     def stop(self, client: Hashable) -> None:

@@ -49,12 +49,12 @@ _LEAVING = 3.0
 
 
 class ViewAddress(NamedTuple):
-    """Where to listen."""
+    """Address to listen at."""
 
     host: str = "127.0.0.1"
     port: int = 8080
     strict: bool = False
-    """Whether another free port will not do."""
+    """True where another free port will not do."""
 
 
 class LiveViewer:
@@ -98,7 +98,7 @@ class LiveViewer:
 
     @property
     def looked_at(self) -> bool:
-        """Whether somebody looks."""
+        """True while somebody looks."""
         return self._looking.is_set()
 
     @property
@@ -232,7 +232,7 @@ class TrainingFollower:
 
     @property
     def over(self) -> bool:
-        """Whether training has ended and nobody looks."""
+        """True when training has ended and nobody looks."""
         return self._ended and not self._looking
 
     def receive(self, said: dict[str, Any]) -> None:

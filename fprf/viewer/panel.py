@@ -89,12 +89,12 @@ class Panel:
 
     @property
     def cameras(self) -> bool:
-        """Whether captured cameras are drawn."""
+        """True where captured cameras are drawn."""
         return bool(self._cameras.value)
 
     @property
     def blocks(self) -> bool:
-        """Whether the boxes of blocks are drawn."""
+        """True where the boxes of blocks are drawn."""
         return bool(self._blocks.value)
 
     @property

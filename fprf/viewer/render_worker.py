@@ -63,13 +63,13 @@ class RenderWorker(Generic[Request]):
 
     @property
     def idle(self) -> bool:
-        """Whether no client waits; work for idle times does not count."""
+        """True where no client waits; work for idle times does not count."""
         with self._change:
             return not (self._busy or self._fresh or self._active or self._jobs)
 
     @property
     def closed(self) -> bool:
-        """Whether `close` was called."""
+        """True after `close`."""
         return self._closed
 
     def close(self, timeout: float = 5.0) -> None:

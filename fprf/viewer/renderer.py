@@ -62,7 +62,7 @@ _UNSURE = 0.45
 
 
 class RenderRequest(NamedTuple):
-    """What a client wants to see."""
+    """A client's request for a picture."""
 
     camera: CameraState
     view: ViewSettings
@@ -76,7 +76,7 @@ class Layers:
 
     pictures: dict[str, Picture]
     share: NDArray[np.float32] | None
-    """How much of each pixel belongs to the region that is picked, [H W]."""
+    """Share of each pixel that belongs to the region that is picked, [H W]."""
     depth: Tensor
     """World distance along each ray, [H W]; infinite where there is nothing."""
 
@@ -233,7 +233,7 @@ class ProgressiveRenderer(SceneRenderer):
 
 
 def _covers(before: RenderRequest, now: RenderRequest) -> bool:
-    """Whether the layers of one request serve the other."""
+    """True where the layers of one request serve the other."""
     same = before.camera == now.camera and before.pixels == now.pixels and before.view.look == now.view.look
     return same and before.view.layers >= now.view.layers
 
@@ -301,7 +301,7 @@ class LayerRenderer:
         return _row(to_uint8(region_colours(self._memberships(part), part.opacity)[None]))
 
     def _memberships(self, part: Part) -> Tensor:
-        """How much each pixel belongs to each region."""
+        """Return the share of each pixel in each region."""
         assert self.scene is not None
         weight = RegionWeight(self.scene, torch.eye(len(self.scene.share))).to(part.content.device)
         semantic = part.content[:, :0] if part.semantic is None else part.semantic

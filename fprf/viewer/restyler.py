@@ -133,7 +133,7 @@ class Restyler:
         return int(share[0].argmax()) if float(opacity[0]) >= _SOLID else None
 
     def region_info(self, look: Look, region: int) -> RegionInfo:
-        """What a region takes in a look."""
+        """Return the style that a region takes in a look."""
         scene, styled = self.encoders.scene, self.styled(look)
         taken: list[tuple[str, float]] = []
         if styled is not None:

@@ -37,7 +37,7 @@ _KINDS = "photographs, a video, or a capture of 3D Gaussians (.ply .splat .spz .
 
 
 class Source(NamedTuple):
-    """What a scene is made of."""
+    """Kind of source that a scene is made of."""
 
     kind: SourceKind
     """`scene` = photographs with their poses."""
@@ -45,12 +45,12 @@ class Source(NamedTuple):
 
 
 def is_capture(path: Path) -> bool:
-    """Whether a path is named like a capture of 3D Gaussians."""
+    """True for a path that is named like a capture of 3D Gaussians."""
     return path.suffix.lower() in CAPTURE_SUFFIXES or path.name == "meta.json" or (path / "meta.json").is_file()
 
 
 def find_source(path: Path) -> Source:
-    """What a file or folder holds, by names alone. Raises DataError where no scene can be made of it."""
+    """Return the kind of a file or folder, by names alone. Raises DataError where no scene can be made of it."""
     if (path / "config.json").is_file():
         return Source("run", path)
     if is_capture(path):

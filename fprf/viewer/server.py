@@ -76,7 +76,7 @@ Loading the scene ..."""
 
 @dataclass(frozen=True)
 class Access:
-    """What a request must show to be answered."""
+    """Checks that a request must pass to be answered."""
 
     host: str
     """Address that is listened on."""
@@ -109,7 +109,7 @@ def make_access(host: str, token: str | None) -> Access:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address means this machine alone."""
+    """True for a name or address of this machine alone."""
     if host.lower() == "localhost":
         return True
     try:

@@ -59,7 +59,7 @@ class Viewed:
     space: Space | None = None
     """Of fields, in which blocks lie."""
     stylizer: RegionToneConfig | None = None
-    """What a look is based on; None = the default."""
+    """Style that a look starts from; None = the default."""
 
 
 def view_of_run(scene: Scene, run: Run, known: Known) -> Viewed:
@@ -167,17 +167,17 @@ class Session:
 
     @property
     def has_clients(self) -> bool:
-        """Whether anybody is connected."""
+        """True while anybody is connected."""
         return bool(self._cameras)
 
     @property
     def in_browser(self) -> bool:
-        """Whether the clients' browsers draw the scene, not this machine."""
+        """True where the clients' browsers draw the scene, not this machine."""
         return isinstance(self.viewed.scene, SplatScene)
 
     @property
     def idle(self) -> bool:
-        """Whether all clients have their sharpest picture."""
+        """True when all clients have their sharpest picture."""
         return self._worker.idle
 
     def reload(self, load: Callable[[], Viewed], open_encoders: OpenEncoders | None = None) -> None:
@@ -324,7 +324,7 @@ class Session:
         return Thumbnail(self._thumbnails, shrink(picture, _THUMBNAIL))
 
     def _result(self, name: Hashable, call: Callable[[], T]) -> T:
-        """What a call returns that runs on the worker. Raises what it raises."""
+        """Run a call on the worker and return its result. Raises what it raises."""
         done: Future[T] = Future()
 
         def job() -> None:

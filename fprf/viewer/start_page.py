@@ -42,20 +42,20 @@ Stage: TypeAlias = Literal["idle", "poses", "training", "opening", "open"]
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a scene is made."""
+    """Progress of a scene that is being made."""
 
     name: str = ""
     stage: Stage = "idle"
     what: str = ""
-    """What is done now, in words."""
+    """Present stage, in words."""
     share: float | None = None
     """Of `what`, in [0, 1]; None = not known."""
     detail: str = ""
     lines: tuple[str, ...] = ()
-    """What the processes said, the last lines of it."""
+    """Last lines of the processes' output."""
     error: str | None = None
     folder: str = ""
-    """Where everything lies."""
+    """Folder that everything lies in."""
 
 
 class _Left(Exception):
@@ -72,7 +72,7 @@ class StartPage:
         self._lock, self._drawing = threading.Lock(), threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._stopped = ""
-        """What was asked for when it was stopped: `show` or `leave`."""
+        """Request on which it was stopped: `show` or `leave`."""
         self._thread: threading.Thread | None = None
         self._picture: tuple[int, bytes] = (-1, b"")
 
@@ -318,7 +318,7 @@ def _newest(run: Path) -> int:
 
 
 def _kind(path: Path) -> str:
-    """What a scene on the list is: `trained`, a `capture`, or photographs that are `not trained yet`."""
+    """Kind of a scene on the list: `trained`, a `capture`, or photographs that are `not trained yet`."""
     if path.name != _FILES:
         return "trained"
     return "capture" if any(is_capture(each) for each in (path, *path.iterdir())) else "not trained yet"
@@ -331,7 +331,7 @@ def _runs(folder: Path) -> Iterator[Path]:
 
 
 def _scenes(output: Path) -> Iterator[tuple[Path, str]]:
-    """What the folder of each scene is opened by: its run, or its files where there is none yet."""
+    """Path that each scene's folder is opened by: its run, or its files where there is none yet."""
     for folder in output.glob("*/"):
         opened = folder / _RUN if _newest(folder / _RUN) >= 0 else folder / _FILES
         if opened.is_dir():

@@ -80,7 +80,7 @@ class Photograph:
 
 
 class RegionRule(NamedTuple):
-    """What a region may take its style from; `photograph` is None where the region is kept as it is."""
+    """A style that a region may take; `photograph` is None where the region is kept as it is."""
 
     region: int
     action: RegionAction
@@ -89,7 +89,7 @@ class RegionRule(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How the scene is coloured. Ranges are those of `StyleConfig`."""
+    """Controls of the scene's colours. Ranges are those of `StyleConfig`."""
 
     mix: tuple[tuple[Photograph, float], ...] = ()
     """Photographs with their weights, above 0, in the order of the shelf; none = the scene as it is."""
@@ -100,7 +100,7 @@ class Look:
     blend: float = 0.1
     luminance: float = 0.0
     smoothness: float = RegionToneConfig.smoothness
-    """How alike neighbouring regions without an edge between them are styled, at least 0."""
+    """Smoothness of styles between neighbouring regions without an edge between them, at least 0."""
     rules: frozenset[RegionRule] = frozenset()
     towards: "Look | None" = None
     """Another look, which has none itself, and how far the scene is on the way to it, in [0, 1]."""
@@ -117,7 +117,7 @@ class Look:
 
     @property
     def plain(self) -> bool:
-        """Whether it is the scene as it was captured."""
+        """True for the scene as it was captured."""
         return (not self.mix or self.strength == 0) and (self.towards is None or self.at == 0)
 
 
@@ -209,7 +209,7 @@ def _renumbered(look: Look, regions: Sequence[int]) -> Look:
 
 
 class ViewSettings(NamedTuple):
-    """What the page shows of a view."""
+    """Parts of a view that the page shows."""
 
     look: Look
     map: Map = "none"
@@ -221,7 +221,7 @@ class ViewSettings(NamedTuple):
 
     @property
     def shows_regions(self) -> bool:
-        """Whether regions of the scene are shown."""
+        """True where regions of the scene are shown."""
         return self.map == "regions" or self.region is not None
 
     @property
@@ -275,13 +275,13 @@ class FilmProgress:
 
     @property
     def busy(self) -> bool:
-        """Whether it is being made."""
+        """True while it is being made."""
         return self.total > 0 and self.path is None
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """How far a training run has come."""
+    """Progress of a training run."""
 
     step: int = 0
     share: float = 0.0
@@ -290,12 +290,12 @@ class TrainingProgress:
     """Of the training rays; None = not known yet."""
     seconds_left: float | None = None
     what: str = ""
-    """Which part of a scene in blocks."""
+    """A part of a scene in blocks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What is shown, to all clients alike but for their cameras."""
+    """State of the page, for all clients alike but for their cameras."""
 
     shelf: tuple[Photograph, ...] = ()
     look: Look = Look()
@@ -304,14 +304,14 @@ class State:
     map_opacity: float = 0.85
     wipe: float | None = None
     picking: bool = False
-    """Whether a click on the scene picks a region."""
+    """True where a click on the scene picks a region."""
     picked: RegionInfo | None = None
     saved: tuple[tuple[str, Look], ...] = ()
     """Looks that were kept, by name."""
     keys: tuple[Key, ...] = ()
     selected_key: int | None = None
     playing: bool = False
-    """Whether a flight is shown to somebody."""
+    """True while a flight is shown to somebody."""
     film: FilmProgress = FilmProgress()
     pictures: tuple[Path, ...] = ()
     """Pictures that were saved."""
@@ -332,13 +332,13 @@ class State:
 
     @property
     def view(self) -> ViewSettings:
-        """What is to be rendered."""
+        """Return the layers to render."""
         region = self.picked.region if self.picked is not None else None
         return ViewSettings(self.look, self.map, self.map_opacity, self.wipe, region)
 
     @property
     def names_regions(self) -> bool:
-        """Whether some region is referred to by its number."""
+        """True where some region is referred to by its number."""
         return self.picked is not None or any(look.rules for look in self._looks)
 
     @property

@@ -72,7 +72,7 @@ class Uploads:
 
     @property
     def folder(self) -> Path:
-        """Where photographs lie as long as the viewer runs."""
+        """Folder of the photographs as long as the viewer runs."""
         return Path(self._folder.name)
 
     def start_decoder(self) -> None:

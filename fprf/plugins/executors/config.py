@@ -45,7 +45,7 @@ class RayConfig(ExecutorConfig):
     """Tasks on many processes or machines, by Ray (`pip install "fprf[cluster]"`; `fprf cluster` explains)."""
 
     address: str = ""
-    """Where a cluster runs, HOST:PORT, or auto for the one of this machine; empty = one is started here."""
+    """Address of a running cluster, HOST:PORT, or auto for the one of this machine; empty = one is started here."""
     workers: int = 2
     """Tasks at a time, where the cluster is started here."""
     processors: float = 1.0
@@ -53,7 +53,7 @@ class RayConfig(ExecutorConfig):
     gpus: float | None = None
     """GPUs that a task takes, or its share of one; 0 hides them from it. None = 1 where training is on CUDA, else 0."""
     retries: int = 3
-    """How often a task whose worker died is started again."""
+    """Times that a task whose worker died is started again."""
 
     def __post_init__(self) -> None:
         at_least("executor.workers", self.workers, 1)

@@ -64,7 +64,7 @@ class ProposalConfig(SamplerConfig):
     anneal_steps: int = 1000
     """Steps over which proposals sharpen from even to trusted."""
     anneal_slope: float = 10.0
-    """How fast they sharpen at first."""
+    """Sharpness at first."""
     padding: float = 1e-3
     """Total probability spread evenly over a ray, so that no place is ruled out; above 0."""
     update_every: int = 5

@@ -40,9 +40,9 @@ class StylizerConfig(PluginConfig):
     """Its stylizers apply `StyleDictionary.allowed` themselves. For others every choice of references gets one of its own."""
 
     features: float = 1.0
-    """How much of the change of features counts, in [0, 1]."""
+    """Share of the change of features that counts, in [0, 1]."""
     colours: float = 0.0
-    """How far the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
+    """Share by which the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
 
     def __post_init__(self) -> None:
         between("stylizer.features", self.features, 0.0, 1.0)
@@ -116,21 +116,21 @@ class _RegionConfig(StylizerConfig):
 
     handles_allowed_references: ClassVar[bool] = True
     transport: ClassVar[bool] = False
-    """Whether each region's map is the optimal transport of all channels, else AdaIN, channel by channel."""
+    """Map each region by the optimal transport of all channels; else AdaIN, channel by channel."""
 
     temperature: float = 0.4
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     similarity: Literal["cosine", "dot"] = "cosine"
     """Score of a match: cosine of centred features, or their dot product."""
     whitening: float = 0.5
-    """How far both sides' semantics are whitened before they are scored as cosines, in [0, 1]; 0 = not at all."""
+    """Whitening of both sides' semantics before they are scored as cosines, in [0, 1]; 0 = none."""
     recentred: int = 5
-    """How often the references' centre is taken again from the codes that the scene takes; 0 = the mean of all codes."""
+    """Times that the references' centre is taken again from the codes that the scene takes; 0 = the mean of all codes."""
     centred: bool = True
     """Cosines are taken from the mean of each side; False = from the encoder's own origin, without whitening: for single
     objects, whose mean says nothing about that of a landscape."""
     smoothness: float = 0.0
-    """How alike the styles of regions are made that meet without an edge of colour between them, at least 0; 0 = each by
+    """Likeness of the styles of regions that meet without an edge of colour between them, at least 0; 0 = each by
     itself. A run from before this was measured is left as it is."""
     gain: float = 8.0
     """Largest amplification of any channel or direction, at least 1, so that the noise of flat regions stays small."""
@@ -178,11 +178,11 @@ class RegionToneConfig(_RegionConfig):
     """Two-sided (recommended): half of AdaIN's change, then each region's colours as a whole to those of its match."""
 
     features: float = 0.5
-    """How much of the change of features (contrast, texture) counts, in [0, 1]."""
+    """Share of the change of features (contrast, texture) that counts, in [0, 1]."""
     colours: float = 1.0
-    """How far the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
+    """Share by which the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
     temperature: float = 0.2
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     smoothness: float = 16.0
-    """How alike the styles of regions are made that meet without an edge of colour between them, at least 0; 0 = each by
+    """Likeness of the styles of regions that meet without an edge of colour between them, at least 0; 0 = each by
     itself. A run from before this was measured is left as it is."""

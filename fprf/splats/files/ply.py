@@ -122,7 +122,7 @@ def ply_bytes(gaussians: Gaussians, antialiased: bool, normals: Floats | None = 
 
 
 def is_compressed(data: bytes) -> bool:
-    """Whether a PLY has SuperSplat's layout."""
+    """True for a PLY with SuperSplat's layout."""
     return b"packed_position" in data[:_HEADER].partition(b"end_header")[0]
 
 

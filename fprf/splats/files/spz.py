@@ -152,7 +152,7 @@ def _header(path: Path, data: bytes) -> _Header:
 
 
 def _unzip(path: Path, data: bytes) -> bytes:
-    """What a gzip file holds: the header first, then no more than that announces."""
+    """Return the content of a gzip file: the header first, then no more than that announces."""
     try:
         head = zlib.decompressobj(31).decompress(data, _HEADER.size)
         header = _header(path, head)
@@ -191,7 +191,7 @@ def _frames(path: Path, data: bytes, header: _Header) -> list[bytes]:
 
 
 def _toc(path: Path, data: bytes, header: _Header) -> tuple[int, list[tuple[int, int]]]:
-    """Where the streams begin, and their packed and raw sizes."""
+    """Return the starts of the streams, and their packed and raw sizes."""
     if len(data) < _WIDE_HEADER.size:
         raise short(path, len(data), _WIDE_HEADER.size, "the header")
     *_, count, at = _WIDE_HEADER.unpack_from(data)
