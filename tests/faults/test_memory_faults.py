@@ -94,7 +94,7 @@ raise SystemExit(cli.main(["train", "fprf-lite", *sys.argv[1:]]))
 def python(text: str, *args: object) -> subprocess.CompletedProcess[str]:
     words = [sys.executable, "-c", BEGIN + text, *map(str, args)]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "1"}
-    environment["MALLOC_MMAP_THRESHOLD_"] = "65536"  # what is freed goes back, so that pieces of the heap do not use up the room
+    environment["MALLOC_MMAP_THRESHOLD_"] = "65536"  # freed memory goes back: no room lost in pieces of the heap
     return subprocess.run(words, capture_output=True, text=True, timeout=250, env=environment)
 
 
