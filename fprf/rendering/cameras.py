@@ -14,7 +14,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from .lens import bend, lens_reach, unbend
+from .lens import PINHOLE, bend, lens_reach, unbend
 
 __all__ = ["LIMIT", "Cameras", "PixelRays", "grid_rays", "normals", "pixel_grid", "project", "rays_through", "sees"]
 
@@ -131,10 +131,14 @@ LIMIT = 256 * 2**20
 
 
 class PixelRays:
-    """`rays_through` for pixels at their centres (+0.5), equal to it within float64 rounding."""
+    """`rays_through` for pixels at their centres (+0.5), equal to it within float64 rounding.
+
+    Directions are kept for each kind of lens, up to `limit` bytes; those of pinholes beyond it are found without iteration.
+    """
 
     def __init__(self, cameras: Cameras, *, limit: int = LIMIT) -> None:
         self.cameras = cameras
+        self.pinholes = bool((cameras.lens == PINHOLE).all())
         described = torch.cat(
             [cameras.focal, cameras.centre, cameras.distortion, cameras.size.double(), cameras.lens[:, None].double()], -1
         )
@@ -145,6 +149,11 @@ class PixelRays:
         self.table: Tensor | None = None
         if int(area.sum()) * 24 <= limit:
             self.table = torch.cat([self._solve(int(view)) for view in first])
+
+    @property
+    def waits(self) -> bool:
+        """True where an accelerator would make the host wait: lenses beyond the limit are inverted by iteration."""
+        return self.table is None and not self.pinholes
 
     @property
     def device(self) -> torch.device:
@@ -161,10 +170,14 @@ class PixelRays:
         self, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"]
     ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
         """Origin and unit direction in the world, float64."""
-        if self.table is None:
+        if self.table is not None:
+            x, y = pixel.long().unbind(-1)
+            local = self.table[self.start[self.kind[view]] + y * self.cameras.size[view, 0] + x]
+        elif self.pinholes:
+            x, y = _plane(self.cameras, view, pixel).unbind(-1)
+            local = torch.nn.functional.normalize(torch.stack([x, -y, -torch.ones_like(x)], -1), dim=-1)
+        else:
             return rays_through(self.cameras, view, pixel)
-        x, y = pixel.long().unbind(-1)
-        local = self.table[self.start[self.kind[view]] + y * self.cameras.size[view, 0] + x]
         pose = self.cameras.pose[view]
         return pose[:, :, 3], (pose[:, :, :3] @ local[:, :, None])[:, :, 0]
 

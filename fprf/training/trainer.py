@@ -191,7 +191,7 @@ class Loop:
             self.manager = prepared.manager.to(device, room=int(config.device_memory * (free or 0)))
         self.batches = Batches(self.manager, device)
         self.through = PixelRays(prepared.scene.cameras)
-        if device.type != "mps":  # which has no float64: rays are made on the CPU
+        if device.type != "mps" and not self.through.waits:  # MPS has no float64: rays are made on the CPU, as those that wait
             self.through.to(device)
         self.background = background_of(prepared.facts, device)
         self.statistics = StepStatistics(device)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
 
 from fprf.rendering.cameras import LIMIT, Cameras, PixelRays, grid_rays, normals, pixel_grid, project, rays_through, sees
@@ -161,6 +162,20 @@ def test_every_pixel_of_mixed_cameras(offset: float, limit: int) -> None:
     assert torch.equal(origin, wanted_origin)
     assert (direction - wanted).abs().max() <= 1e-14
     assert (direction.norm(dim=-1) - 1).abs().max() <= 1e-14
+
+
+@pytest.mark.parametrize("offset", [0.0, 4.5e6])
+def test_many_pinholes_need_neither_a_table_nor_the_host(offset: float) -> None:
+    cameras = rig([PINHOLE] * 3, [(9, 6), (6, 9), (7, 7)], offset=offset)
+    rays = PixelRays(cameras, limit=0)
+    view, pixel = every_pixel(cameras)
+    origin, direction = rays_through(cameras, view, pixel)
+    assert rays.table is None and not rays.waits and PixelRays(rig(*MIXED), limit=0).waits
+    with pretend_cuda() as seen:
+        found = rays.to(CUDA)(view.to(CUDA), pixel.to(CUDA))
+        assert not seen.syncs
+        torch.testing.assert_close(found[0].cpu(), origin, rtol=0, atol=0)
+        torch.testing.assert_close(found[1].cpu(), direction, rtol=0, atol=1e-14)
 
 
 def test_a_lens_that_differs_in_anything_is_another() -> None:
