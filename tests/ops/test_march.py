@@ -110,6 +110,28 @@ def test_the_heaviest_are_kept(samples: int, budget: float, seed: int) -> None:
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("budget", [0.0, 0.1])
+def test_kept_samples_and_their_sums_are_those_of_masks(budget: float) -> None:
+    rays, steps, channels = 37, 11, 5
+    draw = torch.Generator().manual_seed(3)
+    density, t = 3 * torch.rand(rays, steps, generator=draw), torch.rand(rays, steps + 1, generator=draw).cumsum(1)
+    density[:5] = 0  # of these nothing is kept
+    point, latent = torch.rand(rays, steps, 3, generator=draw), torch.rand(rays * steps, channels, generator=draw)
+    view = torch.rand(rays, 3, generator=draw)
+    weighed = march.weigh(density, t, budget)
+    kept = march.gather(weighed, point, latent, view)
+    row, _ = weighed.keep.nonzero().unbind(1)
+    assert 0 < len(row) and (budget == 0 or len(row) < rays * steps)
+    assert torch.equal(kept.ray, row) and torch.equal(kept.weight, weighed.weights[weighed.keep])
+    assert torch.equal(kept.point, point[weighed.keep]) and torch.equal(kept.view, view[row])
+    assert torch.equal(kept.latent, latent.view(rays, steps, channels)[weighed.keep])
+    wanted = torch.zeros(rays, channels, dtype=torch.float64)
+    wanted.index_add_(0, row, kept.weight.double()[:, None] * kept.latent.double())
+    found = march.composite(kept.weight, kept.latent, weighed.start)
+    assert found.shape == wanted.shape and ((found - wanted).abs() <= (steps + 1) * U * wanted).all()
+
+
+@torch.no_grad()
 def test_a_nan_is_kept_to_be_seen() -> None:
     density = torch.full((2, 5), 0.1)
     density[0, 3] = float("nan")
