@@ -121,7 +121,7 @@ def test_kept_samples_and_their_sums_are_those_of_masks(budget: float) -> None:
     weighed = march.weigh(density, t, budget)
     kept = march.gather(weighed, point, latent, view)
     row, _ = weighed.keep.nonzero().unbind(1)
-    assert 0 < len(row) and (budget == 0 or len(row) < rays * steps)
+    assert len(row) > 0 and (budget == 0 or len(row) < rays * steps)
     assert torch.equal(kept.ray, row) and torch.equal(kept.weight, weighed.weights[weighed.keep])
     assert torch.equal(kept.point, point[weighed.keep]) and torch.equal(kept.view, view[row])
     assert torch.equal(kept.latent, latent.view(rays, steps, channels)[weighed.keep])
