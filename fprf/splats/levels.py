@@ -6,8 +6,10 @@ Kerbl et al. 2024, a hierarchical 3D Gaussian representation). A view takes of e
 which what was merged lies within a given number of pixels; the others cost it nothing.
 """
 
+import io
 import math
 import mmap
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,7 +38,9 @@ _SPREAD = 0.9
 """Quantile that says how wide a chunk is, and how far apart is what a level merges."""
 _PART = 1 << 17
 """Gaussians that are in memory at a time while levels are written."""
-_ROWS, _TABLES = "rows.bin", "chunks.npz"
+_TABLES = "begin", "spread", "centre", "radius", "core"
+_FILE, _LENGTH = "rows.bin", 8
+"""Rows, then an .npz archive of the tables, then the number of bytes of that archive in this many bytes, little endian."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,37 +130,40 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
 def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
     """Write levels of detail that `open_levels` maps, in bounded memory where the Gaussians are mapped from a file themselves.
 
-    Neighbours in memory should be neighbours in space, as the cells of a union are. Raises DataError where the system refuses.
+    Neighbours in memory should be neighbours in space, as the cells of a union are. All lies in one file, which is whole or that
+    of before. Raises DataError where the system refuses.
     """
-    tables: list[tuple[NDArray[Any], ...]] = []
+    columns: list[tuple[NDArray[Any], ...]] = []
     written = 0
-    with atomic_path(folder / _ROWS) as temporary, temporary.open("wb") as file:
+    with atomic_path(folder / _FILE) as temporary, temporary.open("wb") as file:
         for first in range(0, len(gaussians), _PART):
             levels = make_levels_of_detail(gaussians.select(torch.arange(first, min(first + _PART, len(gaussians)))))
             file.write(levels.rows.tobytes())
-            tables.append((levels.begin + written, levels.spread, levels.centre, levels.radius, levels.core))
+            columns.append((levels.begin + written, levels.spread, levels.centre, levels.radius, levels.core))
             written += len(levels.rows)
-        width = levels.rows.shape[1]
-    begin, spread, centre, radius, core = (np.concatenate(columns) for columns in zip(*tables, strict=True))
-    parts = {"begin": begin, "spread": spread, "centre": centre, "radius": radius, "core": core}
-    with atomic_path(folder / _TABLES) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, key=np.array(key), width=np.array(width), **parts)
+        parts = dict(zip(_TABLES, (np.concatenate(column) for column in zip(*columns, strict=True)), strict=True))
+        tables = io.BytesIO()
+        np.savez(tables, allow_pickle=False, key=np.array(key), width=np.array(levels.rows.shape[1]), **parts)
+        file.write(tables.getvalue() + len(tables.getvalue()).to_bytes(_LENGTH, "little"))
 
 
 def open_levels(folder: Path, key: str) -> Levels | None:
-    """Levels mapped from files; None where there are none of this key."""
+    """Levels mapped from a file; None where there are none of this key."""
     try:
-        with np.load(folder / _TABLES) as tables:
+        with (folder / _FILE).open("rb") as file:
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        end = len(mapped) - _LENGTH
+        begin = end - int.from_bytes(mapped[end:], "little")
+        if begin < 0:
+            return None
+        with np.load(io.BytesIO(mapped[begin:end])) as tables:
             if str(tables["key"]) != key:
                 return None
-            parts = {name: tables[name] for name in ("begin", "spread", "centre", "radius", "core")}
-            width = int(tables["width"])
-        with (folder / _ROWS).open("rb") as file:
-            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        rows = np.frombuffer(mapped, np.float32).reshape(-1, width)
-    except (OSError, ValueError, KeyError):
+            parts = {name: tables[name] for name in _TABLES}
+            rows = np.frombuffer(mapped, np.float32, begin // 4).reshape(-1, int(tables["width"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    return Levels(rows=rows, **parts, mapped=mapped) if len(rows) == parts["begin"][-1, -1] else None
+    return Levels(rows=rows, **parts, mapped=mapped)
 
 
 def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 from splat_ball import ball
 
@@ -62,5 +63,21 @@ def test_levels_in_files_show_the_same(tmp_path: Path) -> None:
         made = make_levels_of_detail(gaussians).select(_camera(100.0, 300.0), pixels)
         found = stored.select(_camera(100.0, 300.0), pixels)
         assert all(map(torch.equal, vars(made).values(), vars(found).values()))
-    (tmp_path / "rows.bin").write_bytes(b"")
-    assert open_levels(tmp_path, "key") is None
+    file = tmp_path / "rows.bin"
+    whole = file.read_bytes()
+    for damaged in (b"", whole[:-1], whole[: len(whole) // 2], bytes(len(whole))):
+        file.write_bytes(damaged)
+        assert open_levels(tmp_path, "key") is None
+
+
+def test_levels_stay_those_of_before_where_writing_ends_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_levels(tmp_path, _scattered(2000), "before")
+    monkeypatch.setattr("fprf.splats.levels.np.savez", _interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_levels(tmp_path, _scattered(2000).select(torch.arange(1999, -1, -1)), "after")
+    assert open_levels(tmp_path, "before") is not None and open_levels(tmp_path, "after") is None
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.bin"]
+
+
+def _interrupted(*args: object, **named: object) -> None:
+    raise KeyboardInterrupt
