@@ -84,7 +84,7 @@ def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
     folder.save_config(config, "fprf-splats")
     folder.save_known(scene, data, facts)
     lit_after = time.process_time() - start
-    found = write_cells(run, scene, cells)
+    found = write_cells(run, scene, data, cells)
     cut_after = time.process_time() - start
     train_overview(run, config, scene, lambda event: None, spent=0.0)
     return {

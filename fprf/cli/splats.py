@@ -196,7 +196,7 @@ def _train_cells(config: "GaussiansConfig", folder: "Run", scene: "Scene", displ
     from .progress import EventLog
 
     assert config.data is not None
-    cells = write_cells(folder.root, scene, config.cells)
+    cells = write_cells(folder.root, scene, config.data, config.cells)
     pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
     whole = int(scene.cameras.size[scene.train].prod(1).sum())
     display.say(f"{_described(scene)}, {len(cells)} cells, whose windows are {sum(pixels) / whole:.2f} times the photographs")

@@ -5,6 +5,7 @@ in rounds: what is seen through the Gaussians of a neighbour is explained by bot
 union again.
 
 RUN/cells.json                               the cut: boxes, and the windows of each
+RUN/views.json                               where images and masks lie, so that no cell reads the whole scene folder again
 RUN/overview/checkpoints/, done.json         the whole scene, which the first round starts from
 RUN/cells/R/NN/checkpoints/, events.jsonl    a cell in round R, as of any run
 RUN/cells/R/NN/done.json                     what the finished cell was trained as
@@ -43,7 +44,7 @@ from .training import Prepared, gaussians_of, load_photographs, prepare, reach_o
 
 __all__ = ["OVERVIEW", "CellTask", "folder_of", "read_cells", "train_cell", "train_overview", "unite", "write_cells"]
 
-_FORMAT = 2
+_FORMAT, _VIEWS = 2, "views.json"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
 _PIXELS, _SMALLEST = 16_000_000, 4
@@ -76,8 +77,11 @@ def _start_of(root: Path, round: int) -> Path:
     return (root / "cells" / str(round - 1) if round else root / OVERVIEW) / "checkpoints"
 
 
-def write_cells(root: Path, scene: Scene, count: int) -> list[Cell]:
-    """Cut a scene and write cells.json; cells of another cut, which could be taken for these, are removed."""
+def write_cells(root: Path, scene: Scene, data: Path, count: int) -> list[Cell]:
+    """Cut the scene of a folder `data`, and write cells.json and views.json.
+
+    Cells of another cut, which could be taken for these, are removed.
+    """
     cells = cut(scene, count)
     file = root / "cells.json"
     document = {
@@ -96,7 +100,34 @@ def write_cells(root: Path, scene: Scene, count: int) -> list[Cell]:
     if file.is_file() and json.loads(file.read_text()) != document:
         shutil.rmtree(root / "cells", ignore_errors=True)
     write_json(file, document)
+    (root / _VIEWS).unlink(missing_ok=True)
+    if all(path is None or path.is_relative_to(data) for path in (*scene.paths, *scene.masks)):
+        files = {"paths": scene.paths, "masks": scene.masks}
+        write_json(
+            root / _VIEWS,
+            {name: [path and path.relative_to(data).as_posix() for path in paths] for name, paths in files.items()},
+        )
     return cells
+
+
+def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
+    """The views of a run's scene with their images in the folder `data`; parsed where the run does not list them.
+
+    Raises CheckpointError where the list cannot be read.
+    """
+    file = root / _VIEWS
+    if not file.is_file():
+        return scene_of(replace(config, data=data))
+    known = Run(root).load_known()
+    try:
+        document = json.loads(file.read_text())
+        paths, masks = (tuple(name and data / name for name in document[kind]) for kind in ("paths", "masks"))
+        if len(paths) != len(known.cameras):
+            raise ValueError(f"{len(paths)} images for {len(known.cameras)} cameras")
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise CheckpointError(f"{file}: cannot be read ({e!r}); train again to write it") from e
+    train, test = torch.tensor(known.train), torch.tensor(known.test, dtype=torch.int64)
+    return Scene(name=known.name, paths=paths, cameras=known.cameras, train=train, test=test, masks=masks)
 
 
 def read_cells(root: Path) -> list[Cell]:
@@ -171,7 +202,7 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
     folder, before = folder_of(root, task.round, task.cell), _start_of(root, task.round)
     config = Run(root).load_config()[0]
     assert isinstance(config, GaussiansConfig)
-    scene = scene_of(replace(config, data=Path(task.data)))
+    scene = _read_views(root, config, Path(task.data))
     cell = read_cells(root)[task.cell]
     with held(folder):
         start, _ = checkpoint.load_latest(before)

@@ -12,7 +12,7 @@ import torch
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene, find_sightings
-from fprf.splats.cell_training import read_cells
+from fprf.splats.cell_training import CellTask, read_cells, train_cell
 from fprf.splats.cells import Cell, cut
 from fprf.splats.files import read_capture
 from fprf.town.write import write_town
@@ -89,4 +89,11 @@ def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Sce
     assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cells]).sum(0).eq(1).all()
     document = json.loads((run / "cells.json").read_text())
     assert math.isclose(sum(len(cell.windows) for cell in cells), sum(len(each["windows"]) for each in document["cells"]))
+    # A worker reads its own views alone, not the scene folder's list of all.
+    shutil.rmtree(run / "cells" / "1" / "02")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fprf.splats.training.parse_scene", None)
+        task = CellTask(root=str(run), data=str(town), round=1, cell=2, minutes=None, quiet=True)
+        assert train_cell(task, lambda event: None)
+    assert main(command) == 0 and exported("c.ply") == first
     assert main(["eval", str(run), "--split", "test"]) == 0
