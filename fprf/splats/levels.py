@@ -130,8 +130,8 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
 def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
     """Write levels of detail that `open_levels` maps, in bounded memory where the Gaussians are mapped from a file themselves.
 
-    Neighbours in memory should be neighbours in space, as the cells of a union are. All lies in one file, which is whole or that
-    of before. Raises DataError where the system refuses.
+    Neighbours in memory should be neighbours in space, as the cells of a union are. All lies in one file, which is replaced as
+    a whole. Raises DataError where the system refuses.
     """
     columns: list[tuple[NDArray[Any], ...]] = []
     written = 0
