@@ -369,7 +369,7 @@ def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"3 {encoder} {config}".encode())
+    digest.update(f"4 {encoder} {config}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 

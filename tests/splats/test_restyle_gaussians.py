@@ -169,6 +169,25 @@ def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
         find_views(nothing, count=2, size=(64, 48), up=up)
 
 
+def test_views_stand_where_the_sizes_of_gaussians_say_that_photographs_were_taken() -> None:
+    # A frontal scene in a sphere of surroundings; Gaussians look equally large from (4, 1, -3).
+    draws = torch.Generator().manual_seed(0)
+    place, count = torch.tensor([4.0, 1.0, -3.0]), 3000
+    front = torch.rand(count, 3, generator=draws) * torch.tensor([4.0, 3.0, 5.0]) + torch.tensor([2.0, -0.5, 0.0])
+    sphere = place + 60 * torch.nn.functional.normalize(torch.randn(300, 3, generator=draws), dim=1)
+    means = torch.cat([front, sphere])
+    size = ((means - place).norm(dim=1) * 0.02).log() + 0.2 * torch.randn(len(means), generator=draws)
+    size[count:] += 2
+    turn = torch.nn.functional.normalize(torch.randn(len(means), 4, generator=draws), dim=1)
+    scene = Gaussians(means, turn, size[:, None].expand(-1, 3).clone(), torch.full((len(means),), 3.0), means[:, None] * 0)
+    seen = find_views(scene, count=12, size=(64, 48), up=torch.tensor([0.0, -1.0, 0.0]))
+    eye, ahead = seen.pose[:, :, 3], -seen.pose[:, :, 2]
+    assert float((eye - place).norm(dim=1).median()) < 3
+    to_middle = torch.nn.functional.normalize(torch.tensor([4.0, 1.0, 2.5]) - eye, dim=1)
+    assert float((ahead * to_middle).sum(1).median()) > 0.8
+    assert all(float(draw(scene, camera_of(seen, v)).opacity.mean()) > 0.7 for v in range(len(seen)))
+
+
 def test_the_verb_writes_capture_sheet_page_and_style(
     photographs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
