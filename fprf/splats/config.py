@@ -45,7 +45,7 @@ class GaussiansConfig(RunConfig):
     """Gaussians at the end, at most."""
     pixels_per_gaussian: int = 20
     """Pixels of all training views for each Gaussian, at least: few photographs get fewer Gaussians. Not in cells."""
-    degree: int = 1
+    degree: int = 2
     """Degree of the harmonics of view-dependent colours, 0 to 3."""
     ssim: float = 0.2
     """Share of 1 - SSIM in the loss; the rest is the absolute error."""

@@ -49,7 +49,8 @@ def equal(a: Gaussians, b: Gaussians) -> bool:
 def config(tmp_path_factory: pytest.TempPathFactory) -> GaussiansConfig:
     town = tmp_path_factory.mktemp("splats") / "town"
     write_town(town, seed=0, palette="day", views=10, width=32, height=24)
-    return GaussiansConfig(data=town, initial=300, cap=600, surroundings=50, pixels_per_gaussian=1, relocate_every=20)
+    small = GaussiansConfig(data=town, initial=300, cap=600, surroundings=50, pixels_per_gaussian=1)
+    return replace(small, relocate_every=20, degree=1)
 
 
 @pytest.fixture(scope="module")
