@@ -33,7 +33,8 @@ _DESCRIPTION = """Restyle a finished capture of 3D Gaussians with photographs; i
 
 Reads and writes .ply, .compressed.ply, .splat, .spz, .sog and SOG folders (meta.json); the output's ending says which. In the
 format that was read everything but colours is kept bit for bit. REGION is a region's number (--explain lists them), its name
-in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png. REFERENCE is a file or its number, from 0 in the order given."""
+in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png; in --pin also a place: box:X,Y,Z:X,Y,Z:BORDER,
+path:X,Y,Z:X,Y,Z:WIDTH,BORDER or everywhere. REFERENCE is a file or its number, from 0 in the order given."""
 
 
 @dataclass(frozen=True, kw_only=True)

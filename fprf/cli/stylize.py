@@ -33,7 +33,8 @@ _HEAD = ("region", "share", "seen best at", "strength", "entropy", "takes")
 _DESCRIPTION = """Restyle captured views with photographs; no training, the same look from every viewpoint.
 
 REGION is a region's number (--explain lists them), its name in a style file, VIEW:X,Y (a pixel of a view) or VIEW:MASK.png
-(what a mask over a view covers). REFERENCE is a file or its number, from 0 in the order given."""
+(what a mask over a view covers); in --pin of Gaussians also a place: box:X,Y,Z:X,Y,Z:BORDER, path:X,Y,Z:X,Y,Z:WIDTH,BORDER or
+everywhere. REFERENCE is a file or its number, from 0 in the order given."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from ..interfaces import Encoder, Stylizer
 from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import ColourMaps, carried_colours
-from ..style.controls import luma
+from ..style.controls import luma, place_weight
 from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.scene import SceneStyle, membership, own_style
@@ -55,16 +55,16 @@ class Colours(Encoder):
 
 @torch.inference_mode()
 def restyled_harmonics(
-    before: Annotated[Tensor, "N K 3"], semantic: Annotated[Tensor, "N D"], look: Restyle
+    before: Annotated[Tensor, "N K 3"], means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"], look: Restyle
 ) -> Annotated[Tensor, "N K 3"]:
-    """Harmonics in a look, of Gaussians with these semantics. Those that it leaves alone (strength 0) stay, bit for bit."""
+    """Harmonics in a look, of Gaussians with these means and semantics. Those that it leaves alone (strength 0) stay, bit for bit."""
     out = []
     if look.idle:
         return before
     kept = sum(part.share * part.luminance for part in look.parts)
     for start in range(0, len(before), _ROWS):
         rows = before[start : start + _ROWS]
-        matrix, bias, weight = _change(look, semantic[start : start + _ROWS])
+        matrix, bias, weight = _change(look, means[start : start + _ROWS], semantic[start : start + _ROWS])
         matrix = matrix + torch.eye(3)
         if kept > 0:  # what the map adds to luma is taken back from all channels alike
             ones = torch.ones(1, 3)
@@ -111,7 +111,7 @@ def as_drawn(harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N K 3"
 
 
 def _change(
-    look: Restyle, semantic: Annotated[Tensor, "N D"]
+    look: Restyle, means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"]
 ) -> tuple[Annotated[Tensor, "N 3 3"], Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
     """The change of a look against the identity: A and b of each Gaussian, c' = c + c A + b, and its strength."""
     matrix, bias, weight = semantic.new_zeros(len(semantic), 3, 3), semantic.new_zeros(len(semantic), 3), semantic.new_zeros(())
@@ -123,16 +123,26 @@ def _change(
             * part.strength
             * (semantic.new_ones(len(semantic), 1) if part.regions is None else part.regions(semantic))
         )
-        if part.colours is not None:
-            maps = part.colours
-            belongs = membership(semantic, maps.semantic_mean, maps.units, maps.softness)
-            added = torch.einsum("nk,kcd->ncd", belongs, maps.matrix), belongs @ maps.bias
-        else:  # an affine stylizer is known by what it makes of black and of each channel alone
-            black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
-            rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black for axis in torch.eye(3)]
-            added = part.features * (torch.stack(rows, 1) - torch.eye(3)), part.features * black
+        added = _added(part, semantic)
+        for place, other in part.places:
+            inside = place_weight(place, means)[:, None]
+            if bool(inside.any()):
+                there = _added(other, semantic)
+                added = torch.lerp(added[0], there[0], inside[..., None]), torch.lerp(added[1], there[1], inside)
         matrix, bias, weight = matrix + acts[..., None] * added[0], bias + acts * added[1], weight + acts[:, 0]
     return matrix, bias, weight
+
+
+def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> tuple[Annotated[Tensor, "N 3 3"], Annotated[Tensor, "N 3"]]:
+    """A and b of one part at full strength."""
+    if part.colours is not None:
+        maps = part.colours
+        belongs = membership(semantic, maps.semantic_mean, maps.units, maps.softness)
+        return torch.einsum("nk,kcd->ncd", belongs, maps.matrix), belongs @ maps.bias
+    # An affine stylizer is known by what it makes of black and of each channel alone.
+    black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
+    rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black for axis in torch.eye(3)]
+    return part.features * (torch.stack(rows, 1) - torch.eye(3)), part.features * black
 
 
 def region_maps(

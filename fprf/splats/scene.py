@@ -180,7 +180,8 @@ class SplatScene(Scene):
         """The same Gaussians in other colours."""
         if look is None or look.idle:
             return replace(self, harmonics=None)
-        return replace(self, harmonics=restyled_harmonics(self.gaussians.harmonics, self.found().features, look))
+        gaussians = self.gaussians
+        return replace(self, harmonics=restyled_harmonics(gaussians.harmonics, gaussians.means, self.found().features, look))
 
     def cached(self, cameras: Cameras, view: int) -> "GaussianView":
         """A view, of which nothing is kept: drawing it again takes milliseconds."""

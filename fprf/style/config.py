@@ -3,10 +3,11 @@
 What users write about regions, `REGION`, `REGION=REFERENCE`, `REGION=NUMBER`, as pairs of texts.
 
 A region is named by its number, by its name in a style file, by a pixel of a view (`VIEW:X,Y`) or by a mask over one
-(`VIEW:MASK.png`); a reference by its file or by its number, from 0 in the order given. What each text means is found out on
-a scene (`style.regions`); here is only the grammar.
+(`VIEW:MASK.png`), and in pins on Gaussians by a place (`parse_place`); a reference by its file or by its number, from 0 in
+the order given. What each text means is found out on a scene (`style.regions`); here is only the grammar.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,10 +24,12 @@ __all__ = [
     "NO_MASK",
     "PRESETS",
     "Pixel",
+    "Place",
     "RegionValue",
     "StyleConfig",
     "find_reference",
     "labels",
+    "parse_place",
     "parse_region_value",
     "parse_strength",
     "pixel_of",
@@ -50,6 +53,46 @@ class Pixel(NamedTuple):
 
     x: float
     y: float
+
+
+class Place(NamedTuple):
+    """A part of space, in the coordinates of the Gaussians: a box, or all that lies near to a path."""
+
+    points: tuple[tuple[float, ...], ...]
+    """Lowest and highest corner of the box, or the corners of the path."""
+    width: float | None
+    """Of the path, from side to side; None = a box."""
+    border: float
+    """Width of the soft border around it; 0 = a sharp one."""
+
+
+def parse_place(field: str, text: str) -> Place | None:
+    """`box:X,Y,Z:X,Y,Z[:BORDER]`, `path:X,Y,Z:X,Y,Z[...]:WIDTH[,BORDER]` or `everywhere`; None for another region.
+
+    Raises ConfigError naming the field.
+    """
+    kind, *parts = text.split(":")
+    if text == "everywhere":
+        return Place(((-math.inf,) * 3, (math.inf,) * 3), None, 0.0)
+    if kind not in ("box", "path"):
+        return None
+    try:
+        numbers = [tuple(map(float, part.split(","))) for part in parts]
+    except ValueError:
+        numbers = []
+    count = next((k for k, each in enumerate(numbers) if len(each) != 3), len(numbers))
+    points, sizes = numbers[:count], numbers[count:]
+    size = sizes[0] if len(sizes) == 1 else ()
+    given = all(0 <= value < math.inf for value in size) and not any(math.isnan(x) for point in points for x in point)
+    if kind == "box" and given and len(points) == 2 and len(sizes) <= 1 and len(size) == len(sizes):
+        low, high = (tuple(map(choose, *points)) for choose in (min, max))
+        return Place((low, high), None, *(size or (0.0,)))
+    if kind == "path" and given and len(points) >= 2 and size and all(map(math.isfinite, sum(points, ()))):
+        return Place(tuple(points), size[0], size[1] if len(size) > 1 else 0.0)
+    raise ConfigError(
+        f"{field}: {text!r} is no place; write box:X,Y,Z:X,Y,Z:BORDER, for example box:-4,-2,0:4,2,9:0.5, or "
+        "path:X,Y,Z:X,Y,Z:WIDTH,BORDER"
+    )
 
 
 def parse_region_value(field: str, text: str) -> RegionValue:
@@ -129,7 +172,8 @@ class StyleConfig:
     luminance: float = 0.0
     """Share of the scene's own luminance that is kept, in [0, 1]; at 1 the references give their tints alone."""
     pin: tuple[str, ...] = ()
-    """REGION=REFERENCE: the region takes its style from this reference (from any of them, if pinned to several)."""
+    """REGION=REFERENCE: the region takes its style from this reference (from any of them, if pinned to several).
+    For Gaussians REGION may be a place; a later place lies over those before it."""
     forbid: tuple[str, ...] = ()
     """REGION=REFERENCE: the region takes nothing from this reference."""
     keep: tuple[str, ...] = ()
@@ -153,7 +197,9 @@ class StyleConfig:
             between("keep_below", self.keep_below, -1.0, 1.0)
         for name in ("pin", "forbid"):
             for text in getattr(self, name):
-                parse_region_value(name, text)
+                region, _ = parse_region_value(name, text)
+                if name == "pin":
+                    parse_place(name, region)
         for text in self.region_strength:
             parse_strength("region_strength", text)
         for name in ("weights", "masks"):

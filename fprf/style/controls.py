@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from ..errors import UsageError
+from .config import Place
 
-__all__ = ["allowed_references", "blend_strength", "keep_luminance", "luma"]
+__all__ = ["allowed_references", "blend_strength", "keep_luminance", "luma", "place_weight"]
 
 _LUMA = (0.2126, 0.7152, 0.0722)
 """Rec. 709."""
@@ -57,6 +58,25 @@ def keep_luminance(
     fits = (room / tint.abs().clamp_min(torch.finfo(tint.dtype).tiny)).amin(-1, keepdim=True)
     leaves = ((moved < 0) | (moved > 1)).any(-1, keepdim=True)
     return torch.where(leaves, level + fits * tint, moved).clamp(0, 1)  # rounding alone leaves the range now
+
+
+def place_weight(place: Place, points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+    """1 inside of a place, 0 beyond its border, and falling smoothly with the distance between."""
+    corners = points.new_tensor(place.points)
+    if place.width is None:
+        away = torch.maximum(corners[0] - points, points - corners[1]).clamp_min(0).norm(dim=1)
+    else:
+        first, along = corners[:-1], corners[1:] - corners[:-1]
+        local = points[:, None] - first
+        share = (local * along).sum(2) / along.square().sum(1).clamp_min(torch.finfo(points.dtype).tiny)
+        nearest = local - share.clamp(0, 1)[..., None] * along
+        away = (nearest.norm(dim=2).amin(1) - place.width / 2).clamp_min(0)
+    if place.border == 0:
+        sharp: Tensor = (away == 0).to(points)
+        return sharp
+    inside = (1 - away / place.border).clamp(0, 1)
+    smooth: Tensor = inside.square() * (3 - 2 * inside)
+    return smooth
 
 
 def allowed_references(

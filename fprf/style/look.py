@@ -14,6 +14,7 @@ from ..checks import between
 from ..interfaces import Decoder, Stylizer
 from ..types import Want
 from .colours import ColourMaps
+from .config import Place
 from .controls import blend_strength, keep_luminance
 from .regional import RegionWeight
 
@@ -39,6 +40,8 @@ class Restyle:
     """Share of the scene's own luminance that is kept."""
     share: float = 1.0
     """Its part of the mix; those of all parts sum to 1."""
+    places: tuple[tuple[Place, "Restyle"], ...] = ()
+    """Stylizers and colours of places, for Gaussians alone, each over those before it; of these no other field counts."""
     others: tuple["Restyle", ...] = ()
     """The other parts of the mix, which have none themselves."""
 

@@ -12,7 +12,7 @@ from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.plugin_checks import check_stylizer
-from .config import NO_MASK, StyleConfig, find_reference, labels, parse_region_value, parse_strength
+from .config import NO_MASK, Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength
 from .controls import allowed_references
 from .dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
 from .files import StyleFile, check_photographs, read_style
@@ -78,21 +78,22 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
         dictionary = dictionary._replace(origin=basis.origin().to(dictionary.keys))
     regions = Regions(here, scene, basis, file.regions, file.semantic_encoder)
     controls = region_controls(regions, dictionary, style)
-    chosen = style.stylizer
-    stylizer = regional(dictionary, scene, controls.allowed, chosen)
+    if controls.places and here.decoder is not None:
+        raise UsageError("--pin: places are for Gaussians; for a run of fields pin regions, such as --pin 3=autumn.jpg")
+    chosen, device = style.stylizer, here.device
     partly = bool((controls.strength != 1).any())
-    check_stylizer(chosen, stylizer, dictionary, scene)
-    device = here.device
-    stylizer = stylizer.to(device)
-    colours = here.colour_maps(stylizer, dictionary, scene, chosen, controls.allowed)
-    mine = Restyle(
-        stylizer,
-        style.strength,
-        RegionWeight(scene, controls.strength[:, None]).to(device) if partly else None,
-        chosen.features,
-        None if colours is None else colours.to(device),
-        style.luminance,
-    )
+    weight = RegionWeight(scene, controls.strength[:, None]).to(device) if partly else None
+
+    def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
+        stylizer = regional(dictionary, scene, allowed, chosen)
+        check_stylizer(chosen, stylizer, dictionary, scene)
+        stylizer = stylizer.to(device)
+        colours = here.colour_maps(stylizer, dictionary, scene, chosen, allowed)
+        moved = None if colours is None else colours.to(device)
+        return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance)
+
+    places = tuple((place, look(allowed)) for place, allowed in controls.places)
+    mine = replace(look(controls.allowed), places=places)
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
     return Styled(mine, dictionary, scene, codes, controls)
 
@@ -158,6 +159,8 @@ class RegionControls(NamedTuple):
     regions: Regions
     notes: tuple[str, ...]
     """A line for each thing that the user may not expect."""
+    places: tuple[tuple[Place, Annotated[Tensor, "K references"]], ...]
+    """References that each region may take from in places, each over those before it."""
 
 
 def region_scores(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor, "K T"]:
@@ -172,7 +175,8 @@ def region_scores(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[T
 def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleConfig) -> RegionControls:
     """Find every region and reference that the style names. Raises UsageError for those that are not there, or contradict."""
     book = _Book(regions, dictionary, style.references)
-    pins, bans = book.pairs("pin", style.pin), book.pairs("forbid", style.forbid)
+    placed = [text for text in style.pin if parse_place("pin", parse_region_value("pin", text).region)]
+    pins, bans = book.pairs("pin", [text for text in style.pin if text not in placed]), book.pairs("forbid", style.forbid)
     kept = [found for text in style.keep for found in book.find(text)]
     parsed = [parse_strength("region_strength", text) for text in style.region_strength]
     strengths = [(found, value) for text, value in parsed for found in book.find(text)]
@@ -193,15 +197,30 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         best = score.masked_fill(~allowed[:, dictionary.reference], -torch.inf).amax(1)
         poor = (best < style.keep_below).nonzero().flatten().tolist()
         strength[[k for k in poor if k not in pinned]] = 0.0
+    taken: dict[str, set[int]] = {}
+    for wish in (parse_region_value("pin", text) for text in placed):
+        taken.setdefault(wish.region, set()).add(find_reference(wish.value, style.references))
+    places = []
+    for text, chosen in taken.items():
+        place = parse_place("pin", text)
+        assert place is not None
+        only = torch.zeros(len(dictionary.names), dtype=torch.bool)
+        only[[book.order[i] for i in chosen]] = True
+        # What regions may take of these references; all of them where that is none.
+        both = allowed & only
+        places.append((place, torch.where(both.any(1, keepdim=True), both, only)))
     saved = replace(
         style,
-        pin=tuple(f"{book.name(f)}={book.label(i)}" for f, i in pins),
+        pin=(
+            *(f"{book.name(f)}={book.label(i)}" for f, i in pins),
+            *(f"{text}={book.label(i)}" for text, chosen in taken.items() for i in sorted(chosen)),
+        ),
         forbid=tuple(f"{book.name(f)}={book.label(i)}" for f, i in bans),
         keep=tuple(book.name(f) for f in kept),
         region_strength=tuple(f"{book.name(f)}={value:g}" for f, value in strengths),
     )
     file = StyleFile(saved, book.keys, regions.views.semantic_encoder)
-    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)))
+    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)), tuple(places))
 
 
 class _Book:

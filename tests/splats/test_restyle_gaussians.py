@@ -10,7 +10,7 @@ import torch
 from splat_ball import ball
 
 from fprf.cli import main as cli
-from fprf.errors import CheckpointError, DataError, UsageError
+from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
 from fprf.fields.planes import harmonics as functions
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import BundledSemanticConfig
@@ -98,6 +98,33 @@ def test_pinned_regions_take_one_photograph_alone(scene: SplatScene, photographs
     assert (styled(scene, *photographs) - alone).abs().max() > 0.01
     with pytest.raises(UsageError, match="region 9"):
         styled(scene, photographs[0], keep=("9",))
+
+
+def test_places_take_their_own_photograph(scene: SplatScene, photographs: list[Path]) -> None:
+    regions = range(len(scene.measured()[0].share))
+    snow, dusk = (styled(scene, *photographs, pin=tuple(f"{k}={name}" for k in regions)) for name in ("snow", "dusk"))
+    means = scene.gaussians.means
+    for place, border, from_axis in (
+        ("box:-0.3,-9,-9:0.3,9,9:0.4", 0.4, means[:, 0].abs()),
+        ("path:0,-9,0:0,9,0:0.6,0.4", 0.4, means[:, [0, 2]].norm(dim=1)),
+        ("box:0.3,-9,-9:-0.3,9,9", 0.0, means[:, 0].abs()),
+    ):
+        both = styled(scene, *photographs, pin=("everywhere=dusk", f"{place}=snow"))
+        inside, outside = from_axis <= 0.3, from_axis >= 0.3 + border
+        assert inside.any() and outside.any() and (from_axis - 0.3).abs().min() > 1e-6
+        assert torch.equal(both[inside], snow[inside]) and torch.equal(both[outside], dusk[outside])
+        # Between both, the nearer to the place, the more of its style.
+        share = (both - dusk).flatten(1).norm(dim=1) / (snow - dusk).flatten(1).norm(dim=1)
+        free = ~inside & ~outside & ((0.2820948 * both[:, 0]).abs().amax(1) < 0.499)
+        assert bool((share[free][from_axis[free].argsort()].diff() < 0.02).all()) and int(free.sum()) >= 100 * border
+    elsewhere = styled(scene, *photographs, pin=(f"{place}=snow",))
+    assert torch.equal(elsewhere[outside], styled(scene, *photographs)[outside])
+
+
+@pytest.mark.parametrize("place", ["box:1,2:3", "box:1,2,3:4,5,nan", "path:0,0,0:1,1,1", "path:0,0,0:1,1,1:-1"])
+def test_a_malformed_place_is_refused(place: str) -> None:
+    with pytest.raises(ConfigError, match="is no place"):
+        StyleConfig(pin=(f"{place}=snow.png",))
 
 
 def test_luminance_is_kept_and_styles_mix(scene: SplatScene, photographs: list[Path], tmp_path: Path) -> None:
