@@ -57,7 +57,7 @@ class Colours(Encoder):
 def restyled_harmonics(
     before: Annotated[Tensor, "N K 3"], means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"], look: Restyle
 ) -> Annotated[Tensor, "N K 3"]:
-    """Harmonics in a look, of Gaussians with these means and semantics. Those that it leaves alone (strength 0) stay, bit for bit."""
+    """Harmonics of Gaussians in a look. Those that it leaves alone (strength 0) stay, bit for bit."""
     out = []
     if look.idle:
         return before
