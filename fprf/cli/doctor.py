@@ -140,8 +140,8 @@ def speed(environment: Mapping[str, str]) -> Iterator[Finding]:
             yield Finding("threads", f"{name}={threads}, {cores} cores are usable", f"unset {name}", optional=True)
     busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     if busy > cores + 1:
-        found = f"{busy:.0f} programs want the {cores} cores: everything here takes that much longer"
-        yield Finding("load", found, "top    # and end what is not needed", optional=True)
+        finding = f"{busy:.0f} programs want the {cores} cores: everything here takes that much longer"
+        yield Finding("load", finding, "top    # and end what is not needed", optional=True)
     if Path("/proc/driver/nvidia/version").is_file() and "+cpu" in _version("torch"):
         remedy = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu126"
         yield Finding("cuda", "an NVIDIA GPU is here, but torch was built without CUDA", remedy, optional=True)

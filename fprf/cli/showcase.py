@@ -51,15 +51,15 @@ def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: S
         look = scene.restyled(styled.restyle)
         pictures = [look.render(scene.cameras, view) for view in views]
         done = time.perf_counter()
-        found = [match_map(scene, styled, view) for view in views]
-        summaries = [summarize(each, styled.codes) for each in found]
+        maps = [match_map(scene, styled, view) for view in views]
+        summaries = [summarize(each, styled.codes) for each in maps]
         called = dict(zip(labels(file.style.references), file.style.references, strict=True))
         shown.append(
             Shown(
                 name,
                 styled,
                 pictures,
-                [match_picture(each, styled.codes) for each in found] if len(styled.codes.names) > 1 else [],
+                [match_picture(each, styled.codes) for each in maps] if len(styled.codes.names) > 1 else [],
                 [called[label] for label in styled.codes.names],
                 [_mean([row["references"][k]["share"] for row in summaries]) for k in range(len(styled.codes.names))],
                 built - start,
@@ -135,8 +135,8 @@ def _warped(scene: "Scene", views: Sequence[int], pictures: "Sequence[View]") ->
 
     cameras = scene.cameras.select(torch.tensor(list(views), dtype=torch.int64))
     pairs = [(i, i + 1) for i in range(len(views) - 1)]
-    found = consistency([view.rgb for view in pictures], [view.depth for view in pictures], cameras, pairs)
-    rmse = found["rmse"]
+    scores = consistency([view.rgb for view in pictures], [view.depth for view in pictures], cameras, pairs)
+    rmse = scores["rmse"]
     return None if rmse is None else float(rmse)
 
 

@@ -79,12 +79,12 @@ def find_sightings(scene: Scene) -> Sightings | None:
         members[scene.train] = True
         kept = scene.seen[members[scene.seen[:, 0]]]
         kept = kept[kept[:, 0].argsort(stable=True)]
-        found = _sighted(scene.cameras, kept[:, 0], scene.points[kept[:, 1]])
+        sightings = _sighted(scene.cameras, kept[:, 0], scene.points[kept[:, 1]])
     else:
         points = scene.points[:: max(1, len(scene.points) * len(scene.train) // PROJECTIONS)]
         parts = [_nearest(scene.cameras, view, points) for view in scene.train.tolist()]
-        found = Sightings(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-    return found if len(found.view) else None
+        sightings = Sightings(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+    return sightings if len(sightings.view) else None
 
 
 def tile_of(cameras: Cameras, view: Annotated[Tensor, "O"], pixel: Annotated[Tensor, "O 2"]) -> Annotated[Tensor, "O 2"]:

@@ -127,17 +127,17 @@ def path_pairs(frames: int, gap: int) -> list[tuple[int, int]]:
 
 def _at(image: Annotated[Tensor, "H W C"], place: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:
     """Bilinear values; `place` runs from -1 to 1 between the outer edges of the image."""
-    found = grid_sample(
+    sampled = grid_sample(
         image.permute(2, 0, 1)[None], place[None, None], mode="bilinear", padding_mode="border", align_corners=False
     )
-    return found[0, :, 0].T
+    return sampled[0, :, 0].T
 
 
 def _sized(shape: Sequence[int], cameras: Cameras, view: int, what: str) -> None:
     width, height = (int(side) for side in cameras.size[view])
     if tuple(shape) != (height, width):
-        found = "x".join(str(side) for side in reversed(shape))
-        raise DataError(f"view {view}: the {what} is {found}, its camera {width}x{height}; render at the camera's size")
+        size = "x".join(str(side) for side in reversed(shape))
+        raise DataError(f"view {view}: the {what} is {size}, its camera {width}x{height}; render at the camera's size")
 
 
 _ALIKE = 0.1
@@ -194,8 +194,8 @@ def sharpness(plain: Frames, styled: Frames) -> float | None:
         (steep, edge), (steep_after, edge_after) = _steepness(before), _steepness(after)
         both = edge & edge_after
         ratios.append((steep_after[both] / steep[both]).double())
-    found = torch.cat(ratios) if ratios else torch.empty(0)
-    return float(found.median()) if len(found) else None
+    all_ratios = torch.cat(ratios) if ratios else torch.empty(0)
+    return float(all_ratios.median()) if len(all_ratios) else None
 
 
 class _Errors(NamedTuple):
@@ -259,7 +259,7 @@ def published(
     """
     if not len(images) == len(depths) == len(cameras):
         raise DataError(f"{len(images)} images, {len(depths)} depths, {len(cameras)} cameras: one of each per frame is needed")
-    found: dict[str, dict[str, float | int | None]] = {}
+    summary: dict[str, dict[str, float | int | None]] = {}
     for name, gap in (("short", SHORT), ("long", LONG)):
         squares = []
         for t in range(gap, len(images)):
@@ -267,10 +267,10 @@ def published(
             if bool(valid.any()):
                 squares.append(float((images[t][valid].double() - there[valid].double()).square().mean()))
         count = len(squares)
-        found[name] = {
+        summary[name] = {
             "rmse": math.fsum(map(math.sqrt, squares)) / count if count else None,
             "e_warp": math.fsum(squares) / count if count else None,
             "lpips": None,
             "pairs": count,
         }
-    return found
+    return summary

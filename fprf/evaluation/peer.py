@@ -239,9 +239,9 @@ def peer_page(document: Mapping[str, Any]) -> str:
         value = None if document[part] is None else document[part][key]
         lines.append(f"| {label} | {'–' if value is None else format(value, form)} |")
     for key, label in _PUBLISHED:
-        found = document["published"] and document["published"][key]
+        published = document["published"] and document["published"][key]
         for figure, name, form in (("rmse", "RMSE", ".4f"), ("e_warp", "E_warp", ".2e")):
-            value = None if not found else found[figure]
+            value = None if not published else published[figure]
             lines.append(f"| as others report it: {name} ({label}) | {'–' if value is None else format(value, form)} |")
     if document["missing"]:
         lines += ["", *(f"- {part}: not known without {flag}" for part, flag in document["missing"].items())]

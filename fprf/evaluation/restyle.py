@@ -115,8 +115,8 @@ def lineup(recommended: StylizerConfig) -> dict[str, StylizerConfig]:
 def dictionary_of(paths: Sequence[Path], encoders: Encoders, *, clusters: int, blend: float) -> tuple[StyleDictionary, float]:
     """The style dictionary of photographs on a scene, and the seconds it took."""
     start = time.perf_counter()
-    found = [encode_photograph(path, encoders, name=name) for path, name in zip(paths, labels(tuple(paths)), strict=True)]
-    made = build_dictionary(found, clusters=clusters, blend=blend, seed=encoders.seed)
+    photographs = [encode_photograph(path, encoders, name=name) for path, name in zip(paths, labels(tuple(paths)), strict=True)]
+    made = build_dictionary(photographs, clusters=clusters, blend=blend, seed=encoders.seed)
     return made, time.perf_counter() - start
 
 
@@ -129,15 +129,15 @@ def nothing(views: Sequence[SceneView]) -> Shown:
 def transfers(plain: Sequence[Image], references: Sequence[Image]) -> dict[str, Shown]:
     """Transfers of colour of every picture alone, towards all pixels of all references."""
     style = torch.cat([image.reshape(-1, 3) for image in references])
-    found = {}
+    shown = {}
     for name, transfer in {"reinhard": reinhard, "histogram": histogram_matching}.items():
 
         def moved(view: Image, transfer: Callable[[Tensor, Tensor], Tensor] = transfer) -> Image:
             return transfer(view.reshape(-1, 3), style).reshape(view.shape)
 
         pictures, seconds = _each(plain, moved)
-        found[name] = Shown(pictures, None, 0.0, seconds)
-    return found
+        shown[name] = Shown(pictures, None, 0.0, seconds)
+    return shown
 
 
 def in_scene(
@@ -227,9 +227,9 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
     settings = town_settings(trained)
     stage = set_stage(scene, opened.known, settings, views=config.views, frames=config.frames, longest=config.longest)
     encoders = scene.encoders()
-    found = cases(config, stage, encoders, folder, progress)
-    sets = sorted({case.set for case in found}, key=[case.set for case in found].index)
-    means = {name: mean_rows([case.rows for case in found if case.set == name]) for name in sets}
+    results = cases(config, stage, encoders, folder, progress)
+    sets = sorted({case.set for case in results}, key=[case.set for case in results].index)
+    means = {name: mean_rows([case.rows for case in results if case.set == name]) for name in sets}
     best = list(lineup(config.stylizer))[-1]
     document = {
         "benchmark": "restyle",
@@ -257,11 +257,11 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
         "means": means,
         "verdict": verdict(means[JUDGED], best),
         "palettes": {
-            light: {case.set: {"rows": case.rows, "delta_e_by_class": case.classes} for case in found if case.light == light}
+            light: {case.set: {"rows": case.rows, "delta_e_by_class": case.classes} for case in results if case.light == light}
             for light in config.palettes
         },
     }
-    return document, found
+    return document, results
 
 
 def restyle_sheet(found: Sequence[Case]) -> Picture:
@@ -282,18 +282,18 @@ def cases(config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path,
     width, height = (int(side) for side in stage.scene.cameras.size[0])
     chosen = places(config.seeds, (width, height))
     total = len(config.palettes) * len(chosen)
-    found: list[Case] = []
+    results: list[Case] = []
     for light in config.palettes:
         truth = true_views(stage, light)
         for name, where in chosen.items():
-            progress(len(found), total, f"restyling, {light}")
+            progress(len(results), total, f"restyling, {light}")
             references = [photograph(place, light) for place in where]
             paths = [folder / f"{name}-{reference.name}.png" for reference in references]
             for path, reference in zip(paths, references, strict=True):
                 write_image(path, to_uint8(reference.image))
-            found.append(_case(config, stage, encoders, (light, name), references, paths, truth))
+            results.append(_case(config, stage, encoders, (light, name), references, paths, truth))
     progress(total, total, "restyling")
-    return found
+    return results
 
 
 def verdict(rows: Mapping[str, Row], best: str) -> dict[str, Any]:

@@ -115,8 +115,8 @@ def set_stage(
         return [scene.cached(of, i) for i in range(len(of))]
 
     def true(of: Cameras) -> list[Truth]:
-        found = [geometry(town, town_view(of, i)) for i in range(len(of))]
-        return [Truth(torch.from_numpy(depth), torch.from_numpy(labels.astype("int64"))) for depth, labels in found]
+        geometries = [geometry(town, town_view(of, i)) for i in range(len(of))]
+        return [Truth(torch.from_numpy(depth), torch.from_numpy(labels.astype("int64"))) for depth, labels in geometries]
 
     return Stage(scene, settings, town, judged, cached(judged), true(judged), path, cached(path), true(path))
 
@@ -210,8 +210,8 @@ def places(seeds: Sequence[int], size: tuple[int, int]) -> dict[str, tuple[Place
     """The places of `one` and `three` in towns of these seeds; size is (width, height)."""
     width, height = size
     street = walk(seed=seeds[0], views=_WALK, width=width, height=height)[_STREET_VIEW]
-    found = {"one": (Place("street", seeds[0], street),), "three": ()}
-    return found | {"three": tuple(_most(part, seed, size) for part, seed in zip(PARTS, seeds, strict=False))}
+    references = {"one": (Place("street", seeds[0], street),), "three": ()}
+    return references | {"three": tuple(_most(part, seed, size) for part, seed in zip(PARTS, seeds, strict=False))}
 
 
 def photograph(place: Place, light: str) -> Reference:
@@ -270,7 +270,7 @@ def code_classes(
     """Class of each code, int64. References go by the dictionary's names. Raises DataError where semantics are missing."""
     if encoders.semantic is None or encoders.basis is None:
         raise DataError("match rates: the scene has no semantics; train it with a semantic encoder")
-    found = torch.full((len(dictionary.keys),), -1, dtype=torch.int64)
+    code_labels = torch.full((len(dictionary.keys),), -1, dtype=torch.int64)
     for i, name in enumerate(dictionary.names):
         own = (dictionary.reference == i).nonzero().squeeze(1)
         semantic = encoded(references[name].image.to(encoders.device), encoders.semantic, guided, encoders.basis)
@@ -278,8 +278,8 @@ def code_classes(
         for place, code in enumerate(own.tolist()):
             kinds = references[name].classes.flatten()[nearest == place]
             if len(kinds):
-                found[code] = int(kinds.mode().values)
-    return found
+                code_labels[code] = int(kinds.mode().values)
+    return code_labels
 
 
 def winners(share: Annotated[Tensor, "N T"], classes: Annotated[Tensor, "T"]) -> Annotated[Tensor, "N"]:
@@ -376,13 +376,13 @@ def true_class_maps(plain: Labelled, references: Labelled) -> list[Picture]:
 
 def mean_rows(tables: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
     """Mean of every figure over tables with the same methods; what is None somewhere is left out there."""
-    found: dict[str, Row] = {}
+    means: dict[str, Row] = {}
     for method in tables[0]:
-        found[method] = {}
+        means[method] = {}
         for key in tables[0][method]:
             values = [value for table in tables if (value := table[method][key]) is not None]
-            found[method][key] = math.fsum(values) / len(values) if values else None
-    return found
+            means[method][key] = math.fsum(values) / len(values) if values else None
+    return means
 
 
 def _flat(pictures: Labelled) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:

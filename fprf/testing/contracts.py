@@ -366,21 +366,21 @@ def check_loss_term(config: LossTermConfig) -> None:
     for batch, render in ((cases.batch(count), rendered), (bare, rendered._replace(semantic=None))):
         for seed in (None, 3):
             with Unread(name):
-                found = value(render, batch, seed)
-            tensor(found, (), f"{name}: the term")
-            same(value(render, batch, seed), found, 0.0, f"{name}: must be a function of its inputs and the generator")
-    found = value(rendered, cases.batch(count))
-    require(found.requires_grad, f"{name}: no gradient goes through the term")
+                loss = value(render, batch, seed)
+            tensor(loss, (), f"{name}: the term")
+            same(value(render, batch, seed), loss, 0.0, f"{name}: must be a function of its inputs and the generator")
+    loss = value(rendered, cases.batch(count))
+    require(loss.requires_grad, f"{name}: no gradient goes through the term")
     for gradient in torch.autograd.grad(
-        found, [p for m in parts if isinstance(m, nn.Module) for p in m.parameters()], allow_unused=True
+        loss, [p for m in parts if isinstance(m, nn.Module) for p in m.parameters()], allow_unused=True
     ):
         require(gradient is None or bool(gradient.isfinite().all()), f"{name}: its gradient is not finite")
     nothing = torch.zeros_like(rendered.weights)
     for weights, kind in ((nothing, "that meet nothing"), (nothing.index_fill(1, torch.tensor([2]), 1.0), "that end at once")):
         weights.requires_grad_()
-        found = value(rendered._replace(weights=weights, opacity=weights.detach().sum(1)), cases.batch(count))
-        tensor(found, (), f"{name} of rays {kind}")
-        moved = torch.autograd.grad(found, weights, allow_unused=True)[0] if found.requires_grad else None
+        loss = value(rendered._replace(weights=weights, opacity=weights.detach().sum(1)), cases.batch(count))
+        tensor(loss, (), f"{name} of rays {kind}")
+        moved = torch.autograd.grad(loss, weights, allow_unused=True)[0] if loss.requires_grad else None
         require(moved is None or bool(moved.isfinite().all()), f"{name}: its gradient for rays {kind} is not finite")
     follows(lambda: value(rendered, cases.batch(count)), rendered.weights, name)
 

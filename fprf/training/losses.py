@@ -97,13 +97,13 @@ def terms(
     if config.distortion > 0:
         result["distortion"] = distortion(sampled.s, weights)
     if config.depth > 0 and ends is not None:
-        found = ending(sampled.t, weights, ends, ndc=facts.space.kind == "ndc")
-        if found is not None:
-            result["depth"] = found
+        loss = ending(sampled.t, weights, ends, ndc=facts.space.kind == "ndc")
+        if loss is not None:
+            result["depth"] = loss
     if config.sky > 0 and batch.sky is not None:
-        found = emptiness(sampled.t, weights, batch.sky, within=math.inf if facts.space.kind in ("box", "ndc") else SHELL)
-        if found is not None:
-            result["sky"] = found
+        loss = emptiness(sampled.t, weights, batch.sky, within=math.inf if facts.space.kind in ("box", "ndc") else SHELL)
+        if loss is not None:
+            result["sky"] = loss
     if config.extra is not None and extra is not None:
         result["extra"] = extra(rendered, batch, model.parts, step=step, generator=generator)
         check_term(config.extra, result["extra"], rendered.opacity)

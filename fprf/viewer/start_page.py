@@ -256,10 +256,10 @@ class StartPage:
         self._progress = replace(self._progress, **changes)
 
     def _upload(self, name: str | None) -> SceneFiles:
-        found = self._uploads.get(name or "")
-        if found is None:
+        upload = self._uploads.get(name or "")
+        if upload is None:
             raise UsageError("no such scene; begin again by dropping the files")
-        return found
+        return upload
 
     def _unused(self, asked: str) -> str:
         """A folder's name like the one asked for, that no other scene has."""
@@ -270,8 +270,8 @@ class StartPage:
 
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
-        found = [*_scenes(self._output), *((path, path.name) for path in _runs(Path("runs"))), (Path("demo/run"), "demo")]
-        dated = [(path.stat().st_mtime, path, name) for path, name in found if path.is_dir()]
+        scenes = [*_scenes(self._output), *((path, path.name) for path in _runs(Path("runs"))), (Path("demo/run"), "demo")]
+        dated = [(path.stat().st_mtime, path, name) for path, name in scenes if path.is_dir()]
         return [
             {
                 "path": str(path.resolve()),

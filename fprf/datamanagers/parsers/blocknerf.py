@@ -113,8 +113,8 @@ class Example(NamedTuple):
 
     def _wrong(self, name: str, wanted: str) -> DataError:
         value = self.features.get(name)
-        found = "nothing" if value is None else f"{len(value)} {'byte strings' if isinstance(value, list) else value.dtype}"
-        return DataError(f"{self.where}: {name} holds {found}, {wanted} is needed; download the file again")
+        actual = "nothing" if value is None else f"{len(value)} {'byte strings' if isinstance(value, list) else value.dtype}"
+        return DataError(f"{self.where}: {name} holds {actual}, {wanted} is needed; download the file again")
 
 
 def read_records(path: Path) -> Iterator[bytes]:

@@ -73,14 +73,14 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > _LARGEST:
             raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
-        found = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except DataError:
         raise
     except Exception as error:  # the unpickler raises whatever the bytes lead it to
         raise DataError(f"{path}: no tensors of torch.save ({_first_line(error)}); copy the file again") from error
-    if not isinstance(found, dict):
-        raise DataError(f"{path}: holds a {type(found).__name__}, not names and tensors; copy the file again")
-    return found
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: holds a {type(content).__name__}, not names and tensors; copy the file again")
+    return content
 
 
 def _first_line(error: Exception) -> str:
@@ -88,11 +88,11 @@ def _first_line(error: Exception) -> str:
 
 
 def _view(file: Path, images: Path, unit: float) -> View:
-    found = _load(file)
+    metadata = _load(file)
     try:
-        width, height = int(found["W"]), int(found["H"])
-        pose = np.asarray(torch.as_tensor(found["c2w"]).double().numpy())
-        fx, fy, cx, cy = (float(v) for v in torch.as_tensor(found["intrinsics"]).reshape(-1).tolist())
+        width, height = int(metadata["W"]), int(metadata["H"])
+        pose = np.asarray(torch.as_tensor(metadata["c2w"]).double().numpy())
+        fx, fy, cx, cy = (float(v) for v in torch.as_tensor(metadata["intrinsics"]).reshape(-1).tolist())
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         told = f"{file}: W, H, c2w [3 4] and intrinsics [4] are needed ({_first_line(error)}); copy the file again"
         raise DataError(told) from error
