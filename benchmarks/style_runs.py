@@ -18,12 +18,13 @@ from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 from fprf.evaluation.consistency import consistency
-from fprf.evaluation.metrics import luminance_ssim, matched_regions, structure, style_distances
+from fprf.evaluation.metrics import matched_regions, ssim, structure, style_distances
 from fprf.evaluation.restyle import STYLIZERS
 from fprf.evaluation.single_image import histogram_matching, reinhard
 from fprf.interfaces import Encoder
 from fprf.io.images import shrink, to_uint8, write_image
 from fprf.style.config import StyleConfig
+from fprf.style.controls import luma
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.restyle import apply_style
@@ -88,7 +89,7 @@ def judge_exhibit(exhibit: Exhibit, judges: Mapping[str, Encoder], *, full: bool
         pairs = list(zip(exhibit.plain, views, strict=True))
         row: Row = {
             "structure": math.fsum(structure(a, b) for a, b in pairs) / len(pairs),
-            "ssim": math.fsum(luminance_ssim(a, b) for a, b in pairs) / len(pairs),
+            "ssim": math.fsum(_luminance_ssim(a, b) for a, b in pairs) / len(pairs),
         }
         for kind, found in distances.items():
             row[kind] = found[name].pop("mean")
@@ -254,3 +255,9 @@ def town_folder(trained: Trained) -> Path | None:
 def _middle(count: int, views: int) -> list[int]:
     first = max(0, (count - views) // 2)
     return list(range(first, min(count, first + views)))
+
+
+def _luminance_ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
+    """SSIM of the luminances, in [-1, 1]."""
+    grey = [luma(image.reshape(-1, 3)).reshape(*image.shape[:2], 1).expand(-1, -1, 3) for image in (a, b)]
+    return ssim(*grey)

@@ -208,7 +208,6 @@ CASES = [
          lambda d, kind, p: lens.bend(d, kind, lens_reach(d, kind), torch.nn.functional.pad(p, (0, 1), value=1.0))),
     Case("lens.unbend", _lenses, lambda d, kind, p: lens.unbend(d, kind, lens_reach(d, kind), p), tolerance=1e-4),
     Case("space.contract", lambda n: (3 * _draw(n, 3),), _located, slopes=(0,)),
-    Case("space.uncontract", lambda n: (1.8 * _unit(n, 3) - 0.9,), space.uncontract, tolerance=1e-4),
     Case("splines.quaternions", lambda n: (splines.rotations(_quaternions(n)),), splines.quaternions, tolerance=1e-3),
     Case("splines.rotations", lambda n: (_quaternions(n),), splines.rotations),
     Case("splines.slerp", lambda n: (_quaternions(n), _quaternions(n, 4), _unit(n)), splines.slerp, tolerance=1e-4),

@@ -51,7 +51,6 @@ __all__ = [
     "delta_e_2000",
     "gaussian_distance",
     "image_metrics",
-    "luminance_ssim",
     "matched_regions",
     "mean_metrics",
     "psnr",
@@ -164,12 +163,6 @@ def structure(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> f
     var_x, var_y = means[2] - means[0] ** 2, means[3] - means[1] ** 2
     shared = means[4] - means[0] * means[1]
     return float(((2 * shared + _K) / (var_x + var_y + _K)).mean().clamp(-1, 1))
-
-
-def luminance_ssim(a: Annotated[Tensor, "H W 3"], b: Annotated[Tensor, "H W 3"]) -> float:
-    """SSIM of the luminances, in [-1, 1]. Raises as `metrics.ssim`."""
-    grey = [luma(image.reshape(-1, 3)).reshape(*image.shape[:2], 1).expand(-1, -1, 3) for image in (a, b)]
-    return ssim(*grey)
 
 
 def _standard(image: Tensor) -> Annotated[Tensor, "1 1 H W"]:

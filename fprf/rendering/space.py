@@ -23,7 +23,7 @@ from torch import Tensor
 from ..ops import march
 from ..types import Rays
 
-__all__ = ["Kind", "Space", "contract", "uncontract"]
+__all__ = ["Kind", "Space", "contract"]
 
 Kind = Literal["box", "contraction", "ndc", "open"]
 
@@ -33,13 +33,6 @@ def contract(x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
     m = x.abs().amax(-1, keepdim=True).clamp_min(1)
     # x / m first: the product (2 - 1/m) x would overflow where x is near the largest float.
     return (1 - 0.5 / m) * (x / m)
-
-
-def uncontract(y: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
-    """The inverse of `contract` for max |y_i| < 1."""
-    m = y.abs().amax(-1, keepdim=True)
-    outside = 0.5 / (1 - m)
-    return torch.where(m > 0.5, y / m.clamp_min(0.5) * outside, 2 * y)
 
 
 @dataclass(frozen=True)

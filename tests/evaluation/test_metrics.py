@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kornia.color import rgb_to_lab
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.metrics import PSNR_CAP, delta_e_2000, image_metrics, luminance_ssim, psnr, srgb_to_lab, ssim, structure
+from fprf.evaluation.metrics import PSNR_CAP, delta_e_2000, image_metrics, psnr, srgb_to_lab, ssim, structure
 
 
 def noise(height: int, width: int, seed: int = 0) -> torch.Tensor:
@@ -172,14 +172,6 @@ def test_brightness_contrast_and_tint_cost_nothing(contrast: float, brightness: 
     grey = picture()[..., :1].expand(-1, -1, 3)
     tinted = (contrast * grey + brightness) * torch.tensor([red, 1.0, 0.5])
     assert structure(grey, tinted) == pytest.approx(1.0, abs=1e-6)
-
-
-def test_luminance_ssim_sees_light_but_no_hue() -> None:
-    a = picture()
-    grey = (a @ torch.tensor([0.2126, 0.7152, 0.0722]))[..., None].expand(-1, -1, 3)
-    assert luminance_ssim(a, grey) == pytest.approx(1.0, abs=1e-5)
-    assert luminance_ssim(a, a * 0.3) < 0.8 < structure(a, a * 0.3)
-    assert luminance_ssim(grey, grey * 0.5) == pytest.approx(ssim(grey, grey * 0.5), abs=1e-5)
 
 
 @pytest.mark.parametrize(("a", "b"), [((16, 16, 3), (16, 17, 3)), ((10, 30, 3), (10, 30, 3)), ((16, 16), (16, 16))])
