@@ -178,6 +178,13 @@ def test_many_pinholes_need_neither_a_table_nor_the_host(offset: float) -> None:
         torch.testing.assert_close(found[1].cpu(), direction, rtol=0, atol=1e-14)
 
 
+def test_resized_views_look_the_same_way() -> None:
+    cameras = rig(*MIXED)
+    larger = cameras.resized(cameras.size * torch.tensor([3, 2]))
+    view, pixel = every_pixel(cameras)
+    torch.testing.assert_close(rays_through(larger, view, pixel * torch.tensor([3.0, 2.0])), rays_through(cameras, view, pixel))
+
+
 def test_a_lens_that_differs_in_anything_is_another() -> None:
     base = rig([OPENCV], [(12, 5)])
     changed = [

@@ -51,6 +51,13 @@ def test_weights_count_rows_several_times_and_zero_not_at_all() -> None:
         torch.testing.assert_close(found.centres[i].double(), expected, rtol=1e-6, atol=1e-6)
 
 
+def test_the_next_centre_is_drawn_by_squared_distance() -> None:
+    """The heavy row comes first; of the others the one twice as far is drawn four times as often (0.8, +- 4 deviations)."""
+    x, weights = torch.tensor([[1.0, 0.0], [0.0, 0.0], [0.0, 2.0]]), torch.tensor([1.0, 1e9, 1.0])
+    far = [bool((kmeans(x, 2, seed=seed, weights=weights).centres[:, 1] > 1.9).any()) for seed in range(300)]
+    assert abs(sum(far) / 300 - 0.8) < 0.1
+
+
 def test_bad_values_are_refused() -> None:
     with pytest.raises(NumericsError, match="k-means"):
         kmeans(torch.tensor([[float("nan")]]), 1, seed=0)
