@@ -56,8 +56,8 @@ _BACK = (0.0, 0.25)
 _TARGETS, _NARROW = 12, 55.0
 """Directions looked in from there, and the vertical angle in degrees."""
 _CLOSE, _BLUR = 0.15, 3.0
-"""What is nearer than this share of the median distance is in the way. Gaussians e to this times larger in angle than the
-median one as seen from the place are as bad as none."""
+"""Share of the median distance within which things are in the way; logarithm of the size in angle, relative to the median one
+as seen from the place, at which Gaussians are as bad as none."""
 _NEAR = 3.0
 """What a pixel with something close before the camera costs, in filled ones."""
 
