@@ -77,7 +77,9 @@ def device_of(name: str) -> torch.device:
     try:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as e:
-        raise PluginError(f"device: {name!r} is not available here; use cpu or auto") from e
+        known = ", ".join(["auto", "cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
+        ray = "; a worker of Ray counts the GPUs that it was given from 0: take cuda" if name.startswith("cuda:") else ""
+        raise PluginError(f"device: {name!r} is not available here; there is {known}{ray}") from e
 
 
 def with_downscale(config: TrainConfig) -> TrainConfig:
