@@ -147,7 +147,7 @@ def test_a_broken_parser_is_named_and_skipped(
             line.startswith("warning: data parser 'bad' (acme_bad4:ScanConfig from acme-bad 1) is skipped: ") and told in line
         )
         (folder / "sparse").rename(folder / "elsewhere")
-        with pytest.raises(DataError, match=r"choose a parser with --datamanager\.parser NAME \(bad, blocknerf"):
+        with pytest.raises(DataError, match=r"for Gaussians --parser NAME \(bad, blocknerf"):
             recognise(folder)
 
 

@@ -313,8 +313,8 @@ def recognise(data: Path) -> DataParserConfig:
         raise DataError(f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field")
     raise DataError(
         f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {_content(data)}; "
-        f"choose a parser with --datamanager.parser NAME ({', '.join(registry.installed(group))}), "
-        "or make poses with `fprf process`"
+        "choose a parser with --datamanager.parser NAME, for Gaussians --parser NAME "
+        f"({', '.join(registry.installed(group))}), or make poses with `fprf process`"
     )
 
 
