@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -211,11 +212,15 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
 
 def _fitted(place: _Place, points: "Points", config: ExportConfig) -> int:
     """Write splats that are trained against the field's renders; the number of them."""
+    import torch
+
     from ..export.depth_maps import spread_views
     from ..export.fit import fit_gaussians
     from ..splats.files import write_gaussians
 
     views = spread_views(place.trained.known.train, config.views)
+    cameras = place.trained.known.cameras.select(torch.tensor(views))
+    cameras = replace(cameras, pose=torch.cat([cameras.pose[:, :, :3], cameras.pose[:, :, 3:] - place.origin[:, None]], 2))
     looks = [look.restyle for look in place.looks]
     fitted = fit_gaussians(
         place.trained, points, views, looks,
@@ -225,7 +230,7 @@ def _fitted(place: _Place, points: "Points", config: ExportConfig) -> int:
     for look, gaussians in zip(place.looks, fitted, strict=True):
         for ending in (".ply", ".splat"):
             for path in place.paths("splats", look, ending):
-                write_gaussians(path, gaussians, antialiased=True)
+                write_gaussians(path, gaussians, antialiased=True, views=cameras)
         count = len(gaussians)
     return count
 

@@ -96,7 +96,7 @@ def run(args: list[str]) -> int:
             shown = scene.restyled(styled.restyle)
             if config.output is not None:
                 output = _named(config.output, name)
-                write_capture(output, capture, shown.shown.harmonics)
+                write_capture(output, capture, shown.shown.harmonics, scene.views)
                 write_style(_beside(output, "style.json"), styled.controls.saved)
             made.append((name, styled, shown, time.perf_counter() - start))
         display.count(len(named), len(named), "restyling")

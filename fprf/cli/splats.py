@@ -115,7 +115,7 @@ class SplatVerbs(Verbs):
             shown = scene.restyled(look.restyle).shown
             for kind in kinds:
                 paths.append(output if single else output / look_file("splats", look.name, f".{kind}"))
-                write_gaussians(paths[-1], shown, antialiased=True)
+                write_gaussians(paths[-1], shown, antialiased=True, views=scene.views)
         if paths:
             print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}")
 

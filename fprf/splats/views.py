@@ -17,12 +17,14 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError
-from ..ops.rasterise import Pinhole, Rasterised, rasterise
+from ..fields.planes import harmonics as harmonic_functions
+from ..ops.rasterise import Pinhole, Rasterised, lift, rasterise
 from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
-from .gaussians import Gaussians
+from .gaussians import HARMONIC, Gaussians
+from .photographs import cover
 
-__all__ = ["camera_of", "draw", "find_views"]
+__all__ = ["camera_of", "draw", "find_views", "mean_colours"]
 
 _LIFTS = (-8.0, 12.0, 32.0, 55.0)
 """Heights of the rings, in degrees above the middle."""
@@ -60,6 +62,9 @@ _CLOSE, _BLUR = 0.15, 3.0
 as seen from the place, at which Gaussians are as bad as none."""
 _NEAR = 3.0
 """What a pixel with something close before the camera costs, in filled ones."""
+_MEAN_VIEWS, _UNSEEN, _CLIP = 32, 1e-4, 0.01
+"""Views that mean colours are taken from, at most; weight, in pixels, of those that do not show a Gaussian; distance from
+which on they do."""
 
 
 def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
@@ -85,6 +90,29 @@ def draw(
     parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits, gaussians.harmonics[:, :16])
     behind = torch.tensor(background)
     return rasterise(*parts, camera, features=features, background=behind, antialiased=antialiased)
+
+
+@torch.inference_mode()
+def mean_colours(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> Annotated[Tensor, "N 1 3"]:
+    """Harmonics of degree 0: the mean of the colours in which views show each Gaussian, by its weights in their pixels.
+
+    The mean over all directions is another colour where photographs are from one side. What no view shows takes the mean
+    over all of them; what is not finite keeps its constant harmonic.
+    """
+    bands = min(gaussians.degree, 3) + 1
+    shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
+    colours, weights = torch.zeros(len(gaussians), 3), torch.zeros(len(gaussians), 1)
+    for view in torch.linspace(0, len(cameras) - 1, min(_MEAN_VIEWS, len(cameras))).round().long().tolist():
+        camera = cover(cameras, view, _CLIP)[0]
+        direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
+        functions = harmonic_functions(direction, bands)
+        seen = 0.5 + torch.einsum("nk,nkc->nc", functions, gaussians.harmonics[:, : bands**2])
+        pixels = torch.zeros(camera.height, camera.width, 1)
+        weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased).weights[:, None]
+        colours += weight * seen.clamp_min(0)
+        weights += weight
+    found = (colours / weights - 0.5) / HARMONIC
+    return torch.where(found.isfinite(), found, gaussians.harmonics[:, 0])[:, None]
 
 
 @torch.inference_mode()
@@ -202,10 +230,10 @@ def _rings(
     each = max(4, round(1.6 * count / len(rings)))
     side, front = _level(up)
     eyes = []
-    for ring, (lift, far) in enumerate(rings):
+    for ring, (lifted, far) in enumerate(rings):
         turn = (torch.arange(each, dtype=torch.float64) + 0.38 * ring) * (2 * math.pi / each)
         flat = turn.cos()[:, None] * side + turn.sin()[:, None] * front
-        eyes.append(centre + (math.cos(math.radians(lift)) * flat + math.sin(math.radians(lift)) * up) * far * reach)
+        eyes.append(centre + (math.cos(math.radians(lifted)) * flat + math.sin(math.radians(lifted)) * up) * far * reach)
     eye = torch.cat(eyes)
     cameras = pinhole(look_at(eye, centre.expand_as(eye), up), width=size[0], height=size[1], fov=_FOV)
     return cameras, 0.3 * torch.linalg.vector_norm(eye - centre, dim=1)

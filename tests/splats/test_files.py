@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from fprf.errors import DataError
+from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.files import ENDINGS, Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.base import spatial_order
 from fprf.splats.gaussians import Gaussians
@@ -117,6 +118,24 @@ def test_captures_change_their_format_with_the_ending(tmp_path: Path) -> None:
     assert (tmp_path / "w.ply").read_bytes() == packed.data, "a compressed file under the plain ending stays one"
     write_capture(tmp_path / "v.ply", packed, packed.gaussians.harmonics)
     assert torch.equal(read_capture(tmp_path / "v.ply").gaussians.means, packed.gaussians.means)
+
+
+def test_without_view_dependence_a_file_holds_the_colours_that_views_show(tmp_path: Path) -> None:
+    """One Gaussian seen from the front alone, and one that no view shows and that is looked at from there as well."""
+    harmonics = torch.zeros(2, 4, 3)
+    harmonics[:, 2] = torch.tensor([0.6, -0.3, 0.0])  # Y = 0.4886 z
+    means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
+    there = Gaussians(means, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), -2.0), torch.full((2,), 3.0), harmonics)
+    views = pinhole(
+        look_at(torch.tensor([[0.0, 0, 2]]), torch.zeros(1, 3), torch.tensor([0.0, 1, 0])), width=32, height=32, fov=40
+    )
+    write_gaussians(tmp_path / "seen.splat", there, views=views)
+    write_gaussians(tmp_path / "all.splat", there)
+    seen, every = (read_capture(tmp_path / name).gaussians.colours for name in ("seen.splat", "all.splat"))
+    direction = torch.nn.functional.normalize(means - torch.tensor([0.0, 0, 2]), dim=1)
+    wanted = 0.5 + 0.48860251 * direction[:, 2:] * harmonics[:, 2]
+    assert torch.allclose(seen, wanted, atol=0.5 / 255 + 1e-6)
+    assert torch.allclose(every, torch.full((2, 3), 0.5), atol=0.5 / 255 + 1e-6)
 
 
 def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> None:

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...io.atomic import write_bytes
+from ...rendering.cameras import Cameras
 from ..gaussians import Gaussians
+from ..views import mean_colours
 from .base import Capture
 from .ply import compressed_bytes, is_compressed, ply_bytes, read_ply
 from .sog import read_sog, sog_bytes, unbundle
@@ -22,12 +24,13 @@ __all__ = ["ENDINGS", "Capture", "read_capture", "write_capture", "write_gaussia
 class _Format(NamedTuple):
     read: Callable[[Path, bytes], Capture]
     pack: Callable[[Gaussians, bool], bytes]
+    view_dependent: bool = True
 
 
 _FORMATS = {
     ".compressed.ply": _Format(read_ply, compressed_bytes),
     ".ply": _Format(read_ply, ply_bytes),
-    ".splat": _Format(read_splat, splat_bytes),
+    ".splat": _Format(read_splat, splat_bytes, view_dependent=False),
     ".spz": _Format(read_spz, spz_bytes),
     ".sog": _Format(read_sog, sog_bytes),
     "meta.json": _Format(read_sog, sog_bytes),
@@ -50,20 +53,23 @@ def read_capture(path: Path) -> Capture:
     return capture
 
 
-def write_gaussians(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> None:
+def write_gaussians(path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None) -> None:
     """Write a file in the format that its name ends with, whole or not at all. Raises DataError for another ending.
 
-    .ply is exact; the others lose what their bits cannot hold, and .splat has no view dependence. .compressed.ply and SOG
-    have an order of their own.
+    .ply is exact; the others lose what their bits cannot hold. .splat has no view dependence: it holds the mean colours that
+    `views` show, or those over all directions where none are given. .compressed.ply and SOG have an order of their own.
     """
-    _write(path, _FORMATS[_ending(path)].pack(gaussians, antialiased))
+    form = _FORMATS[_ending(path)]
+    if not form.view_dependent and gaussians.degree and views is not None and len(views):
+        gaussians = gaussians.recoloured(mean_colours(gaussians, views, antialiased=antialiased))
+    _write(path, form.pack(gaussians, antialiased))
 
 
-def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"]) -> None:
+def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None) -> None:
     """Write a capture with new harmonics of all its Gaussians, or of all that are finite, in the format that the name says.
 
     In the format that it was read from everything else stays as it was, bit for bit; where no harmonic differs from those
-    read, that is the whole file.
+    read, that is the whole file. Another format gets the colours that `write_gaussians` gives it.
     """
     finite, before = capture.gaussians.finite, capture.gaussians.harmonics
     if len(harmonics) < len(finite):
@@ -73,7 +79,7 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
     plain = ending == ".ply" and here == ".compressed.ply"
     packed = ending == ".compressed.ply" and not is_compressed(capture.data)
     if _FORMATS[ending].read is not _FORMATS[here].read or plain or packed:
-        write_gaussians(path, capture.gaussians.recoloured(harmonics), antialiased=capture.antialiased)
+        write_gaussians(path, capture.gaussians.recoloured(harmonics), antialiased=capture.antialiased, views=views)
         return
     changed = (harmonics != before).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
     data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))
