@@ -3,18 +3,20 @@
     python -m benchmarks exports RUN --references A.jpg [--output benchmarks/results/exports_NAME.json] [--picture FILE.jpg]
 
 The views are the captured ones that nothing was trained on, as pinholes. Figures are PSNR in dB: of the whole picture, over
-black where nothing is drawn, and of the pixels that are covered. Files made before are taken as they are (`--folder`).
+black where nothing is drawn, and of the pixels that are covered. Files made before are taken as they are (`--folder`). Splats
+that `--fit` trained have view-dependent colours and an antialiased opacity: they are drawn by fprf's rasteriser.
 """
 
 import json
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import trimesh
 
 import fprf
@@ -24,6 +26,9 @@ from fprf.errors import UsageError
 from fprf.io.images import write_image
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
+from fprf.splats.files import Capture, read_capture
+from fprf.splats.views import camera_of
+from fprf.splats.views import draw as draw_capture
 
 from .common import ROOT, report
 
@@ -45,6 +50,8 @@ class ExportsConfig:
     """Where the exported files are; made there if they are absent. None = RUN/exports."""
     views: int = 4
     """Held-out views, at most."""
+    fit: float = 0.0
+    """Minutes of training the splats, where the files are made."""
     output: Path | None = None
     """JSON file for the figures."""
     picture: Path | None = None
@@ -57,6 +64,7 @@ def main(argv: list[str]) -> None:
     if not (folder / "export.json").is_file():
         style = ["--styles", "style=" + ",".join(map(str, config.references))] if config.references else []
         command = [sys.executable, "-m", "fprf", "export", str(config.run), "ply", "splat", "glb", "cameras", *style]
+        command += ["--fit", str(config.fit)] if config.fit else []
         subprocess.run([*command, "--output", str(folder)], check=True)
     scene = fprf.load(config.run)
     known = scene.trained.known
@@ -92,8 +100,9 @@ def judge(
 ) -> tuple[dict[str, dict[str, float]], np.ndarray]:
     """Means over the views for each kind of file, and a row of pictures of the first."""
     end = f".{look}" if look else ""
-    ply = read_gaussians((folder / f"splats{end}.ply").read_bytes())
-    splat = read_splat((folder / f"splats{end}.splat").read_bytes())
+    files = [folder / f"splats{end}.ply", folder / f"splats{end}.splat"]
+    ply, splat, captures = read_gaussians(files[0].read_bytes()), read_splat(files[1].read_bytes()), [*map(read_capture, files)]
+    fitted = captures[0].antialiased
     points = trimesh.load(folder / f"points{end}.ply")
     mesh = trimesh.load(folder / f"mesh{end}.ply", process=False)
     [glb] = trimesh.load_scene(folder / f"mesh{end}.glb", process=False).geometry.values()
@@ -105,9 +114,9 @@ def judge(
         pose[:, 3] -= origin
         view = (pose, float(camera.focal[0, 0]), (int(camera.size[0, 0]), int(camera.size[0, 1])))
         start = time.process_time()
-        drawn = {"splats.ply": draw(ply, *view)}
+        drawn = {"splats.ply": drawn_by_fprf(captures[0], camera, origin) if fitted else draw(ply, *view)}
         seconds = time.process_time() - start
-        drawn["splats.splat"] = draw(splat, *view)
+        drawn["splats.splat"] = drawn_by_fprf(captures[1], camera, origin) if fitted else draw(splat, *view)
         drawn["mesh.ply"] = draw_triangles(mesh.vertices, mesh.faces, mesh.visual.vertex_colors[:, :3] / 255, *view)
         drawn["mesh.glb"] = draw_triangles(glb.vertices, glb.faces, shown(glb), *view)
         drawn["points.ply"] = draw_points(points.vertices, points.colors[:, :3] / 255, *view)
@@ -120,6 +129,14 @@ def judge(
             row = [truth, *(drawn[name][0] for name in ("splats.ply", "mesh.ply", "points.ply"))]
     means = {name: {key: float(np.mean([f[key] for f in every])) for key in every[0]} for name, every in figures.items()}
     return means, np.concatenate(row, 1)
+
+
+def drawn_by_fprf(capture: Capture, camera: Cameras, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Image [H W 3] and opacity [H W] of a pinhole view; a .splat cannot say that it is antialiased, and viewers are larger."""
+    pose = camera.pose.clone()
+    pose[0, :, 3] -= torch.from_numpy(origin)
+    seen = draw_capture(capture.gaussians, camera_of(replace(camera, pose=pose), 0), antialiased=True)
+    return seen.image.clamp(0, 1).double().numpy(), seen.opacity.numpy()
 
 
 def shown(mesh: trimesh.Trimesh) -> np.ndarray:
