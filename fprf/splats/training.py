@@ -64,6 +64,8 @@ _PIXELS = 640 * 360
 """Of an image, where nobody says how far to reduce them."""
 _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
+_WIDE = 0.2
+"""Greatest standard deviation of one of them, as a share of their distance."""
 _SOME = 4000
 """Points whose depths say how near to a camera things are."""
 _LEVELS, _MANY = "levels", 400_000
@@ -125,16 +127,33 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     levels = make_levels(scene, images, masks, near)
     far = surroundings(scene, images, points, config.surroundings) if config.surroundings else None
     room = max(config.cap, len(points.position) + config.surroundings)
-    learner = Learner(config, levels, reach_of(scene), room, None if far is None else _before(far), tones=tones_of(facts))
+    sphere = _Sphere.around(far) if far is not None else None
+    bounds = (None, None) if sphere is None else (sphere.encloses, sphere.widest)
+    learner = Learner(config, levels, reach_of(scene), room, *bounds, tones=tones_of(facts))
     learner.begin(points, draw, far)
     return Prepared(scene, learner, near, origin, facts=facts)
 
 
-def _before(far: Points) -> Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]]:
-    """Return the test for means well within the surroundings; only these are split, so that the surroundings stay coarse."""
-    centre = torch.from_numpy(far.position.mean(0)).float()
-    limit = 0.5 * float((torch.from_numpy(far.position).float() - centre).norm(dim=1).min())
-    return lambda means: (means - centre).norm(dim=1) < limit
+class _Sphere(NamedTuple):
+    """The sphere of the surroundings, which stay coarse (only what it encloses is split) and thin."""
+
+    centre: Annotated[Tensor, "3"]
+    radius: float
+
+    @staticmethod
+    def around(far: Points) -> "_Sphere":
+        """The sphere of points."""
+        centre = torch.from_numpy(far.position.mean(0)).float()
+        return _Sphere(centre, float((torch.from_numpy(far.position).float() - centre).norm(dim=1).min()))
+
+    def encloses(self, means: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """Whether means lie well within."""
+        apart: Tensor = (means - self.centre).norm(dim=1)
+        return apart < 0.5 * self.radius
+
+    def widest(self, means: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        """Greatest standard deviations: one that reached the cameras would be drawn before the scene from beside it."""
+        return torch.where(self.encloses(means), math.inf, _WIDE * self.radius)
 
 
 def load_photographs(

@@ -279,6 +279,25 @@ def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
     assert (np.linalg.norm(far.position - centre, axis=1) > 5 * np.linalg.norm(centre)).all()
 
 
+@pytest.mark.parametrize("restored", [False, True])
+def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: Scene, restored: bool) -> None:
+    """However wide one becomes, it is cut to a fifth of its distance: from beside, it would be drawn before the scene."""
+    learner = prepare(config, scene).learner
+    before = learner.gaussians()
+    far = before.means.norm(dim=1) > 0.5 * before.means.norm(dim=1).max()
+    wide = replace(before, log_scales=before.log_scales + 8.0)
+    learner.restore(wide, learner.moments())
+    if restored:
+        other = prepare(config, scene).learner
+        other.restore(learner.gaussians(), learner.moments())
+        learner = other
+    assert learner.step(0, 0.0) is not None
+    after, distance = learner.gaussians(), before.means[far].norm(dim=1, keepdim=True)
+    assert far.sum() == config.surroundings
+    assert (after.log_scales[far].exp() <= 0.22 * distance).all()
+    assert (after.log_scales[~far] > wide.log_scales[~far] - 0.1).all()
+
+
 def test_points_begin_where_there_are_none(scene: Scene) -> None:
     bare = replace(scene, points=None, seen=None)
     found, origin = initial.initial_points(bare, dict(enumerate(load_images(bare))), 500, np.random.default_rng(0))
