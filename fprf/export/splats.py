@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from ..io.atomic import write_bytes
+from ..ops.harmonics import HARMONIC
 from ..splats.files.ply import ply_bytes
-from ..splats.gaussians import HARMONIC, Gaussians
+from ..splats.gaussians import Gaussians
 from .point_cloud import Cloud
 
 __all__ = ["surface_discs", "write_gaussians", "write_splat"]

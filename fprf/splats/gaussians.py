@@ -12,11 +12,10 @@ import torch
 from torch import Tensor
 
 from ..errors import DataError
+from ..ops.harmonics import HARMONIC
 
-__all__ = ["COUNTS", "HARMONIC", "Gaussians"]
+__all__ = ["COUNTS", "Gaussians"]
 
-HARMONIC = 0.28209479177387814
-"""The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
 

@@ -13,13 +13,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..ops.harmonics import HARMONIC
 from ..ops.rasterise_kernels import FIXED, SLOTS
 from ..ops.rasterise_training import errors, learn
 from ..ops.simd import LANES, aligned
 from ..rendering.splines import rotations
 from ..training.camera_optimizers import Tones
 from .config import GaussiansConfig
-from .gaussians import HARMONIC, Gaussians
+from .gaussians import Gaussians
 from .initial import Points, spacing, spatial_order
 from .photographs import Floats, Level
 

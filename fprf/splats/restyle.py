@@ -1,21 +1,21 @@
 """A style on a scene of Gaussians: harmonics in, harmonics out.
 
-    colour' = colour A + b,   0.5 + C0 dc' = (0.5 + C0 dc) A + b,   higher harmonics' = harmonics A
-
-so an affine map of colours is exact, from every direction. Stylizers whose config says `colours` carry the colours of each
-region over as a whole, and nothing else: content features and a decoder would add nothing, since single Gaussians have
-colours that no photograph has. Others move the colours in the place of features. Luminance is kept as an affine map too.
+An affine map of colours is exact on harmonics, from every direction (`ops.harmonics`). Stylizers whose config says `colours`
+carry the colours of each region over as a whole, and nothing else: content features and a decoder would add nothing, since
+single Gaussians have colours that no photograph has. Others move the colours in the place of features. Luminance is kept as
+an affine map too.
 """
 
-import functools
 import math
+from functools import cache
 from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from ..fields.planes import harmonics as harmonic_functions
+from ..fields.planes import harmonics
 from ..interfaces import Encoder, Stylizer
+from ..ops.harmonics import Directions, recoloured
 from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.colours import ColourMaps, carried_colours
@@ -23,14 +23,11 @@ from ..style.controls import luma, place_weight
 from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.scene import SceneStyle, membership, own_style
-from .gaussians import HARMONIC
 
-__all__ = ["Colours", "as_drawn", "region_maps", "restyled_harmonics"]
+__all__ = ["Colours", "all_around", "region_maps", "restyled_harmonics"]
 
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""
-_TINY = 1e-5
-"""Colours below this may be rounded to less than 0."""
 _ROWS = 1 << 15
 """Gaussians at a time: bounds the memory."""
 
@@ -58,63 +55,36 @@ def restyled_harmonics(
     before: Annotated[Tensor, "N K 3"], means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"], look: Restyle
 ) -> Annotated[Tensor, "N K 3"]:
     """Harmonics of Gaussians in a look. Those that it leaves alone (strength 0) stay, bit for bit."""
-    out = []
     if look.idle:
         return before
+    out = torch.empty_like(before)
     kept = sum(part.share * part.luminance for part in look.parts)
+    directions = all_around(before.shape[1])
     for start in range(0, len(before), _ROWS):
-        rows = before[start : start + _ROWS]
-        matrix, bias, weight = _change(look, means[start : start + _ROWS], semantic[start : start + _ROWS])
-        matrix = matrix + torch.eye(3)
+        rows = slice(start, start + _ROWS)
+        change, weight = _change(look, means[rows], semantic[rows])
         if kept > 0:  # what the map adds to luma is taken back from all channels alike
-            ones = torch.ones(1, 3)
-            matrix = matrix + kept * (luma(torch.eye(3)) - luma(matrix)) * ones
-            bias = bias - kept * luma(bias) * ones
-        drawn = as_drawn(rows)
-        colour = 0.5 + HARMONIC * drawn[:, 0]
-        moved = torch.einsum("nc,ncd->nd", colour, matrix) + bias
-        # Within the range of colours, but for those that were outside: what is brighter than white would glow at soft edges.
-        moved = moved.maximum(colour.clamp_max(0)).minimum(colour.clamp_min(1))
-        new = torch.einsum("nkc,ncd->nkd", drawn, matrix)
-        new[:, 0] = (moved - 0.5) / HARMONIC
-        out.append(torch.where((weight > 0)[:, None, None], new, rows))
-    return torch.cat(out)
+            change = change - kept * luma(change)
+        out[rows] = recoloured(before[rows], change, weight, directions)
+    return out
 
 
-def as_drawn(harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N K 3"]:
-    """Harmonics of the colours that renderers show, which are cut at 0: a map would lift what was hidden below.
-
-    Where some direction is cut, the cut colours of directions all around are fitted again, in least squares, by the harmonics
-    up to degree 3.
-    """
-    count = min(harmonics.shape[1], 16)
-    bands = math.isqrt(count)
-    # In no direction harmonics of degree l are further from 0 than their norm times sqrt((2 l + 1) / 4 pi) (addition theorem).
-    square = harmonics[:, :count].square()
-    low = 0.5 + HARMONIC * harmonics[:, 0]
-    for k in range(1, bands):
-        # Sums of slices: vectorised over rows, as reductions of a few numbers are not.
-        norm = functools.reduce(torch.add, square[:, k * k : (k + 1) ** 2].unbind(1)).sqrt()
-        low -= math.sqrt((2 * k + 1) / (4 * math.pi)) * norm
-    some = (low.amin(1) < _TINY).nonzero()[:, 0]
+@cache
+def all_around(bands: int) -> Directions:
+    """Directions all around, for that many bands; no more than those of degree 3."""
     at = torch.arange(_DIRECTIONS) + 0.5
     height, turn = 1 - 2 * at / _DIRECTIONS, at * (math.pi * (5**0.5 - 1))
     flat = (1 - height.square()).sqrt()
     around = torch.stack([flat * turn.cos(), flat * turn.sin(), height], 1)
-    basis = harmonic_functions(around, bands)
-    colour = 0.5 + torch.einsum("db,nbc->ndc", basis, harmonics[some, :count])
-    dark = colour.amin((1, 2)) < 0
-    out = harmonics.clone()
-    fitted = torch.einsum("bd,ndc->nbc", torch.linalg.pinv(basis), colour[dark].clamp_min(0) - 0.5)
-    out[some[dark], :count] = fitted
-    return out
+    values = harmonics(around, math.isqrt(min(bands, 16)))
+    return Directions(values.T.contiguous(), torch.linalg.pinv(values))
 
 
 def _change(
     look: Restyle, means: Annotated[Tensor, "N 3"], semantic: Annotated[Tensor, "N D"]
-) -> tuple[Annotated[Tensor, "N 3 3"], Annotated[Tensor, "N 3"], Annotated[Tensor, "N"]]:
-    """The change of a look against the identity: A and b of each Gaussian, c' = c + c A + b, and its strength."""
-    matrix, bias, weight = semantic.new_zeros(len(semantic), 3, 3), semantic.new_zeros(len(semantic), 3), semantic.new_zeros(())
+) -> tuple[Annotated[Tensor, "N 4 3"], Annotated[Tensor, "N"]]:
+    """The change of a look against the identity: A and below it b of each Gaussian, c' = c + c A + b, and its strength."""
+    change, weight = semantic.new_zeros(len(semantic), 4, 3), semantic.new_zeros(len(semantic))
     for part in look.parts:
         if part.share == 0 or part.strength == 0:
             continue
@@ -127,22 +97,21 @@ def _change(
         for place, other in part.places:
             inside = place_weight(place, means)[:, None]
             if bool(inside.any()):
-                there = _added(other, semantic)
-                added = torch.lerp(added[0], there[0], inside[..., None]), torch.lerp(added[1], there[1], inside)
-        matrix, bias, weight = matrix + acts[..., None] * added[0], bias + acts * added[1], weight + acts[:, 0]
-    return matrix, bias, weight
+                added = torch.lerp(added, _added(other, semantic), inside[..., None])
+        change, weight = change + acts[..., None] * added, weight + acts[:, 0]
+    return change, weight
 
 
-def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> tuple[Annotated[Tensor, "N 3 3"], Annotated[Tensor, "N 3"]]:
+def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
     """A and b of one part at full strength."""
     if part.colours is not None:
         maps = part.colours
         belongs = membership(semantic, maps.semantic_mean, maps.units, maps.softness)
-        return torch.einsum("nk,kcd->ncd", belongs, maps.matrix), belongs @ maps.bias
+        return (belongs @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
     # An affine stylizer is known by what it makes of black and of each channel alone.
     black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
     rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black for axis in torch.eye(3)]
-    return part.features * (torch.stack(rows, 1) - torch.eye(3)), part.features * black
+    return part.features * torch.stack([*(row - axis for row, axis in zip(rows, torch.eye(3), strict=True)), black], 1)
 
 
 def region_maps(

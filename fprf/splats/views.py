@@ -18,10 +18,11 @@ from torch import Tensor
 
 from ..errors import DataError
 from ..fields.planes import harmonics as harmonic_functions
+from ..ops.harmonics import HARMONIC
 from ..ops.rasterise import Pinhole, Rasterised, lift, rasterise
 from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
-from .gaussians import HARMONIC, Gaussians
+from .gaussians import Gaussians
 from .photographs import cover
 
 __all__ = ["camera_of", "draw", "find_views", "mean_colours"]

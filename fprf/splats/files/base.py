@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..gaussians import HARMONIC, Gaussians
+from ...ops.harmonics import HARMONIC
+from ..gaussians import Gaussians
 
 __all__ = [
     "Bools",

@@ -1,0 +1,94 @@
+"""Affine maps of view-dependent colours: harmonics in, harmonics out.
+
+    colour' = colour A + b,   0.5 + Y0 dc' = (0.5 + Y0 dc) A + b,   higher harmonics' = harmonics A
+
+exact from every direction, with the zeroth harmonic Y0. The plain form is the reference for every device and dtype; float32
+on the CPU is compiled.
+"""
+
+# The checker takes compiled functions to have one argument.
+# mypy: disable-error-code="call-arg"
+
+import functools
+import math
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .dense import usable
+
+__all__ = ["HARMONIC", "Directions", "as_drawn", "recoloured", "recoloured_reference"]
+
+HARMONIC = 0.28209479177387814
+"""The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
+_TINY = 1e-5
+"""Colours below this may be rounded to less than 0."""
+
+
+class Directions(NamedTuple):
+    """Directions in which colours are looked at."""
+
+    values: Annotated[Tensor, "B D"]
+    """Values of the first B = (degree + 1)^2 harmonics."""
+    fit: Annotated[Tensor, "B D"]
+    """Their coefficients out of values in the directions, in least squares."""
+
+
+def as_drawn(harmonics: Annotated[Tensor, "N K 3"], directions: Directions) -> Annotated[Tensor, "N K 3"]:
+    """Harmonics of the colours that renderers show, which are cut at 0: a map would lift what was hidden below.
+
+    Where some direction is cut, the cut colours of all directions are fitted again by the first B harmonics, B <= K.
+    """
+    count = len(directions.values)
+    # In no direction harmonics of degree l are further from 0 than their norm times sqrt((2 l + 1) / 4 pi) (addition theorem).
+    square = harmonics[:, :count].square()
+    low = 0.5 + HARMONIC * harmonics[:, 0]
+    for degree in range(1, math.isqrt(count)):
+        # Sums of slices: vectorised over rows, as reductions of a few numbers are not.
+        norm = functools.reduce(torch.add, square[:, degree**2 : (degree + 1) ** 2].unbind(1)).sqrt()
+        low -= math.sqrt((2 * degree + 1) / (4 * math.pi)) * norm
+    some = (low.amin(1) < _TINY).nonzero()[:, 0]
+    colour = 0.5 + torch.einsum("bd,nbc->ndc", directions.values, harmonics[some, :count])
+    dark = colour.amin((1, 2)) < 0
+    out = harmonics.clone()
+    out[some[dark], :count] = torch.einsum("bd,ndc->nbc", directions.fit, colour[dark].clamp_min(0) - 0.5)
+    return out
+
+
+def recoloured_reference(
+    harmonics: Annotated[Tensor, "N K 3"],
+    change: Annotated[Tensor, "N 4 3"],
+    weight: Annotated[Tensor, "N"],
+    directions: Directions,
+) -> Annotated[Tensor, "N K 3"]:
+    """Harmonics as drawn, mapped by A = 1 + change[:, :3] and b = change[:, 3]; those of no weight stay, bit for bit.
+
+    Mean colours stay within [0, 1], but for those that were outside: what is brighter than white would glow at soft edges.
+    """
+    drawn = as_drawn(harmonics, directions)
+    matrix = torch.eye(3).to(change) + change[:, :3]
+    colour = 0.5 + HARMONIC * drawn[:, 0]
+    moved = torch.einsum("nc,ncd->nd", colour, matrix) + change[:, 3]
+    moved = moved.maximum(colour.clamp_max(0)).minimum(colour.clamp_min(1))
+    new = torch.einsum("nkc,ncd->nkd", drawn, matrix)
+    new[:, 0] = (moved - 0.5) / HARMONIC
+    return torch.where((weight > 0)[:, None, None], new, harmonics)
+
+
+def recoloured(
+    harmonics: Annotated[Tensor, "N K 3"],
+    change: Annotated[Tensor, "N 4 3"],
+    weight: Annotated[Tensor, "N"],
+    directions: Directions,
+) -> Annotated[Tensor, "N K 3"]:
+    """`recoloured_reference`, within 60 u of the largest harmonic and change, u = 2^-24; without gradients."""
+    if not usable(harmonics) or len(harmonics) == 0:
+        return recoloured_reference(harmonics, change, weight, directions)
+    from . import harmonics_kernels as kernels
+
+    out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
+    parts = (harmonics, change, weight, directions.values, directions.fit)
+    flat = (part.float().contiguous().view(-1).numpy() for part in parts)
+    kernels.recolour(*flat, len(directions.values), out.view(-1).numpy())
+    return out
