@@ -12,8 +12,6 @@ from typing import Any
 from fprf.evaluation.report import provenance
 from fprf.io.atomic import write_json
 
-__all__ = ["RESULTS", "ROOT", "SHARED", "add_entry", "arguments", "origin", "read_report", "report", "split_flags"]
-
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 SHARED = Path(os.environ.get("FPRF_SHARED", ROOT.parent / "shared"))

@@ -21,8 +21,6 @@ from fprf.town.layout import Town, build_town
 from fprf.town.palettes import palette
 from fprf.town.render import FIELD_OF_VIEW, View, cast, directions, is_test, shade, walk
 
-__all__ = ["SKY", "write_district"]
-
 SKY = (0.72, 0.8, 0.88)
 """sRGB."""
 _LOW, _TILE = np.array([-17.0, -28.0]), np.array([88.0, 56.0])

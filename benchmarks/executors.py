@@ -23,8 +23,6 @@ from typing import Any
 
 from .common import RESULTS, report
 
-__all__ = ["blocks_seconds", "flags", "same_bits", "timed"]
-
 SURROUNDINGS = "surroundings"
 
 

@@ -31,9 +31,6 @@ from fprf.training.views import cache_view
 from .common import RESULTS, arguments, report
 from .pictures import sheet
 
-__all__ = ["false_edges"]
-
-
 _SIGMA = 1.0
 """Pixels that both pictures are blurred by: noise is no edge."""
 _REACH = 12

@@ -31,24 +31,6 @@ from fprf.training.run import Run
 from fprf.training.trainer import Report, train
 from fprf.training.views import render_view
 
-__all__ = [
-    "BUDGETS",
-    "SAMPLES",
-    "VARIANTS",
-    "Point",
-    "Scenes",
-    "Setting",
-    "as_rendered",
-    "front",
-    "half_planes",
-    "measure",
-    "plain_settings",
-    "styled_settings",
-    "trained_points",
-    "variants",
-]
-
-
 BUDGETS = {"0": 0.0, "1/4096": 1 / 4096, "1/1024": 1 / 1024, "1/512": 1 / 512, "1/256": 1 / 256, "1/64": 1 / 64, "1/16": 1 / 16}
 SAMPLES = (0.25, 0.5, 0.75, 1.5, 2.0, 4.0)
 CHUNKS = (1024, 4096, 32768)

@@ -28,9 +28,6 @@ from typing import Any, NamedTuple, TypeGuard
 
 from .common import ROOT, arguments, report
 
-__all__ = ["Mutation", "mutated", "mutations"]
-
-
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,

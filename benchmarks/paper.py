@@ -35,8 +35,6 @@ from fprf.training.views import render_view
 from .common import origin
 from .paper_styles import Bench, PaperConfig, restyled, set_up, style_rows, styled_by_photographs
 
-__all__ = ["COLUMNS", "TRAINED", "SceneDecoder", "SceneDecoderConfig", "Short", "paper", "paper_page", "short_training"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class SceneDecoderConfig(DecoderConfig):

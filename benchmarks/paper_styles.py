@@ -53,18 +53,6 @@ from fprf.training.views import cache_view
 
 from .style_runs import PLAIN, Exhibit, judge_exhibit
 
-__all__ = [
-    "CELL",
-    "ONE_TRAINING",
-    "Bench",
-    "cell_dictionary",
-    "cells",
-    "restyled",
-    "set_up",
-    "style_rows",
-    "styled_by_photographs",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class PaperConfig(ReportConfig):

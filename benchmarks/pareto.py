@@ -33,8 +33,6 @@ from fprf.training.run import view_names
 
 from .knobs import BUDGETS, Point, Scenes, as_rendered, front, measure, plain_settings, styled_settings, trained_points
 
-__all__ = ["Panel", "draw", "main", "pareto", "ticks"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ParetoConfig(BenchConfig):

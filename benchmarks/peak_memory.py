@@ -23,8 +23,6 @@ from fprf.evaluation.subject import attempt, find, fresh_model, settings
 
 from .common import ROOT
 
-__all__ = ["PARTS", "measure_part", "memory", "mib", "peak_mib"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class MemoryConfig(BenchConfig):

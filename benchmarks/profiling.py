@@ -34,8 +34,6 @@ from fprf.style.restyle import restyle
 from fprf.training.model import Model, background_of
 from fprf.types import Rays, Want
 
-__all__ = ["PREFIX", "REST", "Range", "attribute", "exclusive", "labelled", "profile"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileConfig(BenchConfig):

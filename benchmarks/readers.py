@@ -41,9 +41,6 @@ from fprf.style.files import read_style
 from fprf.testing import cases
 from fprf.training import checkpoint, tensorfiles
 
-__all__ = ["Outcome", "Target", "fuzz", "mutated", "targets"]
-
-
 WHOLE_EVERY = 16
 """Rounds of which one is read to the end, where a reader of the bytes alone is known."""
 WORDS = (b"NaN", b"1e400", b"-1", b"0", b"null", b"true", b"[]", b"{}", b"../../etc/passwd", b"\x00", b"\xff\xfe", b"9" * 40)

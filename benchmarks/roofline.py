@@ -22,9 +22,6 @@ from fprf.training.loading import Trained
 
 from .common import origin
 
-__all__ = ["backward_bytes", "bandwidth", "forward_bytes", "roofline_rows", "touched"]
-
-
 COPIED = 1 << 28
 """Bytes of the copy: more than caches hold."""
 GOAL = 50.0

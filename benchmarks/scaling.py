@@ -20,8 +20,6 @@ from fprf.style.restyle import restyle
 from fprf.training.prepare import Prepared
 from fprf.training.views import render_view
 
-__all__ = ["Series", "exponent", "scaling"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ScalingConfig(BenchConfig):

@@ -31,22 +31,6 @@ from fprf.town.render import colours, geometry, walk
 
 from .common import RESULTS, SHARED, report
 
-__all__ = [
-    "COLOURS",
-    "SIZE",
-    "Triplet",
-    "class_match",
-    "matching_rate",
-    "palette_match",
-    "read_regions",
-    "read_triplets",
-    "semantic_matching",
-    "shared_regions",
-    "town_cells",
-    "triplet_names",
-]
-
-
 COLOURS = ("black", "white", "blue", "green", "red", "yellow", "magenta", "cyan", "grey")
 """Names by region id."""
 _CODES = (0x000000, 0xFFFFFF, 0x0000FF, 0x00FF00, 0xFF0000, 0xFFFF00, 0xFF00FF, 0x00FFFF, 0x808080)

@@ -69,8 +69,9 @@ def made_up(path: Path, count: int) -> None:
     """A capture that fills its views as real ones do: discs on a bumpy ball above a plane."""
     import torch
 
+    from fprf.ops.harmonics import HARMONIC
     from fprf.splats.files import write_gaussians
-    from fprf.splats.gaussians import HARMONIC, Gaussians
+    from fprf.splats.gaussians import Gaussians
 
     draw = torch.Generator().manual_seed(0)
     around = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw), dim=1)

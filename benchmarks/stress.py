@@ -33,8 +33,6 @@ from fprf.types import Rays, Want
 from .readers import fuzz, targets
 from .stress_operators import Check, clusters, guided, markdown, matching, sampling, statistics, stylizers, weights
 
-__all__ = ["damage", "decibels", "invariants", "main", "readers", "stress"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class StressConfig(BenchConfig):

@@ -22,23 +22,6 @@ from fprf.style.statistics import covariance, empty, merge, moments
 from fprf.testing import cases
 from fprf.types import Want
 
-__all__ = [
-    "Check",
-    "U",
-    "clusters",
-    "guided",
-    "markdown",
-    "matching",
-    "relative",
-    "sampling",
-    "scaled",
-    "statistics",
-    "stylizers",
-    "unsound",
-    "weights",
-]
-
-
 U = 2.0**-24
 """Unit round-off of float32."""
 

@@ -34,9 +34,6 @@ from fprf.training.views import cache_view
 
 from .pictures import SETS, town_reference
 
-__all__ = ["GOALS", "PLAIN", "RECOMMENDED", "Exhibit", "colour_baselines", "judge_exhibit", "mean_rows", "verdict"]
-
-
 PLAIN = "unstylised"
 RECOMMENDED = "region-tone"
 

@@ -35,8 +35,6 @@ from .style.restyle import Styled, apply_style, mixed
 from .training.loading import LoadedRun, open_run
 from .training.quality import Name, QualityConfig
 
-__all__ = ["Shot", "TrainedScene", "open_scene"]
-
 PathLike = str | Path
 Split = Literal["train", "test", "all"]
 

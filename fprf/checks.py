@@ -4,8 +4,6 @@ import math
 
 from .errors import ConfigError
 
-__all__ = ["at_least", "between", "positive"]
-
 
 def _finite(name: str, value: float) -> None:
     # math.isfinite would raise on an integer too large for a float.

@@ -22,19 +22,6 @@ if TYPE_CHECKING:
     from .training.loading import LoadedRun
     from .training.quality import QualityConfig
 
-__all__ = [
-    "RESUMABLE",
-    "ContentConfig",
-    "IncompleteConfig",
-    "LossConfig",
-    "OptimizerConfig",
-    "RenderConfig",
-    "RunConfig",
-    "SemanticConfig",
-    "StatisticsConfig",
-    "TrainConfig",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ContentConfig:

@@ -13,18 +13,6 @@
 The command line turns each into one line on standard error and exit code 2.
 """
 
-__all__ = [
-    "CheckpointError",
-    "ConfigError",
-    "DataError",
-    "FprfError",
-    "NumericsError",
-    "OutOfMemoryError",
-    "PluginError",
-    "UsageError",
-    "WeightsError",
-]
-
 
 class FprfError(Exception):
     """The root: its text is complete and meant for the user.

@@ -28,22 +28,6 @@ if TYPE_CHECKING:
     from .style.references import Encoders
     from .style.scene import SceneStyle
 
-__all__ = [
-    "BlockLayout",
-    "ContentField",
-    "DataManager",
-    "DataParser",
-    "Decoder",
-    "Encoder",
-    "Executor",
-    "LossTerm",
-    "Sampler",
-    "Scene",
-    "SceneView",
-    "SemanticField",
-    "Stylizer",
-]
-
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 

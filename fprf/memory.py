@@ -16,8 +16,6 @@ from .errors import OutOfMemoryError
 if TYPE_CHECKING:
     import torch
 
-__all__ = ["LEAST", "chunk_size", "free_memory", "in_parts", "out_of_memory", "peak", "shortage", "wanted"]
-
 LEAST = 1024
 """Rays below which parts are not halved: their share of the memory is small beside the model's."""
 _RAY = 192 << 10

@@ -8,8 +8,6 @@ from .plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
 from .plugins.samplers.config import ProposalConfig
 from .splats.config import GaussiansConfig
 
-__all__ = ["fprf", "fprf_lite", "fprf_splats"]
-
 
 def fprf() -> TrainConfig:
     """The paper's sizes: VGG-19 relu2_1 content, DINO semantics, tri-planes 64 to 512, 256 + 128 + 48 samples.

@@ -13,8 +13,6 @@ import os
 import sys
 from collections.abc import MutableMapping
 
-__all__ = ["TRIM", "configure_process", "keep_memory", "wait_briefly"]
-
 SPINS = "1000"
 """Rounds that a waiting thread spins for GNU's OpenMP: some 20 microseconds."""
 BLOCK_MS = "0"

@@ -13,8 +13,6 @@ from typing import Annotated, NamedTuple
 
 from torch import Tensor
 
-__all__ = ["Batch", "Boxes", "FieldSample", "Level", "Rays", "Rendered", "Sampled", "Site", "View", "Want"]
-
 
 class Want(Flag):
     """Outputs that are asked of a field or a render: nothing else is computed."""

@@ -15,8 +15,6 @@ from fprf.rendering import cameras, lens, space, splines, stepfun
 from fprf.rendering.lens import lens_reach
 from fprf.style import clusters, controls, dictionary, matching, scene, statistics
 
-__all__ = ["CASES", "Case"]
-
 Made = Sequence[Tensor]
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 

@@ -4,8 +4,6 @@ import torch
 
 from fprf.splats.gaussians import HARMONIC, Gaussians
 
-__all__ = ["ball"]
-
 
 def ball(count: int, degree: int = 1, seed: int = 0) -> Gaussians:
     """Opaque Gaussians within a unit ball; y points down. Green and rough above, grey and even below."""

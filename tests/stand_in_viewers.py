@@ -2,8 +2,6 @@
 
 import sys
 
-__all__ = ["DEAD", "DEAF", "GREEDY", "NONSENSE", "QUIET", "REFUSED", "viewer"]
-
 _HELLO = """
 import json, sys
 def tell(line):

@@ -26,20 +26,6 @@ from fprf.training.run import Run
 from fprf.training.trainer import Report, train
 from fprf.types import Batch, Rays
 
-__all__ = [
-    "Altered",
-    "Change",
-    "World",
-    "events",
-    "flags",
-    "make_world",
-    "parameters",
-    "rays_of",
-    "spoilt",
-    "stopping",
-    "trained_for",
-]
-
 Change = Callable[[int, Batch], Batch]
 """Step and batch to the batch that is trained on."""
 

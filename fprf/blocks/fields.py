@@ -25,8 +25,6 @@ from ..rendering.space import Space
 from ..types import FieldSample, Rays, Sampled
 from .routing import Chart, Group, Router
 
-__all__ = ["BlockedField", "BlockedSampler", "BlockedSemantic", "Held", "Member", "Members", "emission", "inherit", "relay"]
-
 
 class Member(nn.Module):
     """Fields and sampler of one block, and where they apply. Points are those of the scene's space."""

@@ -21,9 +21,6 @@ from ..fields.layouts import AdaptiveConfig, GridConfig, StreetConfig
 from ..interfaces import BlockLayout
 from ..types import Boxes, Site
 
-__all__ = ["FEW", "REACH", "AdaptiveLayout", "GridLayout", "SingleLayout", "StreetLayout", "bounds", "within"]
-
-
 REACH = 1.0
 """Units beyond the cameras that still belong to the region; a unit is the distance that views commonly see."""
 OUTLIERS = 0.01

@@ -29,24 +29,6 @@ from ..rendering.space import Space
 from ..types import Boxes, Site
 from .routing import chart_of, local, surroundings_of
 
-__all__ = [
-    "BEYOND",
-    "Plan",
-    "Tiles",
-    "boxes_from",
-    "boxes_to",
-    "level_axes",
-    "make_plan",
-    "meets",
-    "open_space",
-    "pixel_mask",
-    "site_of",
-    "tile_rays",
-    "top_view",
-    "visible",
-]
-
-
 FLAT = 0.3
 """Cameras spread over a plane if their third extent is below this share of their second ..."""
 WIDE = 0.2

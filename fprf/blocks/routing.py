@@ -25,22 +25,6 @@ from torch import Tensor
 from ..rendering.space import contract
 from ..types import Boxes
 
-__all__ = [
-    "SLIGHT",
-    "Blend",
-    "Chart",
-    "Everywhere",
-    "Group",
-    "Inset",
-    "Router",
-    "aligned",
-    "chart_of",
-    "local",
-    "shares",
-    "surroundings_of",
-    "window",
-]
-
 
 def aligned(turn: Annotated[Tensor, "3 3"]) -> bool:
     """Return whether axes are those of the space."""

@@ -18,8 +18,6 @@ from .train import train_scene
 if TYPE_CHECKING:
     from ..evaluation.report import Outcome
 
-__all__ = ["NAMES", "bench_run", "console", "run", "write_report"]
-
 NAMES: dict[str, BenchConfig | ReportConfig] = {
     "speed": SpeedConfig(),
     "restyle": RestyleConfig(),

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from ..training.trainer import Report
     from ..viewer.live import LiveViewer
 
-__all__ = ["SHARE", "block_minutes", "run_block", "show_plan", "train_blocks"]
-
 SHARE = 0.2
 """Share of a time limit that the surroundings take, which all blocks start from; the blocks share the rest."""
 

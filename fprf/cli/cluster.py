@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from ..checks import between
 from .parsing import parse
 
-__all__ = ["ClusterConfig", "run"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterConfig:

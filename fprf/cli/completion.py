@@ -14,8 +14,6 @@ from ..export.config import KINDS
 from ..plugins.registry import installed
 from .parsing import LIST_FLAGS
 
-__all__ = ["SHELLS", "Offer", "offers", "run", "script"]
-
 _USAGE = """usage: fprf completion bash|zsh|fish
 
 Prints a script that lets the shell complete verbs, flags and files:

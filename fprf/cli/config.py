@@ -5,8 +5,6 @@ from typing import ClassVar
 
 from ..plugins.config import PluginConfig
 
-__all__ = ["CommandConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class CommandConfig(PluginConfig):

@@ -22,8 +22,6 @@ from .showcase import restyled, write_page
 if TYPE_CHECKING:
     from ..style.look import Restyle
 
-__all__ = ["DemoConfig", "run"]
-
 TITLE = "One garden, photographed once"
 LEAD = (
     "Trained on a CPU from 25 photographs. Each look is then taken from one picture, without training, and is the same "

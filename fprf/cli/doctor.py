@@ -25,8 +25,6 @@ from ..plugins.codec import Missing
 from ..plugins.slots import slots
 from .parsing import parse
 
-__all__ = ["Finding", "cleaned", "machine", "method_needs", "run", "run_folder", "scene_folder", "self_test", "speed"]
-
 _MIB = 1 << 20
 _LEAST_DISK = 1 << 30
 """Bytes below which a training may fail for want of room."""

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ..training.run import Known
     from ..types import View
 
-__all__ = ["EvalConfig", "evaluate_fields", "run", "store"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class EvalConfig(QualityConfig):

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from ..training.loading import Trained
     from ..training.run import Known
 
-__all__ = ["export_cameras", "export_fields", "run"]
-
 _FEW = 0.5
 """A smaller share of what there was is worth a warning."""
 

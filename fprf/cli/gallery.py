@@ -21,8 +21,6 @@ from .style_flags import read_preset, say, with_presets_named
 if TYPE_CHECKING:
     from ..training.run import Known
 
-__all__ = ["GalleryConfig", "run"]
-
 _DESCRIPTION = """Every view in every style, as one page: wipes, match maps, depth, figures. It loads nothing and can be sent.
 
 Each reference is a style of its own; with several of them all together are one more."""

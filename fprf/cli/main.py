@@ -20,8 +20,6 @@ from ..memory import out_of_memory, shortage
 from ..plugins.registry import installed, make, nearest
 from ..process import configure_process
 
-__all__ = ["VERBS", "Verb", "main", "packaged", "run_verb"]
-
 _GROUP = "fprf.commands"
 
 _PIPE_CLOSED = 141

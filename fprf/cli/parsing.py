@@ -26,21 +26,6 @@ from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
 if TYPE_CHECKING:
     from ..config import RunConfig, TrainConfig
 
-__all__ = [
-    "DESCRIBE",
-    "LIST_FLAGS",
-    "Flag",
-    "describe",
-    "explain",
-    "flags_of",
-    "load_field_method",
-    "load_method",
-    "meanings",
-    "methods",
-    "parse",
-    "spell",
-]
-
 
 _MANY = -1
 

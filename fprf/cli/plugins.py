@@ -24,8 +24,6 @@ from ..plugins.stylizers.config import StylizerConfig
 from .config import CommandConfig
 from .parsing import load_method, parse
 
-__all__ = ["KINDS", "METHODS", "Row", "faults", "rows", "run"]
-
 METHODS = "fprf.methods"
 KINDS: dict[str, tuple[type[PluginConfig], ...]] = {
     "fprf.fields": (ContentFieldConfig, SemanticFieldConfig),

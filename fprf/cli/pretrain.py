@@ -11,8 +11,6 @@ from ..errors import UsageError
 from ..pretraining.config import PretrainConfig, PretrainDecoderConfig
 from .parsing import parse
 
-__all__ = ["pretrain", "run"]
-
 _MOVED = ("content", "semantic")
 """Encoders that ship: the repository distils them, not the installed package."""
 Report = dict[str, float | int | str]

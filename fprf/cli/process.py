@@ -15,8 +15,6 @@ from ..reconstruction.config import SfmConfig
 from .parsing import parse
 from .progress import Display
 
-__all__ = ["ProcessConfig", "run"]
-
 MINUTES = 3
 """Minutes of the printed training command."""
 

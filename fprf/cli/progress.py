@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from ..training.run import Run
     from ..training.trainer import Report
 
-__all__ = ["Display", "EventLog"]
-
 LINE_SECONDS = 5.0
 """Time between JSON lines where standard error is no terminal, and in events.jsonl."""
 

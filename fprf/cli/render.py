@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from ..training.loading import LoadedRun
     from ..training.run import Known
 
-__all__ = ["RenderVerbConfig", "camera_path", "frames_of", "run"]
-
 
 _NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
 """Endings that nobody gives a folder."""

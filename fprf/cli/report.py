@@ -15,8 +15,6 @@ from .parsing import parse
 if TYPE_CHECKING:
     from ..training.run import History
 
-__all__ = ["ReportConfig", "run"]
-
 _PLAIN = {"psnr": "PSNR", "rays_per_second": "rays a second", "kept": "samples kept", "skipped_steps": "skipped steps"}
 """Labels of figures that are no losses."""
 _UNITS = {"psnr": "dB", "kept": "share"}

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from ..splats.scene import Semantics, SplatScene
     from ..style.restyle import Styled
 
-__all__ = ["RestyleConfig", "run", "seen_capture"]
-
 _KEPT = 24
 """Captures of which the cache keeps what was found out."""
 

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from ..style.restyle import Styled
     from ..types import View
 
-__all__ = ["Shown", "restyled", "write_page"]
-
 
 class Shown(NamedTuple):
     """One style on the views of a gallery."""

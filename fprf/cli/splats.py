@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
-__all__ = ["SplatVerbs"]
-
 _KINDS = ("ply", "splat", "cameras")
 """Kinds of `fprf export`; the last one not unless it is asked for."""
 

@@ -10,8 +10,6 @@ from ..style.config import PRESETS, StyleConfig, preset_flags, with_preset
 from ..style.files import StyleFile, check_photographs, read_style, with_folders
 from .parsing import parse
 
-__all__ = ["read_flags", "read_preset", "say", "with_presets_named"]
-
 C = TypeVar("C", bound=StyleConfig)
 D = TypeVar("D")
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from ..style.restyle import Styled
     from ..training.run import Known
 
-__all__ = ["StylizeConfig", "print_explained", "run"]
-
 _LONGEST = 80
 """Characters of a style's default name."""
 

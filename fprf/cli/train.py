@@ -26,18 +26,6 @@ if TYPE_CHECKING:
     from ..viewer.live import LiveViewer, ViewAddress
     from .progress import Display
 
-__all__ = [
-    "DEFAULT_METHOD",
-    "VIEW",
-    "check_same",
-    "default_output",
-    "finish_view",
-    "open_view",
-    "run",
-    "take_view",
-    "train_scene",
-]
-
 
 VIEW = "--view"
 

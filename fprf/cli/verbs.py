@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
-__all__ = ["FieldVerbs", "Verbs", "verbs_of"]
-
 
 class Verbs(ABC):
     """`train`, `eval` and `export` for a config of one kind, which a run to be measured was trained with.

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from ..viewer.session import Viewed
     from ..viewer.start_page import StartPage
 
-__all__ = ["ViewConfig", "run"]
-
 _EXIT_TIMEOUT = 15.0
 """Seconds after an interrupt within which all must have ended."""
 

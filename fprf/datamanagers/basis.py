@@ -14,8 +14,6 @@ from torch import Tensor
 from ..checks import at_least
 from ..errors import DataError, NumericsError
 
-__all__ = ["Basis", "fit_basis"]
-
 
 class Basis(NamedTuple):
     """I = Cin channels in, D out. float32."""

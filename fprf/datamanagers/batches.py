@@ -31,9 +31,6 @@ from .features import FeatureStore, Progress, extract
 from .images import load_image, load_images, load_mask
 from .scene import Scene, find_sightings
 
-__all__ = ["HELD", "RayBatches", "allocate_pixels", "generator_of"]
-
-
 HELD = 512 * 2**20
 """Bytes of pixels that are simply held in memory."""
 

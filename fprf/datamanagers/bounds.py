@@ -16,8 +16,6 @@ from ..rendering.cameras import Cameras, rays_through
 from ..rendering.space import Kind, Space
 from .scene import Scene
 
-__all__ = ["FAR", "NEAR", "ROUNDING", "axes", "find_kind", "find_space", "focus"]
-
 FORWARD_ANGLE = math.radians(35)
 """Cameras that all look within this angle of their mean direction may be forward-facing."""
 FORWARD_SPREAD = 0.5

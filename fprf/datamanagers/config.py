@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from .basis import Basis
     from .scene import Scene
 
-__all__ = ["DataManagerConfig", "GuidedConfig", "RayBatchesConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class GuidedConfig:

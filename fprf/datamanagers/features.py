@@ -42,8 +42,6 @@ from .config import GuidedConfig
 if TYPE_CHECKING:
     from ..ops.guided_kernels import ViewTable
 
-__all__ = ["FeatureStore", "Progress", "extract"]
-
 
 GREY = 0.5
 LANES = 8

@@ -25,18 +25,6 @@ from ..memory import out_of_memory
 if TYPE_CHECKING:
     from .scene import Scene
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "MAX_PIXELS",
-    "Image",
-    "header_of",
-    "load_image",
-    "load_images",
-    "load_mask",
-    "photographs",
-    "read_header",
-]
-
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"})
 """Suffixes of images in a folder's list, in lower case."""

@@ -18,8 +18,6 @@ from torch import Tensor
 
 from ..rendering.cameras import Cameras, project
 
-__all__ = ["GAMMA", "Scene", "Sightings", "exposures_differ", "find_sightings", "tile_of", "with_exposure"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:

@@ -8,8 +8,6 @@ from ..checks import at_least, between, positive
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..style.config import StyleConfig
 
-__all__ = ["BenchConfig", "PeerConfig", "ReportConfig", "RestyleConfig", "SpeedConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class BenchConfig:

@@ -34,9 +34,6 @@ from torch.nn.functional import grid_sample
 from ..errors import DataError, NumericsError
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
 
-__all__ = ["consistency", "path_pairs", "published", "sharpness", "steadiness", "warp"]
-
-
 SHORT, LONG = 1, 7
 """Frames between the two views of a pair (Lai et al. 2018, and every peer since)."""
 

@@ -28,8 +28,6 @@ from ..types import Rays, View, Want
 from .consistency import consistency
 from .metrics import image_metrics, mean_metrics
 
-__all__ = ["AlignmentConfig", "align", "align_view", "described", "judge", "judge_views", "peak_memory"]
-
 
 def peak_memory() -> float:
     """Most resident memory that this process ever held, in MiB; 0 where the system does not tell."""

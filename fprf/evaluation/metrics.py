@@ -43,27 +43,6 @@ from ..style.controls import luma
 from ..style.matching import unit
 from ..style.statistics import covariance, moments, symmetric_root
 
-__all__ = [
-    "MIXED",
-    "PSNR_CAP",
-    "RegionStatistics",
-    "delta_e",
-    "delta_e_2000",
-    "gaussian_distance",
-    "image_metrics",
-    "matched_regions",
-    "mean_metrics",
-    "psnr",
-    "region_statistics",
-    "relative_distance",
-    "srgb_to_lab",
-    "ssim",
-    "structure",
-    "style_distances",
-    "whole_cells",
-]
-
-
 PSNR_CAP = 99.0
 """PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of 1.3e-10."""
 

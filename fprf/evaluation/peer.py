@@ -21,9 +21,6 @@ from .consistency import published, steadiness
 from .metrics import delta_e, image_metrics, matched_regions, mean_metrics, structure, style_distances
 from .report import words
 
-__all__ = ["peer", "peer_page", "read_cameras", "read_depths", "read_pictures"]
-
-
 Along = Literal["ray", "axis"]
 
 

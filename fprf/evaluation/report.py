@@ -26,28 +26,6 @@ from ..io.images import Picture, to_uint8
 from ..io.report import number
 from ..training.prepare import device_of
 
-__all__ = [
-    "Column",
-    "Outcome",
-    "Row",
-    "Spread",
-    "Watch",
-    "commit",
-    "contact_sheet",
-    "document",
-    "falls_short",
-    "machine",
-    "markdown",
-    "printed",
-    "provenance",
-    "ratio",
-    "rows_table",
-    "spread",
-    "table",
-    "words",
-]
-
-
 Clock = Literal["wall", "processor"]
 
 

@@ -51,29 +51,6 @@ from .town_truth import (
     winners,
 )
 
-__all__ = [
-    "BOUND",
-    "COLUMNS",
-    "FLAT",
-    "GLOBAL",
-    "GOALS",
-    "MATCHED",
-    "PLAIN",
-    "STYLIZERS",
-    "Shown",
-    "dictionary_of",
-    "in_scene",
-    "lineup",
-    "nothing",
-    "one_by_one",
-    "restyle",
-    "restyle_page",
-    "restyle_sheet",
-    "transfers",
-    "verdict",
-]
-
-
 PLAIN = "no change"
 FLAT = "2d"
 """The recommended stylizer on every picture alone, as if there were no scene."""

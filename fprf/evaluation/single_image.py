@@ -23,17 +23,6 @@ from ..style.look import Restyle
 from ..style.scene import SceneStyle, scene_style
 from ..types import Want
 
-__all__ = [
-    "Flat",
-    "encoded",
-    "flat_look",
-    "flat_scene",
-    "histogram_matching",
-    "reinhard",
-    "render_flat",
-]
-
-
 _CELL = 8
 """Pixels between guided-filter coefficients."""
 _CHUNK = 65_536

@@ -50,18 +50,6 @@ from .subject import (
     watch_of,
 )
 
-__all__ = [
-    "draw_points",
-    "forward_backward",
-    "grid_sample_lookup",
-    "largest_planes",
-    "plain_planes",
-    "replaced",
-    "speed",
-    "triplane_rows",
-    "without_skipping",
-]
-
 
 def grid_sample_lookup(
     points: Annotated[Tensor, "N 3"], table: Annotated[Tensor, "rows F"], resolutions: Sequence[int]

@@ -31,30 +31,6 @@ from ..types import Batch, Rays, Want
 from .config import BenchConfig
 from .report import Watch
 
-__all__ = [
-    "LOOKS",
-    "Subject",
-    "attempt",
-    "batch_rays",
-    "colour_gradient",
-    "count",
-    "difference",
-    "exact",
-    "find",
-    "fresh_model",
-    "loop_of",
-    "plainly",
-    "settings",
-    "size_of",
-    "small_view",
-    "stepper",
-    "test_view",
-    "town_references",
-    "view_rays",
-    "watch_of",
-]
-
-
 LOOKS = {"autumn": (3, 9), "winter": (5, 14), "night": (2, 4)}
 """Palette of each default reference, with the seed of the town that it shows and the view of it."""
 

@@ -39,33 +39,6 @@ from ..training.run import Known
 from .metrics import delta_e, image_metrics, mean_metrics
 from .single_image import encoded
 
-__all__ = [
-    "KINDS",
-    "PARTS",
-    "Matched",
-    "Reference",
-    "Row",
-    "Stage",
-    "best_class_maps",
-    "code_classes",
-    "interior",
-    "match_rates",
-    "mean_rows",
-    "photograph",
-    "places",
-    "score",
-    "set_stage",
-    "short_path",
-    "shows",
-    "town_folder",
-    "town_settings",
-    "town_view",
-    "true_class_maps",
-    "true_views",
-    "winners",
-]
-
-
 _STEP = 0.12
 """Metres between frames of the path: 7 frames on, near things have moved by a quarter of a small picture."""
 _TURN = math.radians(0.8)

@@ -23,9 +23,6 @@ from ..training.views import on_host
 from ..types import Rays, Want
 from .depth_maps import DepthMaps, depth_gaps
 
-__all__ = ["BestViews", "Coloured", "best_views", "colours_in_styles", "expected_presence", "point_colours", "single_view"]
-
-
 _DECAY = math.log(9)
 """Extinctions of a uniform medium over the distance in which a ray meets the middle 80 % of its light."""
 _GRAZING = 1e-3

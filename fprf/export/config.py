@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..style.look import Restyle
 
-__all__ = ["KINDS", "ExportConfig", "Look", "Plan", "look_file", "make_looks", "named_styles", "plan", "styles_of"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(StyleConfig):

@@ -22,18 +22,6 @@ from ..training.model import Model
 from ..training.views import on_host
 from ..types import Rays
 
-__all__ = [
-    "DepthMaps",
-    "Surface",
-    "cosine_map",
-    "default_reach",
-    "depth_gaps",
-    "render_depth_maps",
-    "spread_views",
-    "surface_points",
-]
-
-
 _TORN = 1.25
 """Neighbouring pixels whose depths differ by more than this factor lie on different surfaces: far ground falls away fast."""
 _BENT = 3.0

@@ -27,8 +27,6 @@ from ..splats.training import find_near
 from ..style.look import Restyle
 from ..training.loading import Trained
 
-__all__ = ["fit_gaussians"]
-
 _ALIKE = 0.7
 """Cosine between the axes of views that have a view between them."""
 _COLOURS = 0.3

@@ -32,9 +32,6 @@ from ..training.style_pass import lattice
 from ..types import Rays
 from .colours import colours_in_styles
 
-__all__ = ["colour_pairs", "fit_quality", "write_cube"]
-
-
 SMOOTH = 1e-3
 """s: pairs in a fourteenth of the colour cube outweigh the bending of a twentieth of its side."""
 REACH = 0.25

@@ -25,9 +25,6 @@ from ..splats.files.ply import ply_file
 from .depth_maps import DepthMaps, cosine_map, depth_gaps
 from .point_cloud import SPAN, Cloud, cells, keys, origin_comment, vertex_table
 
-__all__ = ["build_mesh", "write_mesh_glb", "write_mesh_ply"]
-
-
 _TRUNCATION = 3.0
 """Distances are cut at so many edges."""
 _BLOCK = 4

@@ -20,21 +20,6 @@ from ..rendering.cameras import pixel_grid, rays_through
 from ..splats.files.ply import ply_file
 from .depth_maps import DepthMaps, Surface, depth_gaps, surface_points
 
-__all__ = [
-    "SPAN",
-    "Cloud",
-    "cells",
-    "concatenate",
-    "fuse",
-    "keys",
-    "origin_comment",
-    "origin_of",
-    "sky_dome",
-    "vertex_table",
-    "write_points",
-]
-
-
 LEVELS = 12
 """Levels that are told apart: the coarsest voxels are 2048 times as wide as the finest."""
 SPAN = 1 << 18

@@ -19,8 +19,6 @@ from ..splats.files.ply import ply_bytes
 from ..splats.gaussians import Gaussians
 from .point_cloud import Cloud
 
-__all__ = ["surface_discs", "write_gaussians", "write_splat"]
-
 _WIDTH = 0.55
 """Standard deviation along the surface, in spacings."""
 _THICKNESS = 0.1

@@ -8,8 +8,6 @@ import torch
 from ..rendering.cameras import Cameras
 from ..rendering.lens import FISHEYE, OPENCV
 
-__all__ = ["transforms"]
-
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float"
 
 _LAST: list[Json] = [0.0, 0.0, 0.0, 1.0]

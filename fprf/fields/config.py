@@ -12,8 +12,6 @@ from ..plugins.config import PluginConfig
 if TYPE_CHECKING:
     from ..interfaces import ContentField, SemanticField
 
-__all__ = ["ContentFieldConfig", "PlanesConfig", "SemanticFieldConfig", "SemanticPlanesConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ContentFieldConfig(PluginConfig):

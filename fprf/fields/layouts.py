@@ -14,8 +14,6 @@ from ..plugins.config import PluginConfig
 if TYPE_CHECKING:
     from ..interfaces import BlockLayout
 
-__all__ = ["AdaptiveConfig", "GridConfig", "LayoutConfig", "SingleConfig", "StreetConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class LayoutConfig(PluginConfig):

@@ -13,22 +13,6 @@ from ..ops import dense, march, triplane, triplane_numba
 from ..types import FieldSample
 from .config import PlanesConfig, SemanticPlanesConfig
 
-__all__ = [
-    "LIMIT",
-    "MAX_DEGREE",
-    "Planes",
-    "PlanesField",
-    "ProposalField",
-    "SemanticPlanes",
-    "count",
-    "density",
-    "harmonics",
-    "linear",
-    "mlp",
-    "weights",
-]
-
-
 LIMIT = 15.0
 """exp(15) = 3e6 per space unit is opaque within a micro-unit; beyond it only the gradient could overflow."""
 

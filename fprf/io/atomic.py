@@ -12,8 +12,6 @@ from pathlib import Path
 
 from ..errors import DataError, NumericsError
 
-__all__ = ["atomic_path", "remove_unfinished", "unwritable", "write_bytes", "write_json", "write_text"]
-
 _HOPELESS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 _UNFINISHED = re.compile(r"\..{1,40}\.[0-9a-f]{8}(\.\w+)?|\.tmp\w{6}")
 """Hidden names of `atomic_path`, and of safetensors beside them."""

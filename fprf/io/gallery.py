@@ -18,9 +18,6 @@ from .images import Picture, data_uri, shrink, to_uint8
 from .maps import palette
 from .report import Metrics, figures, number
 
-__all__ = ["Reference", "Style", "write_gallery"]
-
-
 _VIEW_SIDE, _MAP_SIDE, _SMALL_SIDE, _TINY_SIDE = 1024, 512, 224, 80
 """Longest sides in pixels of embedded views, of maps and references, of the overview, and of thumbnails."""
 

@@ -20,8 +20,6 @@ from torch import Tensor
 from ..errors import DataError, NumericsError
 from .atomic import write_bytes
 
-__all__ = ["Picture", "checked", "data_uri", "encode", "shrink", "srgb_to_linear", "to_uint8", "write_exr", "write_image"]
-
 _Float = TypeVar("_Float", bound=np.floating)
 Picture: TypeAlias = NDArray[np.uint8]
 Format: TypeAlias = Literal["png", "jpg", "webp"]

@@ -12,8 +12,6 @@ from torch import Tensor
 from ..errors import DataError
 from .images import Picture, to_uint8
 
-__all__ = ["depth_image", "depth_limits", "match_image", "match_summary", "palette", "scale_image", "weighted_sum"]
-
 _EMPTY = (0.50, 0.51, 0.53)
 """Colour of pixels that hit nothing: a grey that neither map uses."""
 

@@ -17,8 +17,6 @@ from .atomic import write_text
 if TYPE_CHECKING:
     from ..training.run import History
 
-__all__ = ["Metrics", "Series", "bar_chart", "figures", "line_chart", "number", "sparkline", "write_report", "write_scalars"]
-
 
 Metrics: TypeAlias = "Mapping[str, float | int | str | Metrics | None]"
 

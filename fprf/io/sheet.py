@@ -13,9 +13,6 @@ from ..errors import DataError
 from .images import Picture, checked
 from .maps import palette
 
-__all__ = ["Tile", "contact_sheet", "highlight", "side_by_side", "wipe"]
-
-
 _SIDE = 240
 """Width of a tile in pixels; pictures are enlarged or reduced to it."""
 _LINE, _GAP, _BAR = 17, 8, 6

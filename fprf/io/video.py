@@ -17,8 +17,6 @@ from .images import Picture, checked, write_image
 if TYPE_CHECKING:
     from types import ModuleType
 
-__all__ = ["FILMS", "missing_frames", "write_frames", "write_video"]
-
 
 Codec = Literal["h264", "mp4v", "gif", "webp", "apng"]
 _ANIMATIONS: dict[str, tuple[Codec, str, list[int]]] = {

@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-__all__ = ["asked_plain", "compiled", "plain"]
-
 _AVAILABLE = importlib.util.find_spec("numba") is not None
 _PLAIN: ContextVar[bool] = ContextVar("fprf.ops.plain", default=False)
 

@@ -19,8 +19,6 @@ from torch import Tensor
 
 from .backend import compiled
 
-__all__ = ["Last", "network", "network_reference", "runs", "usable"]
-
 Last = Literal["linear", "relu"]
 """Activation of the last layer."""
 

@@ -12,8 +12,6 @@ import numpy as np
 from .lanes import BLOCK, WIDE, add_lanes, copy_lanes
 from .tile import ROWS_1, ROWS_2, ROWS_3, ROWS_4, multiply_1, multiply_2, multiply_3, multiply_4
 
-__all__ = ["network", "product", "runs"]
-
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 _LEAST = np.float32(-np.inf)
 

@@ -26,8 +26,6 @@ from ..checks import at_least
 from ..errors import DataError
 from .precision import float64_device, full_precision
 
-__all__ = ["Packed", "apply", "apply_packed", "coefficients", "upsample"]
-
 # Measured on photographs: 8 to 12 cost a tenth of the error that the stride brings anyway, 6 doubles it.
 FINENESS = 10.0
 # Largest intermediate, in elements (64 MiB of float32): channels are worked on in groups that fit.

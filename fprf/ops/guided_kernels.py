@@ -16,8 +16,6 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = ["LANES", "ViewArrays", "ViewTable", "gather_views"]
-
 LANES = 8
 """One AVX register of float32; narrower machines split it."""
 

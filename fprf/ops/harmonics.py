@@ -18,8 +18,6 @@ from torch import Tensor
 
 from .dense import usable
 
-__all__ = ["HARMONIC", "Directions", "as_drawn", "recoloured", "recoloured_reference"]
-
 HARMONIC = 0.28209479177387814
 """The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
 _TINY = 1e-5

@@ -9,8 +9,6 @@ import numpy as np
 
 from .lanes import LANES, dot, scaled
 
-__all__ = ["recolour"]
-
 _C0, _HALF, _TINY = np.float32(0.28209479177387814), np.float32(0.5), np.float32(1e-5)
 _0, _1 = np.float32(0), np.float32(1)
 _REACH = tuple(np.float32(math.sqrt((2 * degree + 1) / (4 * math.pi))) for degree in range(4))

@@ -21,30 +21,6 @@ from llvmlite import binding, ir
 from numba import types
 from numba.extending import intrinsic
 
-__all__ = [
-    "BLOCK",
-    "FUSE",
-    "LANES",
-    "WIDE",
-    "add_lanes",
-    "address",
-    "copy_lanes",
-    "dot",
-    "exp_lanes",
-    "load",
-    "number",
-    "opaque_lanes",
-    "product_backward",
-    "product_backward_wide",
-    "product_forward",
-    "product_forward_wide",
-    "product_slopes",
-    "scaled",
-    "splat",
-    "store",
-    "vector",
-]
-
 
 def _wide() -> int:
     try:

@@ -16,9 +16,6 @@ from torch import Tensor
 from ..types import Rays
 from .backend import compiled
 
-__all__ = ["Gathered", "Warp", "Weighed", "composite", "distances", "gather", "place", "propose", "usable", "warp_of", "weigh"]
-
-
 Warp = Annotated[Tensor, "7"]
 """Map of a space to the unit cube, as the kernels take it."""
 

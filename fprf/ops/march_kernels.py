@@ -12,8 +12,6 @@ import numpy as np
 from .lanes import BLOCK, LANES, WIDE, copy_lanes, dot, exp_lanes, opaque_lanes, product_forward
 from .triplane_kernels import cells
 
-__all__ = ["composite", "distances", "gather", "place", "propose", "weigh"]
-
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 
 RAYS = 16

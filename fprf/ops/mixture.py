@@ -15,8 +15,6 @@ from torch import Tensor
 from .dense import usable
 from .precision import full_precision
 
-__all__ = ["affine", "affine_reference", "attention", "scaled", "scaled_reference"]
-
 
 def affine_reference(
     x: Annotated[Tensor, "N C"],

@@ -22,8 +22,6 @@ from .tile import (
     accumulate_4,
 )
 
-__all__ = ["affine", "attention", "scaled"]
-
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 _0, _1, _LEAST = np.float32(0), np.float32(1), np.float32(-np.inf)
 

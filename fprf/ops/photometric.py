@@ -14,8 +14,6 @@ import numpy as np
 from .simd import LANES, absolute, as_float, lanes, load, splat, store, take, total, traced, where_greater
 from .threads import on_threads
 
-__all__ = ["WINDOW", "blurred", "loss", "slack"]
-
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 WINDOW = 11
 _weights = np.exp(-((np.arange(11.0) - 5) ** 2) / (2 * 1.5**2))

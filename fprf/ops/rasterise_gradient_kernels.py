@@ -53,8 +53,6 @@ from .simd import (
 )
 from .threads import on_threads
 
-__all__ = ["SUMS", "adam", "cache_path", "composite_back", "gradients", "lift", "lift_values"]
-
 SUMS = LANES
 GEOMETRY = 6
 """Sums of an entry that are about its shape; those of channels follow."""

@@ -47,21 +47,6 @@ from .simd import (
 )
 from .threads import on_threads
 
-__all__ = [
-    "BLUR",
-    "FIXED",
-    "MAX_ALPHA",
-    "MIN_ALPHA",
-    "SIDE",
-    "SLOTS",
-    "STOP",
-    "Entries",
-    "bins",
-    "composite",
-    "pack",
-    "project",
-]
-
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 _Ints = np.ndarray[Any, np.dtype[np.int32]]
 FIXED, SLOTS, SIDE = 11, 16, 16

@@ -16,8 +16,6 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Pinhole", "Projected", "evaluate_harmonics", "project_reference", "rasterise_reference", "view_colours"]
-
 BLUR, MIN_ALPHA, MAX_ALPHA = 0.3, 1 / 255, 0.99
 TILE = 16
 _MOST_LOG, _HUGE, _LARGE = 30.0, 1e16, 1e15

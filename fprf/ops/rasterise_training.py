@@ -15,8 +15,6 @@ from . import photometric, rasterise_gradient_kernels, rasterise_kernels
 from .rasterise_kernels import FIXED, SIDE, SLOTS
 from .simd import LANES
 
-__all__ = ["Learnt", "Target", "compile_beside", "errors", "learn"]
-
 Floats = np.ndarray[Any, np.dtype[np.float32]]
 
 

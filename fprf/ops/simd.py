@@ -21,37 +21,6 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-__all__ = [
-    "LANES",
-    "absolute",
-    "added_in_fours",
-    "aligned",
-    "as_float",
-    "exp2",
-    "exp2_rough",
-    "floor",
-    "greater_bits",
-    "lanes",
-    "largest",
-    "least",
-    "load",
-    "log2",
-    "lowest_bit",
-    "maximum",
-    "minimum",
-    "splat",
-    "square_root",
-    "stack",
-    "store",
-    "sums",
-    "swapped",
-    "take",
-    "total",
-    "traced",
-    "transposed",
-    "where_greater",
-]
-
 LANES = 16
 """Numbers of a vector."""
 

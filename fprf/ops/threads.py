@@ -10,8 +10,6 @@ from typing import Any
 import numba
 import numpy as np
 
-__all__ = ["on_threads"]
-
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:

@@ -14,21 +14,6 @@ from numba.extending import intrinsic
 
 from .lanes import FUSE, WIDE, address, load, number, splat, store, vector
 
-__all__ = [
-    "ROWS_1",
-    "ROWS_2",
-    "ROWS_3",
-    "ROWS_4",
-    "accumulate_1",
-    "accumulate_2",
-    "accumulate_3",
-    "accumulate_4",
-    "multiply_1",
-    "multiply_2",
-    "multiply_3",
-    "multiply_4",
-]
-
 _LONG = ir.IntType(64)
 
 

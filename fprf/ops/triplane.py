@@ -20,8 +20,6 @@ from torch import Tensor
 
 from . import triplane_numba, triplane_triton
 
-__all__ = ["AXES", "lookup", "lookup_reference", "point_slopes_reference", "rows", "split", "variation", "variation_reference"]
-
 AXES = ((0, 1), (0, 2), (1, 2))
 
 

@@ -17,8 +17,6 @@ from .lanes import (
     product_slopes,
 )
 
-__all__ = ["GROUP", "backward", "cells", "forward", "point_slopes", "variation", "variation_gradient"]
-
 GROUP = 16
 """Channels of one backward task: a cache line of float32."""
 

@@ -16,8 +16,6 @@ from torch import Tensor
 
 from .backend import compiled
 
-__all__ = ["backward", "forward", "point_slopes", "usable", "variation", "variation_gradient"]
-
 _LANES = 8
 _SLICES = 4
 """Parts of the points with gradients of their own."""

@@ -18,8 +18,6 @@ from torch import Tensor
 
 from .backend import asked_plain
 
-__all__ = ["backward", "forward", "interpreted", "usable"]
-
 _AVAILABLE = importlib.util.find_spec("triton") is not None
 _TILE = 1024
 """Numbers of a program's tile: channels times points. Compiled for compute capability 9.0 this leaves 72 registers a thread

@@ -11,8 +11,6 @@ precision; coordinates, arithmetic and sums are float32. One build serves any nu
 import triton
 import triton.language as tl
 
-__all__ = ["backward", "forward"]
-
 
 @triton.jit
 def _nodes(points, n, inside, axis, SIZE: tl.constexpr):

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
-__all__ = ["Need", "PluginConfig", "absent_file"]
-
 
 class Need(NamedTuple):
     """Something that a plug-in lacks on this machine."""

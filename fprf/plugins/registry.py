@@ -14,21 +14,6 @@ from typing import NamedTuple, TypeVar
 
 from ..errors import PluginError
 
-__all__ = [
-    "Entry",
-    "entry",
-    "forget",
-    "groups",
-    "installed",
-    "load",
-    "load_object",
-    "make",
-    "name_of",
-    "nearest",
-    "peek",
-    "unreadable",
-]
-
 T = TypeVar("T")
 
 

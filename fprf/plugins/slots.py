@@ -12,8 +12,6 @@ from ..errors import PluginError, UsageError
 from . import registry
 from .config import PluginConfig
 
-__all__ = ["Slot", "hints_of", "is_slot", "members", "replace", "resolve", "slots", "take_flag"]
-
 C = TypeVar("C")
 
 

@@ -17,8 +17,6 @@ from . import registry
 from .config import Need, PluginConfig
 from .slots import hints_of, is_slot, members
 
-__all__ = ["Missing", "from_json", "leaves", "to_json"]
-
 T = TypeVar("T")
 
 

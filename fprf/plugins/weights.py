@@ -18,20 +18,6 @@ from torch import Tensor
 from ..errors import WeightsError
 from .config import Need, absent_file
 
-__all__ = [
-    "IMAGENET_MEAN",
-    "IMAGENET_STD",
-    "WeightSource",
-    "find_weights",
-    "read_tensors",
-    "read_weights",
-    "stated_triple",
-    "tensors_hash",
-    "torchvision_file",
-    "weights_needed",
-    "write_weights",
-]
-
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors (half precision widened to float32) and metadata. Raises WeightsError where the file is absent or damaged."""

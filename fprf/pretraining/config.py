@@ -8,8 +8,6 @@ from pathlib import Path
 from ..checks import at_least, positive
 from ..plugins.encoders.config import BundledContentConfig, EncoderConfig
 
-__all__ = ["PretrainConfig", "PretrainDecoderConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig:

@@ -30,22 +30,6 @@ from .config import PretrainDecoderConfig
 from .loop import generator_of, sheet, train
 from .photos import filtered_at, filtered_crop, filtered_whole, find_photos, load_photo, random_pixels, split
 
-__all__ = [
-    "CONTENT",
-    "Crops",
-    "StyleNetwork",
-    "adain",
-    "decoder_report",
-    "load_style_network",
-    "prepare_crops",
-    "pretrain_decoder",
-    "restyling_losses",
-    "restyling_report",
-    "style_distance",
-    "style_statistics",
-]
-
-
 NAMES = ("1_1", "1_2", "2_1", "2_2", "3_1", "3_2", "3_3", "3_4", "4_1")
 LAST = ("relu4_1", "relu3_4")
 """The deepest layer of the style, the first of these that the weights reach."""

@@ -20,17 +20,6 @@ from ..io.images import to_uint8, write_image
 from ..plugins.weights import read_weights, write_weights
 from .config import PretrainConfig
 
-__all__ = [
-    "checkpoint_path",
-    "generator_of",
-    "report_path",
-    "samples_folder",
-    "sheet",
-    "train",
-    "write_report",
-]
-
-
 GAP = 4
 """Pixels between the pictures of a sheet."""
 

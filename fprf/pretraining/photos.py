@@ -18,17 +18,6 @@ from ..errors import DataError
 from ..interfaces import Encoder
 from ..ops.guided import apply, coefficients, upsample
 
-__all__ = [
-    "filtered_at",
-    "filtered_crop",
-    "filtered_whole",
-    "find_photos",
-    "load_photo",
-    "random_pixels",
-    "split",
-]
-
-
 SUFFIXES = (".jpg", ".jpeg", ".png")
 HELD_OUT = 12
 """One photograph in so many is held out."""

@@ -29,9 +29,6 @@ from .config import SfmConfig
 from .scene_folder import SceneFolder, State, step_key
 from .worker import NO_MODEL, NO_PYCOLMAP
 
-__all__ = ["MatchTables", "find_features", "find_matches", "find_poses"]
-
-
 _MAX_IMAGES = 2147483647
 """A pair of images is stored as _MAX_IMAGES * smaller id + larger id."""
 

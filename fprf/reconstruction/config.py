@@ -5,8 +5,6 @@ from typing import Literal
 
 from ..checks import at_least, between
 
-__all__ = ["SfmConfig"]
-
 Lens = Literal["simple-pinhole", "pinhole", "simple-radial", "radial", "opencv", "opencv-fisheye"]
 
 

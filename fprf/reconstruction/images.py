@@ -24,9 +24,6 @@ from ..io.atomic import atomic_path, write_bytes
 from .config import SfmConfig
 from .scene_folder import SceneFolder, State, step_key
 
-__all__ = ["gather_images"]
-
-
 _SIDE = 960
 """Longest side at which sharpness is measured: finer detail is mostly noise, and larger images take long."""
 _NEIGHBOURS = 2

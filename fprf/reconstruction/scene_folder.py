@@ -17,9 +17,6 @@ from typing import Any, NamedTuple, Protocol
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json
 
-__all__ = ["SceneFolder", "State", "report", "step_key", "summary_rows"]
-
-
 _FORMAT = 1
 
 

@@ -10,8 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-__all__ = ["NO_MODEL", "NO_PYCOLMAP", "main"]
-
 NO_PYCOLMAP, NO_MODEL = 3, 4
 
 

@@ -20,8 +20,6 @@ from ..io.atomic import write_json
 from .cameras import Cameras
 from .lens import PINHOLE
 
-__all__ = ["read_camera_path", "write_camera_path"]
-
 _FPS = 24.0
 """Nerfstudio's value where a file has none."""
 _FAR = 1e30

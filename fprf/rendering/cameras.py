@@ -16,8 +16,6 @@ from torch import Tensor
 
 from .lens import PINHOLE, bend, lens_reach, unbend
 
-__all__ = ["LIMIT", "Cameras", "PixelRays", "grid_rays", "normals", "pixel_grid", "project", "rays_through", "sees"]
-
 
 @dataclass(frozen=True)
 class Cameras:

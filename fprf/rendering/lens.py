@@ -13,8 +13,6 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-__all__ = ["FISHEYE", "OPENCV", "PANORAMA", "PINHOLE", "bend", "lens_reach", "unbend"]
-
 PINHOLE, OPENCV, FISHEYE, PANORAMA = 0, 1, 2, 3
 _TOLERANCE = 1e-14
 """In focal lengths; pixels are some 1e3 to 1e4 times smaller, which leaves 1e-10 px."""

@@ -26,24 +26,6 @@ from .lens import PANORAMA, PINHOLE
 from .space import Space
 from .splines import catmull_rom, quaternions, rotations, slerp
 
-__all__ = [
-    "MOTIONS",
-    "STRIP",
-    "coverage",
-    "dataset",
-    "eye_strips",
-    "interpolate",
-    "look_at",
-    "make_path",
-    "orbit",
-    "panoramas",
-    "pinhole",
-    "spiral",
-    "tour",
-    "upwards",
-    "well_covered",
-]
-
 
 def dataset(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Cameras:
     """The captured views of `indices`, in that order, with their own lenses: renders lie over the photographs."""

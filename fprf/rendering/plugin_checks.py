@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from ..style.dictionary import StyleDictionary
     from ..style.scene import SceneStyle
 
-__all__ = ["check_parts", "check_stylizer", "check_term"]
-
 T = TypeVar("T")
 POINTS = 5
 

@@ -26,8 +26,6 @@ from .stepfun import keep_heaviest, midpoints, scale_gradient, transmittance_wei
 if TYPE_CHECKING:
     from ..style.look import Restyle
 
-__all__ = ["Kept", "Parts", "composite", "composite_mean", "enlarged", "march", "march_features", "render_rays", "shade"]
-
 
 _NEAR_CAMERA = 4.0
 """Within this multiple of a ray's nearest distance gradients are scaled down in training."""

@@ -23,8 +23,6 @@ from torch import Tensor
 from ..ops import march
 from ..types import Rays
 
-__all__ = ["Kind", "Space", "contract"]
-
 Kind = Literal["box", "contraction", "ndc", "open"]
 
 

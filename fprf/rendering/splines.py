@@ -8,8 +8,6 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-__all__ = ["catmull_rom", "quaternions", "rotations", "slerp"]
-
 
 def quaternions(rotation: Annotated[Tensor, "M 3 3"]) -> Annotated[Tensor, "M 4"]:
     """Unit quaternions of rotations, either of the two signs.

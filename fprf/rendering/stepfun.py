@@ -9,17 +9,6 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-__all__ = [
-    "distortion",
-    "interlevel",
-    "keep_heaviest",
-    "midpoints",
-    "resample",
-    "scale_gradient",
-    "shifts",
-    "transmittance_weights",
-]
-
 
 class _Weights(torch.autograd.Function):
     """w_i = exp(-sum_{j<i} tau_j) (1 - exp(-tau_i)), with its gradient written out.

@@ -42,8 +42,6 @@ from .learner import Learner
 from .photographs import make_levels
 from .training import Prepared, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
-__all__ = ["OVERVIEW", "CellTask", "folder_of", "read_cells", "train_cell", "train_overview", "unite", "write_cells"]
-
 _FORMAT, _VIEWS = 2, "views.json"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""

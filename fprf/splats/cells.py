@@ -24,8 +24,6 @@ from .initial import spatial_order
 from .levels import in_view
 from .photographs import cover
 
-__all__ = ["Cell", "cut"]
-
 Number = TypeVar("Number", bound=np.generic)
 Window = tuple[int, int, int, int]
 """Left, top, width, height in pixels."""

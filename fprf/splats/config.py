@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..training.quality import QualityConfig
     from .scene import SplatScene
 
-__all__ = ["GaussiansConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class GaussiansConfig(RunConfig):

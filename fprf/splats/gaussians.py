@@ -14,8 +14,6 @@ from torch import Tensor
 from ..errors import DataError
 from ..ops.harmonics import HARMONIC
 
-__all__ = ["COUNTS", "Gaussians"]
-
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
 

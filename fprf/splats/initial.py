@@ -14,8 +14,6 @@ from ..datamanagers.scene import Scene
 from ..rendering.cameras import project
 from .photographs import cover, undistorted
 
-__all__ = ["Points", "initial_points", "spacing", "spatial_order", "surroundings"]
-
 Doubles = NDArray[np.float64]
 _ENOUGH = 100
 """Points that are worth starting from."""

@@ -24,8 +24,6 @@ from .gaussians import Gaussians
 from .initial import Points, spacing, spatial_order
 from .photographs import Floats, Level
 
-__all__ = ["Learner", "Step"]
-
 _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
 _SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85

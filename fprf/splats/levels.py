@@ -25,8 +25,6 @@ from ..rendering.splines import rotations
 from .gaussians import Gaussians
 from .initial import spatial_order
 
-__all__ = ["Levels", "in_view", "make_levels_of_detail", "open_levels", "write_levels"]
-
 _CHUNK, _GROUP, _LEVELS = 512, 4, 4
 """Gaussians of a chunk; those merged into one of the next level; levels, the finest included."""
 _DEVIATIONS = 3.0

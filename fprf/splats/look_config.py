@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 from ..checks import at_least
 
-__all__ = ["LookConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class LookConfig:

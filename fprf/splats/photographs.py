@@ -17,12 +17,12 @@ from ..ops.rasterise import Pinhole, camera_array
 from ..ops.rasterise_training import Target
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
 
-__all__ = ["Floats", "Level", "cover", "distorted", "make_levels", "pinhole", "undistorted"]
-
 Floats = NDArray[np.float32]
 _PANORAMA = 3
 _WIDEST = 4.0
 """Tangent of the widest angle that a pinhole shows: 76 degrees."""
+_SHARPEST = cv2.INTER_LANCZOS4
+"""Out of its lens and back into it a photograph of 135 x 240 pixels comes with 43 dB; by cubic interpolation with 40."""
 
 
 Level = dict[int, Target]
@@ -78,9 +78,11 @@ def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[
     return Pinhole(intrinsics, plain.world_to_camera, wide, tall, near), (tangent * focal - low).view(height, width, 2)
 
 
-def distorted(image: Annotated[Tensor, "h w C"], place: Annotated[Tensor, "H W 2"]) -> Annotated[Tensor, "H W C"]:
-    """An image at the places of `cover`."""
-    return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy())))
+def distorted(
+    image: Annotated[Tensor, "h w C"], place: Annotated[Tensor, "H W 2"], *, linear: bool = False
+) -> Annotated[Tensor, "H W C"]:
+    """An image at the places of `cover`; `linear` for what must not swing over its edges."""
+    return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy(), cv2.INTER_LINEAR if linear else _SHARPEST)))
 
 
 def make_levels(scene: Scene, images: Mapping[int, Image], masks: Mapping[int, NDArray[np.bool_]], near: float) -> list[Level]:
@@ -135,10 +137,10 @@ def _planes(image: Floats) -> Floats:
     return out
 
 
-def _sampled(image: NDArray[Any], place: NDArray[np.float64]) -> NDArray[Any]:
+def _sampled(image: NDArray[Any], place: NDArray[np.float64], interpolation: int = _SHARPEST) -> NDArray[Any]:
     where = (place - 0.5).astype(np.float32)
     x, y = np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1])
-    return np.asarray(cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+    return np.asarray(cv2.remap(np.ascontiguousarray(image), x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:

@@ -24,8 +24,6 @@ from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.scene import SceneStyle, membership, own_style
 
-__all__ = ["Colours", "all_around", "region_maps", "restyled_harmonics"]
-
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""
 _ROWS = 1 << 15

@@ -40,18 +40,6 @@ from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
 from .views import camera_of, draw, find_views
 
-__all__ = [
-    "Semantics",
-    "SplatScene",
-    "cache_name",
-    "find_semantics",
-    "load_scene",
-    "load_semantics",
-    "look_at_capture",
-    "scene_tensors",
-    "semantics_tensors",
-]
-
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
 _SOLID = 0.5
@@ -150,7 +138,9 @@ class SplatScene(Scene):
         drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
         layers = torch.cat([drawn.image, (drawn.depth * _ray_lengths(camera))[..., None], drawn.opacity[..., None]], -1)
         if place is not None:
-            layers = torch.cat([distorted(layers[..., :3], place), distorted(layers[..., 3:].contiguous(), place)], -1)
+            layers = torch.cat(
+                [distorted(layers[..., :3], place), distorted(layers[..., 3:].contiguous(), place, linear=True)], -1
+            )
         return View((layers[..., :3] * torch.tensor(self.tone)).clamp(0, 1), layers[..., 3], layers[..., 4], 1.0)
 
     @torch.inference_mode()

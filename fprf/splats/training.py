@@ -38,23 +38,6 @@ from .levels import Levels, open_levels, write_levels
 from .photographs import make_levels
 from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
 
-__all__ = [
-    "Prepared",
-    "facts_of",
-    "find_near",
-    "gaussians_of",
-    "lit",
-    "load_photographs",
-    "load_tones",
-    "open_gaussians",
-    "prepare",
-    "reach_of",
-    "scene_of",
-    "state_of",
-    "train",
-    "with_downscale",
-]
-
 _PATIENCE = 3
 """Steps in a row without a finite loss after which training gives up."""
 _SMOOTHING = 0.95

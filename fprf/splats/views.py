@@ -25,8 +25,6 @@ from ..rendering.paths import look_at, pinhole
 from .gaussians import Gaussians
 from .photographs import cover
 
-__all__ = ["camera_of", "draw", "find_views", "mean_colours"]
-
 _LIFTS = (-8.0, 12.0, 32.0, 55.0)
 """Heights of the rings, in degrees above the middle."""
 _DISTANCES = (1.2, 1.7)

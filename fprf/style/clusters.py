@@ -12,8 +12,6 @@ from torch import Tensor
 from ..errors import NumericsError
 from ..ops.precision import double
 
-__all__ = ["Clusters", "kmeans"]
-
 _ROWS = 20_480
 """Rows worth clustering: more do not move the centroids, and cost more than half a second."""
 

@@ -25,8 +25,6 @@ from .dictionary import StyleDictionary, blend_codes
 from .scene import SceneStyle, membership, region_units
 from .statistics import mix, monge, symmetric_root
 
-__all__ = ["ColourMaps", "carried_colours", "colour_maps", "decoded_colours"]
-
 _DRAWS = 512
 """Points drawn of each region: means of colours are known to a fiftieth of their deviation."""
 _GAIN = 3.0

@@ -20,24 +20,6 @@ from ..errors import ConfigError, UsageError
 from ..plugins.registry import nearest
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 
-__all__ = [
-    "NO_MASK",
-    "PRESETS",
-    "Pixel",
-    "Place",
-    "RegionValue",
-    "StyleConfig",
-    "find_reference",
-    "labels",
-    "parse_place",
-    "parse_region_value",
-    "parse_strength",
-    "pixel_of",
-    "preset_flags",
-    "with_preset",
-]
-
-
 _PIXEL = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
 
 

@@ -14,8 +14,6 @@ from torch import Tensor
 from ..errors import UsageError
 from .config import Place
 
-__all__ = ["allowed_references", "blend_strength", "keep_luminance", "luma", "place_weight"]
-
 _LUMA = (0.2126, 0.7152, 0.0722)
 """Rec. 709."""
 

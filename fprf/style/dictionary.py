@@ -18,20 +18,6 @@ from ..ops.precision import double
 from .clusters import kmeans
 from .statistics import covariance, group_moments, mix, moments
 
-__all__ = [
-    "BLEND",
-    "CLUSTERS",
-    "Reference",
-    "StyleDictionary",
-    "blend_codes",
-    "build_dictionary",
-    "choose",
-    "code_odds",
-    "load_dictionary",
-    "save_dictionary",
-    "whole_style",
-]
-
 BLEND = 0.1
 """Share of the whole image's (or scene's) statistics in each local code. The paper has none, its released code 0.3, which
 ends further from the truth where that is known (docs/evidence)."""

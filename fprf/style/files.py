@@ -22,8 +22,6 @@ from ..plugins.codec import from_json, packages_of, read_json, to_json
 from ..plugins.registry import nearest
 from .config import NO_MASK, StyleConfig
 
-__all__ = ["Key", "StyleFile", "check_photographs", "read_style", "with_folders", "write_style"]
-
 _FORMAT = 1
 _KEYS = ("format", "fprf", "plugins", "style", "sha256", "semantic_encoder", "regions", "made")
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..interfaces import Scene
     from .look import Restyle
 
-__all__ = ["Key", "fade", "keyed_looks", "read_keyframes"]
-
 _FORMAT = 1
 
 

@@ -18,8 +18,6 @@ from .config import Place
 from .controls import blend_strength, keep_luminance
 from .regional import RegionWeight
 
-__all__ = ["Applied", "Restyle"]
-
 Applied: TypeAlias = tuple[Annotated[Tensor, "N C"], float | Annotated[Tensor, "N 1"], float]
 """Features, strength (one, or one a point) and luminance that is kept."""
 

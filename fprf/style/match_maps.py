@@ -25,20 +25,6 @@ from .regional import RegionWeight
 from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled
 
-__all__ = [
-    "MatchMap",
-    "Region",
-    "Taken",
-    "explain",
-    "match_map",
-    "match_picture",
-    "match_pictures",
-    "region_row",
-    "region_tile",
-    "summarize",
-    "write_pixels",
-]
-
 _LISTED = 0.005
 """Codes that less than this share of a view takes are not listed."""
 

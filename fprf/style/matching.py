@@ -25,22 +25,6 @@ from ..ops import mixture
 from ..ops.dense import usable
 from ..ops.precision import double, full_precision
 
-__all__ = [
-    "Keys",
-    "Matching",
-    "Similarity",
-    "attention",
-    "compared",
-    "match_keys",
-    "point_shares",
-    "score_spread",
-    "scores",
-    "share_mean",
-    "unit",
-    "whitener",
-]
-
-
 Similarity = Literal["cosine", "dot"]
 
 _FLAT = 1e-6

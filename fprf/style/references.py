@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from ..datamanagers.basis import Basis
     from .scene import SceneStyle
 
-__all__ = ["SHORTEST_REFERENCE", "Encoders", "encode_photograph", "read_reference"]
-
 _SAMPLES = 20_000
 """Pixels that are looked at, about, on a regular grid."""
 

@@ -18,8 +18,6 @@ from .scene import SceneStyle, membership, region_units
 if TYPE_CHECKING:
     from ..plugins.stylizers.config import StylizerConfig
 
-__all__ = ["RegionStylizer", "RegionWeight", "regional"]
-
 
 def regional(
     dictionary: StyleDictionary, scene: SceneStyle, allowed: Annotated[Tensor, "K references"], config: "StylizerConfig"

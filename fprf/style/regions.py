@@ -18,8 +18,6 @@ from .matching import scores, unit
 from .regional import RegionWeight
 from .scene import SceneStyle
 
-__all__ = ["ALIKE", "RegionMatch", "Regions", "find_regions", "key_of", "membership_view", "memberships"]
-
 ALIKE = 0.5
 """Least cosine of a region with a key from elsewhere: below, the scene has no such region.
 

@@ -23,8 +23,6 @@ from .regional import RegionWeight, regional
 from .regions import RegionMatch, Regions, find_regions, key_of
 from .scene import SceneStyle
 
-__all__ = ["Codes", "RegionControls", "Styled", "apply_style", "dress", "mixed", "region_controls", "region_scores", "restyle"]
-
 
 class Codes(NamedTuple):
     """The style codes that points can take, of one style or of two that are mixed: what match maps speak of."""

@@ -14,19 +14,6 @@ from .matching import point_shares, score_spread, unit
 from .statistics import Moments, covariance, group_moments
 from .statistics import moments as moments_of
 
-__all__ = [
-    "SceneStyle",
-    "check_fit",
-    "from_tensors",
-    "membership",
-    "own_style",
-    "region_contacts",
-    "region_smoothing",
-    "region_units",
-    "scene_style",
-    "to_tensors",
-]
-
 _SOFTNESS = 0.3
 """Temperature of points belonging to regions, relative to the spread of the scores: fixed with the scene, since the
 regions' statistics are taken with it."""

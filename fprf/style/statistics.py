@@ -18,22 +18,6 @@ from torch import Tensor
 from ..errors import NumericsError
 from ..ops.precision import double, float64_device, full_precision
 
-__all__ = [
-    "Moments",
-    "covariance",
-    "dead_channels",
-    "deviation",
-    "empty",
-    "group_moments",
-    "limit_gain",
-    "merge",
-    "mix",
-    "moments",
-    "monge",
-    "symmetric_root",
-]
-
-
 _CHUNK = 16384
 """Rows centred at a time: bounds the float64 copies of large inputs."""
 

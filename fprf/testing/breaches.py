@@ -7,8 +7,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
-__all__ = ["Unread", "close", "follows", "penalties", "pointwise", "require", "same", "same_parameters", "tensor", "trainable"]
-
 
 def require(condition: bool, breach: str) -> None:
     """Raise AssertionError with the sentence unless the condition holds (also under `python -O`)."""

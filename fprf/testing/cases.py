@@ -18,8 +18,6 @@ from ..style.dictionary import StyleDictionary
 from ..style.scene import SceneStyle
 from ..types import Batch, Rays, Site
 
-__all__ = ["batch", "capture", "dictionary", "normal", "parts", "points", "rays", "scene", "site", "space", "uniform"]
-
 
 def uniform(*shape: int, seed: int) -> Tensor:
     """In [0, 1]. Every call in this package has a seed of its own, so that swapped arguments are seen."""

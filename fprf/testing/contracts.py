@@ -44,21 +44,6 @@ from ..types import Batch, Rays, Rendered, Sampled, Want
 from . import cases
 from .breaches import Unread, close, follows, penalties, pointwise, require, same, same_parameters, tensor, trainable
 
-__all__ = [
-    "check_config",
-    "check_content_field",
-    "check_data_manager",
-    "check_decoder",
-    "check_encoder",
-    "check_executor",
-    "check_layout",
-    "check_loss_term",
-    "check_parser",
-    "check_sampler",
-    "check_semantic_field",
-    "check_stylizer",
-]
-
 
 def check_config(config: PluginConfig) -> None:
     """A frozen dataclass that its defaults build, that compares by value, and that JSON carries there and back."""

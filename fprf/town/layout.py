@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from .shapes import LANTERN, Face, Finish, Lot, Material, Shape, bush, car, church, forest, hedge, house, lamp, tree
 
-__all__ = ["CROSSING", "END", "KERB", "ROAD_HALF", "SQUARE_HALF", "START", "WALK_HALF", "FaceTable", "Town", "build_town"]
-
 ROAD_HALF, WALK_HALF, KERB = 3.4, 5.4, 0.22
 """Half widths of the road and of road plus sidewalks, and the width of the kerb, in metres."""
 START, END, SQUARE_HALF = -8.0, 41.0, 9.0

@@ -25,9 +25,6 @@ from .surface import (
     step,
 )
 
-__all__ = ["foliage_normals", "paint", "paint_ground", "paint_walls"]
-
-
 Colours = NDArray[np.float32]
 Array = NDArray[np.float64]
 

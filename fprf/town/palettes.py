@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 from ..errors import DataError
 
-__all__ = ["PALETTES", "Palette", "palette"]
-
 Colour = tuple[float, float, float]
 
 

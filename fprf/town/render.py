@@ -19,24 +19,6 @@ from .palettes import Palette
 from .shapes import Ellipsoid, Material, Polyhedron, Shape
 from .surface import fractal2, hashed, labels, noise2, step
 
-__all__ = [
-    "FIELD_OF_VIEW",
-    "Picture",
-    "View",
-    "cast",
-    "colours",
-    "directions",
-    "geometry",
-    "is_test",
-    "render",
-    "shade",
-    "shadowed",
-    "sky",
-    "sun_direction",
-    "walk",
-]
-
-
 Array = NDArray[np.float64]
 _NEAR = 1e-4
 """Metres before which nothing is hit: keeps a surface from shadowing itself."""

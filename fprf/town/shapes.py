@@ -12,34 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "LANTERN",
-    "PLINTH",
-    "STOREY",
-    "Cylinder",
-    "Ellipsoid",
-    "Face",
-    "Finish",
-    "Lot",
-    "Material",
-    "Polyhedron",
-    "Shape",
-    "box",
-    "bush",
-    "car",
-    "church",
-    "cylinder",
-    "ellipsoid",
-    "extrude",
-    "forest",
-    "hedge",
-    "house",
-    "lamp",
-    "pyramid",
-    "tree",
-]
-
-
 Array = NDArray[np.float64]
 _FLAT: Array = np.zeros(3)
 

@@ -11,37 +11,6 @@ from numpy.typing import NDArray
 from .layout import END, ROAD_HALF, SQUARE_HALF, WALK_HALF, FaceTable, Town
 from .shapes import PLINTH, Material
 
-__all__ = [
-    "CAR",
-    "CLASSES",
-    "DOOR",
-    "FACADE",
-    "FOLIAGE",
-    "LAMP",
-    "LAWN",
-    "ROAD",
-    "ROOF",
-    "SIDEWALK",
-    "SKY",
-    "TRUNK",
-    "WINDOW",
-    "Parts",
-    "band",
-    "cells",
-    "facade_parts",
-    "fractal2",
-    "fractal3",
-    "ground_class",
-    "hashed",
-    "labels",
-    "mix",
-    "noise2",
-    "noise3",
-    "on_face",
-    "step",
-]
-
-
 SKY, LAWN, ROAD, SIDEWALK, FACADE, ROOF, FOLIAGE, TRUNK, WINDOW, LAMP, DOOR, CAR = range(12)
 
 CLASSES = (

@@ -26,8 +26,6 @@ from .palettes import palette as palette_of
 from .render import Picture, View, directions, is_test, render, walk
 from .surface import CLASSES
 
-__all__ = ["TownSettings", "is_town", "read_truth", "write_town"]
-
 _EDITION = 1
 """Counts the looks of the town: raised with every change to its pictures, so that cached folders are rendered anew."""
 _POINTS = 256

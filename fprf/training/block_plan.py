@@ -33,18 +33,6 @@ from .prepare import Prepared, behind, build_encoders, cache_folder, device_of, 
 from .run import Run
 from .trainer import Loop, optimizer_of
 
-__all__ = [
-    "Estimate",
-    "Laid",
-    "estimates",
-    "lay_out",
-    "plan_scene",
-    "renumber",
-    "seconds_per_step",
-    "trained_tasks",
-    "write_down",
-]
-
 
 class Laid(NamedTuple):
     """A scene that is ready to be trained block by block."""

@@ -47,28 +47,6 @@ from .prepare import Prepared, build_encoders, cache_folder, scene_of
 from .run import Run, held
 from .trainer import Report, train
 
-__all__ = [
-    "FREE",
-    "RAYS",
-    "SURROUNDINGS",
-    "BlockTask",
-    "Built",
-    "Finished",
-    "asked_of",
-    "assemble",
-    "built_block",
-    "folder_of",
-    "inset",
-    "load_boxes",
-    "load_finished",
-    "member_of",
-    "read_done",
-    "restore",
-    "save_finished",
-    "surroundings",
-    "train_block",
-]
-
 FREE = (*RESUMABLE, "blocks", "executor", "statistics", "render")
 """Fields of a config that do not decide what a block of given bounds and rays learns."""
 RAYS = "rays.safetensors"

@@ -20,8 +20,6 @@ from ..datamanagers.scene import GAMMA
 from ..rendering.cameras import Cameras
 from ..types import Rays, Rendered
 
-__all__ = ["Poses", "Tones", "moved", "moving", "refined", "relative", "rotated", "toned"]
-
 _TINY = 1e-24
 """Square of an angle that float64 cannot tell from none: the root of nothing has no slope."""
 

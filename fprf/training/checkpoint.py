@@ -20,8 +20,6 @@ from ..io.atomic import remove_unfinished, write_json
 from . import tensorfiles
 from .model import Model
 
-__all__ = ["Saved", "digest", "load_latest", "reached", "restore", "save", "steps", "tidy", "write"]
-
 KEEP = 2
 """Checkpoints that stay on disk."""
 

@@ -30,8 +30,6 @@ from ..types import Want
 from .model import Facts, Model, build_model
 from .views import render_view, view_rays
 
-__all__ = ["Outcome", "compare", "fast_paths"]
-
 _DIM = 8
 _KINDS = 4
 _ALLOWED = {"encoder": 5e-3, "training step": 2e-3, "render": 1e-3, "restyle": 4e-3}

@@ -16,8 +16,6 @@ from ..style.match_maps import match_map, match_picture
 from ..style.restyle import Styled
 from ..types import View
 
-__all__ = ["Channel", "Take", "limits_of", "panels", "planes", "shoot"]
-
 Channel: TypeAlias = Literal["colour", "depth", "normals", "match"]
 
 _PROBES, _PROBE_RESOLUTION = 4, 0.25

@@ -32,8 +32,6 @@ from .quality import QualityConfig, at_quality
 from .run import Known, Run
 from .views import CachedView, cache_view, paint_pixels, render_view
 
-__all__ = ["LoadedRun", "Shelf", "Trained", "encoders_of", "load_run", "load_style", "open_fields", "open_run"]
-
 
 class Shelf(Members):
     """Blocks of a run, the last used first; the surroundings always at hand."""

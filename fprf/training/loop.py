@@ -12,21 +12,6 @@ from torch import Tensor, nn
 
 from ..config import OptimizerConfig, RunConfig
 
-__all__ = [
-    "CLEAR_EVERY",
-    "PATIENCE",
-    "SMOOTHING",
-    "StepStatistics",
-    "Stop",
-    "clear_denormals",
-    "held_back",
-    "progress",
-    "rate",
-    "unfit_gradients",
-    "unfit_step",
-    "unfit_terms",
-]
-
 
 def progress(config: RunConfig, step: int, seconds: float) -> float:
     """Share of the way, 0 to 1: by steps or by minutes, whichever is further."""

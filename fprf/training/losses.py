@@ -19,9 +19,6 @@ from ..rendering.stepfun import distortion, interlevel, midpoints
 from ..types import Batch, Rendered, Want
 from .model import Facts, Model
 
-__all__ = ["FADE", "NEARBY", "SHELL", "check_penalties", "emptiness", "ending", "extra_term", "terms", "total", "wanted"]
-
-
 FADE = 0.01
 """Share of `loss.depth` that is left at the end: points say where things are, pixels what they look like in detail."""
 SHELL = 4.0

@@ -16,8 +16,6 @@ from ..rendering.renderer import Parts
 from ..rendering.space import Space
 from .camera_optimizers import Poses, Tones
 
-__all__ = ["Facts", "Model", "background_of", "build_decoder", "build_model", "poses_of", "tones_of"]
-
 
 def build_decoder(config: TrainConfig, *, encoder: str, channels: int) -> Decoder:
     """The decoder of the content encoder, by the encoder's identity.

@@ -31,27 +31,6 @@ from .run import read_history
 if TYPE_CHECKING:
     from .trainer import Report
 
-__all__ = [
-    "Forecast",
-    "Outcome",
-    "Prepared",
-    "behind",
-    "build_encoders",
-    "cache_folder",
-    "decoder_needs",
-    "device_of",
-    "exposure_of",
-    "facts_of",
-    "find_downscale",
-    "outcome",
-    "plugin_needs",
-    "prepare",
-    "reach_of",
-    "scene_needs",
-    "scene_of",
-    "with_downscale",
-]
-
 
 class Prepared(NamedTuple):
     """A scene that is ready to be trained."""

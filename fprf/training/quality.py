@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from .loading import Trained
     from .run import Known
 
-__all__ = ["PRESETS", "Preset", "QualityConfig", "at_quality", "mixed_tone"]
-
 Name: TypeAlias = Literal["draft", "standard", "best"]
 
 

@@ -40,21 +40,6 @@ from ..rendering.space import Space
 from . import tensorfiles
 from .model import Facts
 
-__all__ = [
-    "CHANGED_IMAGES",
-    "IMAGES",
-    "LOCK",
-    "History",
-    "Known",
-    "Run",
-    "check_images",
-    "held",
-    "image_hashes",
-    "read_history",
-    "save_image_hashes",
-    "view_names",
-]
-
 FORMAT = 1
 _SHOWN = 8
 """Views of the split `covered`, at most."""

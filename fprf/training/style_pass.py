@@ -20,8 +20,6 @@ from ..style.statistics import Moments, merge, moments
 from .camera_optimizers import refined
 from .model import Model
 
-__all__ = ["POINTS", "lattice", "measure_style", "neighbours"]
-
 POINTS = 2**18
 """Points that regions are measured on, at most: 128 + 64 channels of them take 200 MB."""
 

@@ -19,8 +19,6 @@ from torch import Tensor
 from ..errors import CheckpointError
 from ..io.atomic import atomic_path, unwritable
 
-__all__ = ["load", "load_sealed", "read", "save", "save_sealed"]
-
 _MANIFEST = "manifest"
 _SYSTEM = re.compile(r"os error (\d+)")
 

@@ -41,8 +41,6 @@ from .model import Facts, Model, background_of, build_model
 from .prepare import Prepared, device_of
 from .run import Run
 
-__all__ = ["Loop", "Report", "optimizer_of", "train"]
-
 REPORT_SECONDS = 0.5
 """Time between reports."""
 

@@ -17,8 +17,6 @@ from ..style.look import Restyle
 from ..types import Rays, Rendered, View, Want
 from .model import Facts, Model, background_of
 
-__all__ = ["CachedView", "Part", "cache_view", "on_host", "paint_pixels", "render_view", "view_parts", "view_rays"]
-
 
 def view_rays(
     model: Model, cameras: Cameras, view: int, pixel: Annotated[Tensor, "R 2"] | None = None

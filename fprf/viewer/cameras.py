@@ -21,18 +21,6 @@ from ..rendering.space import Space
 from ..rendering.splines import quaternions, rotations
 from ..types import Boxes
 
-__all__ = [
-    "CameraState",
-    "PageTransform",
-    "Segments",
-    "box_edges",
-    "camera_frustums",
-    "checked_camera",
-    "page_transform",
-    "path_segments",
-    "picture_size",
-]
-
 Segments = NDArray[np.float32]
 """Line segments [N 2 3], page units."""
 

@@ -35,8 +35,6 @@ from .state import FilmProgress, Key, Look, interpolate_looks, simplified, style
 if TYPE_CHECKING:
     from .session import Session
 
-__all__ = ["FilmPlan", "FilmRecorder", "film_cameras", "film_frames", "new_folder", "queued_frames", "write_film_files"]
-
 _MAX_SECONDS = 600.0
 PREVIEW_FPS = 8.0
 """Pictures a second of a flight that is played: as many as a processor makes."""

@@ -31,8 +31,6 @@ from .renderer import RenderedFrame
 from .session import Frontend, Session
 from .state import State
 
-__all__ = ["ViserFrontend", "page_of"]
-
 _COARSE_QUALITY, _FINAL_QUALITY = 70, 92
 """JPEG qualities of pictures on the way and of those that stay."""
 _ORBIT = 0.5

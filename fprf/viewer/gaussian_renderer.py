@@ -24,8 +24,6 @@ from .renderer import Layers, RenderRequest, SceneRenderer, composite_layers, re
 from .restyler import Restyler
 from .state import State, ViewSettings
 
-__all__ = ["Colours", "GaussianRenderer", "page_gaussians"]
-
 Colours: TypeAlias = Annotated[NDArray[np.uint8], "N 3"]
 
 

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from .session import Session
     from .state import TrainingProgress
 
-__all__ = ["LiveViewer", "TrainingFollower", "ViewAddress", "main"]
-
 _START_TIMEOUT = 60.0
 """Seconds within which the viewer must say where it listens."""
 _LOG = "log"

@@ -11,8 +11,6 @@ from msgspec import Meta, Struct
 
 from ..errors import DataError
 
-__all__ = ["check_message"]
-
 Text: TypeAlias = Annotated[str, Meta(max_length=4096)]
 Number: TypeAlias = Annotated[float, Meta(ge=-1e15, le=1e15)]  # NaN fails either bound
 Vector: TypeAlias = tuple[Number, Number, Number]

@@ -30,8 +30,6 @@ from .state import (
     set_weight,
 )
 
-__all__ = ["Page", "described"]
-
 _WAIT = 20.0
 """Seconds until a request for changes is answered without any."""
 _MESSAGES = 20

@@ -30,8 +30,6 @@ from .state import (
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["Panel"]
-
 _NONE = "nothing"
 _DROP_MODES: tuple[DropMode, ...] = ("alone", "in the mix")
 _SIZES = {"small (480)": 480, "medium (960)": 960, "full HD (1920)": 1920}

@@ -9,8 +9,6 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
 
-__all__ = ["RenderWorker"]
-
 Request = TypeVar("Request")
 
 

@@ -32,21 +32,6 @@ from .cameras import CameraState, PageTransform, picture_size
 from .restyler import Restyler
 from .state import ViewSettings
 
-__all__ = [
-    "CHUNK",
-    "LayerRenderer",
-    "Layers",
-    "ProgressiveRenderer",
-    "RenderRequest",
-    "RenderedFrame",
-    "SceneRenderer",
-    "Speed",
-    "composite_layers",
-    "first_speeds",
-    "region_colours",
-    "resolutions",
-]
-
 CACHE_BYTES = 192 << 20
 """Features that are kept, of all clients' views together."""
 CHUNK = 4096

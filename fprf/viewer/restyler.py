@@ -37,16 +37,6 @@ from ..training.run import Run
 from ..training.style_pass import measure_style
 from .state import Look, Photograph, RegionInfo, simplified, style_config
 
-__all__ = [
-    "OpenEncoders",
-    "Restyler",
-    "concatenate",
-    "load_unfinished",
-    "matching_regions",
-    "measure_encoders",
-    "set_parameters",
-]
-
 OpenEncoders: TypeAlias = Callable[[Encoders | None], Encoders]
 """Opens the encoders of a scene with its style, given those that were opened before."""
 Key = TypeVar("Key")

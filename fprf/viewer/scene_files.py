@@ -16,8 +16,6 @@ from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, UsageError
 from ..reconstruction.images import VIDEO_SUFFIXES
 
-__all__ = ["CAPTURE_SUFFIXES", "SceneFiles", "Source", "SourceKind", "check_file", "find_source", "is_capture"]
-
 CAPTURE_SUFFIXES = frozenset({".ply", ".splat", ".spz", ".sog"})
 """Files of 3D Gaussians, in lower case."""
 SourceKind: TypeAlias = Literal["run", "capture", "scene", "photographs", "video"]

@@ -30,20 +30,6 @@ if TYPE_CHECKING:
     from .restyler import OpenEncoders
     from .session import Session, Viewed
 
-__all__ = [
-    "COOKIE",
-    "Access",
-    "Handler",
-    "HttpServer",
-    "Request",
-    "Response",
-    "Routes",
-    "ViewerServer",
-    "json_body",
-    "json_response",
-    "make_access",
-]
-
 COOKIE = "fprf-token"
 _MIN_TOKEN = 16
 """Characters of a token that a user chooses."""

@@ -32,8 +32,6 @@ from .restyler import OpenEncoders, Restyler, matching_regions
 from .state import Look, Photograph, State, Thumbnail, ViewSettings, add_photograph, only, renumber_regions
 from .uploads import Uploads, shown_name
 
-__all__ = ["Frontend", "Session", "Viewed", "view_of_run"]
-
 T = TypeVar("T")
 
 _POLL = 0.5

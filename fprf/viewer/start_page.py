@@ -23,8 +23,6 @@ from ..errors import DataError, FprfError, UsageError
 from .scene_files import SceneFiles, Source, find_source, is_capture
 from .server import Handler, Request, Response, json_body, json_response
 
-__all__ = ["Progress", "StartPage"]
-
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
 _LINES = 40

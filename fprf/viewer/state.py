@@ -17,43 +17,6 @@ from ..style.config import PRESETS, StyleConfig
 from ..style.dictionary import Reference
 from .cameras import CameraState
 
-__all__ = [
-    "MAPS",
-    "MAX_PIXELS",
-    "MIN_PIXELS",
-    "SHELF",
-    "DropMode",
-    "FilmProgress",
-    "Key",
-    "Look",
-    "Map",
-    "Photograph",
-    "RegionAction",
-    "RegionInfo",
-    "RegionRule",
-    "State",
-    "Thumbnail",
-    "TrainingProgress",
-    "ViewSettings",
-    "add_key",
-    "add_photograph",
-    "apply_preset",
-    "interpolate_looks",
-    "move_key",
-    "only",
-    "remove_key",
-    "remove_photograph",
-    "renumber_regions",
-    "replace_key",
-    "restore_key",
-    "save_look",
-    "select_key",
-    "set_rule",
-    "set_weight",
-    "simplified",
-    "style_config",
-]
-
 RegionAction: TypeAlias = Literal["pin", "forbid", "keep"]
 Map: TypeAlias = Literal["none", "matches", "regions", "depth"]
 MAPS: tuple[Map, ...] = ("none", "matches", "regions", "depth")

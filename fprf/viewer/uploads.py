@@ -19,8 +19,6 @@ from typing import TextIO
 from ..datamanagers.images import MAX_PIXELS, header_of
 from ..errors import DataError, FprfError
 
-__all__ = ["MAX_BYTES", "MAX_SIDE", "Uploads", "check_photograph", "limit_memory", "serve_decoder", "shown_name"]
-
 MAX_BYTES = 20 << 20
 """Bytes of a photograph."""
 MAX_SIDE = 1024

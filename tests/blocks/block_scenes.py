@@ -10,8 +10,6 @@ from fprf.datamanagers.scene import Scene
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
 
-__all__ = ["cameras_at", "drone", "scene_of", "street"]
-
 
 def cameras_at(position: Tensor, ahead: Tensor, upright: Tensor, size: tuple[int, int] = (64, 48)) -> Cameras:
     """Pinholes of 90 degrees at positions [V 3], looking ahead [V 3]."""

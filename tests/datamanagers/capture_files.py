@@ -8,19 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-__all__ = [
-    "Capture",
-    "quaternion",
-    "rotations",
-    "write_colmap",
-    "write_image",
-    "write_llff",
-    "write_odm",
-    "write_polycam",
-    "write_record3d",
-    "write_transforms",
-]
-
 
 @dataclass(frozen=True)
 class Capture:

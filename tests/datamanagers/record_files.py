@@ -14,8 +14,6 @@ from fprf.town.layout import build_town
 from fprf.town.palettes import palette
 from fprf.town.render import render, walk
 
-__all__ = ["example", "record", "town_records", "varint"]
-
 
 def varint(value: int) -> bytes:
     value &= 0xFFFFFFFFFFFFFFFF

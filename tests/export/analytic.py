@@ -8,8 +8,6 @@ from torch import Tensor
 from fprf.export.depth_maps import DepthMaps
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 
-__all__ = ["RADIUS", "globe", "looking", "plane_depth", "ring", "sphere_depth"]
-
 RADIUS = 1.0
 
 

@@ -5,8 +5,6 @@ Views are pinholes with OpenGL axes and their centre in the middle, as in `splat
 
 import numpy as np
 
-__all__ = ["draw_points", "draw_triangles", "psnr", "to_view"]
-
 _NEAR = 0.02
 
 

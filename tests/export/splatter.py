@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Gaussians", "draw", "read_gaussians", "read_splat", "table"]
-
 WIDEN = 0.3
 
 

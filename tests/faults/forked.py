@@ -3,8 +3,6 @@
 import os
 from collections.abc import Callable
 
-__all__ = ["DEAD", "Deadly", "forked"]
-
 DEAD = 73
 
 

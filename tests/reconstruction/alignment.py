@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Miss", "align", "misses"]
-
 
 class Miss(NamedTuple):
     position: float

@@ -12,7 +12,6 @@ from fprf.rendering.renderer import Parts
 from fprf.rendering.space import Kind, Space
 from fprf.types import FieldSample, Rays, Want
 
-__all__ = ["EYE", "Never", "Ones", "Shift", "Squash", "Uniform", "parts_of", "rays_of", "space_of"]
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 C, D = 5, 3
 

@@ -17,7 +17,6 @@ from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.town.write import write_town
 
-__all__ = ["BlockWorld", "block_flags", "digests", "done_of", "made", "small", "steps_of", "tensors_of"]
 VIEWS, STEPS = 12, 6
 BLOCKS = StreetConfig(segments=3)
 

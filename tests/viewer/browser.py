@@ -14,8 +14,6 @@ from typing import Any
 
 import pytest
 
-__all__ = ["Front", "front", "served"]
-
 _DROP = """async ([data, name]) => {
   const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0));
   const carried = new DataTransfer();

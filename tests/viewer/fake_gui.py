@@ -5,8 +5,6 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
-__all__ = ["Client", "Gui"]
-
 
 class Client:
     """What viser hands over with an event; its camera is wherever the panel flew it last."""

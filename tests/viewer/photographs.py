@@ -10,8 +10,6 @@ from fprf.viewer.restyler import Restyler
 from fprf.viewer.session import Viewed, view_of_run
 from fprf.viewer.state import Photograph
 
-__all__ = ["encoded", "until", "viewed"]
-
 
 def encoded(restyler: Restyler, world: World) -> tuple[Photograph, Photograph]:
     one, two = (restyler.encode(path, path.name) for path in world.references)

@@ -6,8 +6,6 @@ from pathlib import Path
 from fprf.checks import at_least
 from fprf.pretraining.config import PretrainConfig
 
-__all__ = ["DistilConfig", "SemanticDistilConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class DistilConfig(PretrainConfig):

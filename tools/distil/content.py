@@ -27,8 +27,6 @@ from fprf.training.prepare import device_of
 from .config import DistilConfig
 from .examples import crop, prepared, prepared_path, toned
 
-__all__ = ["Basis", "content_report", "fit_basis", "pretrain_content"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Basis:

@@ -17,8 +17,6 @@ from fprf.plugins.weights import read_weights, write_weights
 
 from .config import DistilConfig
 
-__all__ = ["crop", "nightfall", "prepared", "prepared_path", "toned"]
-
 LUMA = (0.299, 0.587, 0.114)
 Pair = tuple[Tensor, Tensor]
 

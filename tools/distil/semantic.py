@@ -35,23 +35,6 @@ from .config import SemanticDistilConfig
 from .content import Basis, fit_basis
 from .examples import crop, nightfall, prepared, prepared_path, toned
 
-__all__ = [
-    "COMPONENTS",
-    "Ensemble",
-    "MobileNetTeacher",
-    "Streets",
-    "load_teacher",
-    "look",
-    "pretrain_semantic",
-    "relations",
-    "render_streets",
-    "semantic_ensemble",
-    "street_targets",
-    "taught",
-    "view",
-]
-
-
 CELL = 16
 """Pixels per feature."""
 GREY = torch.full((3,), 0.5)

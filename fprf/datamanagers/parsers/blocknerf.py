@@ -33,9 +33,6 @@ from .config import BlockNerfConfig
 from .town import cache_folder
 from .views import View, assemble_scene, index_tensor, rigid_pose
 
-__all__ = ["BlockNerfParser", "crc32c", "is_record", "masked", "read_examples"]
-
-
 _POLYNOMIAL = 0x82F63B78
 _MASK = 0xA282EAD8
 

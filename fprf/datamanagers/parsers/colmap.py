@@ -27,9 +27,6 @@ from .config import ColmapConfig
 from .files import path_inside, read_bytes, read_npz
 from .views import View, assemble_scene, rigid_pose
 
-__all__ = ["ColmapParser", "cloud_of_model", "model_folder", "read_cloud", "read_model"]
-
-
 MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),

@@ -20,23 +20,6 @@ if TYPE_CHECKING:
     from ...interfaces import DataParser
     from ..scene import Scene
 
-__all__ = [
-    "BlockNerfConfig",
-    "ColmapConfig",
-    "DataParserConfig",
-    "LlffConfig",
-    "MegaNerfConfig",
-    "OdmConfig",
-    "PhotoTourismConfig",
-    "PolycamConfig",
-    "Recognised",
-    "Record3DConfig",
-    "TownConfig",
-    "TransformsConfig",
-    "parse_scene",
-    "recognise",
-]
-
 
 class Recognised(NamedTuple):
     """A parser's confidence that it reads a folder."""

@@ -20,20 +20,6 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ..images import IMAGE_SUFFIXES
 
-__all__ = [
-    "Json",
-    "Record",
-    "as_record",
-    "image_names",
-    "name_of",
-    "path_inside",
-    "read_bytes",
-    "read_json",
-    "read_npy",
-    "read_npz",
-]
-
-
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 
 _NPY_HEADER = re.compile(

@@ -16,8 +16,6 @@ from .config import LlffConfig
 from .files import image_names, path_inside, read_bytes, read_npy
 from .views import View, assemble_scene, rigid_pose
 
-__all__ = ["LlffParser"]
-
 
 class LlffParser(DataParser):
     """`poses_bounds.npy` beside a folder of images."""

@@ -19,8 +19,6 @@ from .config import MegaNerfConfig
 from .files import name_of
 from .views import View, assemble_scene, index_tensor, rigid_pose
 
-__all__ = ["MegaNerfParser"]
-
 _LARGEST = 1 << 24
 """Bytes of a file of metadata."""
 

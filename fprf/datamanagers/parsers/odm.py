@@ -24,8 +24,6 @@ from .config import OdmConfig
 from .files import Json, Record, as_record, path_inside, read_json
 from .views import View, assemble_scene, check_images_exist, rigid_pose
 
-__all__ = ["OdmParser", "project_file"]
-
 _RECONSTRUCTION, _SHOTS = "opensfm/reconstruction.json", "odm_report/shots.geojson"
 _RADIAL = {"perspective": OPENCV, "simple_radial": OPENCV, "radial": OPENCV, "brown": OPENCV}
 _LENSES = _RADIAL | {"fisheye": FISHEYE, "fisheye_opencv": FISHEYE}

@@ -16,8 +16,6 @@ from ..scene import Scene
 from .colmap import ColmapParser, model_folder
 from .config import ColmapConfig, PhotoTourismConfig
 
-__all__ = ["PhotoTourismParser", "read_list"]
-
 
 class PhotoTourismParser(DataParser):
     """A COLMAP model and its table."""

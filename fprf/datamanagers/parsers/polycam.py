@@ -16,8 +16,6 @@ from .config import PolycamConfig
 from .files import Record, as_record, image_names, read_json
 from .views import View, assemble_scene, rigid_pose
 
-__all__ = ["PolycamParser", "keyframes"]
-
 _PAIRS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _MOST = 1e6
 """Pixels of a side."""

@@ -20,8 +20,6 @@ from .config import Record3DConfig
 from .files import Json, as_record, image_names, read_json
 from .views import View, assemble_scene, rigid_pose
 
-__all__ = ["Record3DParser", "recording"]
-
 _Rows: TypeAlias = NDArray[np.float64]
 _PAIRS = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata", "rgb"), ("metadata.json", "rgbd"))
 _MOST = 1e6

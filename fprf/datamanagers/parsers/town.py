@@ -9,8 +9,6 @@ from ...interfaces import DataParser
 from ..scene import Scene
 from .config import TownConfig, TransformsConfig
 
-__all__ = ["TownParser", "cache_folder"]
-
 
 class TownParser(DataParser):
     """Renders the town where there is none yet."""

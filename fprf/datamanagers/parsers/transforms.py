@@ -25,8 +25,6 @@ from .config import TransformsConfig
 from .files import Record, as_record, path_inside, read_json
 from .views import View, assemble_scene, check_images_exist, index_tensor, rigid_pose
 
-__all__ = ["TransformsParser"]
-
 _LENSES = {
     "PINHOLE": PINHOLE,
     "SIMPLE_PINHOLE": PINHOLE,

@@ -21,9 +21,6 @@ from ..images import read_header
 from ..scene import Scene
 from .files import name_of
 
-__all__ = ["View", "assemble_scene", "check_images_exist", "index_tensor", "rigid_pose"]
-
-
 MASKS, SKY_MASKS = "masks", "sky_masks"
 """Names of the folders."""
 

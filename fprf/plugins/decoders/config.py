@@ -19,8 +19,6 @@ from ..typed_json import Missing
 if TYPE_CHECKING:
     from ...interfaces import Decoder
 
-__all__ = ["DecoderConfig", "MlpDecoderConfig", "Objective", "ResidualDecoderConfig", "pretrain_line"]
-
 
 Objective = Literal["identity", "paper"]
 """Training objective of a decoder: returning photographs alone, or the paper's content and style losses as well."""

@@ -18,9 +18,6 @@ from ...ops import dense
 from ..weights import read_weights
 from .config import Objective
 
-__all__ = ["DECODER_KIND", "ColourHead", "MlpDecoder", "ResidualDecoder", "load_decoder", "residual_share"]
-
-
 DECODER_KIND = "mlp-decoder"
 FOLDER = Path(__file__).parent / "weights"
 NAMES = ("first.weight", "first.bias", "second.weight", "second.bias")

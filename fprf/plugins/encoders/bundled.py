@@ -11,16 +11,6 @@ from ...errors import WeightsError
 from ..weights import read_weights
 from .frozen import FrozenEncoder, NetworkEncoder, freeze, reflect_pad, replicate_to_multiple
 
-__all__ = [
-    "CONTENT_KIND",
-    "SEMANTIC_KIND",
-    "ContentStudent",
-    "RandomEncoder",
-    "SemanticStudent",
-    "load_content_encoder",
-    "load_semantic_encoder",
-]
-
 
 class ContentStudent(nn.Module):
     """2x2 pixels to channels, two 3x3 convolutions, a projection: stride 2, the 10 pixels that VGG-19 relu2_1 sees.

@@ -17,8 +17,6 @@ from torch import Tensor, nn
 from ...interfaces import Encoder
 from .frozen import FrozenEncoder, finest, freeze, street
 
-__all__ = ["AveragedEncoder", "ConcatEncoder", "build_concat", "unit_of"]
-
 
 class AveragedEncoder(FrozenEncoder):
     """Mean of `inner` over `scales` of the image, and over its mirror images if `flip`."""

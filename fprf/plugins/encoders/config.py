@@ -16,23 +16,6 @@ from ..config import Need, PluginConfig, absent_file
 if TYPE_CHECKING:
     from ...interfaces import Encoder
 
-__all__ = [
-    "AveragedConfig",
-    "BundledContentConfig",
-    "BundledSemanticConfig",
-    "ConcatConfig",
-    "DeepLabConfig",
-    "DinoConfig",
-    "Dinov2Config",
-    "Dinov3Config",
-    "EncoderConfig",
-    "EspNetConfig",
-    "MobileNetV2Config",
-    "RandomConfig",
-    "Vgg16Config",
-    "Vgg19Config",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig(PluginConfig):

@@ -18,8 +18,6 @@ from torch import Tensor, nn
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, WeightSource, find_weights, read_tensors, stated_triple
 from .frozen import FrozenTensors, NetworkEncoder, fitting
 
-__all__ = ["SOURCE", "EspNet", "build_espnet", "class_scores", "convolve", "norm", "normed_activation", "prelu"]
-
 
 def convolve(
     tensors: FrozenTensors, x: Annotated[Tensor, "B F H W"], name: str, *, stride: int = 1, dilation: int = 1

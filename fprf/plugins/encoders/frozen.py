@@ -14,19 +14,6 @@ from ...errors import WeightsError
 from ...interfaces import Encoder
 from ..weights import tensors_hash
 
-__all__ = [
-    "FrozenEncoder",
-    "FrozenTensors",
-    "NetworkEncoder",
-    "finest",
-    "fitting",
-    "freeze",
-    "reflect_pad",
-    "replicate_to_multiple",
-    "resize_to_multiple",
-    "street",
-]
-
 
 class FrozenTensors(nn.Module):
     """Tensors by the names that they have in their file; they move with the module that holds them."""

@@ -20,20 +20,6 @@ from ...errors import WeightsError
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, WeightSource, find_weights, read_tensors, stated_triple, torchvision_file
 from .frozen import FrozenTensors, NetworkEncoder, fitting
 
-__all__ = [
-    "CLASSIFIER",
-    "DEEPLAB",
-    "DEEPLAB_SOURCE",
-    "SOURCE",
-    "Layout",
-    "MobileNetV2",
-    "build_deeplab",
-    "build_mobilenet",
-    "fold",
-    "stride_at",
-]
-
-
 TENSORFLOW_EPS, TORCHVISION_EPS = 1e-3, 1e-5
 FLAG = "--semantic.encoder.weights"
 SOURCE = torchvision_file("MobileNetV2", "mobilenet_v2-b0353104.pth", FLAG)

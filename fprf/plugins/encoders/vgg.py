@@ -22,8 +22,6 @@ from ...interfaces import Encoder
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, find_weights, read_tensors, stated_triple, tensors_hash, torchvision_file
 from .frozen import freeze, reflect_pad, street
 
-__all__ = ["CONVOLUTIONS", "VggEncoder", "build_vgg16", "build_vgg19", "reaches", "vgg_activations"]
-
 
 def _places(depths: Sequence[int]) -> Mapping[str, int]:
     """Convolution and ReLU take two places, a pool one after each block."""

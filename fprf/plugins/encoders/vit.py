@@ -15,8 +15,6 @@ from ...errors import WeightsError
 from ..weights import tensors_hash
 from .frozen import FrozenEncoder, freeze
 
-__all__ = ["VitEncoder", "build_vit"]
-
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # ViT interpolates its position table on demand, DINOv2 always does, DINOv3 turns its tokens by where they lie.
 CALLS: Mapping[str, Mapping[str, bool]] = {"dino": {"interpolate_pos_encoding": True}, "dinov2": {}, "dinov3": {}}

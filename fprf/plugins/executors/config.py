@@ -12,8 +12,6 @@ from ..config import Need, PluginConfig
 if TYPE_CHECKING:
     from ...interfaces import Executor
 
-__all__ = ["ExecutorConfig", "RayConfig", "SerialConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ExecutorConfig(PluginConfig):

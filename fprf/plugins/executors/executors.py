@@ -14,9 +14,6 @@ from ...errors import PluginError
 from ...interfaces import Executor
 from .config import RayConfig
 
-__all__ = ["RayExecutor", "SerialExecutor", "resources"]
-
-
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 

@@ -11,8 +11,6 @@ from ..config import PluginConfig
 if TYPE_CHECKING:
     from ...interfaces import LossTerm
 
-__all__ = ["LossTermConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class LossTermConfig(PluginConfig):

@@ -12,8 +12,6 @@ from ..config import PluginConfig
 if TYPE_CHECKING:
     from ...interfaces import Sampler
 
-__all__ = ["ProposalConfig", "SamplerConfig", "UniformConfig"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerConfig(PluginConfig):

@@ -11,8 +11,6 @@ from ...rendering.stepfun import midpoints, resample, shifts, transmittance_weig
 from ...types import Level, Rays, Sampled
 from .config import ProposalConfig, UniformConfig
 
-__all__ = ["ProposalSampler", "UniformSampler", "even_edges"]
-
 
 def even_edges(rays: Rays, samples: int, generator: torch.Generator | None) -> Tensor:
     """Edges s [R samples+1] at even steps; with a generator the inner ones move together by up to half a step a ray."""

@@ -20,8 +20,6 @@ from ...style.scene import SceneStyle, check_fit
 from ...style.statistics import deviation
 from ...types import Want
 
-__all__ = ["AdainStylizer", "IdentityStylizer", "LocalAdainStylizer"]
-
 
 class IdentityStylizer(Stylizer):
     """Content goes through bit for bit."""

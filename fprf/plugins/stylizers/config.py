@@ -19,16 +19,6 @@ if TYPE_CHECKING:
     from ...style.dictionary import StyleDictionary
     from ...style.scene import SceneStyle
 
-__all__ = [
-    "AdainConfig",
-    "IdentityConfig",
-    "LocalAdainConfig",
-    "RegionAdainConfig",
-    "RegionOtConfig",
-    "RegionToneConfig",
-    "StylizerConfig",
-]
-
 
 @dataclass(frozen=True, kw_only=True)
 class StylizerConfig(PluginConfig):

@@ -23,8 +23,6 @@ from ...style.scene import SceneStyle, check_fit, membership, own_style, region_
 from ...style.statistics import deviation, monge
 from ...types import Want
 
-__all__ = ["ChannelMaps", "MatrixMaps", "RegionMaps", "RegionPlan", "TwoSidedStylizer", "plan_regions", "region_table"]
-
 
 def region_table(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
     """Share of each style code in each region, float64; rows sum to 1.

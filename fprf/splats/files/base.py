@@ -16,22 +16,6 @@ from ...errors import DataError
 from ...ops.harmonics import HARMONIC
 from ..gaussians import Gaussians
 
-__all__ = [
-    "Bools",
-    "Capture",
-    "Floats",
-    "assembled",
-    "colours_of",
-    "constants_of",
-    "logit",
-    "short",
-    "sigmoid",
-    "smallest_three",
-    "spatial_order",
-    "steps",
-    "three_to_four",
-]
-
 Floats: TypeAlias = NDArray[Any]
 Bools: TypeAlias = NDArray[np.bool_]
 

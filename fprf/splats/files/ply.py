@@ -34,8 +34,6 @@ from .base import (
     three_to_four,
 )
 
-__all__ = ["compressed_bytes", "is_compressed", "ply_bytes", "ply_file", "read_ply"]
-
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",

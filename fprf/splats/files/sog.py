@@ -27,8 +27,6 @@ from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians
 from .base import Bools, Capture, Floats, assembled, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
 
-__all__ = ["bundle", "read_sog", "sog_bytes", "unbundle"]
-
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
 _ROW = 64

@@ -11,8 +11,6 @@ from ...errors import DataError
 from ..gaussians import Gaussians
 from .base import Bools, Capture, Floats, assembled, colours_of, constants_of, logit, sigmoid, steps
 
-__all__ = ["read_splat", "splat_bytes"]
-
 _RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
 _LEAST = 1e-12
 """Standard deviations are at least this, so that their logarithm is finite."""

@@ -21,8 +21,6 @@ from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians
 from .base import Bools, Capture, Floats, assembled, logit, short, sigmoid, smallest_three, steps, three_to_four
 
-__all__ = ["read_spz", "spz_bytes"]
-
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 _ENTRY = struct.Struct("<QQ")
