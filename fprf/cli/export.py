@@ -181,11 +181,11 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
 
     kinds = place.what.kinds
     seen = best_views(place.maps, cloud.point, cloud.normal, cloud.edge, config.witnesses)
-    found = place.colours(cloud.point, seen, config.tolerance)
-    solid = found.presence >= config.presence * expected_presence(place.maps, cloud.point, seen, config.tolerance)
+    stored = place.colours(cloud.point, seen, config.tolerance)
+    solid = stored.presence >= config.presence * expected_presence(place.maps, cloud.point, seen, config.tolerance)
     if not bool(solid.any()):
         raise DataError(f"export: no point is as present as {config.presence:g} in the field; lower --presence")
-    cloud, colours = Cloud(*(column[solid] for column in cloud)), [colour[solid] for colour in found.colours]
+    cloud, colours = Cloud(*(column[solid] for column in cloud)), [colour[solid] for colour in stored.colours]
     above = sky_dome(place.maps, cloud) if config.sky and "splat" in kinds else None
     whole = cloud if above is None else concatenate(cloud, above)
     beyond = None if above is None else place.colours(above.point, single_view(above.view), None).colours

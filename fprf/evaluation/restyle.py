@@ -435,21 +435,21 @@ def restyle_page(document: Mapping[str, Any], *, picture: str | None = None) -> 
         parts.append(f"![all methods, one view of each palette, three references]({picture})\n")
     parts.append("## By palette\n")
     for light, sets in document["palettes"].items():
-        for name, found in sets.items():
-            parts += [f"### {light}, {name}\n", markdown(found["rows"], COLUMNS, first="method"), ""]
+        for name, images in sets.items():
+            parts += [f"### {light}, {name}\n", markdown(images["rows"], COLUMNS, first="method"), ""]
     parts += ["## ΔE2000 by class, three references, mean over palettes\n", _by_class(document), "", _USE]
     return "\n".join(parts)
 
 
 def _verdict(document: Mapping[str, Any]) -> str:
-    found = document["verdict"]
-    lines = [f"Recommended: `{document['recommended']}`; the best global baseline is `{found['best_global']}`.\n"]
+    judged = document["verdict"]
+    lines = [f"Recommended: `{document['recommended']}`; the best global baseline is `{judged['best_global']}`.\n"]
     lines += ["| with three references | reached | goal | |", "|---|---:|---:|---|"]
     for name, (label, unit, sign) in _GOALS.items():
-        reached, met = found["reached"][name], found["met"][name]
+        reached, met = judged["reached"][name], judged["met"][name]
         value = "–" if reached is None else f"{reached:.3g} {unit}".strip()
         verdict = {None: "not known", True: "met", False: "**not met**"}[met]
-        lines.append(f"| {label} | {value} | {sign} {found['goals'][name]:g} {unit} | {verdict} |")
+        lines.append(f"| {label} | {value} | {sign} {judged['goals'][name]:g} {unit} | {verdict} |")
     return "\n".join(lines)
 
 

@@ -169,7 +169,7 @@ def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], 
     Folders stand for the images in them, and `report` is told which of these cannot be read. Raises UsageError for another
     form or a name that comes twice, and what reading a style file raises.
     """
-    found = []
+    styles = []
     for text in texts:
         name, equals, what = text.partition("=")
         if not (equals and name and what) or name != _tidy(name):
@@ -181,8 +181,8 @@ def named_styles(texts: Sequence[str], base: StyleFile, report: Callable[[str], 
             check_photographs(Path(what), file)
         else:
             file = StyleFile(with_folders(_with(base.style, tuple(Path(part) for part in what.split(","))), report))
-        found.append(Named(name, file))
-    return found
+        styles.append(Named(name, file))
+    return styles
 
 
 def styles_of(config: ExportConfig, base: StyleFile, report: Callable[[str], None] = warnings.warn) -> list[Named]:

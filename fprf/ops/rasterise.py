@@ -128,13 +128,13 @@ def lift(
     pixels = torch.cat([pixels, torch.ones_like(pixels[..., :1])], -1).detach()
     shape = (means.detach(), quaternions.detach(), log_scales.detach(), logits.detach())
     if _fits(*shape, pixels):
-        found = _lifted(_view(*shape, harmonics, camera, antialiased), pixels)
+        lifted = _lifted(_view(*shape, harmonics, camera, antialiased), pixels)
     else:
         with torch.enable_grad():
             values = means.new_zeros(len(means), pixels.shape[-1], requires_grad=True)
             image, _ = rasterise_reference(*shape, values, camera, pixels.new_zeros(pixels.shape[-1]), antialiased=antialiased)
-            (found,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
-    return Lifted(found[:, :-1], found[:, -1])
+            (lifted,) = torch.autograd.grad((image[..., :-1] * pixels).sum(), values)
+    return Lifted(lifted[:, :-1], lifted[:, -1])
 
 
 class _Rasterise(torch.autograd.Function):
@@ -275,17 +275,17 @@ def _backward(
     begin = 0
     for (channels, values, stride, first), (out, left) in zip(groups, made, strict=True):
         slope = _planes(view, grad[..., begin : begin + channels], channels)
-        found = kernels.composite_back(
+        gradients = kernels.composite_back(
             channels, view.entries, view.splats, values, stride, first, view.width, view.height,
             out.reshape(-1), left.reshape(-1), slope.reshape(-1), of_left.reshape(-1),
         )  # fmt: skip
         begin += channels
         if total is None:
-            total, of_left = found, np.zeros_like(of_left)
+            total, of_left = gradients, np.zeros_like(of_left)
         else:
-            total.reshape(-1, kernels.SUMS)[:-1, :6] += found.reshape(-1, kernels.SUMS)[:-1, :6]  # the last is spare
+            total.reshape(-1, kernels.SUMS)[:-1, :6] += gradients.reshape(-1, kernels.SUMS)[:-1, :6]  # the last is spare
             kernels.lift_values(
-                found, view.entries.first_slot, view.total, of_features.reshape(-1), of_features.shape[1], first, channels
+                gradients, view.entries.first_slot, view.total, of_features.reshape(-1), of_features.shape[1], first, channels
             )
     assert total is not None
     blocks = np.empty_like(view.blocks)
@@ -309,6 +309,6 @@ def _lifted(view: _View, pixels: Tensor) -> Tensor:
     out = np.empty((view.total, -(-channels // 8) * 8), np.float32)
     for first in range(0, out.shape[1], 8):
         slope = _planes(view, pixels[..., first : first + 8], 8)
-        found = kernels.lift(view.entries, view.splats, view.width, view.height, slope.reshape(-1))
-        kernels.lift_values(found, view.entries.first_slot, view.total, out.reshape(-1), out.shape[1], first, 8)
+        sums = kernels.lift(view.entries, view.splats, view.width, view.height, slope.reshape(-1))
+        kernels.lift_values(sums, view.entries.first_slot, view.total, out.reshape(-1), out.shape[1], first, 8)
     return torch.from_numpy(out)[:, :channels]

@@ -198,9 +198,9 @@ def lift(entries: Entries, splats_in: Floats, width: int, height: int, pixels: F
 
 
 def _summed(kernel: Any, entries: Entries, *args: Any) -> Floats:
-    found = aligned((len(entries.ids) + 1) * SUMS)
-    on_threads(kernel, entries.start, entries.ids, entries.slots, entries.blocks, *args, found)
-    return found
+    sums = aligned((len(entries.ids) + 1) * SUMS)
+    on_threads(kernel, entries.start, entries.ids, entries.slots, entries.blocks, *args, sums)
+    return sums
 
 
 @jit
@@ -340,9 +340,9 @@ def _block_gradient(blocks, at, bands, view, summed):
 
     # Colour: no gradient where it is cut at 0.
     dx, dy, dz, shrink = direction(mean, view)
-    found = basis(dx, dy, dz, bands)
+    values = basis(dx, dy, dz, bands)
     colours = [
-        where_greater(was, 0, slope, 0) for was, slope in zip(colour(blocks, at, found), (red, green, blue), strict=True)
+        where_greater(was, 0, slope, 0) for was, slope in zip(colour(blocks, at, values), (red, green, blue), strict=True)
     ]
     gx, gy, gz = _direction_slopes(dx, dy, dz, bands, blocks, at, *colours)
     along = gx * dx + gy * dy + gz * dz
@@ -351,7 +351,7 @@ def _block_gradient(blocks, at, bands, view, summed):
         for r, (g, d) in enumerate(((gx, dx), (gy, dy), (gz, dz)))
     ]
     of_shape = [where_greater(drawn, 0, each, 0) for each in (*of_means, *of_scales, *of_quaternion)]
-    return [*of_shape, s0 * (1 - opacity(load(blocks, at + 10 * LANES))), *(b * each for b in found for each in colours)]
+    return [*of_shape, s0 * (1 - opacity(load(blocks, at + 10 * LANES))), *(b * each for b in values for each in colours)]
 
 
 @traced

@@ -120,11 +120,11 @@ def direction(mean, view):
 
 def basis(x, y, z, bands):
     """The first `bands` of the 16 real spherical harmonics at unit vectors."""
-    found = [splat(x, 0.28209479177387814)]
+    values = [splat(x, 0.28209479177387814)]
     if bands > 1:
-        found += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+        values += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if bands > 4:
-        found += [
+        values += [
             1.0925484305920792 * x * y,
             -1.0925484305920792 * y * z,
             0.31539156525252005 * (2 * z * z - x * x - y * y),
@@ -132,7 +132,7 @@ def basis(x, y, z, bands):
             0.5462742152960396 * (x * x - y * y),
         ]
     if bands > 9:
-        found += [
+        values += [
             -0.5900435899266435 * y * (3 * x * x - y * y),
             2.890611442640554 * x * y * z,
             -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
@@ -141,15 +141,15 @@ def basis(x, y, z, bands):
             1.445305721320277 * z * (x * x - y * y),
             -0.5900435899266435 * x * (x * x - 3 * y * y),
         ]
-    return found
+    return values
 
 
 def colour(blocks, at, basis):
     """0.5 + harmonics times the basis: three vectors, before they are cut at 0."""
-    found = [splat(basis[0], 0.5)] * 3
+    colours = [splat(basis[0], 0.5)] * 3
     for k, b in enumerate(basis):
-        found = [each + b * load(blocks, at + (FIXED + 3 * k + c) * LANES) for c, each in enumerate(found)]
-    return found
+        colours = [each + b * load(blocks, at + (FIXED + 3 * k + c) * LANES) for c, each in enumerate(colours)]
+    return colours
 
 
 def rotation(w, x, y, z):

@@ -77,11 +77,11 @@ def learn(
         channels = slope[: 3 * area].reshape(3, area)
         pull[:] = np.einsum("ca,ca->c", channels, shown[: 3 * area].reshape(3, area))
         channels *= factors[:, None]
-    found = rasterise_gradient_kernels.composite_back(
+    gradients = rasterise_gradient_kernels.composite_back(
         3, entries, splats, splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
     )
     rasterise_gradient_kernels.adam(
-        blocks, *moments, count, bands, camera, found, entries.first_slot, rates, step
+        blocks, *moments, count, bands, camera, gradients, entries.first_slot, rates, step
     )  # fmt: skip
     return Learnt(l1, similar, shown, pull)
 
@@ -101,11 +101,11 @@ def errors(
     apart = np.abs(_exposed(out, target, factors) - target.planes)[: 3 * area]
     if target.valid is not None:
         apart *= target.valid[: 3 * area]
-    pixels, found = np.zeros(8 * area, np.float32), np.empty((count, 8), np.float32)
+    pixels, sums = np.zeros(8 * area, np.float32), np.empty((count, 8), np.float32)
     pixels[:area] = apart.reshape(3, area).sum(0)
     summed = rasterise_gradient_kernels.lift(entries, splats, target.width, target.height, pixels)
-    rasterise_gradient_kernels.lift_values(summed, entries.first_slot, count, found.reshape(-1), 8, 0, 8)
-    return found[:, 0]
+    rasterise_gradient_kernels.lift_values(summed, entries.first_slot, count, sums.reshape(-1), 8, 0, 8)
+    return sums[:, 0]
 
 
 def _area(target: Target) -> int:
@@ -159,11 +159,11 @@ def _compile(bands: int, part: str) -> None:
         rasterise_kernels.composite(3, entries, splats, splats, SLOTS, 6, camera[:3], size, size, planes, left.reshape(-1))
     else:
         slope = photometric.loss(planes, planes, photometric.blurred(planes, size, size), size, size, 0.2)[2]
-        found = rasterise_gradient_kernels.composite_back(
+        gradients = rasterise_gradient_kernels.composite_back(
             3, entries, splats, splats, SLOTS, 6, size, size, planes, left.reshape(-1), slope, left.reshape(-1)
         )  # fmt: skip
         rasterise_gradient_kernels.adam(
-            blocks, first, second, size, bands, camera, found, entries.first_slot, np.zeros(rows, np.float32), 0
+            blocks, first, second, size, bands, camera, gradients, entries.first_slot, np.zeros(rows, np.float32), 0
         )  # fmt: skip
 
 

@@ -363,12 +363,12 @@ def transposed(rows):
 
 def swapped(blocks):
     """Four vectors of four quarters: the first quarters of all in one vector, and so on."""
-    found, quarter = [], LANES // 4
+    swapped_lanes, quarter = [], LANES // 4
     for k in range(4):
         pair = [k * quarter + lane + side * LANES for side in (0, 1) for lane in range(quarter)] * 2
         low, high = _picked(*blocks[:2], pair), _picked(*blocks[2:], pair)
-        found.append(_picked(low, high, [lane if lane < LANES // 2 else lane + LANES for lane in range(LANES)]))
-    return found
+        swapped_lanes.append(_picked(low, high, [lane if lane < LANES // 2 else lane + LANES for lane in range(LANES)]))
+    return swapped_lanes
 
 
 def added_in_fours(x):
@@ -380,27 +380,27 @@ def added_in_fours(x):
 
 def sums(values):
     """The sums of the lanes of each of at most LANES vectors, in the lanes of one; what is left over is undefined."""
-    found, fours = list(values), LANES // 4
+    vectors, fours = list(values), LANES // 4
 
     def halve(low, high):
         """Add picked lanes of each pair of vectors: half as many vectors."""
-        pairs = [(found[k], found[k + 1] if k + 1 < len(found) else None) for k in range(0, len(found), 2)]
+        pairs = [(vectors[k], vectors[k + 1] if k + 1 < len(vectors) else None) for k in range(0, len(vectors), 2)]
         return [_picked(x, y, low) + _picked(x, y, high) for x, y in pairs]
 
     def within_fours(*offsets):
         return [4 * g + o for g in range(fours) for o in offsets]
 
-    found = halve(within_fours(0, LANES, 1, LANES + 1), within_fours(2, LANES + 2, 3, LANES + 3))
-    found = halve(within_fours(0, 1, LANES, LANES + 1), within_fours(2, 3, LANES + 2, LANES + 3))
+    vectors = halve(within_fours(0, LANES, 1, LANES + 1), within_fours(2, LANES + 2, 3, LANES + 3))
+    vectors = halve(within_fours(0, 1, LANES, LANES + 1), within_fours(2, 3, LANES + 2, LANES + 3))
     left = fours
     while left > 1:
         # Group g of a vector holds the partial sums of four of them; the groups of one vector are added in pairs.
         low, high = (
             [side * LANES + 4 * g + j for side in (0, 1) for g in range(first, fours, 2) for j in range(4)] for first in (0, 1)
         )
-        found, left = halve(low, high), left // 2
-    assert len(found) == 1
-    return found[0]
+        vectors, left = halve(low, high), left // 2
+    assert len(vectors) == 1
+    return vectors[0]
 
 
 def _fit(function, degree, low, high):

@@ -82,17 +82,17 @@ class Cell:
         What others hide, and what covers next to nothing, is not shown, so their number does not grow with the scene.
         """
         cameras = self.scene(scene).cameras
-        found = self.around(gaussians.means)
+        visible = self.around(gaussians.means)
         order, centre, radius = _runs(gaussians)
         for view in self.windows:
             camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
-            in_sight = torch.zeros_like(found)
+            in_sight = torch.zeros_like(visible)
             in_sight[order[torch.from_numpy(in_view(camera, centre, radius)[1])]] = True
             some = in_sight.nonzero()[:, 0]
             shape = gaussians.means[some], gaussians.quaternions[some], gaussians.log_scales[some], gaussians.logits[some]
             weights = lift(*shape, camera, torch.zeros(camera.height, camera.width, 1), antialiased=True).weights
-            found[some[weights > _WEIGHT]] = True
-        return found
+            visible[some[weights > _WEIGHT]] = True
+        return visible
 
     def cut(self, view: int, image: NDArray[Number]) -> NDArray[Number]:
         """The window of an image [H W ...] of a view."""

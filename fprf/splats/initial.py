@@ -43,14 +43,14 @@ def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: n
         position = scene.points.double().numpy()
         position = position[np.isfinite(position).all(1)]
         chosen = rng.permutation(len(position))[:count]
-        found, kind = _coloured(scene, images, position[np.sort(chosen)]), "points of the reconstruction"
+        points, kind = _coloured(scene, images, position[np.sort(chosen)]), "points of the reconstruction"
     else:
-        found, kind = _matched(scene, images), "points matched between views"
-        if len(found.position) < _ENOUGH:
-            found, kind = _scattered(scene, images, min(count, 10_000), rng), "random points"
-        chosen = np.sort(rng.permutation(len(found.position))[:count])
-        found = Points(found.position[chosen], found.colour[chosen])
-    return found, kind
+        points, kind = _matched(scene, images), "points matched between views"
+        if len(points.position) < _ENOUGH:
+            points, kind = _scattered(scene, images, min(count, 10_000), rng), "random points"
+        chosen = np.sort(rng.permutation(len(points.position))[:count])
+        points = Points(points.position[chosen], points.colour[chosen])
+    return points, kind
 
 
 def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, count: int) -> Points:
@@ -143,10 +143,10 @@ def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
     places: dict[int, Doubles] = {}
     features: dict[int, NDArray[np.float32]] = {}
     for view in views:
-        found, described = detector.detectAndCompute(cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY), None)
-        if described is None or len(found) < 2:
+        keypoints, described = detector.detectAndCompute(cv2.cvtColor(pictures[view], cv2.COLOR_RGB2GRAY), None)
+        if described is None or len(keypoints) < 2:
             continue
-        places[view] = np.array([each.pt for each in found], np.float64) + 0.5
+        places[view] = np.array([each.pt for each in keypoints], np.float64) + 0.5
         features[view] = np.sqrt(described / np.maximum(described.sum(1, keepdims=True), 1e-9)).astype(np.float32)  # RootSIFT
     centre = {v: scene.cameras.pose[v][:, 3].numpy() for v in views}
     axis = {v: -scene.cameras.pose[v][:, 2].numpy() for v in views}
@@ -189,8 +189,8 @@ def _pairs(first: NDArray[np.float32], second: NDArray[np.float32]) -> tuple[NDA
 def _triangulated(rays: list[Doubles], pixels: tuple[Doubles, Doubles], centres: tuple[Doubles, Doubles]) -> Doubles:
     """World points [M 3]; NaN where the error is too large, the point lies behind a view, or the rays are nearly parallel."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = cv2.triangulatePoints(rays[0], rays[1], pixels[0].T, pixels[1].T)
-        position = (found[:3] / found[3]).T
+        homogeneous = cv2.triangulatePoints(rays[0], rays[1], pixels[0].T, pixels[1].T)
+        position = (homogeneous[:3] / homogeneous[3]).T
         good = np.isfinite(position).all(1)
         for matrix, pixel in zip(rays, pixels, strict=True):
             shown = position @ matrix[:, :3].T + matrix[:, 3]

@@ -115,19 +115,19 @@ class Learner:
         epoch, turn = divmod(step, len(views))
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
         target = level[view]
-        found = learn(
+        measured = learn(
             self.blocks, (self.first, self.second), self.count, self.bands, self.splats, target,
             background=self.config.background, ssim=self.config.ssim, rates=self._rates(share), step=step,
             factors=self._factors(view),
         )  # fmt: skip
-        if not math.isfinite(found.l1 + found.ssim):
+        if not math.isfinite(measured.l1 + measured.ssim):
             return None
         if self.limits is not None:
             scales = self.blocks.reshape(-1, self.rows, LANES)[:, 3:6]
             np.minimum(scales, self.limits, out=scales)
         if self.tones is not None and self.adam is not None:
             self.adam.zero_grad()
-            self.tones(torch.tensor([view]))[0].log().backward(torch.from_numpy(found.pull))
+            self.tones(torch.tensor([view]))[0].log().backward(torch.from_numpy(measured.pull))
             self.adam.param_groups[0]["lr"] = self.config.rate * _TONES * 0.1**share
             self.adam.step()
         moved = (step + 1) % self.config.relocate_every == 0 and not self.colours_only
@@ -135,9 +135,9 @@ class Learner:
             self._relocate(step, level, share)
         height, width = target.height, target.width
         tall, wide = -(-height // LANES) * LANES, -(-width // LANES) * LANES
-        apart = (found.image - target.planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
+        apart = (measured.image - target.planes)[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width]
         squared = float(np.square(apart).mean())
-        return Step(found.l1, found.ssim, squared, self.count, width * height)
+        return Step(measured.l1, measured.ssim, squared, self.count, width * height)
 
     def _rates(self, share: float) -> Floats:
         """Learning rates of the rows of a block. They fall to a tenth, those of the means to a fiftieth."""
@@ -148,15 +148,15 @@ class Learner:
         falls = np.where(np.arange(len(rates)) < 3, 0.02**share, 0.1**share)
         if self.colours_only:
             rates[:FIXED] = 0
-        found: Floats = (self.config.rate * rates * falls).astype(np.float32)
-        return found
+        scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
+        return scaled
 
     def _factors(self, view: int) -> Floats | None:
         """Return the factors of renders of a view."""
         if self.tones is None:
             return None
-        found: Floats = self.tones(torch.tensor([view]))[0].detach().numpy()
-        return found
+        factors: Floats = self.tones(torch.tensor([view]))[0].detach().numpy()
+        return factors
 
     def _relocate(self, step: int, level: Level, share: float) -> None:
         """Split Gaussians where views err: as many as became transparent, which move there, and as the number grows by.
@@ -221,12 +221,12 @@ class Learner:
     def moments(self) -> dict[str, Tensor]:
         """Return the rest of a checkpoint: Adam's moments, and the number of Gaussians that training began with."""
         first, second = (torch.from_numpy(_rows(x, self.rows)[:, : self.count].T.copy()) for x in (self.first, self.second))
-        found = {"first": first, "second": second, "begun": torch.tensor(self.begun)}
+        tensors = {"first": first, "second": second, "begun": torch.tensor(self.begun)}
         if self.tones is not None and self.adam is not None:
             for name, parameter in self.tones.named_parameters():
                 kept = {"value": parameter.detach(), **self.adam.state[parameter]}
-                found |= {f"tones.{name}.{key}": each.clone() for key, each in kept.items()}
-        return found
+                tensors |= {f"tones.{name}.{key}": each.clone() for key, each in kept.items()}
+        return tensors
 
     def start_from(self, gaussians: Gaussians) -> None:
         """Begin with Gaussians, of the config's degree, as they are."""
@@ -259,6 +259,6 @@ def _rows(blocks: Floats, rows: int) -> Floats:
 
 
 def _blocks(rows: Floats) -> Floats:
-    found = aligned(rows.size)
-    found.reshape(-1, len(rows), LANES)[:] = rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)
-    return found
+    blocks = aligned(rows.size)
+    blocks.reshape(-1, len(rows), LANES)[:] = rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)
+    return blocks

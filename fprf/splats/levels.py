@@ -69,10 +69,10 @@ class Levels:
         chunks = np.flatnonzero(seen)
         first, last = self.begin[chunks, level[chunks]], self.begin[chunks, level[chunks] + 1]
         parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
-        found = np.concatenate(parts)
+        nodes = np.concatenate(parts)
         if self.mapped is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
             self.mapped.madvise(mmap.MADV_DONTNEED)
-        return _gaussians(torch.from_numpy(found))
+        return _gaussians(torch.from_numpy(nodes))
 
 
 def in_view(
@@ -197,9 +197,9 @@ def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
     area = values[:, 1:].prod(1).sqrt()
     opacity = (weight.sum((1, 2)) / area).clamp(1e-6, _OPAQUE)
     harmonics = (share[..., None] * gaussians.harmonics.double()[index].view(len(mean), _GROUP, -1, 3)).sum(1)
-    found = (mean, _quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
+    parts = (mean, _quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
     apart = torch.linalg.eigvalsh(between)[:, -1].clamp_min(0).sqrt()
-    return Gaussians(*(part.float() for part in found)), apart.numpy()
+    return Gaussians(*(part.float() for part in parts)), apart.numpy()
 
 
 def _quaternions(turns: Annotated[Tensor, "N 3 3"]) -> Annotated[Tensor, "N 4"]:
@@ -217,8 +217,8 @@ def _quaternions(turns: Annotated[Tensor, "N 3 3"]) -> Annotated[Tensor, "N 4"]:
         ],
         1,
     )
-    found = rows[torch.arange(len(turns)), squares.argmax(1)]
-    return torch.nn.functional.normalize(found, dim=1)
+    quaternions = rows[torch.arange(len(turns)), squares.argmax(1)]
+    return torch.nn.functional.normalize(quaternions, dim=1)
 
 
 def _rows(gaussians: Gaussians) -> Annotated[Tensor, "N 11+3K"]:

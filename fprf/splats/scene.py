@@ -293,9 +293,9 @@ def find_semantics(
         trust = coarse[..., 3:] ** _TRUST
         parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
         pixels = torch.cat([fine * trust, trust], 2)
-        found = lift(*parts, camera_of(small, 0, near), pixels, antialiased=antialiased).features
-        sums += found[:, :dim]
-        weights += found[:, dim]
+        lifted = lift(*parts, camera_of(small, 0, near), pixels, antialiased=antialiased).features
+        sums += lifted[:, :dim]
+        weights += lifted[:, dim]
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
         height, width = fine.shape[:2]
         colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
@@ -349,8 +349,8 @@ def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bo
         cameras = Cameras(**_group(tensors, "camera"))
     except TypeError as error:
         raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
-    found = load_semantics(tensors, len(gaussians))
-    return captured(gaussians, antialiased, cameras, lambda: found)
+    semantics = load_semantics(tensors, len(gaussians))
+    return captured(gaussians, antialiased, cameras, lambda: semantics)
 
 
 def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -205,10 +205,10 @@ def train(config: GaussiansConfig, prepared: Prepared, run: Run, report: Callabl
         try:
             while (share := progress(config, step, clock)) < 1:
                 stop.obey()
-                found = learner.step(prepared.before + step, first + (last - first) * share)
+                measured = learner.step(prepared.before + step, first + (last - first) * share)
                 step += 1
-                meter.add(found)
-                if found is None:
+                meter.add(measured)
+                if measured is None:
                     run.log({"step": step - 1, "skipped": "loss"})
                 if meter.failed >= _PATIENCE:
                     raise NumericsError(f"step {step}: the loss is not finite for {_PATIENCE} steps in a row; lower --rate")
@@ -315,12 +315,12 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
 
 def _stored(folder: Path, gaussians: Gaussians, key: str) -> Levels:
     """Levels of detail of a run, written where there are none of its checkpoint."""
-    found = open_levels(folder, key)
-    if found is None:
+    levels = open_levels(folder, key)
+    if levels is None:
         write_levels(folder, gaussians, key)
-        found = open_levels(folder, key)
-    assert found is not None  # it was just written
-    return found
+        levels = open_levels(folder, key)
+    assert levels is not None  # it was just written
+    return levels
 
 
 def load_tones(run: Run) -> Tones | None:
@@ -351,9 +351,9 @@ def _semantics(run: Run, step: int, known: Known, gaussians: Gaussians, near: fl
     every = torch.tensor(known.train)
     views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
     views = views.scaled(max(1.0, float(views.size.amax()) / _SEEN))
-    found = find_semantics(gaussians, True, encoder, views, _REGIONS, near=near)
-    run.save_tensors("style", {**semantics_tensors(found), "step": torch.tensor(step)})
-    return found
+    semantics = find_semantics(gaussians, True, encoder, views, _REGIONS, near=near)
+    run.save_tensors("style", {**semantics_tensors(semantics), "step": torch.tensor(step)})
+    return semantics
 
 
 def find_near(scene: Scene, points: Points) -> float:

@@ -110,8 +110,8 @@ def mean_colours(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -
         weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased).weights[:, None]
         colours += weight * seen.clamp_min(0)
         weights += weight
-    found = (colours / weights - 0.5) / HARMONIC
-    return torch.where(found.isfinite(), found, gaussians.harmonics[:, 0])[:, None]
+    harmonics = (colours / weights - 0.5) / HARMONIC
+    return torch.where(harmonics.isfinite(), harmonics, gaussians.harmonics[:, 0])[:, None]
 
 
 @torch.inference_mode()

@@ -175,22 +175,22 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
     book = _Book(regions, dictionary, style.references)
     placed = [text for text in style.pin if parse_place("pin", parse_region_value("pin", text).region)]
     pins, bans = book.pairs("pin", [text for text in style.pin if text not in placed]), book.pairs("forbid", style.forbid)
-    kept = [found for text in style.keep for found in book.find(text)]
+    kept = [match for text in style.keep for match in book.find(text)]
     parsed = [parse_strength("region_strength", text) for text in style.region_strength]
-    strengths = [(found, value) for text, value in parsed for found in book.find(text)]
+    strengths = [(match, value) for text, value in parsed for match in book.find(text)]
     pinned: dict[int, set[int]] = {}
-    for found, i in pins:
-        pinned.setdefault(found.number, set()).add(book.order[i])
+    for match, i in pins:
+        pinned.setdefault(match.number, set()).add(book.order[i])
     allowed = allowed_references(
         len(regions.scene.share), len(dictionary.names), pin=pinned, forbid=[(f.number, book.order[i]) for f, i in bans]
     )
-    for found in kept:
-        if found.number in pinned or found.number in {f.number for f, _ in strengths}:
-            raise UsageError(f"region {found.name}: is to be kept, and to be pinned or restyled in part; leave out one of both")
+    for match in kept:
+        if match.number in pinned or match.number in {f.number for f, _ in strengths}:
+            raise UsageError(f"region {match.name}: is to be kept, and to be pinned or restyled in part; leave out one of both")
     strength, score = torch.ones(len(allowed)), region_scores(regions.scene, dictionary)
-    for found, value in strengths:
-        strength[found.number] = value
-    strength[[found.number for found in kept]] = 0.0
+    for match, value in strengths:
+        strength[match.number] = value
+    strength[[match.number for match in kept]] = 0.0
     if style.keep_below is not None:
         best = score.masked_fill(~allowed[:, dictionary.reference], -torch.inf).amax(1)
         poor = (best < style.keep_below).nonzero().flatten().tolist()
@@ -234,18 +234,18 @@ class _Book:
         self.notes: list[str] = []
 
     def find(self, text: str) -> list[RegionMatch]:
-        found = find_regions(self.regions, text)
-        if not found:
+        matches = find_regions(self.regions, text)
+        if not matches:
             self.notes.append(f"region {text!r} of the style: no region here is most like it, so it is left out")
-        for each in found:
+        for each in matches:
             if each.name in self.regions.keys:
                 self.notes.append(f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})")
-        return found
+        return matches
 
     def pairs(self, field: str, texts: Sequence[str]) -> list[tuple[RegionMatch, int]]:
         """Regions and references of REGION=REFERENCE; a mask may mean several regions."""
         wishes = [parse_region_value(field, text) for text in texts]
-        return [(found, find_reference(w.value, self.references)) for w in wishes for found in self.find(w.region)]
+        return [(match, find_reference(w.value, self.references)) for w in wishes for match in self.find(w.region)]
 
     def label(self, reference: int) -> str:
         """A reference as a style file names it, wherever its photographs are moved to."""

@@ -58,8 +58,8 @@ def follows(call: Callable[[], Tensor], like: Tensor, name: str) -> None:
     Called with float64 on the CPU, while new tensors that name no device are put elsewhere: those cannot be computed with.
     """
     plain = call()
-    found, kind = f"{plain.dtype} on {plain.device}", f"{like.dtype} on {like.device}"
-    require(found == kind, f"{name}: expected {kind} for inputs of that kind, found {found}")
+    kind_found, kind = f"{plain.dtype} on {plain.device}", f"{like.dtype} on {like.device}"
+    require(kind_found == kind, f"{name}: expected {kind} for inputs of that kind, found {kind_found}")
     try:
         with torch.device("meta"):
             again = call()
@@ -79,9 +79,9 @@ class Regularised(Protocol):
 
 def penalties(part: Regularised, name: str) -> None:
     """Finite scalars by name, the same names at each call, of a part in float64."""
-    found = part.penalties()
-    require(part.penalties().keys() == found.keys(), f"{name}: must have the same penalties at each call")
-    for key, value in found.items():
+    penalties = part.penalties()
+    require(part.penalties().keys() == penalties.keys(), f"{name}: must have the same penalties at each call")
+    for key, value in penalties.items():
         require(isinstance(key, str) and value.ndim == 0, f"{name}: penalty {key!r} must be a scalar")
         require(bool(value.isfinite()), f"{name}: penalty {key!r} is not finite")
         follows(lambda key=key: part.penalties()[key], value, f"{name}: penalty {key!r}")  # type: ignore[misc]
@@ -109,7 +109,7 @@ def trainable(module: nn.Module, loss: Tensor, name: str) -> None:
     """Every parameter gets a finite gradient."""
     named = dict(module.named_parameters())
     require(loss.requires_grad or not named, f"{name}: no gradient goes through its answer")
-    found = torch.autograd.grad(loss, list(named.values()), allow_unused=True) if named else ()
-    for key, gradient in zip(named, found, strict=True):
+    gradients = torch.autograd.grad(loss, list(named.values()), allow_unused=True) if named else ()
+    for key, gradient in zip(named, gradients, strict=True):
         require(gradient is not None, f"{name}: no gradient reaches {key}")
         require(bool(gradient.isfinite().all()), f"{name}: the gradient of {key} is not finite")

@@ -71,8 +71,8 @@ class Shelf(Members):
             return self._here[number]
         while self._room is not None and len(self._here) >= self._room:
             self._here.popitem(last=False)
-        self._here[number] = found = self._fetch(number)
-        return found
+        self._here[number] = member = self._fetch(number)
+        return member
 
     def _fetch(self, number: int) -> Member:
         self._told(number)

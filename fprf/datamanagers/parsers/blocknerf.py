@@ -152,15 +152,15 @@ def read_examples(path: Path) -> Iterator[Example]:
 
 
 def _example(data: memoryview) -> dict[str, Feature]:
-    found: dict[str, Feature] = {}
+    record: dict[str, Feature] = {}
     for features in _children(data, 1):
         for entry in _children(features, 1):
             names, values = list(_children(entry, 1)), list(_children(entry, 2))
             if len(names) != 1:
                 raise ValueError("a feature without a name")
             name = bytes(names[0]).decode("utf-8")
-            found[name] = _feature(values[-1]) if values else []
-    return found
+            record[name] = _feature(values[-1]) if values else []
+    return record
 
 
 def _feature(data: memoryview) -> Feature:
@@ -187,16 +187,16 @@ def _floats(data: memoryview) -> NDArray[np.float32]:
 
 
 def _integers(data: memoryview) -> NDArray[np.int64]:
-    found = []
+    numbers = []
     for number, kind, value, whole in _fields(data):
         if number == 1 and kind == _VARINT:
-            found.append(whole)
+            numbers.append(whole)
         elif number == 1 and kind == _BYTES:
             at = 0
             while at < len(value):
                 whole, at = _varint(value, at)
-                found.append(whole)
-    return np.array(found, dtype=np.uint64).astype(np.int64)
+                numbers.append(whole)
+    return np.array(numbers, dtype=np.uint64).astype(np.int64)
 
 
 def _children(data: memoryview, number: int) -> Iterator[memoryview]:

@@ -170,8 +170,8 @@ class EspNet(nn.Module):
         reduced = normed_activation(self.tensors, convolve(self.tensors, x, f"{name}.proj_1x1.conv"), f"{name}.proj_1x1")
         branches: list[Tensor] = []
         for index, dilation in enumerate(dilations):
-            found = convolve(self.tensors, reduced, f"{name}.spp_dw.{index}.conv", stride=stride, dilation=dilation)
-            branches.append(found + branches[-1] if branches else found)
+            level = convolve(self.tensors, reduced, f"{name}.spp_dw.{index}.conv", stride=stride, dilation=dilation)
+            branches.append(level + branches[-1] if branches else level)
         joined = normed_activation(self.tensors, torch.cat(branches, dim=1), f"{name}.br_after_cat")
         return norm(self.tensors, convolve(self.tensors, joined, f"{name}.conv_1x1_exp.conv"), f"{name}.conv_1x1_exp.bn")
 

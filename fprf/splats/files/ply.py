@@ -214,13 +214,13 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
 
 def _parse(path: Path, data: bytes) -> tuple[list[str], dict[str, _Element]]:
     """Comments, and the elements up to the first of variable length."""
-    found = re.search(rb"\nend_header\r?\n", data[:_HEADER])
-    if not data.startswith(b"ply") or found is None:
+    end = re.search(rb"\nend_header\r?\n", data[:_HEADER])
+    if not data.startswith(b"ply") or end is None:
         raise DataError(f"{path}: no PLY header; the file is damaged or of another kind")
-    lines = data[: found.start()].decode("ascii", "replace").splitlines()
+    lines = data[: end.start()].decode("ascii", "replace").splitlines()
     if "format binary_little_endian 1.0" not in lines:
         raise DataError(f"{path}: no binary little-endian PLY; export it again as one")
-    comments, offset, elements = [line[8:] for line in lines if line.startswith("comment ")], found.end(), {}
+    comments, offset, elements = [line[8:] for line in lines if line.startswith("comment ")], end.end(), {}
     starts = [i for i, line in enumerate(lines) if line.startswith("element ")]
     for start, stop in zip(starts, [*starts[1:], len(lines)], strict=False):
         words, properties = lines[start].split(), [line.split() for line in lines[start + 1 : stop] if line[:9] == "property "]

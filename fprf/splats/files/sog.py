@@ -183,12 +183,12 @@ class _Pictures:
         if name == "codebook" and value and value[0] is None:
             value = [value[1], *value[1:]]
         try:
-            found = np.array(value, dtype=np.float64)
+            values = np.array(value, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
-            found = np.array([np.nan])
-        if found.shape != (length,) or not np.isfinite(found).all():
+            values = np.array([np.nan])
+        if values.shape != (length,) or not np.isfinite(values).all():
             raise self._wrong(f"{group}.{name} is no list of {length} numbers")
-        return found
+        return values
 
     def picture(self, name: str, most: int | None = None) -> _Bytes:
         """An image [H W 4], RGBA, of at most so many pixels."""
@@ -197,12 +197,12 @@ class _Pictures:
         if header is None or header.kind not in ("webp", "png") or not 0 < header.width * header.height <= most:
             raise self._wrong(f"{name} is no image of at most {most} pixels")
         try:
-            found = cv2.imdecode(np.frombuffer(self.parts[name], np.uint8), cv2.IMREAD_UNCHANGED)
+            image = cv2.imdecode(np.frombuffer(self.parts[name], np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
-            found = None
-        if found is None or found.dtype != np.uint8 or found.ndim != 3 or found.shape[2] not in (3, 4):
+            image = None
+        if image is None or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
             raise self._wrong(f"{name} cannot be decoded")
-        return np.asarray(cv2.cvtColor(found, cv2.COLOR_BGRA2RGBA if found.shape[2] == 4 else cv2.COLOR_BGR2RGBA), np.uint8)
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA), np.uint8)
 
     def rows(self, group: str, which: int) -> _Bytes:
         """The pixels [N 4] of an image, one a Gaussian."""
