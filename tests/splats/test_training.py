@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,14 @@ from fprf.datamanagers.scene import Scene
 from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
 from fprf.ops.rasterise import rasterise
-from fprf.rendering.cameras import project
+from fprf.rendering.cameras import Cameras, project
 from fprf.rendering.paths import pinhole
 from fprf.splats import initial, photographs
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.learner import Learner
-from fprf.splats.training import prepare
+from fprf.splats.training import prepare, reach_of
 from fprf.town.write import write_town
 
 STEPS = 260
@@ -296,6 +296,20 @@ def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: S
     assert far.sum() == config.surroundings
     assert (after.log_scales[far].exp() <= 0.22 * distance).all()
     assert (after.log_scales[~far] > wide.log_scales[~far] - 0.1).all()
+
+
+def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene) -> None:
+    """Two copies of a scene far from each other are learnt at the rate of one."""
+    apart = torch.tensor([1000.0, 0.0, 0.0], dtype=torch.float64)
+    pose = scene.cameras.pose
+    moved = torch.cat([pose[:, :, :3], (pose[:, :, 3] + apart)[:, :, None]], 2)
+    columns = {each.name: torch.cat([getattr(scene.cameras, each.name)] * 2) for each in fields(Cameras)}
+    both = Cameras(**{**columns, "pose": torch.cat([pose, moved])})
+    assert scene.points is not None
+    train = torch.cat([scene.train, scene.train + len(pose)])
+    twice = replace(scene, cameras=both, train=train, points=torch.cat([scene.points, scene.points + apart]), seen=None)
+    assert reach_of(twice) < 1.5 * reach_of(replace(scene, seen=None))
+    assert reach_of(replace(twice, points=None)) > 500
 
 
 def test_points_begin_where_there_are_none(scene: Scene) -> None:
