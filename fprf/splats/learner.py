@@ -33,6 +33,8 @@ _JUDGES = 8
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
+_CUT_EVERY = 10
+"""Steps between cuts of what became too wide."""
 _TONES = 2e-3
 """Learning rate of the logarithms of factors. It falls to a tenth."""
 
@@ -51,8 +53,8 @@ class Step(NamedTuple):
 class Learner:
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
-    Only Gaussians whose means are `inside` are split or moved; None = all. `widest` tells the greatest standard deviation of
-    Gaussians from their means; None = none is limited.
+    Only Gaussians whose means are `inside` are split or moved; None = all. `widest` tells the greatest logarithms of
+    standard deviations from the blocks' means; None = none is limited.
     With `tones` each view's factors are learnt as well; with `colours_only` nothing but harmonics is.
     """
 
@@ -63,7 +65,7 @@ class Learner:
         reach: float,
         room: int,
         inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
-        widest: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
+        widest: Callable[[Annotated[Floats, "B 3 L"]], Annotated[Floats, "B 1 L"]] | None = None,
         *,
         tones: Tones | None = None,
         colours_only: bool = False,
@@ -74,7 +76,6 @@ class Learner:
         self.room = -(-room // LANES) * LANES
         self.count = self.begun = 0
         self.blocks, self.first, self.second = (_blocks(np.zeros((self.rows, self.room), np.float32)) for _ in range(3))
-        self.limits: Floats | None = None
         self.splats = aligned(self.room * SLOTS)
         self.tones, self.colours_only = tones, colours_only
         self.adam = None if tones is None else torch.optim.Adam(tones.parameters(), lr=_TONES)
@@ -104,7 +105,6 @@ class Learner:
         rows[10, :count] = logit
         rows[11:14, :count] = (colour.T - 0.5) / HARMONIC
         self.blocks = _blocks(rows)
-        self._find_limits()
 
     def step(self, step: int, share: float) -> Step | None:
         """Learn from one view; None where the loss was not finite, and nothing was changed."""
@@ -122,9 +122,9 @@ class Learner:
         )  # fmt: skip
         if not math.isfinite(measured.l1 + measured.ssim):
             return None
-        if self.limits is not None:
-            scales = self.blocks.reshape(-1, self.rows, LANES)[:, 3:6]
-            np.minimum(scales, self.limits, out=scales)
+        if self.widest is not None and step % _CUT_EVERY == 0:
+            rows = self.blocks.reshape(-1, self.rows, LANES)
+            np.minimum(rows[:, 3:6], self.widest(rows[:, :3]), out=rows[:, 3:6])
         if self.tones is not None and self.adam is not None:
             self.adam.zero_grad()
             self.tones(torch.tensor([view]))[0].log().backward(torch.from_numpy(measured.pull))
@@ -204,13 +204,6 @@ class Learner:
             for part in parts:
                 part[:, : self.count] = part[:, order]
         self.blocks, self.first, self.second = (_blocks(each) for each in parts)
-        self._find_limits()
-
-    def _find_limits(self) -> None:
-        """Take the greatest logarithms of sizes, beside the blocks: where Gaussians lie changes little until they are moved."""
-        if self.widest is not None:
-            means = torch.from_numpy(_rows(self.blocks, self.rows)[:3].T.copy())
-            self.limits = self.widest(means).log().numpy().astype(np.float32).reshape(-1, 1, LANES)
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now."""
@@ -236,7 +229,6 @@ class Learner:
         rows[6], rows[10] = 1, -20
         rows[:, : self.count] = torch.cat([*parts, gaussians.harmonics.flatten(1)], 1).T.numpy()
         self.blocks = _blocks(rows)
-        self._find_limits()
 
     def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
         """Go on from what a checkpoint holds."""

@@ -34,7 +34,7 @@ from .gaussians import Gaussians
 from .initial import Points, initial_points, surroundings
 from .learner import Learner, Step
 from .levels import Levels, open_levels, write_levels
-from .photographs import make_levels
+from .photographs import Floats, make_levels
 from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
 
 _PATIENCE = 3
@@ -136,9 +136,10 @@ class _Sphere(NamedTuple):
         apart: Tensor = (means - self.centre).norm(dim=1)
         return apart < 0.5 * self.radius
 
-    def widest(self, means: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
-        """Greatest standard deviations: one that reached the cameras would be drawn before the scene from beside it."""
-        return torch.where(self.encloses(means), math.inf, _WIDE * self.radius)
+    def widest(self, means: Annotated[Floats, "B 3 L"]) -> Annotated[Floats, "B 1 L"]:
+        """Logarithms of the greatest standard deviations: one that reached the cameras would be drawn before the scene."""
+        square = np.square(means - self.centre.numpy()[:, None]).sum(1, keepdims=True)
+        return np.where(square < (0.5 * self.radius) ** 2, np.float32(np.inf), np.float32(math.log(_WIDE * self.radius)))
 
 
 def load_photographs(
