@@ -99,8 +99,8 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     from fprf.memory import peak
     from fprf.plugins.encoders.config import BundledSemanticConfig
     from fprf.plugins.stylizers.config import RegionToneConfig
+    from fprf.splats.config import LookConfig
     from fprf.splats.files import read_capture, write_capture
-    from fprf.splats.look_config import LookConfig
     from fprf.splats.scene import look_at_capture
     from fprf.style.config import StyleConfig
     from fprf.style.files import StyleFile

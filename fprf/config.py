@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from .checks import at_least, between, positive
 from .datamanagers.config import DataManagerConfig, RayBatchesConfig
@@ -184,6 +184,9 @@ class StatisticsConfig:
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
     """Fields of every run, whatever its scene is made of."""
+
+    untrained: ClassVar[tuple[str, ...]] = ()
+    """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
 
     data: Path | None = None
     """Scene folder, which must be named; `town` is the embedded one."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ..checks import at_least
 from ..errors import CheckpointError, UsageError
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
-from ..splats.look_config import LookConfig
+from ..splats.config import LookConfig
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, write_style
 from .progress import Display
@@ -18,7 +18,6 @@ from .style_flags import read_flags
 from .stylize import print_explained
 
 if TYPE_CHECKING:
-    from ..interfaces import Encoder
     from ..io.images import Picture
     from ..splats.files import Capture
     from ..splats.scene import Semantics, SplatScene
@@ -71,18 +70,16 @@ def run(args: list[str]) -> int:
     config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("capture",))
     _check(config)
     from ..io.images import write_image
-    from ..plugins.encoders.config import BundledSemanticConfig
     from ..splats.files import read_capture, write_capture
     from ..style.regions import Regions
     from ..style.restyle import apply_style
 
     begun = time.perf_counter()
-    capture, encoder = read_capture(config.capture), BundledSemanticConfig().build()
+    capture = read_capture(config.capture)
     count = len(capture.gaussians)
     with Display() as display:
-        look = LookConfig(up=config.up, inside=config.inside, views=config.views, size=config.size, regions=config.regions)
         scene = seen_capture(
-            capture, encoder, look, config.cache, lambda done, total: display.count(done, total, "looking"), display.say
+            capture, config, config.cache, lambda done, total: display.count(done, total, "looking"), display.say
         )
         scene.found()
         looked = time.perf_counter() - begun
@@ -154,7 +151,6 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
 
 def seen_capture(
     capture: "Capture",
-    encoder: "Encoder",
     look: LookConfig,
     cache: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -168,13 +164,13 @@ def seen_capture(
     from ..training.prepare import cache_folder
     from ..training.tensorfiles import load_sealed, save_sealed
 
-    folder = cache or cache_folder() / "captures"
+    folder, encoder = cache or cache_folder() / "captures", look.semantic.encoder.build()
     path = folder / cache_name(capture.data, encoder.identity, look)
     finite = capture.gaussians.finite
     gaussians = capture.gaussians if bool(finite.all()) else capture.gaussians.select(finite)
     if path.is_file():
         try:
-            scene = load_scene(load_sealed(path), gaussians, capture.antialiased)
+            scene = load_scene(load_sealed(path), gaussians, capture.antialiased, encoder)
         except CheckpointError as error:
             say(f"looking again: {error}")
         else:

@@ -38,10 +38,15 @@ class SplatVerbs(Verbs):
     def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
         if view is not None:
             raise UsageError(f"--view: {method} is not shown while it trains; leave --view out")
+        for need in self.needs():
+            if not need.downloaded:
+                raise UsageError(f"fprf train {method}: {need.what}: {need.remedy}")
         return _train(self.config, method, quiet, others)
 
     def needs(self) -> "list[Need]":
-        return []
+        from ..training.prepare import plugin_needs
+
+        return plugin_needs(self.config)
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         import torch

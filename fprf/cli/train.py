@@ -310,7 +310,7 @@ def check_same(folder: "Run", config: "RunConfig") -> None:
 
     old, _ = folder.load_config()
     cut = [getattr(each, "blocks", None) for each in (old, config)]
-    free = FREE if all(blocks is not None and blocks.cuts for blocks in cut) else RESUMABLE
+    free = (*(FREE if all(blocks is not None and blocks.cuts for blocks in cut) else RESUMABLE), *config.untrained)
     mine, theirs = leaves(config), leaves(old)
     changed = [path for path in theirs | mine if path.partition(".")[0] not in free and mine.get(path) != theirs.get(path)]
     if changed:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ..checks import at_least, between
 from ..errors import CheckpointError, UsageError
+from ..splats.config import GaussianSemanticsConfig
 from ..training.quality import QualityConfig
 from .parsing import parse
 from .style_flags import say
@@ -37,6 +38,8 @@ class ViewConfig(QualityConfig):
     """Direction that points up in a capture's own axes."""
     inside: bool | None = None
     """Look at a capture from within, as in rooms and streets, or around an object; none = found out."""
+    semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
+    """Semantics of a capture; a run has its own."""
     references: tuple[Path, ...] = ()
     """Photographs, or folders of them, to begin with: on the shelf, and all in the mix."""
     host: str = "127.0.0.1"
@@ -126,17 +129,16 @@ def _load(config: ViewConfig, path: Path, name: str | None, notify: Callable[[st
         run = open_run(path, config.device, config)
         viewed = view_of_run(run.scene, run.run, run.known)
         return viewed if name is None else replace(viewed, name=name)
-    from ..plugins.encoders.config import BundledSemanticConfig
     from ..plugins.stylizers.config import RegionToneConfig
+    from ..splats.config import LookConfig
     from ..splats.files import read_capture
-    from ..splats.look_config import LookConfig
     from .restyle import seen_capture
 
     def progress(done: int, total: int) -> None:
         if done == 0:
             notify("looking at the capture, once; a photograph can be dropped already")
 
-    capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside)
-    scene = seen_capture(capture, BundledSemanticConfig().build(), look, progress=progress)
+    capture, look = read_capture(path), LookConfig(up=config.up, inside=config.inside, semantic=config.semantic)
+    scene = seen_capture(capture, look, progress=progress)
     name = name or path.resolve().name.partition(".")[0]
     return Viewed(scene, name, 0, root=config.output / name, capture=capture, stylizer=RegionToneConfig(centred=False))

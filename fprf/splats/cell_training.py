@@ -262,7 +262,7 @@ def _task(
     tree = to_json(config)
     assert isinstance(tree, dict)
     parts: dict[str, Any] = {
-        "config": {name: value for name, value in tree.items() if name not in (*RESUMABLE, "executor", "cells")},
+        "config": {name: value for name, value in tree.items() if name not in (*RESUMABLE, *config.untrained, "cells")},
         "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
     }
     if cell is not None:

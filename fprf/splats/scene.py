@@ -17,11 +17,10 @@ from torch import Tensor
 
 from ..datamanagers.basis import Basis, fit_basis
 from ..datamanagers.config import GuidedConfig
-from ..errors import CheckpointError, DataError, WeightsError
+from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer
 from ..ops.guided import upsample
 from ..ops.rasterise import Pinhole, lift
-from ..plugins.encoders.config import BundledSemanticConfig
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
@@ -33,9 +32,9 @@ from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
 from ..types import View
+from .config import LookConfig
 from .gaussians import Gaussians
 from .levels import Levels, make_levels_of_detail
-from .look_config import LookConfig
 from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
 from .views import camera_of, draw, find_views
@@ -78,6 +77,8 @@ class SplatScene(Scene):
     view_names: tuple[str, ...]
     found: Callable[[], Semantics]
     """Semantics from the views: asked for when first needed."""
+    encoder: Callable[[], Encoder]
+    """The encoder of these semantics, for references: built when first needed."""
     longest: int
     """Longest side in pixels at which that was looked at."""
     near: float = 0.01
@@ -187,11 +188,9 @@ class SplatScene(Scene):
         return self.found().style, self.found().basis
 
     def encoders(self) -> Encoders:
-        """Colours in the place of content, and the bundled semantic encoder. Raises WeightsError where that is another one."""
-        found, encoder = self.found(), BundledSemanticConfig().build()
-        if encoder.identity != found.encoder:
-            raise WeightsError(f"semantic encoder: the scene was seen with {found.encoder}, this is {encoder.identity}")
-        return Encoders(Colours(), encoder, found.basis, found.style, longest=self.longest)
+        """Colours in the place of content, and the semantic encoder. Raises WeightsError where weights are missing."""
+        found = self.found()
+        return Encoders(Colours(), self.encoder(), found.basis, found.style, longest=self.longest)
 
     def colour_maps(
         self,
@@ -241,13 +240,15 @@ def look_at_capture(
     def found() -> Semantics:
         return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, progress=progress)
 
-    return captured(gaussians, antialiased, cameras, cache(found))
+    return captured(gaussians, antialiased, cameras, cache(found), encoder)
 
 
-def captured(gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Callable[[], Semantics]) -> SplatScene:
+def captured(
+    gaussians: Gaussians, antialiased: bool, cameras: Cameras, found: Callable[[], Semantics], encoder: Encoder
+) -> SplatScene:
     """The scene of a capture; its views are numbered."""
     names = tuple(f"{view:02d}" for view in range(len(cameras)))
-    return SplatScene(gaussians, antialiased, cameras, names, found, int(cameras.size.amax()))
+    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, int(cameras.size.amax()))
 
 
 @torch.inference_mode()
@@ -343,14 +344,16 @@ def scene_tensors(scene: SplatScene) -> dict[str, Tensor]:
     return {**cameras, **semantics_tensors(scene.found())}
 
 
-def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bool) -> SplatScene:
-    """The scene of `scene_tensors`. Raises CheckpointError where they are not those of the Gaussians."""
+def load_scene(tensors: dict[str, Tensor], gaussians: Gaussians, antialiased: bool, encoder: Encoder) -> SplatScene:
+    """The scene of `scene_tensors`. Raises CheckpointError where they are not of these Gaussians and this encoder."""
     try:
         cameras = Cameras(**_group(tensors, "camera"))
     except TypeError as error:
         raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
     semantics = load_semantics(tensors, len(gaussians))
-    return captured(gaussians, antialiased, cameras, lambda: semantics)
+    if semantics.encoder != encoder.identity:
+        raise CheckpointError(f"what is known of a capture is of the encoder {semantics.encoder}, not {encoder.identity}")
+    return captured(gaussians, antialiased, cameras, lambda: semantics, encoder)
 
 
 def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
@@ -360,7 +363,7 @@ def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"4 {encoder} {config}".encode())
+    digest.update(f"5 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 

@@ -18,7 +18,7 @@ from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, find_sightings
 from ..errors import CheckpointError, NumericsError, UsageError
-from ..plugins.encoders.config import BundledSemanticConfig
+from ..interfaces import Encoder
 from ..rendering.cameras import project
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
@@ -40,9 +40,8 @@ from .scene import Semantics, SplatScene, find_semantics, load_semantics, semant
 _PATIENCE = 3
 """Steps in a row without a finite loss after which training gives up."""
 _SMOOTHING = 0.95
-_VIEWS, _SEEN, _REGIONS = 32, 400, 24
-"""Training views that semantics are found in, at most; their longest side in pixels; regions of the scene: with 16, 24 and 32
-of them 89, 91 and 91 % of the town's pixels take from the right class."""
+_VIEWS, _SEEN = 32, 400
+"""Training views that semantics are found in, at most; their longest side in pixels."""
 _PIXELS = 640 * 360
 """Of an image, where nobody says how far to reduce them."""
 _SURROUNDINGS = 10
@@ -310,12 +309,14 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
     known, gaussians = run.load_known(), gaussians_of(saved)
     near = float(saved.model.get("near", torch.tensor(0.01)))
     resolution = preset.resolution if preset is not None else 1.0
+    encoder = cache(config.semantic.encoder.build)
     scene = SplatScene(
         gaussians,
         True,
         known.cameras,
         known.names,
-        cache(lambda: _semantics(run, saved.step, known, gaussians, near)),
+        cache(lambda: _semantics(run, saved.step, known, gaussians, near, encoder(), config.regions)),
+        encoder,
         min(_SEEN, int(known.cameras.size.amax())),
         near,
         config.background,
@@ -353,20 +354,23 @@ def _tones(saved: checkpoint.Saved, facts: Facts) -> Tones | None:
     return tones
 
 
-def _semantics(run: Run, step: int, known: Known, gaussians: Gaussians, near: float) -> Semantics:
-    """Return the semantics, from the run folder; found anew and kept there where training has gone on since."""
-    encoder = BundledSemanticConfig().build()
+def _semantics(
+    run: Run, step: int, known: Known, gaussians: Gaussians, near: float, encoder: Encoder, regions: int
+) -> Semantics:
+    """Return the semantics, from the run folder; found anew and kept where those are of another step, encoder or number."""
     if (run.root / "style.safetensors").is_file():
         tensors = run.load_tensors("style")
-        if int(tensors.pop("step", torch.tensor(-1))) == step:
+        of = int(tensors.pop("step", torch.tensor(-1))), int(tensors.pop("regions", torch.tensor(-1)))
+        if of == (step, regions):
             kept = load_semantics(tensors, len(gaussians))
             if kept.encoder == encoder.identity:
                 return kept
     every = torch.tensor(known.train)
     views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
     views = views.scaled(max(1.0, float(views.size.amax()) / _SEEN))
-    semantics = find_semantics(gaussians, True, encoder, views, _REGIONS, near=near)
-    run.save_tensors("style", {**semantics_tensors(semantics), "step": torch.tensor(step)})
+    semantics = find_semantics(gaussians, True, encoder, views, regions, near=near)
+    known_of = {"step": torch.tensor(step), "regions": torch.tensor(regions)}
+    run.save_tensors("style", {**semantics_tensors(semantics), **known_of})
     return semantics
 
 

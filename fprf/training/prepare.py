@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from ..config import TrainConfig
+from ..config import RunConfig, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.batches import WHITE
 from ..datamanagers.bounds import find_space
@@ -300,7 +300,7 @@ def outcome(root: Path, config: TrainConfig, scene: Scene) -> Outcome | None:
     return Outcome(min(history.step[-1] for history in blocks), sum(psnr) / len(psnr), rays / pixels)
 
 
-def plugin_needs(config: TrainConfig) -> list[Need]:
+def plugin_needs(config: RunConfig) -> list[Need]:
     """The needs of all plug-ins of a config, each opened by the path of its slot.
 
     Raises PluginError where a plug-in cannot say what it needs.

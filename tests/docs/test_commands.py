@@ -84,6 +84,7 @@ def commands(page: Path) -> Iterator[Command]:
 
 
 EVERY = [command for page in PAGES for command in commands(page)]
+GAUSSIANS = ["--steps", "5", "--initial", "300", "--cap", "400"]
 OURS = [command for command in EVERY if command.words[0] == "fprf" and not set(command.words) & ELSEWHERE.keys()]
 
 
@@ -183,7 +184,8 @@ def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 )
 def test_it_trains(world: World, place: Path, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
-    size = flags(world, tmp_path / "run")[2:]
+    fields = any(word.startswith("fprf") for word in words[2:3])
+    size = flags(world, tmp_path / "run")[2:] if fields else [*GAUSSIANS, "--output", str(tmp_path / "run")]
     assert cli.main([*words[1:], *size]) == 0
     assert "--plan" in words or (tmp_path / "run" / "config.json").is_file()
 

@@ -168,7 +168,7 @@ folder, town = Path(sys.argv[1]), Path(sys.argv[2])
 subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={sys.argv[3]}", "none", str(folder)], check=True)
 if sys.argv[3] == "8m":
     subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
-from kills import tiny
+from benchmarks.kills import tiny
 from dataclasses import replace
 from fprf.cli import main as cli
 from fprf.plugins.codec import save_config
@@ -190,8 +190,8 @@ def test_a_disk_that_is_full_or_read_only(world: World, tmp_path: Path, size: st
         pytest.skip("may not mount here")
     (tmp_path / "disk").mkdir()
     shutil.copytree(world.town, tmp_path / "town")
-    benchmarks = Path(__file__).parents[2] / "benchmarks"
-    words = [sys.executable, "-c", MOUNTED, str(tmp_path / "disk"), str(tmp_path / "town"), size, str(benchmarks)]
+    project = Path(__file__).parents[2]
+    words = [sys.executable, "-c", MOUNTED, str(tmp_path / "disk"), str(tmp_path / "town"), size, str(project)]
     done = subprocess.run(["unshare", "-m", *words], capture_output=True, text=True, timeout=240)
     errors = [line for line in done.stderr.splitlines() if not line.startswith("{")]
     assert len(errors) == 1 and errors[0].startswith("error: ") and f"cannot be written ({reason}" in errors[0], done.stderr

@@ -1,5 +1,6 @@
 """Styles on Gaussians: exact where colours are affine, nothing but colours, and the scene itself where nothing is asked."""
 
+import json
 from dataclasses import fields
 from pathlib import Path
 
@@ -14,11 +15,11 @@ from fprf.errors import CheckpointError, ConfigError, DataError, UsageError
 from fprf.fields.planes import harmonics as functions
 from fprf.interfaces import Encoder
 from fprf.ops.harmonics import as_drawn
-from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionOtConfig, RegionToneConfig, StylizerConfig
+from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture, write_gaussians
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.look_config import LookConfig
 from fprf.splats.restyle import all_around
 from fprf.splats.scene import SplatScene, load_scene, look_at_capture, scene_tensors
 from fprf.splats.views import camera_of, draw, find_views
@@ -145,11 +146,13 @@ def test_luminance_is_kept_and_styles_mix(scene: SplatScene, photographs: list[P
     assert int(free.sum()) > 50 and torch.allclose(mixed[free], (0.75 * a + 0.25 * b)[free], atol=1e-4)
 
 
-def test_a_scene_that_was_kept_gives_the_same_colours(scene: SplatScene, photographs: list[Path]) -> None:
-    again = load_scene(scene_tensors(scene), scene.gaussians, False)
+def test_a_scene_that_was_kept_gives_the_same_colours(scene: SplatScene, encoder: Encoder, photographs: list[Path]) -> None:
+    again = load_scene(scene_tensors(scene), scene.gaussians, False, encoder)
     assert torch.equal(styled(again, photographs[0]), styled(scene, photographs[0]))
     with pytest.raises(CheckpointError, match="of another one"):
-        load_scene(scene_tensors(scene), ball(10), False)
+        load_scene(scene_tensors(scene), ball(10), False, encoder)
+    with pytest.raises(CheckpointError, match="of the encoder"):
+        load_scene(scene_tensors(scene), scene.gaussians, False, RandomConfig().build())
 
 
 def test_objects_are_seen_from_around_and_rooms_from_within() -> None:
@@ -243,6 +246,28 @@ def test_the_verb_writes_capture_sheet_page_and_style(
     kept = next((tmp_path / "cache").iterdir())
     kept.write_bytes(kept.read_bytes()[:-9])
     assert cli.main([*words, *same]) == 0, "what is damaged is made again"
+
+
+def test_any_encoder_finds_the_regions(photographs: list[Path], tmp_path: Path) -> None:
+    """Also those of other packages: the slot is that of fields. What each found is kept beside what others did."""
+    write_gaussians(tmp_path / "in.ply", ball(200))
+    words = [
+        "restyle",
+        str(tmp_path / "in.ply"),
+        *SMALL,
+        "--cache",
+        str(tmp_path / "cache"),
+        "--references",
+        *map(str, photographs),
+    ]
+    random = ["--semantic.encoder", "random", "--semantic.encoder.channels", "6"]
+    for name, flags in (("bundled", []), ("random", random), ("again", random)):
+        assert cli.main([*words, *flags, "--output", str(tmp_path / f"{name}.ply")]) == 0
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+    bundled, other, again = ((tmp_path / f"{name}.ply").read_bytes() for name in ("bundled", "random", "again"))
+    assert other == again != bundled
+    known = json.loads((tmp_path / "random.style.json").read_text())
+    assert known["semantic_encoder"] == RandomConfig(channels=6).build().identity
 
 
 @pytest.mark.parametrize(

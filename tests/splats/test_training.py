@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from fprf.datamanagers.scene import Scene
 from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
 from fprf.ops.rasterise import rasterise
+from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.rendering.cameras import Cameras, project
 from fprf.rendering.paths import pinhole
 from fprf.splats import initial, photographs
@@ -28,6 +30,7 @@ from fprf.splats.gaussians import Gaussians
 from fprf.splats.learner import Learner
 from fprf.splats.training import prepare, reach_of
 from fprf.town.write import write_town
+from fprf.training.loading import open_run
 
 STEPS = 260
 
@@ -154,10 +157,19 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     again = parse_scene(tmp_path / "files", 1, None)
     assert torch.allclose(again.cameras.pose, fprf.load(run).cameras.pose) and (tmp_path / "files" / "splats.ply").is_file()
     assert main(["export", str(run), "--output", str(tmp_path / "cameras.json")]) == 0
-    # A run that is done goes on doing nothing.
+    # A run that is done goes on doing nothing, also where other semantics are asked for.
     before = (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes()
     assert main(["train", str(run / "config.json")]) == 0
-    assert (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
+    shutil.copytree(run, tmp_path / "other")
+    words = ["--semantic.encoder", "random", "--semantic.encoder.channels", "6", "--regions", "3"]
+    assert main(["train", str(tmp_path / "other" / "config.json"), *words]) == 0
+    for folder in (run, tmp_path / "other"):
+        assert (folder / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
+    plain, other = (open_run(folder, "cpu").scene for folder in (run, tmp_path / "other"))
+    assert plain.semantic_encoder == BundledSemanticConfig().build().identity and len(plain.measured()[0].share) > 3
+    encoder = RandomConfig(channels=6).build().identity
+    assert other.semantic_encoder == other.encoders().semantic.identity == encoder and len(other.measured()[0].share) == 3
+    assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg16", "--semantic.encoder.weights", "no.pth"]) == 2
 
 
 def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

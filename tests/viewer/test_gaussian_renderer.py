@@ -15,8 +15,8 @@ from tiny_world import World
 from fprf.io.images import to_uint8
 from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
+from fprf.splats.config import LookConfig
 from fprf.splats.files import read_capture
-from fprf.splats.look_config import LookConfig
 from fprf.splats.scene import SplatScene, look_at_capture
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style

@@ -47,7 +47,8 @@ def read_capture(path: Path) -> Capture:
         data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
-    capture = reader(path, data)
+    with np.errstate(over="ignore", invalid="ignore"):  # damaged files hold numbers of any kind
+        capture = reader(path, data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
     return capture

@@ -41,8 +41,7 @@ class Capture:
 def assembled(means: Floats, quaternions: Floats, log_scales: Floats, logits: Floats, harmonics: Floats) -> Gaussians:
     """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
     parts = (means, quaternions, log_scales, logits, harmonics)
-    with np.errstate(over="ignore"):
-        return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
+    return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:
