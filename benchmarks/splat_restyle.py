@@ -116,6 +116,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
         look_at_capture(read_capture(Path(folder) / "x.splat").gaussians, False, encoder, LookConfig(views=1, size=(64, 48)))
     start = time.process_time()
     scene = look_at_capture(capture.gaussians, capture.antialiased, encoder, LookConfig())
+    scene.found()
     looked = time.process_time() - start
     seconds, rims = [], []
     for reference in references:
@@ -127,7 +128,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
         seconds.append(time.process_time() - start)
         rims.append(rim_ratio(scene, new))
     return {
-        "capture": path.name,
+        "capture": f"{path.parent.name} (SOG folder)" if path.name == "meta.json" else path.name,
         "gaussians": len(capture.gaussians),
         "read_seconds": round(read, 2),
         "look_seconds": round(looked, 2),
