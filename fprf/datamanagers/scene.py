@@ -136,7 +136,7 @@ def with_exposure(scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"
     """
     if scene.exposure is not None or len(scene.train) < 2:
         return scene
-    sightings = find_sightings(_sparser(scene))
+    sightings = find_sightings(sparser(scene))
     gain = None if sightings is None else _gains(sightings, scene, image)
     if gain is None:
         return scene
@@ -150,7 +150,7 @@ def with_exposure(scene: Scene, image: Callable[[int], Annotated[Tensor, "H W 3"
     return replace(scene, exposure=(gain / GAMMA).exp())
 
 
-def _sparser(scene: Scene) -> Scene:
+def sparser(scene: Scene) -> Scene:
     """The scene with every n-th point, so that about MOST pairs are left."""
     if scene.points is None:
         return scene

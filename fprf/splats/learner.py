@@ -170,13 +170,14 @@ class Learner:
         for view in views:
             target, background = level[view], self.config.background
             chance += errors(self.blocks, self.count, self.bands, self.splats, target, background, self._factors(view))
-        parts = [_rows(each, self.rows) for each in (self.blocks, self.first, self.second)]
-        rows, first, second = parts
-        opacity = 1 / (1 + np.exp(-rows[10, : self.count].astype(np.float64)))
+        parts = [each.reshape(-1, self.rows, LANES) for each in (self.blocks, self.first, self.second)]
+        blocks, first, second = parts
+        means = blocks[:, :3].transpose(0, 2, 1).reshape(-1, 3)
+        opacity = 1 / (1 + np.exp(-blocks[:, 10].reshape(-1)[: self.count].astype(np.float64)))
         chance = np.nan_to_num(chance * opacity)
         transparent = opacity < _DEAD
         if self.inside is not None:
-            inside = self.inside(torch.from_numpy(rows[:3, : self.count].T)).numpy()
+            inside = self.inside(torch.from_numpy(means[: self.count])).numpy()
             chance, transparent = chance * inside, transparent & inside
         dead = np.flatnonzero(transparent)
         chance[dead] = 0
@@ -187,23 +188,26 @@ class Learner:
         if many > 0:
             picked = draw.choice(self.count, many, replace=False, p=chance / chance.sum())
             to = np.concatenate([dead, np.arange(self.count, self.count + more)])[:many]
-            longest: NDArray[np.int64] = np.asarray(rows[3:6, picked].argmax(0))
-            turns: Floats = rotations(torch.from_numpy(rows[6:10, picked].T)).numpy()
-            across = turns[np.arange(many), :, longest].T * np.exp(rows[3 + longest, picked])
-            rows[3 + longest, picked] += math.log(_SPLIT_SIZE)
+            halves = blocks[_at(picked)]
+            longest = np.arange(many), 3 + halves[:, 3:6].argmax(1)
+            turns: Floats = rotations(torch.from_numpy(halves[:, 6:10])).numpy()
+            across = turns[longest[0], :, longest[1] - 3] * np.exp(halves[longest])[:, None]
+            halves[longest] += math.log(_SPLIT_SIZE)
             each = np.clip(_SPLIT_OPACITY * opacity[picked], _DEAD, 0.995)
-            rows[10, picked] = np.log(each / (1 - each))
-            first[:, picked], second[:, picked] = 0, 0.5 * second[:, picked]
-            for part in parts:
-                part[:, to] = part[:, picked]
-            rows[:3, picked] += _SPLIT_DISTANCE * across
-            rows[:3, to] -= _SPLIT_DISTANCE * across
+            halves[:, 10] = np.log(each / (1 - each))
+            others = halves.copy()
+            halves[:, :3] += _SPLIT_DISTANCE * across
+            others[:, :3] -= _SPLIT_DISTANCE * across
+            blocks[_at(picked)], blocks[_at(to)] = halves, others
+            first[_at(picked)] = first[_at(to)] = 0
+            second[_at(picked)] *= 0.5
+            second[_at(to)] = second[_at(picked)]
             self.count += max(0, many - len(dead))
         if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * self.count:
-            order = spatial_order(rows[:3, : self.count].T)
-            for part in parts:
-                part[:, : self.count] = part[:, order]
-        self.blocks, self.first, self.second = (_blocks(each) for each in parts)
+            means = blocks[:, :3].transpose(0, 2, 1).reshape(-1, 3)
+            order = spatial_order(means[: self.count])
+            for part in parts:  # one after the other: a copy takes as much again
+                part[_at(np.arange(self.count))] = part[_at(order)]
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now."""
@@ -243,6 +247,11 @@ class Learner:
                 kept = {key.rpartition(".")[2]: each for key, each in moments.items() if key.startswith(f"tones.{name}.")}
                 parameter.data.copy_(kept.pop("value"))
                 self.adam.state[parameter] = kept
+
+
+def _at(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], slice, NDArray[np.int64]]:
+    """Where Gaussians lie in blocks [B rows LANES]."""
+    return index // LANES, slice(None), index % LANES
 
 
 def _rows(blocks: Floats, rows: int) -> Floats:

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..datamanagers.bounds import find_space
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.parsers.config import parse_scene
-from ..datamanagers.scene import Scene, find_sightings
+from ..datamanagers.scene import Scene, find_sightings, sparser
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Encoder
 from ..rendering.cameras import project
@@ -48,8 +48,6 @@ _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
 _WIDE = 0.2
 """Greatest standard deviation of one of them, as a share of their distance."""
-_MOST = 1_000_000
-"""Points seen by views, about, whose distances say at which one they commonly are."""
 _SOME = 4000
 """Points whose depths say how near to a camera things are."""
 _LEVELS, _MANY = "levels", 400_000
@@ -160,15 +158,10 @@ def reach_of(scene: Scene) -> float:
     At most the distance at which views commonly see points, where the capture knows: steps in proportion to the radius of a
     district scatter what its views show.
     """
-    centre = scene.cameras.pose[:, :, 3]
-    around = centre[scene.train]
+    around = scene.cameras.pose[scene.train][:, :, 3]
     reach = 1.1 * float((around - around.mean(0)).norm(dim=1).max()) or 1.0
-    sightings = find_sightings(scene)
-    if sightings is None or len(sightings.view) == 0:
-        return reach
-    some = slice(None, None, -(-len(sightings.view) // _MOST))
-    apart = (sightings.point[some] - centre[sightings.view[some]]).norm(dim=1)
-    return min(reach, float(apart.median()))
+    sightings = find_sightings(sparser(scene))
+    return reach if sightings is None else min(reach, float(sightings.distance.median()))
 
 
 def lit(facts: Facts, config: GaussiansConfig, scene: Scene, image: Callable[[int], Image]) -> Facts:
