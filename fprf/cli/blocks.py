@@ -92,7 +92,7 @@ def run_block(task: "BlockTask", view: "LiveViewer | None" = None) -> None:
 
         def begun(model: "Model") -> None:
             if view is not None:
-                view.begin(Path(task.root), model, device, block=task.block, what=name)
+                view.begin(Path(task.root), model.state_dict, device, block=task.block, what=name)
 
         if not train_block(task, report, begun):
             display.say(f"{name} is finished already")

@@ -96,6 +96,8 @@ def run(args: list[str]) -> int:
                 config.output / f"{style.name.replace(' ', '-')}.ply",
                 scene.restyled(style.styled.restyle).shown,
                 antialiased=True,
+                views=scene.views,
+                plain=True,
             )
         looks = [styles[0].styled.restyle.faded, *(style.styled.restyle for style in styles[: len(references)])]
         # From one held-out view to the next, where other views surround the camera.

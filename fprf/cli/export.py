@@ -228,7 +228,7 @@ def _fitted(place: _Place, points: "Points", config: ExportConfig) -> int:
     for look, gaussians in zip(place.looks, fitted, strict=True):
         for ending in (".ply", ".splat"):
             for path in place.paths("splats", look, ending):
-                write_gaussians(path, gaussians, antialiased=True, views=cameras)
+                write_gaussians(path, gaussians, antialiased=True, views=cameras, plain=config.plain)
         count = len(gaussians)
     return count
 

@@ -36,12 +36,12 @@ class SplatVerbs(Verbs):
         raise UsageError(f"--plan: {method} trains a scene in one piece; leave --plan out")
 
     def train(self, method: str, *, quiet: bool = False, view: "LiveViewer | None" = None, others: bool = False) -> Path:
-        if view is not None:
-            raise UsageError(f"--view: {method} is not shown while it trains; leave --view out")
+        if view is not None and self.config.cells > 1:
+            raise UsageError("--view: cells are not shown while they train; leave --view or --cells out")
         for need in self.needs():
             if not need.downloaded:
                 raise UsageError(f"fprf train {method}: {need.what}: {need.remedy}")
-        return _train(self.config, method, quiet, others)
+        return _train(self.config, method, quiet, view, others)
 
     def needs(self) -> "list[Need]":
         from ..training.prepare import plugin_needs
@@ -118,12 +118,12 @@ class SplatVerbs(Verbs):
             shown = scene.restyled(look.restyle).shown
             for kind in kinds:
                 paths.append(output if single else output / look_file("splats", look.name, f".{kind}"))
-                write_gaussians(paths[-1], shown, antialiased=True, views=scene.views)
+                write_gaussians(paths[-1], shown, antialiased=True, views=scene.views, plain=config.plain)
         if paths:
             print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}")
 
 
-def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) -> Path:
+def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewer | None", others: bool) -> Path:
     """Train to the end, or go on; see `train.train_scene` for fields."""
     from ..ops.rasterise_training import compile_beside
 
@@ -131,10 +131,10 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
     from ..datamanagers.images import load_images
     from ..io.atomic import remove_unfinished
     from ..splats.cell_training import OVERVIEW
-    from ..splats.training import facts_of, lit, prepare, scene_of, train, with_downscale
+    from ..splats.training import facts_of, lit, prepare, scene_of, state_of, train, with_downscale
     from ..training.run import Run, check_images, held, image_hashes, save_image_hashes
     from .progress import EventLog
-    from .train import check_same, default_output
+    from .train import check_same, default_output, finish_view
 
     start = time.perf_counter()
     output = config.output or default_output(config, method)
@@ -142,6 +142,8 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
     folder = Run(output)
     with held(output), Display(quiet=quiet) as display:
         display.say(f"{method} on {config.data}, run folder {output}")
+        if view is not None:
+            display.say(f"live at {view.address}")
         if config.downscale is None and folder.exists:
             config = replace(config, downscale=folder.load_config()[0].downscale)
         config = with_downscale(config)
@@ -174,7 +176,12 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
         def report(event: "Report") -> None:
             display.training(event)
             log(event)
+            if view is not None:
+                view(event)
 
+        if view is not None:
+            learner, near = prepared.learner, prepared.near
+            view.begin(output, lambda: state_of(learner.gaussians(), near), "cpu")
         if compiling:
             display.say("compiling kernels, once after installation")
             for process in compiling:
@@ -185,6 +192,7 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, others: bool) ->
             display.say(f"at most {most} steps: {config.passes} passes over {len(scene.train)} photographs (--passes)")
         train(replace(config, steps=min(config.steps, most)), prepared, folder, report, spent=spent)
         display.say(f"done after {time.perf_counter() - start:.0f} s: fprf eval {output}")
+    finish_view(view, display)
     return output
 
 

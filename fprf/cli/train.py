@@ -201,7 +201,7 @@ def train_scene(
             model = config.executor.on(prepare.device_of(config.device).type).build().map(train, [None])[0]
         else:  # here, where its parameters can be looked at
             model = build_model(config, prepared.facts).to(prepare.device_of(config.device))
-            view.begin(output, model, config.device)
+            view.begin(output, model.state_dict, config.device)
             model = train(model)
         trained = time.perf_counter()
         folder.log({"part": "training", "seconds": round(trained - start - spent, 3)})

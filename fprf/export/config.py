@@ -57,6 +57,9 @@ class ExportConfig(StyleConfig):
     surfaces, without training. For runs of fields."""
     fit_cap: int = 60_000
     """Splats that are trained, at most."""
+    plain: bool = False
+    """Trained Gaussians get the opacities that views show, for viewers that do not compensate opacities (Mip-Splatting), most
+    among them; others show thin Gaussians too heavily. Not exact: leave it out where fprf reads the file again."""
     mesh_edge: float | None = None
     """Edge of the mesh's lattice in world units, above 0; none = twice the finest voxel's."""
     lut_size: int = 33

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
     from ..training.loading import LoadedRun
     from ..training.quality import QualityConfig
+    from ..training.unfinished import UnfinishedRun
     from .scene import SplatScene
 
 
@@ -133,6 +134,12 @@ class GaussiansConfig(RunConfig):
         from .training import open_gaussians
 
         return open_gaussians(run, self, quality)
+
+    def load_unfinished(self, run: Path, device: str, block: int | None) -> "UnfinishedRun":
+        """Its Gaussians come from training; they are drawn on the CPU, whatever the device."""
+        from .training import UnfinishedGaussians
+
+        return UnfinishedGaussians(run, self)
 
     def read_scene(self) -> "Scene":
         """Parse the folder."""

@@ -37,7 +37,7 @@ from .gaussians import Gaussians
 from .levels import Levels, make_levels_of_detail
 from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
-from .views import camera_of, draw, find_views
+from .views import SeenMeans, camera_of, draw, find_views, seen_means
 
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
@@ -126,6 +126,11 @@ class SplatScene(Scene):
         if self.stored is not None and self.harmonics is None:
             return self.stored()
         return make_levels_of_detail(self.shown)
+
+    @cached_property
+    def seen(self) -> SeenMeans:
+        """Means of what the views show of the Gaussians, for renderers that know no more."""
+        return seen_means(self.gaussians, self.views, antialiased=self.antialiased)
 
     @torch.inference_mode()
     def render(self, cameras: Cameras, view: int, *, resolution: float | None = None) -> View:

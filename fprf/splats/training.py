@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,7 +19,8 @@ from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, find_sightings, sparser
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Encoder
-from ..rendering.cameras import project
+from ..rendering.cameras import Cameras, project
+from ..style.references import Encoders
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
 from ..training.loading import LoadedRun
@@ -29,6 +30,7 @@ from ..training.prepare import exposure_of
 from ..training.quality import PRESETS, QualityConfig, mixed_tone
 from ..training.run import Known, Run
 from ..training.trainer import REPORT_SECONDS, Report
+from ..training.unfinished import UnfinishedRun
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points, surroundings
@@ -321,6 +323,40 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
 
 
+class UnfinishedGaussians(UnfinishedRun):
+    """A run of Gaussians; what a style needs is found from few, small views. Raises CheckpointError where it has not begun."""
+
+    def __init__(self, root: Path, config: GaussiansConfig) -> None:
+        self.run, self.known, self.config = Run(root), Run(root).load_known(), config
+        self._encoder = cache(config.semantic.encoder.build)
+        self._scene: SplatScene | None = None
+
+    def scene(self, tensors: Mapping[str, Tensor]) -> SplatScene:
+        gaussians, near = Gaussians(*(tensors[name] for name in _PARTS)), float(tensors["near"])
+        views = _some_views(self.known, _VIEWS // 4, _SEEN // 2)
+
+        def found() -> Semantics:
+            return find_semantics(gaussians, True, self._encoder(), views, self.config.regions, near=near)
+
+        cameras, longest = self.known.cameras, int(views.size.amax())
+        self._scene = SplatScene(
+            gaussians, True, cameras, self.known.names, cache(found), self._encoder, longest, near, self.config.background
+        )
+        return self._scene
+
+    def encoders(self, before: Encoders | None) -> Encoders:
+        if self._scene is None:
+            raise CheckpointError(f"{self.run.root}: no parameters have come from training yet; wait for them")
+        return self._scene.encoders()
+
+
+def _some_views(known: Known, count: int, longest: int) -> Cameras:
+    """Training views, spread evenly, at most `count` of at most so many pixels a side."""
+    every = torch.tensor(known.train)
+    views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(count, len(every))).round().long()])
+    return views.scaled(max(1.0, float(views.size.amax()) / longest))
+
+
 def _stored(folder: Path, gaussians: Gaussians, key: str) -> Levels:
     """Levels of detail of a run, written where there are none of its checkpoint."""
     levels = open_levels(folder, key)
@@ -358,10 +394,7 @@ def _semantics(
             kept = load_semantics(tensors, len(gaussians))
             if kept.encoder == encoder.identity:
                 return kept
-    every = torch.tensor(known.train)
-    views = known.cameras.select(every[torch.linspace(0, len(every) - 1, min(_VIEWS, len(every))).round().long()])
-    views = views.scaled(max(1.0, float(views.size.amax()) / _SEEN))
-    semantics = find_semantics(gaussians, True, encoder, views, regions, near=near)
+    semantics = find_semantics(gaussians, True, encoder, _some_views(known, _VIEWS, _SEEN), regions, near=near)
     known_of = {"step": torch.tensor(step), "regions": torch.tensor(regions)}
     run.save_tensors("style", {**semantics_tensors(semantics), **known_of})
     return semantics

@@ -11,7 +11,8 @@ before the camera.
 """
 
 import math
-from typing import Annotated
+from dataclasses import replace
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from ..errors import DataError
 from ..fields.planes import harmonics as harmonic_functions
 from ..ops.harmonics import HARMONIC
 from ..ops.rasterise import Pinhole, Rasterised, lift, rasterise
+from ..ops.rasterise_reference import project_reference
 from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
 from .gaussians import Gaussians
@@ -62,7 +64,7 @@ as seen from the place, at which Gaussians are as bad as none."""
 _NEAR = 3.0
 """What a pixel with something close before the camera costs, in filled ones."""
 _MEAN_VIEWS, _UNSEEN, _CLIP = 32, 1e-4, 0.01
-"""Views that mean colours are taken from, at most; weight, in pixels, of those that do not show a Gaussian; distance from
+"""Views that means are taken from, at most; weight, in pixels, of those that do not show a Gaussian; distance from
 which on they do."""
 
 
@@ -91,27 +93,49 @@ def draw(
     return rasterise(*parts, camera, features=features, background=behind, antialiased=antialiased)
 
 
+class SeenMeans(NamedTuple):
+    """Means over the views that show each Gaussian: what comes nearest to them where a renderer knows one colour a Gaussian and
+    no compensation of opacities (Mip-Splatting), as in browsers and .splat files."""
+
+    functions: Annotated[Tensor, "N K"]
+    """Of the functions of the harmonics, at most those of degree 3."""
+    opacities: Annotated[Tensor, "N"]
+
+    def colours(self, harmonics: Annotated[Tensor, "N K 3"]) -> Annotated[Tensor, "N 3"]:
+        """Mean colours; may leave [0, 1]."""
+        return 0.5 + torch.einsum("nk,nkc->nc", self.functions, harmonics[:, : self.functions.shape[1]])
+
+    def plain(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians with mean opacities."""
+        return replace(gaussians, logits=torch.logit(self.opacities, 1e-6))
+
+    def gaussians(self, gaussians: Gaussians) -> Gaussians:
+        """The Gaussians with mean colours and opacities."""
+        return self.plain(gaussians.recoloured((self.colours(gaussians.harmonics) - 0.5)[:, None] / HARMONIC))
+
+
 @torch.inference_mode()
-def mean_colours(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> Annotated[Tensor, "N 1 3"]:
-    """Harmonics of degree 0: the mean of the colours in which views show each Gaussian, by its weights in their pixels.
+def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> SeenMeans:
+    """Means of what views show of each Gaussian, by its weights in their pixels.
 
     The mean over all directions is another colour where photographs are from one side. What no view shows takes the mean
     over all of them; what is not finite keeps its constant harmonic.
     """
     bands = min(gaussians.degree, 3) + 1
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
-    colours, weights = torch.zeros(len(gaussians), 3), torch.zeros(len(gaussians), 1)
+    functions, opacities, weights = (torch.zeros(len(gaussians), n) for n in (bands**2, 1, 1))
     for view in torch.linspace(0, len(cameras) - 1, min(_MEAN_VIEWS, len(cameras))).round().long().tolist():
         camera = cover(cameras, view, _CLIP)[0]
         direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
-        functions = harmonic_functions(direction, bands)
-        seen = 0.5 + torch.einsum("nk,nkc->nc", functions, gaussians.harmonics[:, : bands**2])
         pixels = torch.zeros(camera.height, camera.width, 1)
         weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased).weights[:, None]
-        colours += weight * seen.clamp_min(0)
+        functions += weight * harmonic_functions(direction, bands)
+        opacities += weight * project_reference(*shape, camera, antialiased=antialiased).opacity[:, None]
         weights += weight
-    harmonics = (colours / weights - 0.5) / HARMONIC
-    return torch.where(harmonics.isfinite(), harmonics, gaussians.harmonics[:, 0])[:, None]
+    constant = torch.zeros(bands**2)
+    constant[0] = HARMONIC
+    functions, finite = functions / weights, functions.isfinite().all(1, keepdim=True)
+    return SeenMeans(torch.where(finite, functions, constant), (opacities / weights)[:, 0])
 
 
 @torch.inference_mode()

@@ -18,6 +18,7 @@ import viser
 from numpy.typing import NDArray
 
 from ..errors import FprfError
+from ..interfaces import Scene
 from ..io.images import to_uint8
 from ..rendering.cameras import pixel_grid
 from ..splats.scene import SplatScene
@@ -61,7 +62,7 @@ class ViserFrontend(Frontend):
         self._viser.scene.set_up_direction(session.transform.up)
         self._viser.scene.world_axes.visible = False
         self._home = self._set_home()
-        self._splats = self._add_gaussians(session.viewed.scene) if isinstance(session.viewed.scene, SplatScene) else None
+        self._splats = self._add_gaussians(session.viewed.scene)
         self._lock = threading.Lock()
         self.panel = Panel(self._viser.gui, session, self._move_camera, self._camera_of, self.draw_lines)
         self._viser.on_client_connect(self._connected)
@@ -86,6 +87,10 @@ class ViserFrontend(Frontend):
             depth=self._page_depth(frame) if lined else None,
         )
         handle.flush()
+
+    def reload(self, scene: Scene) -> None:
+        self._splats = self._add_gaussians(scene)
+        self._viser.flush()
 
     def recolour(self, colours: Colours) -> None:
         if self._splats is not None:
@@ -153,17 +158,20 @@ class ViserFrontend(Frontend):
         camera.up, camera.fov = np.asarray(transform.up), state.fov
         return state
 
-    def _add_gaussians(self, scene: SplatScene) -> Any:
-        """Let browsers draw the Gaussians over the scene's background."""
+    def _add_gaussians(self, scene: Scene) -> Any:
+        """Let browsers draw Gaussians over the scene's background, in the place of those before; None for a scene of others."""
+        if not isinstance(scene, SplatScene):
+            return None
         background = np.array(scene.background, np.float32)
         self._viser.scene.set_background_image(to_uint8(torch.tensor(background)[None, None]), format="png")
-        means, covariances = page_gaussians(scene.gaussians, self._session.transform)
+        gaussians = scene.seen.gaussians(scene.gaussians)
+        means, covariances = page_gaussians(gaussians, self._session.transform)
         return self._viser.scene.add_gaussian_splats(
             "/gaussians",
             means.numpy(),
             covariances.numpy(),
-            scene.gaussians.colours.clamp(0, 1).numpy(),
-            scene.gaussians.opacities[:, None].numpy(),
+            gaussians.colours.clamp(0, 1).numpy(),
+            gaussians.opacities[:, None].numpy(),
         )
 
     def _look_at(self, state: CameraState) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
 """Scenes of Gaussians, drawn in the clients' browsers: a look or a map is new colours of the same Gaussians, for all clients.
 
-Browsers draw one colour each Gaussian: the mean of its harmonics over all directions.
+Browsers draw one colour each Gaussian, without compensation of its opacity: they get the means over the scene's views.
 """
 
 from collections.abc import Callable, Generator, Hashable, Iterator
@@ -59,7 +59,7 @@ class GaussianRenderer(SceneRenderer):
     def _colours(self, view: ViewSettings) -> Colours:
         scene, styled = self._scene, self._restyler.styled(view.look)
         look = None if styled is None else styled.restyle
-        pictures = {"look": to_uint8(scene.restyled(look).shown.colours.clamp(0, 1)[None])}
+        pictures = {"look": to_uint8(scene.seen.colours(scene.restyled(look).shown.harmonics).clamp(0, 1)[None])}
         share: NDArray[np.float32] | None = None
         solid = torch.ones(1, len(scene.gaussians))
         if view.shows_regions:

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Full, Queue
@@ -26,9 +26,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 from ..errors import FprfError, UsageError
 
 if TYPE_CHECKING:
-    from ..training.loading import Trained
-    from ..training.model import Model
+    from torch import Tensor
+
     from ..training.trainer import Report
+    from ..training.unfinished import UnfinishedRun
     from .server import Access, ViewerServer
     from .session import Session
     from .state import TrainingProgress
@@ -67,7 +68,7 @@ class LiveViewer:
         self._looking = threading.Event()
         self._wanted = threading.Event()
         self._ended = threading.Event()
-        self._model: Model | None = None
+        self._parameters: Callable[[], Mapping[str, Tensor]] | None = None
         self._next = 0.0
         with (Path(self._folder.name) / _LOG).open("w") as log:
             self._process = subprocess.Popen(
@@ -107,9 +108,20 @@ class LiveViewer:
         lines = (Path(self._folder.name) / _LOG).read_text(errors="replace").split("\n")
         return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "it said nothing")
 
-    def begin(self, root: Path, model: "Model", device: str, *, block: int | None = None, what: str = "") -> None:
-        """Show this run, or a `block` of it, whose config.json and scene.json are written. The page calls it `what`."""
-        self._model = model
+    def begin(
+        self,
+        root: Path,
+        parameters: "Callable[[], Mapping[str, Tensor]]",
+        device: str,
+        *,
+        block: int | None = None,
+        what: str = "",
+    ) -> None:
+        """Show this run, or a `block` of it, whose config.json and scene.json are written. The page calls it `what`.
+
+        `parameters` gives those of the moment, for the config's `load_unfinished`.
+        """
+        self._parameters = parameters
         self._send({"run": str(root.resolve()), "device": device, "block": block, "what": what})
 
     def __call__(self, report: "Report") -> None:
@@ -118,17 +130,17 @@ class LiveViewer:
             return
         self._send({"report": [report.step, report.share, report.psnr, report.seconds]})
         now = time.perf_counter()
-        if not self._wanted.is_set() or self._model is None or now < self._next:
+        if not self._wanted.is_set() or self._parameters is None or now < self._next:
             return
         self._wanted.clear()
-        copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in self._model.state_dict().items()}
+        copy = {name: tensor.detach().to("cpu", copy=True) for name, tensor in self._parameters().items()}
         self._next = now + (time.perf_counter() - now) / _COPY_SHARE
         self._send({"snapshot": copy})
 
     def finish(self, *, stay: bool) -> bool:
         """Training has ended. With `stay`, return when nobody looks any more. Return whether somebody had looked."""
         looked = self.looked_at and not self._ended.is_set()
-        self._model = None
+        self._parameters = None
         self._send({"done": True})
         while stay and looked and self.looked_at and not self._ended.wait(0.2):
             pass
@@ -224,7 +236,7 @@ class TrainingFollower:
         self._run: _TrainingRun | None = None
         self._shown: _TrainingRun | None = None
         self._session: Session | None = None
-        self._trained: Trained | None = None
+        self._unfinished: UnfinishedRun | None = None
         self._looking = self._wanted = self._ended = False
         self._last_seen = self._last_new = 0.0
 
@@ -276,7 +288,7 @@ class TrainingFollower:
         """Take new parameters; the first ones open the page."""
         from safetensors.torch import load_file
 
-        from .restyler import load_unfinished, measure_encoders, set_parameters
+        from ..training.run import Run
         from .session import Viewed, view_of_run
         from .state import TrainingProgress
 
@@ -284,30 +296,29 @@ class TrainingFollower:
         self._wanted, self._last_new = False, time.monotonic()
         run, session = self._run, self._session
         assert run is not None
-        if self._trained is None or run != self._shown:
-            self._trained = load_unfinished(run.root, run.device, run.block)
-        trained, self._shown = self._trained, run
+        if self._unfinished is None or run != self._shown:
+            self._unfinished = Run(run.root).load_config()[0].load_unfinished(run.root, run.device, run.block)
+        unfinished, self._shown = self._unfinished, run
 
         def load() -> Viewed:
-            set_parameters(trained, tensors)
-            return view_of_run(trained, trained.run, trained.known)
+            return view_of_run(unfinished.scene(tensors), unfinished.run, unfinished.known)
 
         if session is None:
-            self._session = self._server.open(load, (), 640, lambda before: measure_encoders(trained, before))
+            self._session = self._server.open(load, (), 640, unfinished.encoders)
             self._set_progress(TrainingProgress(what=run.what))
         else:
-            session.reload(load, lambda before: measure_encoders(trained, before))
+            session.reload(load, unfinished.encoders)
 
     def _load_finished(self) -> None:
         """Show the run as it was saved, with the style that training measured."""
         if self._session is None or self._run is None:
             return
-        from ..training.loading import load_run
+        from ..training.loading import open_run
         from .session import view_of_run
         from .state import TrainingProgress
 
-        last = load_run(self._run.root, self._run.device)
-        self._session.reload(lambda: view_of_run(last, last.run, last.known), lambda before: last.encoders())
+        last = open_run(self._run.root, self._run.device)
+        self._session.reload(lambda: view_of_run(last.scene, last.run, last.known), lambda before: last.scene.encoders())
         self._set_progress(TrainingProgress(last.step, 1.0))
 
     def _set_progress(self, training: "TrainingProgress") -> None:

@@ -1,10 +1,10 @@
-"""Photographs and looks on one scene, and a scene in the middle of its training. Runs on the render worker alone.
+"""Photographs and looks on one scene. Runs on the render worker alone.
 
 A photograph is encoded when it comes and clustered once for each number of clusters: a slider costs the stylizer alone.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, TypeAlias, TypeVar
@@ -12,9 +12,8 @@ from typing import Annotated, TypeAlias, TypeVar
 import torch
 from torch import Tensor
 
-from ..datamanagers.basis import Basis
 from ..datamanagers.images import load_image
-from ..errors import CheckpointError, UsageError
+from ..errors import UsageError
 from ..interfaces import Scene
 from ..io.images import shrink
 from ..plugins.stylizers.config import RegionToneConfig
@@ -28,13 +27,6 @@ from ..style.references import Encoders, encode_photograph
 from ..style.regions import memberships
 from ..style.restyle import Styled, dress, mixed
 from ..style.scene import SceneStyle
-from ..training import tensorfiles
-from ..training.blocks import RAYS, built_block, folder_of, load_boxes
-from ..training.loading import Trained, encoders_of
-from ..training.model import build_model
-from ..training.prepare import device_of
-from ..training.run import Run
-from ..training.style_pass import measure_style
 from .state import Look, Photograph, RegionInfo, simplified, style_config
 
 OpenEncoders: TypeAlias = Callable[[Encoders | None], Encoders]
@@ -48,8 +40,6 @@ _CACHED = 24
 """Dictionaries and styles that are kept for when somebody returns to them."""
 _SOLID = 0.01
 """Opacity below which there is nothing to point at."""
-_RAYS = 2**14
-"""Rays that the style of an unfinished run is measured with: 0.2 s instead of seconds, and it changes soon."""
 
 
 class Restyler:
@@ -185,47 +175,6 @@ def _use(cache: OrderedDict[Key, Value], key: Key) -> Value:
     while len(cache) > _CACHED:
         cache.popitem(last=False)
     return cache[key]
-
-
-def load_unfinished(root: Path, device: str, block: int | None = None) -> Trained:
-    """A run whose config.json and scene.json are written, with its model, or that of a block in its surroundings, untrained.
-
-    Raises CheckpointError.
-    """
-    run = Run(root)
-    saved, method = run.load_config()
-    config = saved.fields_only(root)
-    known = run.load_known()
-    if block is None:
-        model = build_model(config, known.facts)
-    else:
-        views = tensorfiles.read(folder_of(root, block) / RAYS)["views"]
-        model = built_block(root, config, known.facts, load_boxes(root), block, views).model
-    model.requires_grad_(False)
-    return Trained(run, config, method, known, model.to(device_of(device)).eval(), 0, 0.0)
-
-
-def set_parameters(trained: Trained, tensors: Mapping[str, Tensor]) -> Trained:
-    """The run with other parameters in its model. Raises CheckpointError where they are not of this model."""
-    try:
-        trained.model.load_state_dict(dict(tensors))
-    except RuntimeError as error:
-        raise CheckpointError(f"{trained.run.root}: its parameters are not those of its config ({error})") from error
-    return trained
-
-
-def measure_encoders(trained: Trained, before: Encoders | None) -> Encoders:
-    """Encoders with the style of the scene as it is now; those that were opened `before` are kept.
-
-    Raises DataError where the scene still renders empty, NumericsError where its features are not finite.
-    """
-    config, known = trained.config, trained.known
-    few = replace(config, statistics=replace(config.statistics, rays=min(_RAYS, config.statistics.rays)))
-    scene = measure_style(few, trained.model, known.cameras, torch.tensor(known.train))
-    if before is not None:
-        return before._replace(scene=scene)
-    basis = None if scene.keys.shape[1] == 0 else Basis.from_tensors(trained.run.load_tensors("basis"))
-    return encoders_of(trained, scene, basis)
 
 
 def matching_regions(before: SceneStyle, now: SceneStyle) -> Annotated[Tensor, "K"]:

@@ -74,6 +74,10 @@ class Frontend(ABC):
         """Show a picture to a client."""
 
     @abstractmethod
+    def reload(self, scene: Scene) -> None:
+        """Show another state of the scene to all clients, where their browsers draw it."""
+
+    @abstractmethod
     def recolour(self, colours: Colours) -> None:
         """Show Gaussians in other colours to all clients."""
 
@@ -185,6 +189,8 @@ class Session:
             self.viewed = load()
             before = self.restyler.reload(self.viewed.scene, open_encoders)
             self.renderer = self._make_renderer()
+            if self._frontend is not None:
+                self._frontend.reload(self.viewed.scene)
             if before is not None and self.state.names_regions:
                 regions = matching_regions(before, self.restyler.encoders.scene).tolist()
                 self.update(lambda state: renumber_regions(state, regions))
@@ -241,7 +247,7 @@ class Session:
             path = self.uploads.folder / "restyled.ply"
             shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
             if viewed.capture is None:
-                write_gaussians(path, shown, antialiased=scene.antialiased)
+                write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True)
             else:
                 write_capture(path, viewed.capture, shown.harmonics)
             return path.read_bytes()

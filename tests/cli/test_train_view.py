@@ -11,9 +11,9 @@ from fprf.cli.train import take_view
 from fprf.errors import UsageError
 from fprf.training import trainer
 from fprf.training.run import Run
+from fprf.training.unfinished import UnfinishedFields
 from fprf.viewer import live
 from fprf.viewer.live import LiveViewer, ViewAddress
-from fprf.viewer.restyler import load_unfinished
 
 
 @pytest.mark.parametrize(
@@ -76,5 +76,5 @@ def test_blocks_are_shown_one_after_the_other_and_trained_the_same(
     for line in heard:
         shown = line["block"] if "run" in line else shown
         if "names" in line:  # what was handed over fits the model that the viewer builds
-            assert line["names"] == sorted(load_unfinished(tmp_path / "shown", "cpu", shown).model.state_dict())
+            assert line["names"] == sorted(UnfinishedFields(tmp_path / "shown", "cpu", shown).trained.model.state_dict())
     assert any("names" in line for line in heard)

@@ -17,6 +17,7 @@ from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.files import ENDINGS, Capture, read_capture, write_capture, write_gaussians
 from fprf.splats.files.base import spatial_order
 from fprf.splats.gaussians import Gaussians
+from fprf.splats.views import camera_of, draw
 
 SHAPE = ("means", "quaternions", "log_scales", "logits")
 COUNT = 600
@@ -136,6 +137,29 @@ def test_without_view_dependence_a_file_holds_the_colours_that_views_show(tmp_pa
     wanted = 0.5 + 0.48860251 * direction[:, 2:] * harmonics[:, 2]
     assert torch.allclose(seen, wanted, atol=0.5 / 255 + 1e-6)
     assert torch.allclose(every, torch.full((2, 3), 0.5), atol=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize("ending", [".ply", ".splat"])
+def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path, ending: str) -> None:
+    """Needles that one view shows apart from each other: without compensation they would be up to five times as heavy."""
+    means = torch.tensor([[0.4 * x, 0.4 * y, 0.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    scales = torch.log(torch.tensor([0.1, 1e-3, 1e-3])) + torch.linspace(0, 2, 9)[:, None]
+    turns = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 9)
+    there = Gaussians(means, turns, scales, torch.full((9,), 2.0), torch.full((9, 1, 3), 1.0))
+    eye, up = torch.tensor([[0.0, 0, 2]]), torch.tensor([0.0, 1, 0])
+    views = pinhole(look_at(eye, torch.zeros(1, 3), up), width=64, height=64, fov=45)
+    write_gaussians(tmp_path / f"x{ending}", there, antialiased=True, views=views, plain=ending == ".ply")
+    plain = read_capture(tmp_path / f"x{ending}")
+    assert not plain.antialiased
+    camera = camera_of(views, 0)
+    wanted, shown, heavy = (
+        draw(g, camera, antialiased=aa).opacity for g, aa in ((there, True), (plain.gaussians, False), (there, False))
+    )
+    assert (shown - wanted).abs().max() < (1e-4 if ending == ".ply" else 0.03)
+    assert (heavy - wanted).abs().max() > 0.4
+    write_gaussians(tmp_path / "exact.ply", there, antialiased=True, views=views)
+    exact = read_capture(tmp_path / "exact.ply")
+    assert exact.antialiased and torch.equal(exact.gaussians.logits, there.logits)
 
 
 def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> None:

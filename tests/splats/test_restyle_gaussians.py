@@ -71,11 +71,12 @@ def test_a_style_is_one_affine_map_of_what_is_seen(
     before = as_drawn(scene.gaussians.harmonics, all_around(scene.gaussians.harmonics.shape[1]))
     around = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(1)), dim=1)
     basis = functions(around, 2)
-    old, now = (torch.einsum("db,nbc->ndc", basis, each) for each in (before, new))
+    old, now = (torch.einsum("db,nbc->ndc", basis, each).double() for each in (before, new))
     inside = (0.5 + 0.2820948 * new[:, 0]).sub(0.5).abs().amax(1) < 0.499  # nothing was cut
     assert int(inside.sum()) > 20
     for k in inside.nonzero()[:20, 0].tolist():
-        plus = torch.cat([old[k], torch.ones(64, 1)], 1)
+        plus = torch.cat([old[k], torch.ones(64, 1, dtype=torch.float64)], 1)
+        # In float64: of some Gaussians the old colours lie in a plane, which float32 solves or not by its last bit.
         left = now[k] - plus @ torch.linalg.lstsq(plus, now[k]).solution
         assert left.abs().max() < 1e-4 and (now[k] - old[k]).abs().max() > 1e-3
 

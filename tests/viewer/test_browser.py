@@ -165,10 +165,13 @@ def test_photographs_become_a_restyled_ply_without_a_terminal(tmp_path: Path) ->
         assert found.errors == []
 
 
-def test_training_is_shown_live_and_goes_on_without_its_viewer(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["fprf-lite", "fprf-splats"])
+def test_training_is_shown_live_and_goes_on_without_its_viewer(world: World, tmp_path: Path, method: str) -> None:
     few = flags(world, tmp_path / "run")
     few[few.index("--steps") + 1] = "100000"
-    command = [sys.executable, "-m", "fprf", "train", "fprf-lite", *few, "--view", "0"]
+    if method == "fprf-splats":
+        few = [*few[:4], "--steps", "1000000", "--passes", "1000000", "--initial", "300", "--cap", "400"]
+    command = [sys.executable, "-m", "fprf", "train", method, *few, "--view", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         try:

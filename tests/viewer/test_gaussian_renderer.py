@@ -50,7 +50,8 @@ def test_a_drop_sends_the_colours_of_the_restyled_scene(
     photograph = session.upload(world.references[0].read_bytes(), "dusk.png")
     listener.until(lambda: len(listener.colours) == 1)
     wanted = scene.restyled(apply_style(scene, StyleFile(style_config(session.state.look, TONE))).restyle)
-    assert np.abs(listener.colours[0].astype(int) - to_uint8(wanted.shown.colours.clamp(0, 1)[None])[0]).max() <= 1
+    colours = to_uint8(scene.seen.colours(wanted.shown.harmonics).clamp(0, 1)[None])[0]
+    assert np.abs(listener.colours[0].astype(int) - colours).max() <= 1
     session.move_camera(1, session.transform.camera_state(scene.cameras, 1))
     session.update(lambda state: replace(state, look=set_rule(state.look, 0, "keep")))
     listener.until(lambda: len(listener.colours) == 2)  # none for the camera alone
@@ -59,7 +60,8 @@ def test_a_drop_sends_the_colours_of_the_restyled_scene(
     assert belongs.any()
     session.update(lambda state: replace(state, look=Look(mix=((photograph, 1.0),), strength=0.0)))
     listener.until(lambda: len(listener.colours) == 3)
-    assert np.array_equal(listener.colours[2], to_uint8(scene.gaussians.colours.clamp(0, 1)[None])[0])
+    plain = scene.seen.gaussians(scene.gaussians)
+    assert np.array_equal(listener.colours[2], to_uint8(plain.colours.clamp(0, 1)[None])[0])
     assert listener.frames == []
 
 

@@ -160,7 +160,7 @@ def test_a_viewer_that_cannot_start_is_one_line(script: str) -> None:
 def test_who_looks_gets_the_parameters_of_now_and_how_it_goes(world: World, tmp_path: Path) -> None:
     model, log = world.load().model, tmp_path / "log"
     with LiveViewer(ViewAddress(), viewer(GREEDY, str(log))) as view:
-        view.begin(world.run, model, "cpu")
+        view.begin(world.run, model.state_dict, "cpu")
         until(lambda: log.is_file() and log.read_text().count("snapshot") >= 2, lambda: view(event(7)))
         assert view.looked_at and view.finish(stay=True)  # returns when the viewer says that nobody looks any more
         assert not view.looked_at
@@ -176,7 +176,7 @@ def test_what_is_handed_over_does_not_change_with_the_model(world: World, monkey
     model = world.load().model
     said: list[dict[str, object]] = []
     with LiveViewer(ViewAddress(), viewer(QUIET)) as view:
-        view.begin(world.run, model, "cpu")
+        view.begin(world.run, model.state_dict, "cpu")
         view._looking.set()
         view._wanted.set()
         with monkeypatch.context() as patched:
@@ -196,7 +196,7 @@ def test_copies_take_a_bounded_share_of_the_time(world: World, monkeypatch: pyte
     clock = iter(range(0, 10_000, 1))  # each look at the clock is a second later: a copy takes one
     monkeypatch.setattr(live.time, "perf_counter", lambda: float(next(clock)))
     with LiveViewer(ViewAddress(), viewer(QUIET)) as view:
-        view.begin(world.run, world.load().model, "cpu")
+        view.begin(world.run, world.load().model.state_dict, "cpu")
         view._looking.set()
         copies = 0
         for step in range(200):
@@ -209,7 +209,7 @@ def test_copies_take_a_bounded_share_of_the_time(world: World, monkeypatch: pyte
 @pytest.mark.parametrize("script", [DEAF, NONSENSE, DEAD])
 def test_no_viewer_holds_training_up(world: World, script: str) -> None:
     with LiveViewer(ViewAddress(), viewer(script)) as view:
-        view.begin(world.run, world.load().model, "cpu")
+        view.begin(world.run, world.load().model.state_dict, "cpu")
         until(lambda: view.looked_at or view.fault is not None)
         for step in range(500):
             view(event(step))

@@ -1,21 +1,18 @@
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from photographs import encoded
 from tiny_world import World
 
-from fprf.errors import CheckpointError, UsageError
+from fprf.errors import UsageError
 from fprf.style.files import StyleFile
 from fprf.style.look import Restyle
 from fprf.style.regions import membership_view
 from fprf.style.restyle import apply_style
 from fprf.style.scene import SceneStyle
-from fprf.training.loading import load_run, load_style
 from fprf.training.views import render_view
-from fprf.viewer.restyler import Restyler, load_unfinished, matching_regions, measure_encoders, set_parameters
+from fprf.viewer.restyler import Restyler, matching_regions
 from fprf.viewer.state import Look, set_rule, style_config
 
 
@@ -74,41 +71,6 @@ def test_a_click_finds_the_region_that_is_there(world: World) -> None:
         assert restyler.region_at(cameras, (x + 0.5, y + 0.5)) == int(share[y, x].argmax())
     with pytest.raises(UsageError, match="outside"):
         restyler.region_at(cameras, (32.0, 1.0))
-
-
-@pytest.fixture
-def fresh(world: World, tmp_path: Path) -> Path:
-    """A run as it is when training begins: no checkpoint, no style."""
-    run = tmp_path / "run"
-    run.mkdir()
-    for name in ("config.json", "scene.json", "basis.safetensors"):
-        shutil.copy(world.run / name, run / name)
-    return run
-
-
-def test_a_run_that_has_just_begun_renders_and_with_its_parameters_is_the_run(world: World, fresh: Path) -> None:
-    trained, last = load_unfinished(fresh, "cpu"), world.load()
-    assert not trained.model.training and not any(p.requires_grad for p in trained.model.parameters())
-    facts, cameras, config = trained.known.facts, trained.known.cameras, trained.config.render
-    start = render_view(trained.model, facts, cameras, 0, config).rgb
-    assert set_parameters(trained, last.model.state_dict()) is trained
-    end = render_view(trained.model, facts, cameras, 0, config).rgb
-    assert torch.equal(end, render_view(last.model, facts, cameras, 0, config).rgb) and not torch.equal(start, end)
-
-
-def test_parameters_of_another_config_are_refused(fresh: Path) -> None:
-    with pytest.raises(CheckpointError, match="not those of its config"):
-        set_parameters(load_unfinished(fresh, "cpu"), {"x": torch.zeros(3)})
-
-
-def test_the_style_of_a_moment_is_that_which_training_measures(world: World, fresh: Path) -> None:
-    trained = set_parameters(load_unfinished(fresh, "cpu"), world.load().model.state_dict())
-    first = measure_encoders(trained, None)
-    wanted, _ = load_style(load_run(world.run, "cpu").run)  # the tiny world has fewer rays than a moment takes
-    for found, each in zip(first.scene, wanted, strict=True):
-        assert torch.allclose(found, each, atol=1e-5)
-    again = measure_encoders(trained, first)
-    assert again.content is first.content and again.semantic is first.semantic and again.basis is first.basis
 
 
 def test_regions_are_known_again_whatever_their_order() -> None:

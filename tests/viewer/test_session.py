@@ -9,6 +9,7 @@ from photographs import viewed
 from tiny_world import World
 
 from fprf.errors import UsageError
+from fprf.interfaces import Scene
 from fprf.training.loading import load_run
 from fprf.viewer.film import FilmPlan
 from fprf.viewer.gaussian_renderer import Colours
@@ -24,6 +25,7 @@ class Listener(Frontend):
         self.frames: list[tuple[Hashable, RenderedFrame]] = []
         self.states: list[State] = []
         self.colours: list[Colours] = []
+        self.scenes: list[Scene] = []
         self.said: list[str] = []
         self.news = threading.Condition()
         self.deaf = False
@@ -34,6 +36,10 @@ class Listener(Frontend):
         with self.news:
             self.frames.append((client, frame))
             self.news.notify_all()
+
+    def reload(self, scene: Scene) -> None:
+        with self.news:
+            self.scenes.append(scene)
 
     def recolour(self, colours: Colours) -> None:
         with self.news:

@@ -11,7 +11,7 @@ from ...errors import DataError
 from ...io.atomic import write_bytes
 from ...rendering.cameras import Cameras
 from ..gaussians import Gaussians
-from ..views import mean_colours
+from ..views import seen_means
 from .base import Capture
 from .ply import compressed_bytes, is_compressed, ply_bytes, read_ply
 from .sog import read_sog, sog_bytes, unbundle
@@ -24,13 +24,14 @@ __all__ = ["ENDINGS", "Capture", "read_capture", "write_capture", "write_gaussia
 class _Format(NamedTuple):
     read: Callable[[Path, bytes], Capture]
     pack: Callable[[Gaussians, bool], bytes]
-    view_dependent: bool = True
+    plain: bool = False
+    """It holds neither view dependence nor whether opacities are compensated."""
 
 
 _FORMATS = {
     ".compressed.ply": _Format(read_ply, compressed_bytes),
     ".ply": _Format(read_ply, ply_bytes),
-    ".splat": _Format(read_splat, splat_bytes, view_dependent=False),
+    ".splat": _Format(read_splat, splat_bytes, plain=True),
     ".spz": _Format(read_spz, spz_bytes),
     ".sog": _Format(read_sog, sog_bytes),
     "meta.json": _Format(read_sog, sog_bytes),
@@ -54,15 +55,21 @@ def read_capture(path: Path) -> Capture:
     return capture
 
 
-def write_gaussians(path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None) -> None:
+def write_gaussians(
+    path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None, plain: bool = False
+) -> None:
     """Write a file in the format that its name ends with, whole or not at all. Raises DataError for another ending.
 
-    .ply is exact; the others lose what their bits cannot hold. .splat has no view dependence: it holds the mean colours that
-    `views` show, or those over all directions where none are given. .compressed.ply and SOG have an order of their own.
+    .ply is exact; the others lose what their bits cannot hold, and .compressed.ply and SOG have an order of their own.
+    .splat holds neither view dependence nor whether opacities are compensated (`antialiased`): it gets the means of what
+    `views` show, or the colours over all directions where none are given. With `plain` all formats get such opacities, for
+    renderers that do not compensate.
     """
     form = _FORMATS[_ending(path)]
-    if not form.view_dependent and gaussians.degree and views is not None and len(views):
-        gaussians = gaussians.recoloured(mean_colours(gaussians, views, antialiased=antialiased))
+    if views is not None and len(views) and ((form.plain and gaussians.degree) or (antialiased and (form.plain or plain))):
+        seen = seen_means(gaussians, views, antialiased=antialiased)
+        gaussians = seen.gaussians(gaussians) if form.plain else seen.plain(gaussians)
+        antialiased = False
     _write(path, form.pack(gaussians, antialiased))
 
 
