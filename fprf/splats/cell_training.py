@@ -47,6 +47,8 @@ OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
 _PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
+_VISITS = 10
+"""Times that the whole scene sees each of them, at least, however few `steps` there are: cells do not make up for fewer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -184,6 +186,7 @@ def train_overview(
     )
     small = scene_of(own)
     small = replace(small, train=small.train[:: -(-pixels // (factor**2 * _PIXELS))])
+    own = replace(own, steps=max(own.steps, _VISITS * len(small.train)))
     prepared = prepare(own, small, saved=Run(root).load_known().facts)._replace(shares=(0.0, config.overview))
     train(own, prepared, Run(folder), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})
