@@ -40,7 +40,7 @@ from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .learner import Learner
 from .photographs import make_levels
-from .training import Prepared, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
+from .training import CUT, Prepared, clear_of, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
 _FORMAT, _VIEWS = 2, "views.json"
 OVERVIEW = "overview"
@@ -239,7 +239,8 @@ def _prepared(
     cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
     tones = tones_of(facts) if any(name.startswith("tones.") for name in start.optimizer) else None
     levels = make_levels(own, images, masks, near)
-    learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, tones=tones)
+    clear = clear_of(scene)  # of all cameras: what lies before those of other cells is part of the union
+    learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, clear, cut_every=CUT, tones=tones)
     # As if the number had grown from the beginning of the schedule.
     passed = min(shares[0] / config.grow, 0.99)
     begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))

@@ -33,8 +33,6 @@ _JUDGES = 8
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
-_CUT_EVERY = 10
-"""Steps between cuts of what became too wide."""
 _TONES = 2e-3
 """Learning rate of the logarithms of factors. It falls to a tenth."""
 
@@ -53,8 +51,8 @@ class Step(NamedTuple):
 class Learner:
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
-    Only Gaussians whose means are `inside` are split or moved; None = all. `widest` tells the greatest logarithms of
-    standard deviations from the blocks' means; None = none is limited.
+    Only Gaussians whose means are `inside` are split or moved; None = all. Every `cut_every` steps `widest` tells the greatest
+    logarithms of standard deviations from the blocks' means; None = none is limited.
     With `tones` each view's factors are learnt as well; with `colours_only` nothing but harmonics is.
     """
 
@@ -67,10 +65,11 @@ class Learner:
         inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
         widest: Callable[[Annotated[Floats, "B 3 L"]], Annotated[Floats, "B 1 L"]] | None = None,
         *,
+        cut_every: int = 10,
         tones: Tones | None = None,
         colours_only: bool = False,
     ) -> None:
-        self.inside, self.widest = inside, widest
+        self.inside, self.widest, self.cut_every = inside, widest, cut_every
         self.config, self.levels, self.reach = config, levels, reach
         self.bands = (config.degree + 1) ** 2
         self.room = -(-room // LANES) * LANES
@@ -122,7 +121,7 @@ class Learner:
         )  # fmt: skip
         if not math.isfinite(measured.l1 + measured.ssim):
             return None
-        if self.widest is not None and step % _CUT_EVERY == 0:
+        if self.widest is not None and step % self.cut_every == 0:
             rows = self.blocks.reshape(-1, self.rows, LANES)
             np.minimum(rows[:, 3:6], self.widest(rows[:, :3]), out=rows[:, 3:6])
         if self.tones is not None and self.adam is not None:

@@ -50,6 +50,9 @@ _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
 _WIDE = 0.2
 """Greatest standard deviation of one of them, as a share of their distance."""
+CUT, _CLEAR, _TOGETHER = 100, 0.25, 16_384
+"""In scenes of cells: steps between cuts of what became too wide; greatest standard deviation, as a share of the distance to
+the nearest camera; Gaussians whose distances are taken together."""
 _SOME = 4000
 """Points whose depths say how near to a camera things are."""
 _LEVELS, _MANY = "levels", 400_000
@@ -112,8 +115,11 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     far = surroundings(scene, images, points, config.surroundings) if config.surroundings else None
     room = max(config.cap, len(points.position) + config.surroundings)
     sphere = _Sphere.around(far) if far is not None else None
-    bounds = (None, None) if sphere is None else (sphere.encloses, sphere.widest)
-    learner = Learner(config, levels, reach_of(scene), room, *bounds, tones=tones_of(facts))
+    if config.cells > 1:
+        learner = Learner(config, levels, reach_of(scene), room, None, clear_of(scene), cut_every=CUT, tones=tones_of(facts))
+    else:
+        bounds = (None, None) if sphere is None else (sphere.encloses, sphere.widest)
+        learner = Learner(config, levels, reach_of(scene), room, *bounds, tones=tones_of(facts))
     learner.begin(points, draw, far)
     return Prepared(scene, learner, near, origin, facts=facts)
 
@@ -139,6 +145,21 @@ class _Sphere(NamedTuple):
         """Logarithms of the greatest standard deviations: one that reached the cameras would be drawn before the scene."""
         square = np.square(means - self.centre.numpy()[:, None]).sum(1, keepdims=True)
         return np.where(square < (0.5 * self.radius) ** 2, np.float32(np.inf), np.float32(math.log(_WIDE * self.radius)))
+
+
+def clear_of(scene: Scene) -> Callable[[Annotated[Floats, "B 3 L"]], Annotated[Floats, "B 1 L"]]:
+    """Logarithms of the greatest standard deviations in large scenes: shares of the distance to the nearest training camera.
+
+    Of thousands of photographs each is seen rarely, and a Gaussian that grows where some are taken covers others as haze.
+    """
+    centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
+
+    def widest(means: Annotated[Floats, "B 3 L"]) -> Annotated[Floats, "B 1 L"]:
+        points = torch.from_numpy(means).transpose(1, 2).reshape(-1, 3)
+        near = torch.cat([torch.cdist(part, centres).amin(1) for part in torch.split(points, _TOGETHER)])
+        return (_CLEAR * near).clamp_min(1e-12).log().view(len(means), 1, -1).numpy()
+
+    return widest
 
 
 def load_photographs(

@@ -343,6 +343,17 @@ def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: S
     assert (after.log_scales[~far] > wide.log_scales[~far] - 0.1).all()
 
 
+def test_in_scenes_of_cells_nothing_covers_a_camera(config: GaussiansConfig, scene: Scene) -> None:
+    learner = prepare(replace(config, cells=2), scene).learner
+    before = learner.gaussians()
+    learner.restore(replace(before, log_scales=before.log_scales + 8.0), learner.moments())
+    assert learner.step(0, 0.0) is not None
+    centres = scene.cameras.pose[scene.train][:, :, 3].float()
+    near = torch.stack([(before.means - centre).norm(dim=1) for centre in centres]).amin(0)[:, None]
+    after = learner.gaussians().log_scales.exp()
+    assert (after <= 0.26 * near).all() and (after > 0.2 * near).any()
+
+
 def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene) -> None:
     """Two copies of a scene far from each other are learnt at the rate of one."""
     apart = torch.tensor([1000.0, 0.0, 0.0], dtype=torch.float64)
