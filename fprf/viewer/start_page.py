@@ -156,8 +156,9 @@ class StartPage:
 
     async def _stop(self, request: Request) -> Response:
         """Stop what is being made, to show what there is, or to leave it; a failure is put away."""
+        busy = self._thread is not None and self._thread.is_alive()  # asked before it ends by this very request
         self._interrupt("show" if json_body(request).get("then") == "show" else "leave")
-        if self._thread is None or not self._thread.is_alive():
+        if not busy:
             self._progress = Progress()
         return json_response({})
 
