@@ -32,7 +32,8 @@ from ..errors import CheckpointError
 from ..io.atomic import write_json
 from ..plugins.codec import to_json
 from ..training import checkpoint
-from ..training.model import Facts, tones_of
+from ..training.camera_optimizers import Tones
+from ..training.model import Facts
 from ..training.run import Run, held
 from ..training.trainer import Report
 from .cells import Cell, cut
@@ -187,7 +188,9 @@ def train_overview(
     small = scene_of(own)
     small = replace(small, train=small.train[:: -(-pixels // (factor**2 * _PIXELS))])
     own = replace(own, steps=max(own.steps, _VISITS * len(small.train)))
-    prepared = prepare(own, small, saved=Run(root).load_known().facts)._replace(shares=(0.0, config.overview))
+    facts = Run(root).load_known().facts
+    facts = replace(facts, held=_others(small, small.train.tolist()) if facts.exposure else ())
+    prepared = prepare(own, small, saved=facts)._replace(shares=(0.0, config.overview))
     train(own, prepared, Run(folder), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})
     return True
@@ -237,7 +240,8 @@ def _prepared(
     # Only what lies inside and in the border becomes more: its share of all that may be added.
     around = int(cell.around(gaussians.means).sum())
     cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
-    tones = tones_of(facts) if any(name.startswith("tones.") for name in start.optimizer) else None
+    tones = _tones_of(facts, start)
+    tones = tones and tones.going_on(_others(scene, list(cell.windows)))
     levels = make_levels(own, images, masks, near)
     clear = clear_of(scene)  # of all cameras: what lies before those of other cells is part of the union
     learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, clear, cut_every=CUT, tones=tones)
@@ -245,9 +249,24 @@ def _prepared(
     passed = min(shares[0] / config.grow, 0.99)
     begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
     moments = {name: start.optimizer[name][shown] for name in ("first", "second")}
-    moments |= {name: tensor for name, tensor in start.optimizer.items() if name.startswith("tones.")}
     learner.restore(gaussians, {**moments, "begun": torch.tensor(begun)})
     return Prepared(own, learner, near, "the whole scene", start.step, shares)
+
+
+def _others(scene: Scene, views: list[int]) -> tuple[int, ...]:
+    """All views but some."""
+    return tuple(sorted(set(range(len(scene.paths))) - set(views)))
+
+
+def _tones_of(facts: Facts, start: checkpoint.Saved) -> Tones | None:
+    """The exposures that cells go on from; None where none are learnt."""
+    if "tones.gain.value" not in start.optimizer:
+        return None
+    gain, exponent = (start.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent"))
+    never = (gain == 0).all(1).nonzero()[:, 0]  # views that only cells learn from
+    tones = Tones(torch.tensor(facts.exposure), tuple(never.tolist()))
+    tones.load_state_dict({"gain": gain, "exponent": exponent})
+    return tones
 
 
 def _begin(folder: Path, task: str) -> None:
@@ -313,24 +332,24 @@ def unite(root: Path, round: int, cells: Sequence[Cell], to: Path | None = None)
     *united, first, second = (torch.cat(columns) for columns in zip(*parts, strict=True))
     gaussians = Gaussians(*united)
     moments = {"first": first, "second": second, "begun": torch.tensor(len(gaussians))}
-    moments |= _mean_tones(start, lights, cells)
+    moments |= _mean_tones(_tones_of(Run(root).load_known().facts, start), lights, cells)
     state = state_of(gaussians, float(start.model["near"]))
     checkpoint.write(to or _start_of(root, round + 1), state, moments, step=step, seconds=seconds)
     return len(gaussians)
 
 
-def _mean_tones(start: checkpoint.Saved, found: list[dict[str, Tensor]], cells: Sequence[Cell]) -> dict[str, Tensor]:
+def _mean_tones(start: Tones | None, found: list[dict[str, Tensor]], cells: Sequence[Cell]) -> dict[str, Tensor]:
     """Average the exposure parameters of cells: for each view, over the cells that have a window of it."""
-    named = {}
-    for name, before in start.optimizer.items():
-        if not name.startswith("tones."):
-            continue
-        every = torch.stack([each[name] for each in found])
-        if before.dim() == 2:  # a row a view
-            used = torch.zeros(len(cells), len(before), 1, dtype=every.dtype)
-            for number, cell in enumerate(cells):
-                used[number, list(cell.windows)] = 1
-            named[name] = torch.where(used.sum(0) > 0, (used * every).sum(0) / used.sum(0).clamp_min(1), before)
-        else:
-            named[name] = every.mean(0)
-    return named
+    if start is None:
+        return {}
+    views = len(start.exposure)
+    total, count = torch.zeros(views, 3), torch.zeros(views, 1)
+    for each, cell in zip(found, cells, strict=True):
+        used = torch.zeros(views, dtype=torch.bool)
+        used[list(cell.windows)] = True
+        tones = start.going_on(tuple((~used).nonzero()[:, 0].tolist()))
+        tones.load_state_dict({name: each[f"tones.{name}.value"] for name in ("gain", "exponent")})
+        total[used] += tones.gains().detach()[used]
+        count[used] += 1
+    gain = torch.where(count > 0, total / count.clamp_min(1), start.gains().detach())
+    return {"tones.gain.value": gain, "tones.exponent.value": start.exponent.detach()}

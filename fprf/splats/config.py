@@ -1,4 +1,4 @@
-"""How 3D Gaussians are looked at, and what a run of them is made of. Imports no torch."""
+"""Configs of runs of 3D Gaussians and of views of a capture. Imports no torch."""
 
 from dataclasses import dataclass
 from pathlib import Path

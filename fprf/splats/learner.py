@@ -234,14 +234,14 @@ class Learner:
         self.blocks = _blocks(rows)
 
     def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint holds."""
+        """Go on from what a checkpoint holds; without their moments, tones go on as they are."""
         self.start_from(gaussians)
         self.begun = int(moments["begun"])
         for name in ("first", "second"):
             rows = np.zeros((self.rows, self.room), np.float32)
             rows[:, : self.count] = moments[name].T.numpy()
             setattr(self, name, _blocks(rows))
-        if self.tones is not None and self.adam is not None:
+        if self.tones is not None and self.adam is not None and "tones.gain.value" in moments:
             for name, parameter in self.tones.named_parameters():
                 kept = {key.rpartition(".")[2]: each for key, each in moments.items() if key.startswith(f"tones.{name}.")}
                 parameter.data.copy_(kept.pop("value"))
@@ -249,7 +249,7 @@ class Learner:
 
 
 def _at(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], slice, NDArray[np.int64]]:
-    """Where Gaussians lie in blocks [B rows LANES]."""
+    """Index of Gaussians in blocks [B rows LANES]."""
     return index // LANES, slice(None), index % LANES
 
 

@@ -128,6 +128,7 @@ class Tones(nn.Module):
 
     exposure: Tensor
     learned: Tensor
+    known: Tensor
 
     def __init__(self, exposure: Annotated[Tensor, "V"], held: tuple[int, ...]) -> None:
         """`exposure` is `relative`; `held` are views that are not learnt from."""
@@ -139,13 +140,26 @@ class Tones(nn.Module):
         learned[list(held)] = 0
         self.register_buffer("exposure", exposure.float(), persistent=False)
         self.register_buffer("learned", learned, persistent=False)
+        self.register_buffer("known", torch.zeros(views, 3), persistent=False)
+
+    def gains(self) -> Annotated[Tensor, "V 3"]:
+        """Logarithms of what exposures do not say. The mean over the views that are learnt from does not change."""
+        centre = (self.gain * self.learned).sum(0) / self.learned.sum().clamp_min(1)
+        gains: Tensor = self.known + (self.gain - centre) * self.learned
+        return gains
 
     def forward(self, view: Annotated[Tensor, "R"]) -> Annotated[Tensor, "R 3"]:
-        """Factors of views; of one that is not learnt from, what its exposure alone says."""
-        centre = (self.gain * self.learned).sum(0) / self.learned.sum().clamp_min(1)
-        free = (self.gain - centre) * self.learned
+        """Factors of views; of one that was never learnt from, what its exposure alone says."""
         at = view.to(self.gain.device)
-        return torch.exp(free.index_select(0, at) + self.exponent * self.exposure.index_select(0, at)[:, None])
+        return torch.exp(self.gains().index_select(0, at) + self.exponent * self.exposure.index_select(0, at)[:, None])
+
+    def going_on(self, held: tuple[int, ...]) -> "Tones":
+        """Tones that start as these are now, and learn from other views; the exponent stays."""
+        tones = Tones(self.exposure, held)
+        with torch.no_grad():
+            tones.known.copy_(self.gains())
+            tones.exponent.copy_(self.exponent).requires_grad_(False)
+        return tones
 
     def mixed(self, views: tuple[int, ...], weights: tuple[float, ...]) -> Annotated[Tensor, "3"]:
         """Factors between those of some views, weighted; weights sum to 1. Means are taken of logarithms."""

@@ -207,21 +207,19 @@ def test_views_stand_where_the_sizes_of_gaussians_say_that_photographs_were_take
     assert all(float(draw(scene, camera_of(seen, v)).opacity.mean()) > 0.7 for v in range(len(seen)))
 
 
+def restyled(folder: Path, photographs: list[Path]) -> list[str]:
+    """Words of the command for a capture in.ply, with a cache, without an output."""
+    kept = ["--cache", str(folder / "cache")]
+    return ["restyle", str(folder / "in.ply"), *SMALL, *kept, "--references", *map(str, photographs)]
+
+
 def test_the_verb_writes_capture_sheet_page_and_style(
     photographs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = ball(200)
     made.means[7, 0] = torch.nan
     write_gaussians(tmp_path / "in.ply", made)
-    words = [
-        "restyle",
-        str(tmp_path / "in.ply"),
-        *SMALL,
-        "--cache",
-        str(tmp_path / "cache"),
-        "--references",
-        *map(str, photographs),
-    ]
+    words = restyled(tmp_path, photographs)
     outputs = [
         "--output",
         str(tmp_path / "out.ply"),
@@ -252,15 +250,7 @@ def test_the_verb_writes_capture_sheet_page_and_style(
 def test_any_encoder_finds_the_regions(photographs: list[Path], tmp_path: Path) -> None:
     """Also those of other packages: the slot is that of fields. What each found is kept beside what others did."""
     write_gaussians(tmp_path / "in.ply", ball(200))
-    words = [
-        "restyle",
-        str(tmp_path / "in.ply"),
-        *SMALL,
-        "--cache",
-        str(tmp_path / "cache"),
-        "--references",
-        *map(str, photographs),
-    ]
+    words = restyled(tmp_path, photographs)
     random = ["--semantic.encoder", "random", "--semantic.encoder.channels", "6"]
     for name, flags in (("bundled", []), ("random", random), ("again", random)):
         assert cli.main([*words, *flags, "--output", str(tmp_path / f"{name}.ply")]) == 0

@@ -12,10 +12,14 @@ import torch
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene, find_sightings
+from fprf.splats import cell_training
 from fprf.splats.cell_training import CellTask, read_cells, train_cell
 from fprf.splats.cells import Cell, cut
 from fprf.splats.files import read_capture
 from fprf.town.write import write_town
+from fprf.training.camera_optimizers import Tones
+from fprf.training.checkpoint import load_latest
+from fprf.training.run import Run
 
 COUNT = 3
 
@@ -97,3 +101,37 @@ def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Sce
         assert train_cell(task, lambda event: None)
     assert main(command) == 0 and exported("c.ply") == first
     assert main(["eval", str(run), "--split", "test"]) == 0
+
+
+def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which knows those of the photographs that it had memory for. Each cell moves its own, and not their mean."""
+    monkeypatch.setattr(cell_training, "_PIXELS", 1500)
+    run = tmp_path / "run"
+    command = ["train", "fprf-splats", "--data", str(town), "--downscale", "1", "--steps", "60", "--cells", "2"]
+    assert main([*command, "--initial", "300", "--cap", "600", "--tones", "true", "--output", str(run)]) == 0
+    overview, _ = load_latest(run / "overview" / "checkpoints")
+    facts = Run(run).load_known().facts
+    assert overview is not None and facts.exposure
+    gain = overview.optimizer["tones.gain.value"]
+    learned = (gain != 0).all(1)
+    assert 0 < int(learned.sum()) < len(Run(run).load_known().train), "some photographs were left out"
+    start = Tones(torch.tensor(facts.exposure), tuple((~learned).nonzero()[:, 0].tolist()))
+    start.load_state_dict({name: overview.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent")})
+    means = []
+    for number, cell in enumerate(read_cells(run)):
+        saved, _ = load_latest(run / "cells" / "0" / f"{number:02d}" / "checkpoints")
+        assert saved is not None
+        outside = torch.ones(len(gain), dtype=torch.bool)
+        outside[list(cell.windows)] = False
+        moved = saved.optimizer["tones.gain.value"]
+        assert torch.equal(moved[outside], torch.zeros(int(outside.sum()), 3)) and (moved[~outside] != 0).any()
+        tones = start.going_on(tuple(outside.nonzero()[:, 0].tolist()))
+        tones.load_state_dict({name: saved.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent")})
+        torch.testing.assert_close(tones.gains()[~outside].mean(0), start.gains()[~outside].mean(0), atol=1e-5, rtol=0)
+        means.append(torch.where(outside[:, None], torch.nan, tones.gains().detach()))
+    union, _ = load_latest(run / "cells" / "0" / "checkpoints")
+    assert union is not None
+    mean = torch.stack(means).nanmean(0)
+    torch.testing.assert_close(
+        union.optimizer["tones.gain.value"], torch.where(mean.isnan(), start.gains().detach(), mean), atol=1e-6, rtol=1e-5
+    )

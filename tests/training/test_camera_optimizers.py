@@ -148,6 +148,27 @@ def test_what_the_training_views_share_belongs_to_the_scene(count: int, held: in
     torch.testing.assert_close(tones(torch.arange(count + held)), factor, atol=1e-5, rtol=1e-4)
 
 
+def test_tones_that_go_on_with_other_views_start_as_they_were_and_keep_the_mean_of_these() -> None:
+    """Else every cell would choose how bright the scene is, and views that nobody learns from would move."""
+    draw = torch.Generator().manual_seed(0)
+    views, before = torch.arange(8), Tones(torch.linspace(-0.5, 0.5, 8), (5, 6, 7))
+    with torch.no_grad():
+        before.gain.copy_(torch.randn(8, 3, generator=draw))
+        before.exponent.fill_(0.6)
+    after, learned = before.going_on((0, 1, 2, 7)), torch.tensor([3, 4, 5, 6])
+    torch.testing.assert_close(after(views), before(views))
+    start = before(views).log().detach()
+    optimizer = torch.optim.Adam(after.parameters(), lr=0.1)
+    for view in (3, 5, 3, 6, 4):
+        optimizer.zero_grad()
+        after(torch.tensor([view])).sum().backward()
+        optimizer.step()
+    moved = after(views).log().detach() - start
+    assert moved[learned].abs().amin() > 1e-3
+    torch.testing.assert_close(moved[learned].mean(0), torch.zeros(3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(moved[[0, 1, 2, 7]], torch.zeros(4, 3))
+
+
 def test_known_exposures_speak_for_views_that_are_held_out() -> None:
     exposure = torch.tensor([1.0, 2.0, 4.0, 2.0])
     log = relative(exposure, 4)
