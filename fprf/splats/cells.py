@@ -86,9 +86,7 @@ class Cell:
         order, centre, radius = _runs(gaussians)
         for view in self.windows:
             camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
-            in_sight = torch.zeros_like(visible)
-            in_sight[order[torch.from_numpy(in_view(camera, centre, radius)[1])]] = True
-            some = in_sight.nonzero()[:, 0]
+            some = torch.unique(order[torch.from_numpy(in_view(camera, centre, radius)[1])])
             shape = gaussians.means[some], gaussians.quaternions[some], gaussians.log_scales[some], gaussians.logits[some]
             weights = lift(*shape, camera, torch.zeros(camera.height, camera.width, 1), antialiased=True).weights
             visible[some[weights > _WEIGHT]] = True
