@@ -27,7 +27,7 @@ import numpy as np
 from .common import RESULTS, add_entry, arguments
 from .district_scene import SKY, write_district
 
-CELLS, STEPS, COARSE_STEPS, GAUSSIANS, POINTS = 4, 200, 100, 8000, 3000
+CELLS, STEPS, COARSE_STEPS, GAUSSIANS, POINTS = 4, 400, 100, 8000, 3000
 """Cells of a town; steps of a cell; steps of the whole for each town; Gaussians of a cell at the end and at the start."""
 Result = TypeVar("Result")
 
@@ -75,7 +75,7 @@ def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
     # One round: `--steps` covers the whole, then one cell.
     config = GaussiansConfig(
         data=data, downscale=1, cells=cells, rounds=1, steps=coarse + STEPS, overview=coarse / (coarse + STEPS), coarse=0.0,
-        initial=POINTS * cells, cap=GAUSSIANS * cells, background=SKY, checkpoint_minutes=0.03,
+        initial=POINTS * cells, cap=GAUSSIANS * cells, background=SKY, checkpoint_minutes=0.02,
     )  # fmt: skip
     start = time.process_time()
     scene, folder = scene_of(config), Run(run)
