@@ -43,7 +43,7 @@ from .learner import Learner
 from .photographs import make_levels
 from .training import CUT, Prepared, clear_of, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
-_FORMAT, _VIEWS = 2, "views.json"
+_FORMAT, _VIEWS = 3, "views.json"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
 _PIXELS, _SMALLEST = 16_000_000, 4
@@ -293,6 +293,7 @@ def _task(
     tree = to_json(config)
     assert isinstance(tree, dict)
     parts: dict[str, Any] = {
+        "format": _FORMAT,
         "config": {name: value for name, value in tree.items() if name not in (*RESUMABLE, *config.untrained, "cells")},
         "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
     }
