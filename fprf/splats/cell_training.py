@@ -262,7 +262,7 @@ def _prepared(
 
 
 def _others(scene: Scene, views: list[int]) -> tuple[int, ...]:
-    """All views but some."""
+    """Numbers of the views that are not among some."""
     return tuple(sorted(set(range(len(scene.paths))) - set(views)))
 
 
