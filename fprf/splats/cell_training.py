@@ -304,7 +304,7 @@ def _task(
     for view in views:
         digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
     for tensor in () if start is None else (*start.model.values(), *start.optimizer.values()):
-        digest.update(tensor.contiguous().numpy().tobytes())
+        digest.update(tensor.contiguous().numpy().data)
     return digest.hexdigest()[:32]
 
 

@@ -84,12 +84,16 @@ class Cell:
         cameras = self.scene(scene).cameras
         visible = self.around(gaussians.means)
         order, centre, radius = _runs(gaussians)
+        shape = [part[order] for part in (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)]
+        shape[-1].view(-1)[len(gaussians) :] = -math.inf  # the last ones, repeated
+        shown = torch.zeros(order.shape, dtype=torch.bool)
         for view in self.windows:
             camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
-            some = torch.unique(order[torch.from_numpy(in_view(camera, centre, radius)[1])])
-            shape = gaussians.means[some], gaussians.quaternions[some], gaussians.log_scales[some], gaussians.logits[some]
-            weights = lift(*shape, camera, torch.zeros(camera.height, camera.width, 1), antialiased=True).weights
-            visible[some[weights > _WEIGHT]] = True
+            runs = torch.from_numpy(in_view(camera, centre, radius)[1]).nonzero()[:, 0]
+            some = [part[runs].flatten(0, 1) for part in shape]
+            weights = lift(*some, camera, torch.zeros(camera.height, camera.width, 1), antialiased=True).weights
+            shown[runs] |= weights.view(-1, _RUN) > _WEIGHT
+        visible[order[shown]] = True
         return visible
 
     def cut(self, view: int, image: NDArray[Number]) -> NDArray[Number]:

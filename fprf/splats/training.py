@@ -50,7 +50,7 @@ _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
 _WIDE = 0.2
 """Greatest standard deviation of one of them, as a share of their distance."""
-CUT, _CLEAR, _TOGETHER = 100, 0.25, 16_384
+CUT, _CLEAR, _TOGETHER = 100, 0.25, 256
 """In scenes of cells: steps between cuts of what became too wide; greatest standard deviation, as a share of the distance to
 the nearest camera; Gaussians whose distances are taken together."""
 _SOME = 4000
@@ -154,9 +154,16 @@ def clear_of(scene: Scene) -> Callable[[Annotated[Floats, "B 3 L"]], Annotated[F
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
 
+    def nearest(points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
+        # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
+        middle = (points.amin(0) + points.amax(0)) / 2
+        radius, apart = (points - middle).norm(dim=1).amax(), (centres - middle).norm(dim=1)
+        some = centres[apart <= 1.001 * (apart.amin() + 2 * radius)]
+        return torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
+
     def widest(means: Annotated[Floats, "B 3 L"]) -> Annotated[Floats, "B 1 L"]:
         points = torch.from_numpy(means).transpose(1, 2).reshape(-1, 3)
-        near = torch.cat([torch.cdist(part, centres).amin(1) for part in torch.split(points, _TOGETHER)])
+        near = torch.cat([nearest(part) for part in torch.split(points, _TOGETHER)])
         return (_CLEAR * near).clamp_min(1e-12).log().view(len(means), 1, -1).numpy()
 
     return widest

@@ -354,6 +354,20 @@ def test_in_scenes_of_cells_nothing_covers_a_camera(config: GaussiansConfig, sce
     assert (after <= 0.26 * near).all() and (after > 0.2 * near).any()
 
 
+@pytest.mark.parametrize("spread", [0.1, 3.0, 100.0])
+def test_the_nearest_of_many_cameras_is_found(scene: Scene, spread: float) -> None:
+    draw = torch.Generator().manual_seed(0)
+    cameras = scene.cameras.select(torch.zeros(400, dtype=torch.int64))
+    centre = 10 * torch.randn(400, 3, generator=draw, dtype=torch.float64)
+    cameras = replace(cameras, pose=torch.cat([cameras.pose[:, :, :3], centre[:, :, None]], 2))
+    means = 10 * torch.randn(60, 3, 1, generator=draw) + spread * torch.randn(60, 3, 16, generator=draw)
+    widest = training.clear_of(replace(scene, cameras=cameras, train=torch.arange(0, 400, 2)))(means.numpy())
+    apart = (means[:, None].double() - centre[::2, :, None]).norm(dim=2).amin(1, keepdim=True)
+    # Roundings of coordinates to float32, and of the logarithm.
+    allowed = (4 * means.abs().max() + 16 * apart) * torch.finfo(torch.float32).eps
+    assert ((torch.from_numpy(widest).double().exp() / 0.25 - apart).abs() <= allowed).all()
+
+
 def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene) -> None:
     """Two copies of a scene far from each other are learnt at the rate of one."""
     apart = torch.tensor([1000.0, 0.0, 0.0], dtype=torch.float64)
