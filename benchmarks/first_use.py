@@ -28,7 +28,6 @@ from fprf.datamanagers.parsers.files import read_json
 from fprf.datamanagers.scene import Scene
 from fprf.evaluation.evaluate import judge
 from fprf.io.atomic import write_json
-from fprf.io.images import to_uint8
 from fprf.io.video import write_frames
 from fprf.process import keep_memory
 from fprf.training.loading import load_run
@@ -78,7 +77,7 @@ def measured(data: Path, run: Path, steps: int, side: int, flags: list[str], ren
     metrics, pictures = judge(trained, scene, views, lambda done, total, what: None)
     if renders is not None:
         renders.mkdir(parents=True, exist_ok=True)
-        write_frames(renders, [trained.known.names[view] for view in views], [to_uint8(p.rgb) for p in pictures])
+        write_frames(renders, [trained.known.names[view] for view in views], pictures)
     return {
         "training_views": len(scene.train),
         "held_out_views": len(views),

@@ -15,8 +15,8 @@ from .progress import Display
 from .verbs import verbs_of
 
 if TYPE_CHECKING:
+    from ..datamanagers.images import Image
     from ..training.run import Known
-    from ..types import View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,23 +66,22 @@ def evaluate_fields(config: EvalConfig) -> dict[str, object]:
         if config.fit_poses:
             trained, moves = align(trained, scene, views, display.count)
             fitted = {"fitted_poses": {trained.known.names[view]: described(move) for view, move in moves.items()}}
-        metrics, renders = judge(trained, scene, views, display.count)
-    return store(config, trained.known, trained.method, views, metrics | fitted, renders)
+        metrics, images = judge(trained, scene, views, display.count)
+    return store(config, trained.known, trained.method, views, metrics | fitted, images)
 
 
 def store(
-    config: EvalConfig, known: "Known", method: str, views: Sequence[int], found: dict[str, Any], renders: "list[View]"
+    config: EvalConfig, known: "Known", method: str, views: Sequence[int], found: dict[str, Any], images: "list[Image]"
 ) -> dict[str, object]:
     """Write metrics.json and, if they are wanted, the renders; returns what is written."""
     from ..io.atomic import write_json
-    from ..io.images import to_uint8
     from ..io.video import write_frames
 
     metrics = {"method": method, "scene": known.name, "split": config.split, "quality": config.quality, **found}
     write_json(config.run / "metrics.json", metrics)
     if config.images:
         names = [known.names[v] for v in views]
-        write_frames(config.run / "renders" / config.split, names, [to_uint8(v.rgb) for v in renders])
+        write_frames(config.run / "renders" / config.split, names, images)
     return metrics
 
 

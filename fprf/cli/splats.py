@@ -76,9 +76,9 @@ class SplatVerbs(Verbs):
             return replace(shown, tone=(red, green, blue)).render(known.cameras, view)
 
         with Display() as display:
-            scores, renders = judge_views(known, scene, views, draw, display.count, masks=self.config.masks)
+            scores, images = judge_views(known, scene, views, draw, display.count, masks=self.config.masks)
         scores |= {"train_seconds": opened.seconds, "train_steps": opened.step, "gaussians": len(shown.gaussians)}
-        return store(config, known, opened.method, views, scores, renders)
+        return store(config, known, opened.method, views, scores, images)
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
         from ..export.config import Plan, look_file, make_looks, styles_of

@@ -97,24 +97,48 @@ def consistency(
     """
     if not len(images) == len(depths) == len(cameras):
         raise DataError(f"{len(images)} images, {len(depths)} depths, {len(cameras)} cameras: one of each per view is needed")
-    squared = variation = 0.0
-    compared = pixels = 0
+    error = WarpError(cameras)
     for a, b in pairs:
-        warped, valid = warp(images[b], depths[a], depths[b], cameras, a, b)
+        error.add(a, b, images[a], images[b], depths[a], depths[b])
+    return error.summary()
+
+
+class WarpError:
+    """Sums of `consistency` over pairs of views of `cameras`, so that no more than two renders are held at a time."""
+
+    def __init__(self, cameras: Cameras) -> None:
+        self.cameras = cameras
+        self.squared = self.variation = 0.0
+        self.compared = self.pixels = self.pairs = 0
+
+    def add(
+        self,
+        a: int,
+        b: int,
+        image_a: Annotated[Tensor, "H W 3"],
+        image_b: Annotated[Tensor, "G F 3"],
+        depth_a: Annotated[Tensor, "H W"],
+        depth_b: Annotated[Tensor, "G F"],
+    ) -> None:
+        """Warp view b into view a and compare. Raises DataError for sizes that are not the cameras'."""
+        warped, valid = warp(image_b, depth_a, depth_b, self.cameras, a, b)
         count = int(valid.sum())
-        pixels, compared = pixels + valid.numel(), compared + count
+        self.pixels, self.compared, self.pairs = self.pixels + valid.numel(), self.compared + count, self.pairs + 1
         if count:
-            here, there = images[a][valid].double(), warped[valid].double()
-            squared += float((here - there).square().sum())
-            variation += sum(float((colour - colour.mean(dim=0)).square().sum()) for colour in (here, there)) / 2
-    if not math.isfinite(squared):
-        raise NumericsError("consistency: a render holds colours that are not finite; nothing can be judged by it")
-    return {
-        "rmse": math.sqrt(squared / (3 * compared)) if compared else None,
-        "relative": math.sqrt(squared / variation) if variation > 0 else None,
-        "valid_share": compared / pixels if pixels else 0.0,
-        "pairs": len(pairs),
-    }
+            here, there = image_a[valid].double(), warped[valid].double()
+            self.squared += float((here - there).square().sum())
+            self.variation += sum(float((colour - colour.mean(dim=0)).square().sum()) for colour in (here, there)) / 2
+
+    def summary(self) -> dict[str, float | int | None]:
+        """The figures of `consistency`. Raises NumericsError for colours that are not finite."""
+        if not math.isfinite(self.squared):
+            raise NumericsError("consistency: a render holds colours that are not finite; nothing can be judged by it")
+        return {
+            "rmse": math.sqrt(self.squared / (3 * self.compared)) if self.compared else None,
+            "relative": math.sqrt(self.squared / self.variation) if self.variation > 0 else None,
+            "valid_share": self.compared / self.pixels if self.pixels else 0.0,
+            "pairs": self.pairs,
+        }
 
 
 def path_pairs(frames: int, gap: int) -> list[tuple[int, int]]:

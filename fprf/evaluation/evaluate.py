@@ -13,8 +13,9 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from ..datamanagers.images import load_image, load_mask
+from ..datamanagers.images import Image, load_image, load_mask
 from ..datamanagers.scene import Scene
+from ..io.images import to_uint8
 from ..memory import peak
 from ..rendering.cameras import Cameras, PixelRays
 from ..rendering.renderer import render_rays
@@ -25,7 +26,7 @@ from ..training.prepare import reach_of
 from ..training.run import Known
 from ..training.views import render_view
 from ..types import Rays, View, Want
-from .consistency import consistency
+from .consistency import WarpError
 from .metrics import image_metrics, mean_metrics
 
 
@@ -36,8 +37,8 @@ def peak_memory() -> float:
 
 def judge(
     trained: Trained, scene: Scene, views: Sequence[int], progress: Callable[[int, int, str], None]
-) -> tuple[dict[str, Any], list[View]]:
-    """Metrics of the views of a run of fields, and the renders (see `judge_views`)."""
+) -> tuple[dict[str, Any], list[Image]]:
+    """Metrics of the views of a run of fields, and their images (see `judge_views`)."""
     facts, cameras, tones = trained.known.facts, trained.known.cameras, trained.model.tones
 
     def draw(view: int) -> View:
@@ -46,8 +47,8 @@ def judge(
         return render_view(trained.model, facts, cameras, view, trained.config.render, factor=factor)
 
     masks = trained.config.datamanager.masks
-    metrics, renders = judge_views(trained.known, scene, views, draw, progress, masks=masks)
-    return metrics | {"train_seconds": trained.seconds, "train_steps": trained.step}, renders
+    metrics, images = judge_views(trained.known, scene, views, draw, progress, masks=masks)
+    return metrics | {"train_seconds": trained.seconds, "train_steps": trained.step}, images
 
 
 def judge_views(
@@ -58,30 +59,34 @@ def judge_views(
     progress: Callable[[int, int, str], None],
     *,
     masks: bool,
-) -> tuple[dict[str, Any], list[View]]:
-    """Metrics of the views (means and each by name), and the renders, which `draw` makes.
+) -> tuple[dict[str, Any], list[Image]]:
+    """Metrics of the views (means and each by name), and their images; `draw` renders them, one after the other.
 
     Pixels that the capture's masks leave out do not count. Seconds are those of rendering alone. Consistency warps each view
     into the next one of the list by the rendered depth.
     """
     cameras = known.cameras
-    renders, rows, seconds = [], {}, 0.0
+    images: list[Image] = []
+    before: View | None = None
+    rows, seconds, kept, pixels = {}, 0.0, 0.0, 0
+    warped = WarpError(cameras.select(torch.tensor(list(views), dtype=torch.int64)))
     for i, view in enumerate(views):
         progress(i, len(views), "rendering")
         start = time.perf_counter()
         render = draw(view)
         seconds += time.perf_counter() - start
-        renders.append(render)
+        images.append(to_uint8(render.rgb))
+        kept += render.kept
+        if before is not None:
+            warped.add(i - 1, i, before.rgb, render.rgb, before.depth, render.depth)
+        before = render
         width, height = (int(v) for v in cameras.size[view])
+        pixels += width * height
         truth = torch.from_numpy(load_image(scene.paths[view], (width, height), known.facts.background)).float() / 255
         mask = scene.masks[view] if scene.masks and masks else None
         where = None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
         rows[known.names[view]] = image_metrics(render.rgb, truth, where)
     progress(len(views), len(views), "rendering")
-    pixels = sum(v.rgb.shape[0] * v.rgb.shape[1] for v in renders)
-    chosen = cameras.select(torch.tensor(list(views), dtype=torch.int64))
-    pairs = [(i, i + 1) for i in range(len(views) - 1)]
-    warped = consistency([v.rgb for v in renders], [v.depth for v in renders], chosen, pairs)
     means = mean_metrics(rows.values())
     return {
         **means,
@@ -90,11 +95,11 @@ def judge_views(
         "render_seconds": seconds,
         "seconds_per_view": seconds / max(1, len(views)),
         "rays_per_second": pixels / max(seconds, 1e-9),
-        "kept_samples_share": sum(v.kept for v in renders) / max(1, len(renders)),
+        "kept_samples_share": kept / max(1, len(views)),
         "peak_rss_mib": peak_memory(),
-        "consistency": warped,
+        "consistency": warped.summary(),
         "per_view": rows,
-    }, renders
+    }, images
 
 
 @dataclass(frozen=True, kw_only=True)

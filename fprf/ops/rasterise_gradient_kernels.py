@@ -355,7 +355,11 @@ def _block_gradient(blocks, at, bands, view, summed):
 
 
 @traced
-def _learn_block(blocks, first, second, at, bands, view, memory, rates, unbiased):
+def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates):
+    at = start * (FIXED + 3 * bands)
+    w = load(weight, start)
+    w = w + (1 - _BETAS[1]) * (1 - w)
+    store(weight, start, w)
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 3]
     for row, g in enumerate(_block_gradient(blocks, at, bands, view, [*summed, 0])):
         o = at + row * LANES
@@ -364,7 +368,7 @@ def _learn_block(blocks, first, second, at, bands, view, memory, rates, unbiased
         s = s + (1 - _BETAS[1]) * (g * g - s)
         store(first, o, m)
         store(second, o, s)
-        store(blocks, o, load(blocks, o) - rates[row] * unbiased[0] * m / (square_root(s * unbiased[1]) + 1e-15))
+        store(blocks, o, load(blocks, o) - rates[row] * m / (square_root(s / w) + 1e-15))
 
 
 @traced
@@ -410,7 +414,7 @@ def _gradients(bands):
 
 def _adam(bands):
     @jit
-    def adam(counters, blocks, first, second, count, view, found, first_slot, rates, unbiased):
+    def adam(counters, blocks, first, second, weight, count, view, found, first_slot, rates):
         memory = stack(_BLOCK)
         while True:
             begin = take(counters, 0) * BLOCKS * LANES
@@ -419,8 +423,7 @@ def _adam(bands):
             for start in range(begin, min(count, begin + BLOCKS * LANES), LANES):
                 if first_slot[start + LANES] > first_slot[start]:
                     _add_block(found, first_slot, start, memory)
-                    at = start * (FIXED + 3 * bands)
-                    _learn_block(blocks, first, second, at, bands, view, memory, rates, unbiased)
+                    _learn_block(blocks, first, second, weight, start, bands, view, memory, rates)
 
     return adam
 
@@ -438,20 +441,21 @@ def adam(
     blocks: Floats,
     first: Floats,
     second: Floats,
+    weight: Floats,
     count: int,
     bands: int,
     view: Floats,
     found: Floats,
     first_slot: Any,
     rates: Floats,
-    step: int,
 ) -> None:
     """One step of Adam, in place, for the blocks that have an entry; the others keep their moments as well.
 
-    found: sums of shape and colour. rates: a learning rate for each row of a block. step: how many there were before.
+    found: sums of shape and colour. rates: a learning rate for each row of a block. weight: sum of the weights in the second
+    moment of a Gaussian, 1 - 0.99^k after k steps: what is seen for the first time moves as it would have in the first step.
+    The first moment is not corrected, so the rates rise over a Gaussian's first ten steps.
     """
-    unbiased = np.array([1 / (1 - beta ** (step + 1)) for beta in _BETAS], np.float32)
-    on_threads(_ADAM[bands], blocks, first, second, count, view, found, first_slot, rates, unbiased)
+    on_threads(_ADAM[bands], blocks, first, second, weight, count, view, found, first_slot, rates)
 
 
 def cache_path(bands: int) -> str:

@@ -48,7 +48,7 @@ class Learnt(NamedTuple):
 
 def learn(
     blocks: Floats,
-    moments: tuple[Floats, Floats],
+    moments: tuple[Floats, Floats, Floats],
     count: int,
     bands: int,
     splats: Floats,
@@ -57,12 +57,13 @@ def learn(
     background: tuple[float, float, float],
     ssim: float,
     rates: Floats,
-    step: int,
     factors: Annotated[Floats, "3"] | None = None,
 ) -> Learnt:
-    """Render `count` Gaussians, compare, and move them by a step of Adam, the first one being 0. Where the loss is not finite
-    nothing is changed. `splats` is room for SLOTS numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss; renders are
-    multiplied by `factors`, one a channel, before they are compared.
+    """Render `count` Gaussians, compare, and move them by a step of Adam. Where the loss is not finite nothing is changed.
+
+    `moments` are the first, the second and the weight in it (`rasterise_gradient_kernels.adam`). `splats` is room for SLOTS
+    numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss; renders are multiplied by `factors`, one a channel, before
+    they are compared.
     """
     width, height, camera, planes, blurred, valid = target
     entries, out, left = _render(blocks, count, bands, splats, target, background)
@@ -81,7 +82,7 @@ def learn(
         3, entries, splats, splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
     )
     rasterise_gradient_kernels.adam(
-        blocks, *moments, count, bands, camera, gradients, entries.first_slot, rates, step
+        blocks, *moments, count, bands, camera, gradients, entries.first_slot, rates
     )  # fmt: skip
     return Learnt(l1, similar, shown, pull)
 
@@ -163,7 +164,7 @@ def _compile(bands: int, part: str) -> None:
             3, entries, splats, splats, SLOTS, 6, size, size, planes, left.reshape(-1), slope, left.reshape(-1)
         )  # fmt: skip
         rasterise_gradient_kernels.adam(
-            blocks, first, second, size, bands, camera, gradients, entries.first_slot, np.zeros(rows, np.float32), 0
+            blocks, first, second, splats, size, bands, camera, gradients, entries.first_slot, np.zeros(rows, np.float32)
         )  # fmt: skip
 
 

@@ -43,18 +43,14 @@ from .learner import Learner
 from .photographs import make_levels
 from .training import CUT, Prepared, clear_of, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
-_FORMAT, _VIEWS = 3, "views.json"
+_FORMAT, _VIEWS = 4, "views.json"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
+_MOMENTS = "first", "second", "weight"
 _PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
 _VISITS = 10
 """Times that the whole scene sees each of them, at least, however few `steps` there are: cells do not make up for fewer."""
-_RATE = 1.3
-"""The learning rates of the whole scene, at most as asked for: times the root of the share of views that a cell learns from.
-What a view moves is next seen hundreds of steps later, from elsewhere: with all of the rates 875 views of a district got worse
-until these had fallen (16.0 dB after ten visits each, 24.5 with 0.3 of them). Where each view shows most of the scene, less
-loses (0.8 dB with 0.3)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,9 +169,6 @@ def train_overview(
     What is finished stays when a run is gone on with for more steps or minutes.
     """
     folder = root / OVERVIEW
-    cells = read_cells(root)
-    seen = sum(len(cell.windows) for cell in cells) / len(cells) / len(scene.train)
-    config = replace(config, rate=config.rate * min(1.0, _RATE * math.sqrt(seen)))
     task = _task(config, scene, scene.train.tolist())
     done = _read_done(folder)
     if done is not None and done["task"] == task:
@@ -256,7 +249,7 @@ def _prepared(
     # As if the number had grown from the beginning of the schedule.
     passed = min(shares[0] / config.grow, 0.99)
     begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
-    moments = {name: start.optimizer[name][shown] for name in ("first", "second")}
+    moments = {name: start.optimizer[name][shown] for name in _MOMENTS}
     learner.restore(gaussians, {**moments, "begun": torch.tensor(begun)})
     return Prepared(own, learner, near, "the whole scene", start.step, shares)
 
@@ -335,12 +328,12 @@ def unite(root: Path, round: int, cells: Sequence[Cell], to: Path | None = None)
             raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`")
         own = cell.holds(saved.model["means"])
         gaussians = gaussians_of(saved).select(own)
-        parts.append((*vars(gaussians).values(), saved.optimizer["first"][own], saved.optimizer["second"][own]))
+        parts.append((*vars(gaussians).values(), *(saved.optimizer[name][own] for name in _MOMENTS)))
         lights.append({name: each.clone() for name, each in saved.optimizer.items() if name.startswith("tones.")})
         step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
-    *united, first, second = (torch.cat(columns) for columns in zip(*parts, strict=True))
-    gaussians = Gaussians(*united)
-    moments = {"first": first, "second": second, "begun": torch.tensor(len(gaussians))}
+    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
+    gaussians, moments = Gaussians(*columns[: -len(_MOMENTS)]), dict(zip(_MOMENTS, columns[-len(_MOMENTS) :], strict=True))
+    moments["begun"] = torch.tensor(len(gaussians))
     moments |= _mean_tones(_tones_of(Run(root).load_known().facts, start), lights, cells)
     state = state_of(gaussians, float(start.model["near"]))
     checkpoint.write(to or _start_of(root, round + 1), state, moments, step=step, seconds=seconds)

@@ -84,14 +84,16 @@ class Cell:
         cameras = self.scene(scene).cameras
         visible = self.around(gaussians.means)
         order, centre, radius = _runs(gaussians)
-        shape = [part[order] for part in (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)]
-        shape[-1].view(-1)[len(gaussians) :] = -math.inf  # the last ones, repeated
+        means, quaternions, log_scales = (x[order] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales))
+        logits = gaussians.logits[order]
+        logits.view(-1)[len(gaussians) :] = -math.inf  # the last one, repeated
         shown = torch.zeros(order.shape, dtype=torch.bool)
         for view in self.windows:
             camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
             runs = torch.from_numpy(in_view(camera, centre, radius)[1]).nonzero()[:, 0]
-            some = [part[runs].flatten(0, 1) for part in shape]
-            weights = lift(*some, camera, torch.zeros(camera.height, camera.width, 1), antialiased=True).weights
+            mean, quaternion, log_scale = (x[runs].flatten(0, 1) for x in (means, quaternions, log_scales))
+            nothing = torch.zeros(camera.height, camera.width, 1)
+            weights = lift(mean, quaternion, log_scale, logits[runs].flatten(), camera, nothing, antialiased=True).weights
             shown[runs] |= weights.view(-1, _RUN) > _WEIGHT
         visible[order[shown]] = True
         return visible

@@ -33,8 +33,8 @@ _JUDGES = 8
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
-_TONES = 2e-3
-"""Learning rate of the logarithms of factors. It falls to a tenth."""
+_GAIN, _EXPONENT = 0.02, 2e-3
+"""Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
 
 
 class Step(NamedTuple):
@@ -75,9 +75,10 @@ class Learner:
         self.room = -(-room // LANES) * LANES
         self.count = self.begun = 0
         self.blocks, self.first, self.second = (_blocks(np.zeros((self.rows, self.room), np.float32)) for _ in range(3))
-        self.splats = aligned(self.room * SLOTS)
+        self.weight, self.splats = aligned(self.room), aligned(self.room * SLOTS)
+        self.weight[:] = 0
         self.tones, self.colours_only = tones, colours_only
-        self.adam = None if tones is None else torch.optim.Adam(tones.parameters(), lr=_TONES)
+        self.tone_moments = {} if tones is None else _tone_moments(tones)
 
     @property
     def rows(self) -> int:
@@ -115,8 +116,8 @@ class Learner:
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
         target = level[view]
         measured = learn(
-            self.blocks, (self.first, self.second), self.count, self.bands, self.splats, target,
-            background=self.config.background, ssim=self.config.ssim, rates=self._rates(share), step=step,
+            self.blocks, (self.first, self.second, self.weight), self.count, self.bands, self.splats, target,
+            background=self.config.background, ssim=self.config.ssim, rates=self._rates(share),
             factors=self._factors(view),
         )  # fmt: skip
         if not math.isfinite(measured.l1 + measured.ssim):
@@ -124,11 +125,7 @@ class Learner:
         if self.widest is not None and step % self.cut_every == 0:
             rows = self.blocks.reshape(-1, self.rows, LANES)
             np.minimum(rows[:, 3:6], self.widest(rows[:, :3]), out=rows[:, 3:6])
-        if self.tones is not None and self.adam is not None:
-            self.adam.zero_grad()
-            self.tones(torch.tensor([view]))[0].log().backward(torch.from_numpy(measured.pull))
-            self.adam.param_groups[0]["lr"] = self.config.rate * _TONES * 0.1**share
-            self.adam.step()
+        self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)
         moved = (step + 1) % self.config.relocate_every == 0 and not self.colours_only
         if moved and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, level, share)
@@ -142,13 +139,26 @@ class Learner:
         """Learning rates of the rows of a block. They fall to a tenth, those of the means to a fiftieth."""
         rest = np.full(3 * (self.bands - 1), 0.01)
         rates = np.concatenate(
-            [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.04), np.full(4, 0.008), [0.4], np.full(3, 0.28), rest]
+            [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.04), np.full(4, 0.008), [0.1], np.full(3, 0.07), rest]
         )
         falls = np.where(np.arange(len(rates)) < 3, 0.02**share, 0.1**share)
         if self.colours_only:
             rates[:FIXED] = 0
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return scaled
+
+    @torch.no_grad()
+    def _learn_tones(self, view: int, pull: Annotated[Tensor, "3"], rate: float) -> None:
+        """Move the exposure of a view by a step of Adam. Each view counts its own steps: with moments of all views together,
+        one that is seen every thousandth step moved by the root of a thousand times the rate, and far scenes got worse.
+        """
+        if self.tones is None:
+            return
+        first, second, steps = self.tone_moments["gain"]
+        _adam(self.tones.gain[view], pull, (first[view], second[view], steps[view]), _GAIN * rate)
+        if self.tones.exponent.requires_grad:
+            slope = pull.sum() * self.tones.exposure[view]
+            _adam(self.tones.exponent, slope, self.tone_moments["exponent"], _EXPONENT * rate)
 
     def _factors(self, view: int) -> Floats | None:
         """Return the factors of renders of a view."""
@@ -201,12 +211,14 @@ class Learner:
             first[_at(picked)] = first[_at(to)] = 0
             second[_at(picked)] *= 0.5
             second[_at(to)] = second[_at(picked)]
+            self.weight[to] = self.weight[picked]
             self.count += max(0, many - len(dead))
         if (step + 1) % (_SORT_EVERY * self.config.relocate_every) == 0 or more > 0.3 * self.count:
             means = blocks[:, :3].transpose(0, 2, 1).reshape(-1, 3)
             order = spatial_order(means[: self.count])
             for part in parts:  # one after the other: a copy takes as much again
                 part[_at(np.arange(self.count))] = part[_at(order)]
+            self.weight[: self.count] = self.weight[order]
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now."""
@@ -215,13 +227,14 @@ class Learner:
         return Gaussians(*(part.contiguous() for part in parts))
 
     def moments(self) -> dict[str, Tensor]:
-        """Return the rest of a checkpoint: Adam's moments, and the number of Gaussians that training began with."""
+        """Return the rest of a checkpoint: Adam's moments and the weight in the second, exposures, the number at the start."""
         first, second = (torch.from_numpy(_rows(x, self.rows)[:, : self.count].T.copy()) for x in (self.first, self.second))
-        tensors = {"first": first, "second": second, "begun": torch.tensor(self.begun)}
-        if self.tones is not None and self.adam is not None:
+        weight = torch.from_numpy(self.weight[: self.count].copy())
+        tensors = {"first": first, "second": second, "weight": weight, "begun": torch.tensor(self.begun)}
+        if self.tones is not None:
             for name, parameter in self.tones.named_parameters():
-                kept = {"value": parameter.detach(), **self.adam.state[parameter]}
-                tensors |= {f"tones.{name}.{key}": each.clone() for key, each in kept.items()}
+                kept = zip(_TONE_STATE, (parameter.detach(), *self.tone_moments[name]), strict=True)
+                tensors |= {f"tones.{name}.{key}": each.clone() for key, each in kept}
         return tensors
 
     def start_from(self, gaussians: Gaussians) -> None:
@@ -234,18 +247,39 @@ class Learner:
         self.blocks = _blocks(rows)
 
     def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint holds; without their moments, tones go on as they are."""
+        """Go on from what a checkpoint holds; without their moments, tones go on as they are.
+
+        Checkpoints of before have no weights: their second moments are taken as they are.
+        """
         self.start_from(gaussians)
         self.begun = int(moments["begun"])
         for name in ("first", "second"):
             rows = np.zeros((self.rows, self.room), np.float32)
             rows[:, : self.count] = moments[name].T.numpy()
             setattr(self, name, _blocks(rows))
-        if self.tones is not None and self.adam is not None and "tones.gain.value" in moments:
+        self.weight[: self.count] = moments["weight"].numpy() if "weight" in moments else 1
+        if self.tones is not None and "tones.gain.value" in moments:
             for name, parameter in self.tones.named_parameters():
-                kept = {key.rpartition(".")[2]: each for key, each in moments.items() if key.startswith(f"tones.{name}.")}
-                parameter.data.copy_(kept.pop("value"))
-                self.adam.state[parameter] = kept
+                for key, each in zip(_TONE_STATE, (parameter.data, *self.tone_moments[name]), strict=True):
+                    if f"tones.{name}.{key}" in moments:
+                        each.copy_(moments[f"tones.{name}.{key}"])
+
+
+_TONE_STATE = "value", "first", "second", "steps"
+
+
+def _tone_moments(tones: Tones) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
+    """Room for the moments of each parameter, and for the steps of each view."""
+    return {name: (torch.zeros_like(p), torch.zeros_like(p), p.new_zeros(p.shape[:1])) for name, p in tones.named_parameters()}
+
+
+def _adam(value: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor, Tensor], rate: float) -> None:
+    """One step of Adam, in place. The third of `moments` counts the steps."""
+    first, second, steps = moments
+    steps += 1
+    first.lerp_(gradient, 1 - 0.9)
+    second.lerp_(gradient.square(), 1 - 0.999)
+    value -= rate * first / (1 - 0.9**steps) / ((second / (1 - 0.999**steps)).sqrt() + 1e-8)
 
 
 def _at(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], slice, NDArray[np.int64]]:

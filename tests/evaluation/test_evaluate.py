@@ -19,14 +19,14 @@ from fprf.training.views import render_view
 def test_metrics_are_those_of_the_renders(world: World) -> None:
     trained, scene = world.load(), world.prepared.scene
     told: list[tuple[int, int, str]] = []
-    metrics, renders = judge(trained, scene, trained.known.test, lambda *of: told.append(of))
+    metrics, images = judge(trained, scene, trained.known.test, lambda *of: told.append(of))
     assert [of[:2] for of in told] == [(0, 2), (1, 2), (2, 2)]
-    assert len(renders) == metrics["views"] == 2 and metrics["per_view"].keys() == {"0000", "0008"}
-    for view, render in zip(trained.known.test, renders, strict=True):
+    assert len(images) == metrics["views"] == 2 and metrics["per_view"].keys() == {"0000", "0008"}
+    for view, image in zip(trained.known.test, images, strict=True):
         again = render_view(trained.model, trained.known.facts, trained.known.cameras, view, trained.config.render)
-        assert torch.equal(again.rgb, render.rgb)
+        assert (to_uint8(again.rgb) == image).all()
         truth = torch.from_numpy(load_image(scene.paths[view], (32, 24))).float() / 255
-        assert metrics["per_view"][scene.paths[view].stem] == image_metrics(render.rgb, truth)
+        assert metrics["per_view"][scene.paths[view].stem] == image_metrics(again.rgb, truth)
     assert metrics["psnr"] == pytest.approx(sum(v["psnr"] for v in metrics["per_view"].values()) / 2)
     assert metrics["rays_per_second"] == pytest.approx(2 * 24 * 32 / metrics["render_seconds"])
     assert metrics["seconds_per_view"] == pytest.approx(metrics["render_seconds"] / 2)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from stand_in_viewers import GREEDY, viewer
+from torch import Tensor
 
 import fprf
 from fprf.cli import train as cli_train
@@ -23,6 +24,7 @@ from fprf.errors import CheckpointError
 from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
 from fprf.ops.rasterise import rasterise
+from fprf.ops.rasterise_training import learn
 from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.rendering.cameras import Cameras, project
 from fprf.rendering.paths import pinhole
@@ -34,6 +36,7 @@ from fprf.splats.learner import Learner
 from fprf.splats.training import prepare, reach_of
 from fprf.town.write import write_town
 from fprf.training import checkpoint
+from fprf.training.camera_optimizers import Tones
 from fprf.training.loading import open_run
 from fprf.training.run import Run
 from fprf.viewer.live import LiveViewer
@@ -118,6 +121,61 @@ def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: 
     for photograph in learner.levels[1].values():
         photograph.planes[:] = np.nan
     assert learner.step(0, 0.0) is None and equal(learner.gaussians(), before)
+
+
+def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig, scene: Scene) -> None:
+    """Two views in opposite directions: what the second one shows moves as if nothing had been learnt before."""
+    pose = scene.cameras.pose[0].clone()
+    back = pose * torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=pose.dtype)
+    cameras = replace(scene.cameras.select(torch.zeros(2, dtype=torch.int64)), pose=torch.stack([pose, back]))
+    both = replace(scene, cameras=cameras, train=torch.arange(2))
+    draw = np.random.default_rng(0)
+    images = {view: draw.integers(0, 255, (24, 32, 3), np.uint8) for view in range(2)}
+    levels = photographs.make_levels(both, images, {}, 0.01)
+    spread, quaternions = (torch.from_numpy(draw.normal(size=(32, k))) for k in (3, 4))
+    means = pose[:, 3] - torch.where(torch.arange(32) < 16, 4.0, -4.0)[:, None] * pose[:, 2] + 0.5 * spread
+    harmonics = torch.zeros(32, (config.degree + 1) ** 2, 3)
+    start = Gaussians(means.float(), quaternions.float(), torch.full((32, 3), -1.5), torch.zeros(32), harmonics)
+
+    def learnt(order: list[int]) -> Tensor:
+        learner = Learner(config, levels, 1.0, 32)
+        learner.start_from(start)
+        moments = learner.first, learner.second, learner.weight
+        rates = np.full(learner.rows, 0.01, np.float32)
+        for view in order:
+            learn(
+                learner.blocks, moments, 32, learner.bands, learner.splats, levels[0][view],
+                background=config.background, ssim=0.2, rates=rates,
+            )  # fmt: skip
+        return torch.cat([part[16:].flatten() for part in vars(learner.gaussians()).values()])
+
+    alone = learnt([1] * 3)
+    assert not torch.equal(alone, learnt([]))
+    assert torch.equal(learnt([0] * 40 + [1] * 3), alone)
+
+
+def test_an_exposure_learns_alike_however_rarely_its_view_is_seen(config: GaussiansConfig, scene: Scene) -> None:
+    """Nothing lies in view, so a render is the background times the factor; all photographs but one are of that colour."""
+    many = 40
+    same = replace(scene, cameras=scene.cameras.select(torch.zeros(many, dtype=torch.int64)), train=torch.arange(many))
+    grey = replace(config, background=(0.4, 0.4, 0.4))
+    images = {view: np.full((24, 32, 3), 204 if view == 0 else 102, np.uint8) for view in range(many)}
+    camera = scene.cameras.pose[0]
+    behind = (camera[:, 3] + 5 * camera[:, 2]).float().expand(16, 3)
+    nothing = Gaussians(behind, torch.ones(16, 4), torch.full((16, 3), -3.0), torch.zeros(16), torch.zeros(16, 9, 3))
+
+    def gain(views: int) -> Tensor:
+        tones = Tones(torch.zeros(many), ())
+        levels = photographs.make_levels(replace(same, train=torch.arange(views)), images, {}, 0.01)
+        learner = Learner(replace(grey, degree=2), levels, 1.0, 16, tones=tones)
+        learner.start_from(nothing)
+        for step in range(3 * views):
+            assert learner.step(step, 0.0) is not None
+        return tones.gain.detach()
+
+    often, rarely = gain(1), gain(many)
+    assert (often[0] > 0.01).all()
+    torch.testing.assert_close(rarely[0], often[0], rtol=0.1, atol=0)  # apart by the mean of all, which stays
 
 
 def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) -> None:
