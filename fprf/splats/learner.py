@@ -33,7 +33,7 @@ _JUDGES = 8
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
-_GAIN, _EXPONENT = 0.02, 2e-3
+_GAIN, _EXPONENT = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
 
 
@@ -136,12 +136,12 @@ class Learner:
         return Step(measured.l1, measured.ssim, squared, self.count, width * height)
 
     def _rates(self, share: float) -> Floats:
-        """Learning rates of the rows of a block. They fall to a tenth, those of the means to a fiftieth."""
+        """Learning rates of the rows of a block. They fall to a fifth, those of the means to a twentieth."""
         rest = np.full(3 * (self.bands - 1), 0.01)
         rates = np.concatenate(
-            [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.04), np.full(4, 0.008), [0.1], np.full(3, 0.07), rest]
+            [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.08), np.full(4, 0.016), [0.1], np.full(3, 0.07), rest]
         )
-        falls = np.where(np.arange(len(rates)) < 3, 0.02**share, 0.1**share)
+        falls = np.where(np.arange(len(rates)) < 3, 0.05**share, 0.2**share)
         if self.colours_only:
             rates[:FIXED] = 0
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
