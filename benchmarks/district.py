@@ -72,9 +72,9 @@ def begin(data: Path, run: Path, towns: int) -> dict[str, Any]:
 
     torch.set_num_threads(1)
     cells, coarse = CELLS * towns, COARSE_STEPS * towns
-    # One round: `--steps` covers the whole, then one cell.
+    # `--steps` covers the whole, then one cell.
     config = GaussiansConfig(
-        data=data, downscale=1, cells=cells, rounds=1, steps=coarse + STEPS, overview=coarse / (coarse + STEPS), coarse=0.0,
+        data=data, downscale=1, cells=cells, steps=coarse + STEPS, overview=coarse / (coarse + STEPS), coarse=0.0,
         initial=POINTS * cells, cap=GAUSSIANS * cells, background=SKY, checkpoint_minutes=0.02,
     )  # fmt: skip
     start = time.process_time()
@@ -112,9 +112,9 @@ def one_cell(data: Path, run: Path, cell: int) -> dict[str, Any]:
     torch.set_num_threads(1)
     vars(training)["time"] = SimpleNamespace(perf_counter=time.process_time)
     start = time.process_time()
-    train_cell(CellTask(root=str(run), data=str(data), round=0, cell=cell, minutes=None, quiet=True), lambda event: None)
+    train_cell(CellTask(root=str(run), data=str(data), cell=cell, minutes=None, quiet=True), lambda event: None)
     seconds = time.process_time() - start
-    saved, _ = checkpoint.load_latest(folder_of(run, 0, cell) / "checkpoints")
+    saved, _ = checkpoint.load_latest(folder_of(run, cell) / "checkpoints")
     assert saved is not None
     digest = hashlib.sha256(b"".join(tensor.numpy().tobytes() for tensor in saved.model.values())).hexdigest()
     return {
@@ -132,15 +132,15 @@ def killed(data: Path, run: Path, cell: int) -> str:
     """Train a cell that is killed once it has a checkpoint; the digest of what it is in the end."""
     from fprf.splats.cell_training import folder_of
 
-    shutil.rmtree(folder_of(run, 0, cell))
+    shutil.rmtree(folder_of(run, cell))
     process = multiprocessing.get_context("spawn").Process(target=one_cell, args=(data, run, cell))
     process.start()
-    while process.is_alive() and not [*folder_of(run, 0, cell).glob("checkpoints/step-*/manifest.json")]:
+    while process.is_alive() and not [*folder_of(run, cell).glob("checkpoints/step-*/manifest.json")]:
         time.sleep(0.05)
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
     process.join()
-    assert not (folder_of(run, 0, cell) / "done.json").exists(), "the cell was finished before it could be killed"
+    assert not (folder_of(run, cell) / "done.json").exists(), "the cell was finished before it could be killed"
     digest: str = apart(one_cell, data, run, cell)["digest"]
     return digest
 

@@ -188,6 +188,8 @@ class RunConfig:
 
     untrained: ClassVar[tuple[str, ...]] = ()
     """Fields that may differ when a run is resumed, beside RESUMABLE: nothing that is trained depends on them."""
+    former: ClassVar[tuple[str, ...]] = ()
+    """Fields of files written before that mean nothing any more."""
 
     data: Path | None = None
     """Scene folder, which must be named; `town` is the embedded one."""

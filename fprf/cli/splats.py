@@ -221,17 +221,12 @@ def _train_cells(config: "GaussiansConfig", folder: "Run", scene: "Scene", displ
         display.say("the whole scene is trained already")
     root, data = str(folder.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
     order = sorted(range(len(cells)), key=lambda cell: -pixels[cell])
-    count, executor = 0, config.executor.on("cpu").build()
-    for number in range(config.rounds):
-        minutes = None
-        if config.minutes is not None:
-            left = max(config.minutes - (time.perf_counter() - start) / 60, 0.05 * config.minutes)
-            minutes = left / (config.rounds - number) / len(cells)
-        executor.map(
-            run_cell,
-            [CellTask(root=root, data=data, round=number, cell=cell, minutes=minutes, quiet=display.quiet) for cell in order],
-        )
-        count = unite(folder.root, number, cells, folder.checkpoints if number == config.rounds - 1 else None)
+    minutes = None
+    if config.minutes is not None:
+        minutes = max(config.minutes - (time.perf_counter() - start) / 60, 0.05 * config.minutes) / len(cells)
+    tasks = [CellTask(root=root, data=data, cell=cell, minutes=minutes, quiet=display.quiet) for cell in order]
+    config.executor.on("cpu").build().map(run_cell, tasks)
+    count = unite(folder.root, cells)
     display.say(f"done after {time.perf_counter() - start:.0f} s, {count} Gaussians: fprf eval {folder.root}")
 
 
@@ -241,12 +236,12 @@ def run_cell(task: "CellTask") -> None:
     from ..training.run import Run
     from .progress import EventLog
 
-    log = EventLog(Run(folder_of(Path(task.root), task.round, task.cell)))
+    log = EventLog(Run(folder_of(Path(task.root), task.cell)))
     with Display(quiet=task.quiet) as display:
 
         def report(event: "Report") -> None:
-            display.training(event, f"round {task.round}, cell {task.cell:02d}")
+            display.training(event, f"cell {task.cell:02d}")
             log(event)
 
         if not train_cell(task, report):
-            display.say(f"round {task.round}, cell {task.cell:02d} is finished already")
+            display.say(f"cell {task.cell:02d} is finished already")

@@ -74,7 +74,10 @@ def _config(whole: dict[str, Any]) -> "RunConfig":
 
     fields, method, packages = whole["config"], whole["method"], whole["plugins"]
     try:
-        return from_json(fields, type(method_config(method)), packages=packages)
+        kind = type(method_config(method))
+        if isinstance(fields, dict):
+            fields = {name: value for name, value in fields.items() if name not in kind.former}
+        return from_json(fields, kind, packages=packages)
     except PluginError as fault:  # not installed, or broken
         reason = str(fault)
     known = hints_of(TrainConfig)

@@ -1,16 +1,13 @@
 """Cells as tasks: idempotent, resumable, each in a folder of its own, so that they can run anywhere and again.
 
-The whole scene is trained first, on photographs of half the size, up to a share of the schedule. Each cell goes on from there,
-in rounds: what is seen through the Gaussians of a neighbour is explained by both, differently, until they start from the same
-union again.
+The whole scene is trained first, on photographs of half the size, for most of the schedule. Each cell goes on from there.
 
 RUN/cells.json                               the cut: boxes, and the windows of each
 RUN/views.json                               where images and masks lie, so that no cell reads the whole scene folder again
-RUN/overview/checkpoints/, done.json         the whole scene, which the first round starts from
-RUN/cells/R/NN/checkpoints/, events.jsonl    a cell in round R, as of any run
-RUN/cells/R/NN/done.json                     what the finished cell was trained as
-RUN/cells/R/checkpoints/                     the union of the round
-RUN/checkpoints/                             that of the last one
+RUN/overview/checkpoints/, done.json         the whole scene, which cells start from
+RUN/cells/NN/checkpoints/, events.jsonl      a cell, as of any run
+RUN/cells/NN/done.json                       what the finished cell was trained as
+RUN/checkpoints/                             the union of all cells
 """
 
 import hashlib
@@ -43,7 +40,7 @@ from .learner import Learner
 from .photographs import make_levels
 from .training import CUT, Prepared, clear_of, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
-_FORMAT, _VIEWS = 4, "views.json"
+_FORMAT, _VIEWS = 5, "views.json"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
 _MOMENTS = "first", "second", "weight"
@@ -61,7 +58,6 @@ class CellTask:
     """Run folder."""
     data: str
     """Scene folder."""
-    round: int
     cell: int
     minutes: float | None
     """Its part of the time limit."""
@@ -69,14 +65,18 @@ class CellTask:
     """Show nothing."""
 
 
-def folder_of(root: Path, round: int, cell: int) -> Path:
+def folder_of(root: Path, cell: int) -> Path:
     """Folder of a cell in a run."""
-    return root / "cells" / str(round) / f"{cell:02d}"
+    return root / "cells" / f"{cell:02d}"
 
 
-def _start_of(root: Path, round: int) -> Path:
-    """Folder of the checkpoints that the cells of a round start from."""
-    return (root / "cells" / str(round - 1) if round else root / OVERVIEW) / "checkpoints"
+def _load_overview(root: Path) -> checkpoint.Saved:
+    """The whole scene, mapped: of large ones a cell reads a part. Raises CheckpointError where it was not trained."""
+    folder = root / OVERVIEW / "checkpoints"
+    saved, _ = checkpoint.load_latest(folder, verify=False)
+    if saved is None:
+        raise CheckpointError(f"{folder}: no checkpoint to start a cell from; train the run again")
+    return saved
 
 
 def write_cells(root: Path, scene: Scene, data: Path, count: int) -> list[Cell]:
@@ -164,14 +164,19 @@ def _bounds(values: list[float | None], infinite: float) -> Tensor:
 def train_overview(
     root: Path, config: GaussiansConfig, scene: Scene, report: Callable[[Report], None], *, spent: float
 ) -> bool:
-    """Train the whole scene on photographs of half the size, up to where cells go on; False where that was done already.
+    """Train the whole scene on photographs of half the size, for its part of the schedule; False where that was done already.
 
-    What is finished stays when a run is gone on with for more steps or minutes.
+    Its rates fall as those of one piece do, so that cells start from the best there is. What is finished stays when a run is
+    gone on with for more steps or minutes. Raises CheckpointError where it is damaged.
     """
     folder = root / OVERVIEW
     task = _task(config, scene, scene.train.tolist())
-    done = _read_done(folder)
-    if done is not None and done["task"] == task:
+    done, kept = _read_done(folder), checkpoint.steps(folder / "checkpoints")
+    if done is not None and done["task"] == task and kept:
+        try:
+            checkpoint.load(folder / "checkpoints", kept[-1])  # verified here, once for all cells
+        except CheckpointError as e:
+            raise CheckpointError(f"{e}, or remove {folder} and train it again") from e
         return False
     _begin(folder, task)
     # Smaller images, then fewer, where memory would not be bounded: at most as many pixels of all together.
@@ -182,7 +187,9 @@ def train_overview(
         config,
         downscale=factor * (config.downscale or 1),
         # The levels that one piece would be trained on, of images which are smaller already.
-        coarse=config.coarse / 3 ** math.log2(factor),
+        coarse=min(1.0, config.coarse / config.overview / 3 ** math.log2(factor)),
+        # As many as one piece would have by then.
+        cap=round(config.initial * (config.cap / config.initial) ** min(1.0, config.overview / config.grow)),
         steps=max(1, round(config.overview * config.steps)),
         minutes=None if config.minutes is None else config.overview * config.minutes,
     )
@@ -191,8 +198,7 @@ def train_overview(
     own = replace(own, steps=max(own.steps, _VISITS * len(small.train)))
     facts = Run(root).load_known().facts
     facts = replace(facts, held=_others(small, small.train.tolist()) if facts.exposure else ())
-    prepared = prepare(own, small, saved=facts)._replace(shares=(0.0, config.overview))
-    train(own, prepared, Run(folder), report, spent=spent)
+    train(own, prepare(own, small, saved=facts), Run(folder), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})
     return True
 
@@ -204,32 +210,26 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
     CheckpointError where the whole scene was not trained before.
     """
     root = Path(task.root)
-    folder, before = folder_of(root, task.round, task.cell), _start_of(root, task.round)
+    folder = folder_of(root, task.cell)
     config = Run(root).load_config()[0]
     assert isinstance(config, GaussiansConfig)
     scene = _read_views(root, config, Path(task.data))
     cell = read_cells(root)[task.cell]
     with held(folder):
-        start, _ = checkpoint.load_latest(before)
-        if start is None:
-            raise CheckpointError(f"{before}: no checkpoint to start a cell from; train the run again")
-        named = _task(config, scene, list(cell.windows), cell, start)
+        start = _load_overview(root)
+        named = _task(config, scene, list(cell.windows), cell, checkpoint.digest(root / OVERVIEW / "checkpoints"))
         asked = {"format": _FORMAT, "task": named, "steps": config.steps, "minutes": config.minutes}
         if _read_done(folder) == asked:
             return False
         _begin(folder, named)
-        each = (1 - config.overview) / config.rounds
-        own = replace(config, steps=max(1, round(each * config.steps)), minutes=task.minutes)
-        first = config.overview + each * task.round
+        own = replace(config, steps=max(1, round((1 - config.overview) * config.steps)), minutes=task.minutes)
         facts = Run(root).load_known().facts
-        train(own, _prepared(own, scene, facts, cell, start, (first, first + each)), Run(folder), report, spent=0.0)
+        train(own, _prepared(own, scene, facts, cell, start), Run(folder), report, spent=0.0)
         write_json(folder / "done.json", asked)
     return True
 
 
-def _prepared(
-    config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved, shares: tuple[float, float]
-) -> Prepared:
+def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved) -> Prepared:
     """A cell's windows, and the Gaussians of the whole scene that they show."""
     images, masks = load_photographs(config, scene, list(cell.windows))
     images = {view: cell.cut(view, image) for view, image in images.items()}
@@ -247,11 +247,11 @@ def _prepared(
     clear = clear_of(scene)  # of all cameras: what lies before those of other cells is part of the union
     learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, clear, cut_every=CUT, tones=tones)
     # As if the number had grown from the beginning of the schedule.
-    passed = min(shares[0] / config.grow, 0.99)
+    passed = min(config.overview / config.grow, 0.99)
     begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))
     moments = {name: start.optimizer[name][shown] for name in _MOMENTS}
     learner.restore(gaussians, {**moments, "begun": torch.tensor(begun)})
-    return Prepared(own, learner, near, "the whole scene", start.step, shares)
+    return Prepared(own, learner, near, "the whole scene", start.step, (config.overview, 1.0))
 
 
 def _others(scene: Scene, views: list[int]) -> tuple[int, ...]:
@@ -280,13 +280,14 @@ def _begin(folder: Path, task: str) -> None:
 
 
 def _task(
-    config: GaussiansConfig, scene: Scene, views: list[int], cell: Cell | None = None, start: checkpoint.Saved | None = None
+    config: GaussiansConfig, scene: Scene, views: list[int], cell: Cell | None = None, start: str = ""
 ) -> str:
     """Digest of what is asked for, steps and minutes aside; while it stays the same, what was trained stays good."""
     tree = to_json(config)
     assert isinstance(tree, dict)
     parts: dict[str, Any] = {
         "format": _FORMAT,
+        "start": start,
         "config": {name: value for name, value in tree.items() if name not in (*RESUMABLE, *config.untrained, "cells")},
         "cameras": [scene.cameras.pose[views].tolist(), scene.cameras.focal[views].tolist()],
     }
@@ -296,8 +297,6 @@ def _task(
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
     for view in views:
         digest.update(zlib.crc32(scene.paths[view].read_bytes()).to_bytes(4, "little"))
-    for tensor in () if start is None else (*start.model.values(), *start.optimizer.values()):
-        digest.update(tensor.contiguous().numpy().data)
     return digest.hexdigest()[:32]
 
 
@@ -311,32 +310,28 @@ def _read_done(folder: Path) -> dict[str, Any] | None:
     return document
 
 
-def unite(root: Path, round: int, cells: Sequence[Cell], to: Path | None = None) -> int:
-    """Write the union of all cells of a round as a checkpoint, by default for the next one; the number of its Gaussians.
+def unite(root: Path, cells: Sequence[Cell]) -> int:
+    """Write the union of all cells as the run's checkpoint; the number of its Gaussians.
 
     Raises CheckpointError where a cell is not finished.
     """
-    start, _ = checkpoint.load_latest(_start_of(root, round))
-    assert start is not None  # the cells were trained from it
+    start = _load_overview(root)
     parts: list[tuple[Tensor, ...]] = []
     step, seconds = start.step, start.seconds
     lights: list[dict[str, Tensor]] = []
     for number, cell in enumerate(cells):
-        folder = folder_of(root, round, number)
+        folder = folder_of(root, number)
         saved, _ = checkpoint.load_latest(folder / "checkpoints")
         if saved is None or _read_done(folder) is None:
             raise CheckpointError(f"{folder}: this cell is not finished; go on with `fprf train {root / 'config.json'}`")
-        own = cell.holds(saved.model["means"])
-        gaussians = gaussians_of(saved).select(own)
-        parts.append((*vars(gaussians).values(), *(saved.optimizer[name][own] for name in _MOMENTS)))
+        gaussians = gaussians_of(saved)
+        parts.append(tuple(vars(gaussians.select(cell.holds(gaussians.means))).values()))
         lights.append({name: each.clone() for name, each in saved.optimizer.items() if name.startswith("tones.")})
         step, seconds = max(step, start.step + saved.step), seconds + saved.seconds
-    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
-    gaussians, moments = Gaussians(*columns[: -len(_MOMENTS)]), dict(zip(_MOMENTS, columns[-len(_MOMENTS) :], strict=True))
-    moments["begun"] = torch.tensor(len(gaussians))
-    moments |= _mean_tones(_tones_of(Run(root).load_known().facts, start), lights, cells)
+    gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
+    tones = _mean_tones(_tones_of(Run(root).load_known().facts, start), lights, cells)
     state = state_of(gaussians, float(start.model["near"]))
-    checkpoint.write(to or _start_of(root, round + 1), state, moments, step=step, seconds=seconds)
+    checkpoint.write(Run(root).checkpoints, state, tones, step=step, seconds=seconds)
     return len(gaussians)
 
 

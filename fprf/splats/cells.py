@@ -31,7 +31,7 @@ _BORDER = 0.05
 """Of the cell's width to each side, from which it learns as well."""
 _SEEN = 8
 """Points of a cell that a view shows, at least, where the cell learns from it."""
-_OWN = 0.15
+_OWN = 0.05
 """Share of the points in a window that are the cell's own, at least."""
 _LEAST, _ROOM = 64, 6
 """Least width and height of a window; pixels around the points in it."""
@@ -152,7 +152,28 @@ def cut(scene: Scene, count: int) -> list[Cell]:
         if not windows:
             raise ConfigError(f"cells: no view shows {_SEEN} points of one of {count} cells; take fewer")
         cells.append(Cell(frame=frame, low=low, high=high, border=border, windows=windows))
-    return cells
+    return _widened(cells, scene)
+
+
+def _widened(cells: list[Cell], scene: Scene) -> list[Cell]:
+    """The same cells with the outermost windows of each photograph reaching its edges: few points lie there, but it shows."""
+    outermost: dict[int, tuple[int, int, int, int]] = {}
+    for cell in cells:
+        for view, (left, top, width, height) in cell.windows.items():
+            far = outermost.get(view, (left, top, left + width, top + height))
+            outermost[view] = (min(far[0], left), min(far[1], top), max(far[2], left + width), max(far[3], top + height))
+    widened = []
+    for cell in cells:
+        windows = {}
+        for view, (left, top, width, height) in cell.windows.items():
+            first_x, first_y, last_x, last_y = outermost[view]
+            right, bottom = left + width, top + height
+            left, top = 0 if left == first_x else left, 0 if top == first_y else top
+            right = int(scene.cameras.size[view, 0]) if right == last_x else right
+            bottom = int(scene.cameras.size[view, 1]) if bottom == last_y else bottom
+            windows[view] = (left, top, right - left, bottom - top)
+        widened.append(replace(cell, windows=windows))
+    return widened
 
 
 def _bisected(

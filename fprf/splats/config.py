@@ -56,6 +56,7 @@ class GaussiansConfig(RunConfig):
     """3D Gaussians, trained from photographs on the CPU."""
 
     untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "executor")
+    former: ClassVar[tuple[str, ...]] = ("rounds",)
 
     steps: int = 10_000
     """Optimiser steps: one view each."""
@@ -73,7 +74,7 @@ class GaussiansConfig(RunConfig):
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
     surroundings: int = 500
     """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. None is split.
-    At most a tenth of `cap`; 0 = none. Not in cells."""
+    At most a tenth of `cap`; 0 = none."""
     cap: int = 60_000
     """Gaussians at the end, at most."""
     pixels_per_gaussian: int = 20
@@ -93,10 +94,8 @@ class GaussiansConfig(RunConfig):
     cells: int = 1
     """Parts of space that are trained apart, each with a part of the time and of the Gaussians; 1 = none. More need points of a
     reconstruction."""
-    overview: float = 0.6
+    overview: float = 0.8
     """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on from there."""
-    rounds: int = 2
-    """Times that cells are trained, each time from the union of all after the time before."""
     executor: ExecutorConfig = SerialConfig()
     """Executor that trains cells: one after the other, or several at a time."""
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()
@@ -114,7 +113,6 @@ class GaussiansConfig(RunConfig):
         at_least("cap", self.cap, 1)
         at_least("pixels_per_gaussian", self.pixels_per_gaussian, 1)
         at_least("cells", self.cells, 1)
-        at_least("rounds", self.rounds, 1)
         at_least("regions", self.regions, 1)
         if self.degree not in range(4):
             raise ConfigError(f"degree: {self.degree}; 0, 1, 2 or 3 are possible")

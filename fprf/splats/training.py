@@ -93,11 +93,12 @@ def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
 
 
 def _bounded(config: GaussiansConfig, scene: Scene) -> GaussiansConfig:
-    """The config with no more Gaussians than there are photographed pixels for, in the same proportions."""
-    pixels = int(scene.cameras.size[scene.train].prod(1).sum())
-    cap = max(1, min(config.cap, pixels // config.pixels_per_gaussian))
-    initial = max(1, config.initial * cap // config.cap)
-    return replace(config, cap=cap, initial=initial, surroundings=min(config.surroundings, cap // _SURROUNDINGS))
+    """The config with few surroundings; in one piece with no more Gaussians than there are photographed pixels for."""
+    if config.cells == 1:
+        pixels = int(scene.cameras.size[scene.train].prod(1).sum())
+        cap = max(1, min(config.cap, pixels // config.pixels_per_gaussian))
+        config = replace(config, cap=cap, initial=max(1, config.initial * cap // config.cap))
+    return replace(config, surroundings=min(config.surroundings, config.cap // _SURROUNDINGS))
 
 
 def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -> Prepared:
@@ -105,7 +106,7 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
 
     `saved` are the facts of a run that goes on: its exposures are not measured again.
     """
-    config = replace(config, surroundings=0) if config.cells > 1 else _bounded(config, scene)
+    config = _bounded(config, scene)
     images, masks = load_photographs(config, scene, scene.train.tolist())
     facts = saved or lit(facts_of(config, scene), config, scene, lambda view: images[view])
     draw = np.random.default_rng((config.seed, 0))
@@ -115,11 +116,12 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     far = surroundings(scene, images, points, config.surroundings) if config.surroundings else None
     room = max(config.cap, len(points.position) + config.surroundings)
     sphere = _Sphere.around(far) if far is not None else None
+    inside = None if sphere is None else sphere.encloses
     if config.cells > 1:
-        learner = Learner(config, levels, reach_of(scene), room, None, clear_of(scene), cut_every=CUT, tones=tones_of(facts))
+        learner = Learner(config, levels, reach_of(scene), room, inside, clear_of(scene), cut_every=CUT, tones=tones_of(facts))
     else:
-        bounds = (None, None) if sphere is None else (sphere.encloses, sphere.widest)
-        learner = Learner(config, levels, reach_of(scene), room, *bounds, tones=tones_of(facts))
+        widest = None if sphere is None else sphere.widest
+        learner = Learner(config, levels, reach_of(scene), room, inside, widest, tones=tones_of(facts))
     learner.begin(points, draw, far)
     return Prepared(scene, learner, near, origin, facts=facts)
 

@@ -12,9 +12,11 @@ import torch
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene, find_sightings
+from fprf.plugins.codec import load_config, save_config
 from fprf.splats import cell_training
 from fprf.splats.cell_training import CellTask, read_cells, train_cell
 from fprf.splats.cells import Cell, cut
+from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.town.write import write_town
 from fprf.training.camera_optimizers import Tones
@@ -70,10 +72,28 @@ def test_windows_show_their_points_through_their_cameras(scene: Scene, cells: li
         assert inside[mine].double().mean() > 0.9  # outliers and views with few points are left out
 
 
+def test_windows_of_a_photograph_reach_its_edges(scene: Scene, cells: list[Cell]) -> None:
+    for view in {view for cell in cells for view in cell.windows}:
+        width, height = scene.cameras.size[view].tolist()
+        windows = [cell.windows[view] for cell in cells if view in cell.windows]
+        assert min(left for left, _, _, _ in windows) == min(top for _, top, _, _ in windows) == 0
+        assert max(left + wide for left, _, wide, _ in windows) == width
+        assert max(top + tall for _, top, _, tall in windows) == height
+
+
+def test_a_run_of_before_with_its_rounds_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "config.json"
+    save_config(file, GaussiansConfig(cells=3), "fprf-splats")
+    document = json.loads(file.read_text())
+    document["config"]["rounds"] = 2
+    file.write_text(json.dumps(document))
+    assert load_config(file) == (GaussiansConfig(cells=3), "fprf-splats")
+
+
 def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Scene, cells: list[Cell], tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = ["train", "fprf-splats", "--data", str(town), "--downscale", "1", "--steps", "40", "--cells", str(COUNT)]
-    command += ["--rounds", "2", "--initial", "300", "--cap", "600", "--output", str(run)]
+    command += ["--initial", "300", "--cap", "600", "--output", str(run)]
     assert main(command) == 0
 
     def exported(name: str) -> bytes:
@@ -82,22 +102,22 @@ def test_a_lost_cell_is_trained_again_and_changes_nothing(town: Path, scene: Sce
 
     first = exported("a.ply")
     stamps = {path: path.stat().st_mtime_ns for path in run.glob("**/done.json")}
-    assert len(stamps) == 1 + 2 * COUNT
-    shutil.rmtree(run / "cells" / "0" / "01")
+    assert len(stamps) == 1 + COUNT
+    shutil.rmtree(run / "cells" / "01")
     assert main(command) == 0
     assert exported("b.ply") == first
     changed = [path.parent.relative_to(run) for path, stamp in stamps.items() if path.stat().st_mtime_ns != stamp]
-    assert changed == [Path("cells/0/01")]
+    assert changed == [Path("cells/01")]
     assert [*map(repr, read_cells(run))] == [*map(repr, cells)]
     gaussians = read_capture(tmp_path / "a.ply").gaussians
     assert len(gaussians) > 0 and torch.stack([cell.holds(gaussians.means) for cell in cells]).sum(0).eq(1).all()
     document = json.loads((run / "cells.json").read_text())
     assert math.isclose(sum(len(cell.windows) for cell in cells), sum(len(each["windows"]) for each in document["cells"]))
     # A worker reads its own views alone, not the scene folder's list of all.
-    shutil.rmtree(run / "cells" / "1" / "02")
+    shutil.rmtree(run / "cells" / "02")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fprf.splats.training.parse_scene", None)
-        task = CellTask(root=str(run), data=str(town), round=1, cell=2, minutes=None, quiet=True)
+        task = CellTask(root=str(run), data=str(town), cell=2, minutes=None, quiet=True)
         assert train_cell(task, lambda event: None)
     assert main(command) == 0 and exported("c.ply") == first
     assert main(["eval", str(run), "--split", "test"]) == 0
@@ -119,7 +139,7 @@ def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path:
     start.load_state_dict({name: overview.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent")})
     means = []
     for number, cell in enumerate(read_cells(run)):
-        saved, _ = load_latest(run / "cells" / "0" / f"{number:02d}" / "checkpoints")
+        saved, _ = load_latest(run / "cells" / f"{number:02d}" / "checkpoints")
         assert saved is not None
         outside = torch.ones(len(gain), dtype=torch.bool)
         outside[list(cell.windows)] = False
@@ -129,7 +149,7 @@ def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path:
         tones.load_state_dict({name: saved.optimizer[f"tones.{name}.value"] for name in ("gain", "exponent")})
         torch.testing.assert_close(tones.gains()[~outside].mean(0), start.gains()[~outside].mean(0), atol=1e-5, rtol=0)
         means.append(torch.where(outside[:, None], torch.nan, tones.gains().detach()))
-    union, _ = load_latest(run / "cells" / "0" / "checkpoints")
+    union, _ = load_latest(run / "checkpoints")
     assert union is not None
     mean = torch.stack(means).nanmean(0)
     torch.testing.assert_close(
