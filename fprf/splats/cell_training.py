@@ -279,9 +279,7 @@ def _begin(folder: Path, task: str) -> None:
         write_json(mark, task)
 
 
-def _task(
-    config: GaussiansConfig, scene: Scene, views: list[int], cell: Cell | None = None, start: str = ""
-) -> str:
+def _task(config: GaussiansConfig, scene: Scene, views: list[int], cell: Cell | None = None, start: str = "") -> str:
     """Digest of what is asked for, steps and minutes aside; while it stays the same, what was trained stays good."""
     tree = to_json(config)
     assert isinstance(tree, dict)
