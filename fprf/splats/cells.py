@@ -31,7 +31,7 @@ _BORDER = 0.05
 """Of the cell's width to each side, from which it learns as well."""
 _SEEN = 8
 """Points of a cell that a view shows, at least, where the cell learns from it."""
-_OWN = 0.05
+_OWN = 0.15
 """Share of the points in a window that are the cell's own, at least."""
 _LEAST, _ROOM = 64, 6
 """Least width and height of a window; pixels around the points in it."""
