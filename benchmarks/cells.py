@@ -1,11 +1,12 @@
 """Captures trained in cells, in one piece and in blocks of fields: equal processor seconds, size, and number of Gaussians.
 
-    python -m benchmarks cells SCENE ... [--steps 3000] [--cells 4] [--output FILE.json]
+    python -m benchmarks cells SCENE ... [--steps 3000] [--share 1.0] [--cells 4] [--output FILE.json]
 
 The piece is trained for `--steps`, the cells for `--share` of them (their first steps, of images of half the size, are cheaper,
-and each step after that serves one cell), blocks of `fprf-lite` for the seconds that the piece took, features not counted.
-Seconds are those of the processor, imports included. The error at borders is that of pixels within three of a change of the
-cell that what they show lies in, in held-out views, over that of all others. Each scene is an entry with its own commit.
+each step after that serves one cell: the share at which both take as long depends on the scene), blocks of `fprf-lite` for the
+seconds that the piece took, features not counted. Seconds are those of the processor, imports included. The error at borders is
+that of pixels within three of a change of the cell that what they show lies in, in held-out views, over that of all others.
+Each scene is an entry with its own commit.
 """
 
 import json
@@ -88,10 +89,10 @@ def blocks(data: Path, place: Path, downscale: int, seconds: float) -> dict[str,
 def main(argv: list[str]) -> None:
     parser = arguments("cells", __doc__)
     parser.add_argument("scenes", nargs="+", type=Path)
-    parser.add_argument("--side", type=int, default=250, help="longest side of the images at most, in pixels")
+    parser.add_argument("--side", type=int, default=640, help="longest side of the images at most, in pixels")
     parser.add_argument("--steps", type=int, default=3000)
-    parser.add_argument("--share", type=float, default=0.55, help="of the steps, for the cells")
-    parser.add_argument("--cap", type=int, default=30_000)
+    parser.add_argument("--share", type=float, default=1.0, help="of the steps, for the cells")
+    parser.add_argument("--cap", type=int, default=60_000)
     parser.add_argument("--cells", type=int, default=4)
     parser.add_argument("--only", nargs="+", choices=("piece", "cells", "blocks"), default=("piece", "cells", "blocks"))
     parser.add_argument("--output", type=Path)
