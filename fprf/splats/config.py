@@ -73,7 +73,7 @@ class GaussiansConfig(RunConfig):
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
     surroundings: int = 500
-    """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. None is split.
+    """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. None is split, but by cells.
     At most a tenth of `cap`; 0 = none."""
     cap: int = 60_000
     """Gaussians at the end, at most."""
