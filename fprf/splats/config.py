@@ -73,8 +73,8 @@ class GaussiansConfig(RunConfig):
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
     surroundings: int = 500
-    """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. None is split, but by cells.
-    At most a tenth of `cap`; 0 = none."""
+    """Further Gaussians on a distant sphere at the start: they hold sky, and fill what no photograph shows. Only cells
+    split them. At most a tenth of `cap`; 0 = none."""
     cap: int = 60_000
     """Gaussians at the end, at most."""
     pixels_per_gaussian: int = 20
