@@ -173,8 +173,10 @@ def region_scores(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[T
 def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleConfig) -> RegionControls:
     """Find every region and reference that the style names. Raises UsageError for those that are not there, or contradict."""
     book = _Book(regions, dictionary, style.references)
-    placed = [text for text in style.pin if parse_place("pin", parse_region_value("pin", text).region)]
-    pins, bans = book.pairs("pin", [text for text in style.pin if text not in placed]), book.pairs("forbid", style.forbid)
+    wishes = [parse_region_value("pin", text) for text in style.pin]
+    spots = {wish.region: place for wish in wishes if (place := parse_place("pin", wish.region))}
+    pins = book.pairs([wish for wish in wishes if wish.region not in spots])
+    bans = book.pairs([parse_region_value("forbid", text) for text in style.forbid])
     kept = [match for text in style.keep for match in book.find(text)]
     parsed = [parse_strength("region_strength", text) for text in style.region_strength]
     strengths = [(match, value) for text, value in parsed for match in book.find(text)]
@@ -196,17 +198,16 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         poor = (best < style.keep_below).nonzero().flatten().tolist()
         strength[[k for k in poor if k not in pinned]] = 0.0
     taken: dict[str, set[int]] = {}
-    for wish in (parse_region_value("pin", text) for text in placed):
-        taken.setdefault(wish.region, set()).add(find_reference(wish.value, style.references))
+    for wish in wishes:
+        if wish.region in spots:
+            taken.setdefault(wish.region, set()).add(find_reference(wish.value, style.references))
     places = []
     for text, chosen in taken.items():
-        place = parse_place("pin", text)
-        assert place is not None
         only = torch.zeros(len(dictionary.names), dtype=torch.bool)
         only[[book.order[i] for i in chosen]] = True
         # What regions may take of these references; all of them where that is none.
         both = allowed & only
-        places.append((place, torch.where(both.any(1, keepdim=True), both, only)))
+        places.append((spots[text], torch.where(both.any(1, keepdim=True), both, only)))
     saved = replace(
         style,
         pin=(
@@ -242,10 +243,9 @@ class _Book:
                 self.notes.append(f"region {text!r} of the style is region {each.number} here (cosine {each.alike:.2f})")
         return matches
 
-    def pairs(self, field: str, texts: Sequence[str]) -> list[tuple[RegionMatch, int]]:
+    def pairs(self, wishes: Sequence[tuple[str, str]]) -> list[tuple[RegionMatch, int]]:
         """Regions and references of REGION=REFERENCE; a mask may mean several regions."""
-        wishes = [parse_region_value(field, text) for text in texts]
-        return [(match, find_reference(w.value, self.references)) for w in wishes for match in self.find(w.region)]
+        return [(match, find_reference(value, self.references)) for region, value in wishes for match in self.find(region)]
 
     def label(self, reference: int) -> str:
         """A reference as a style file names it, wherever its photographs are moved to."""
