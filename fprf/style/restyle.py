@@ -174,8 +174,8 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
     """Find every region and reference that the style names. Raises UsageError for those that are not there, or contradict."""
     book = _Book(regions, dictionary, style.references)
     wishes = [parse_region_value("pin", text) for text in style.pin]
-    spots = {wish.region: place for wish in wishes if (place := parse_place("pin", wish.region))}
-    pins = book.pairs([wish for wish in wishes if wish.region not in spots])
+    place_of = {wish.region: place for wish in wishes if (place := parse_place("pin", wish.region))}
+    pins = book.pairs([wish for wish in wishes if wish.region not in place_of])
     bans = book.pairs([parse_region_value("forbid", text) for text in style.forbid])
     kept = [match for text in style.keep for match in book.find(text)]
     parsed = [parse_strength("region_strength", text) for text in style.region_strength]
@@ -199,7 +199,7 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         strength[[k for k in poor if k not in pinned]] = 0.0
     taken: dict[str, set[int]] = {}
     for wish in wishes:
-        if wish.region in spots:
+        if wish.region in place_of:
             taken.setdefault(wish.region, set()).add(find_reference(wish.value, style.references))
     places = []
     for text, chosen in taken.items():
@@ -207,7 +207,7 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         only[[book.order[i] for i in chosen]] = True
         # What regions may take of these references; all of them where that is none.
         both = allowed & only
-        places.append((spots[text], torch.where(both.any(1, keepdim=True), both, only)))
+        places.append((place_of[text], torch.where(both.any(1, keepdim=True), both, only)))
     saved = replace(
         style,
         pin=(
