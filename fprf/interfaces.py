@@ -7,7 +7,7 @@ Shapes use the letters of `fprf.types`.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -166,6 +166,10 @@ class Stylizer(nn.Module, ABC):
         """Attention of each point to each style code; rows sum to 1."""
 
 
+Values: TypeAlias = Callable[[Annotated[Tensor, "M D"], Annotated[Tensor, "M 3"] | None], Annotated[Tensor, "M X"]]
+"""Anything that follows from semantics, and from positions in the world where they are given."""
+
+
 class SceneView(ABC):
     """One view of a scene, to be drawn in one look after the other; results are on the CPU."""
 
@@ -219,14 +223,14 @@ class Scene(ABC):
         cameras: "Cameras",
         view: int,
         pixel: Annotated[Tensor, "R 2"],
-        values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+        values: Values,
         *,
         semantic: bool = True,
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
         """Means over what each pixel sees of anything that follows from semantics, and the opacity.
 
         Pixels that see nothing get 0. `values` is given features without channels where the scene has no semantics or
-        `semantic` is false.
+        `semantic` is false, and positions where styles of this kind of scene may differ from place to place.
         """
 
     @abstractmethod

@@ -89,9 +89,10 @@ def run(args: list[str]) -> int:
             start = time.perf_counter()
             styled = apply_style(scene, each, encoders)
             shown = scene.restyled(styled.restyle)
+            harmonics = shown.shown.harmonics
             if config.output is not None:
                 output = _named(config.output, name)
-                write_capture(output, capture, shown.shown.harmonics, scene.views)
+                write_capture(output, capture, harmonics, scene.views)
                 write_style(_beside(output, "style.json"), styled.controls.saved)
             made.append((name, styled, shown, time.perf_counter() - start))
         display.count(len(named), len(named), "restyling")

@@ -1,5 +1,6 @@
 """Runs of 3D Gaussians on the command line."""
 
+import hashlib
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -82,8 +83,9 @@ class SplatVerbs(Verbs):
 
     def export(self, config: "ExportConfig", file: "StyleFile") -> None:
         from ..export.config import Plan, look_file, make_looks, styles_of
-        from ..splats.files import ENDINGS, write_gaussians
+        from ..splats.files import ENDINGS, write_gaussians, write_ply_parts
         from ..splats.training import open_gaussians
+        from ..training.checkpoint import digest
         from ..training.quality import QualityConfig
         from .export import export_cameras
         from .style_flags import say
@@ -115,10 +117,15 @@ class SplatVerbs(Verbs):
             print(f"cameras in {what.single or what.folder / 'transforms.json'}")
         kinds = () if table else tuple(kind for kind in kinds if kind != "cameras")
         for look in looks if kinds else ():
-            shown = scene.restyled(look.restyle).shown
+            shown = scene.restyled(look.restyle)
             for kind in kinds:
-                paths.append(output if single else output / look_file("splats", look.name, f".{kind}"))
-                write_gaussians(paths[-1], shown, antialiased=True, views=scene.views, plain=config.plain)
+                paths.append(path := output if single else output / look_file("splats", look.name, f".{kind}"))
+                if path.suffix.lower() == ".ply" and not path.name.lower().endswith(".compressed.ply") and not config.plain:
+                    key = f"{digest(opened.run.checkpoints)} {'' if look.restyle is None else look.restyle.digest}"
+                    key = hashlib.sha256(key.encode()).hexdigest()
+                    write_ply_parts(path, shown.part, len(scene.gaussians), key, antialiased=True)
+                else:
+                    write_gaussians(path, shown.shown, antialiased=True, views=scene.views, plain=config.plain)
         if paths:
             print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}")
 

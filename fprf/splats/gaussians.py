@@ -68,6 +68,10 @@ class Gaussians:
         """The same Gaussians with other harmonics."""
         return replace(self, harmonics=harmonics)
 
+    def part(self, rows: slice) -> "Gaussians":
+        """Some of the Gaussians, without a copy."""
+        return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
+
     def select(self, index: Annotated[Tensor, "M"]) -> "Gaussians":
         """Some of the Gaussians, in the order of `index` (int64, or a mask of all)."""
         return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))

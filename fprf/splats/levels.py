@@ -10,6 +10,8 @@ import io
 import math
 import mmap
 import zipfile
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,11 +36,16 @@ _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""
 _SPREAD = 0.9
 """Quantile that says how wide a chunk is, and how far apart is what a level merges."""
+_AT_ONCE = 64
+"""Chunks that are recoloured together."""
 _PART = 1 << 17
 """Gaussians that are in memory at a time while levels are written."""
+_KEPT = 1 << 28
+"""Bytes of colours that a look keeps of chunks it has drawn."""
 _TABLES = "begin", "spread", "centre", "radius", "core"
 _FILE, _LENGTH = "rows.bin", 8
-"""Rows, then an .npz archive of the tables, then the number of bytes of that archive in this many bytes, little endian."""
+"""Rows, their order (int32), an .npz archive of the tables, the bytes of that archive as a number of this many bytes; all
+little endian."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,23 +63,80 @@ class Levels:
     """Of a ball around all that a chunk shows."""
     core: Annotated[NDArray[np.float64], "B"]
     """Of a ball around nearly all means of a chunk."""
+    order: Annotated[NDArray[np.int32], "N"]
+    """Which Gaussian each row of the finest level is, chunk after chunk."""
     mapped: mmap.mmap | None = None
     """The file that the rows lie in: of its pages none stays in memory."""
 
     def select(self, camera: Pinhole, pixels: float) -> Gaussians:
         """Return the Gaussians that a camera sees, merged where they lie within `pixels`; 0 = nothing is merged."""
+        return self.gather(*self.visible(camera, pixels))
+
+    def visible(self, camera: Pinhole, pixels: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the chunks that a camera sees, in ascending order, and the level of each."""
         local, seen = in_view(camera, self.centre, self.radius)
         fx, fy = float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1])
         distance = np.maximum(np.linalg.norm(local, axis=1) - self.core, camera.near)
         fine = self.spread * max(fx, fy) <= pixels * distance[:, None]
         level = np.minimum.accumulate(fine, axis=1).sum(1) - 1
         chunks = np.flatnonzero(seen)
-        first, last = self.begin[chunks, level[chunks]], self.begin[chunks, level[chunks] + 1]
+        return chunks, level[chunks]
+
+    def gather(self, chunks: NDArray[np.int64], level: NDArray[np.int64]) -> Gaussians:
+        """Return the Gaussians of chunks, each at its level."""
+        first, last = self.begin[chunks, level], self.begin[chunks, level + 1]
         parts = [self.rows[a:b] for a, b in zip(first, last, strict=True)] or [self.rows[:0]]
         nodes = np.concatenate(parts)
         if self.mapped is not None and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
             self.mapped.madvise(mmap.MADV_DONTNEED)
         return _gaussians(torch.from_numpy(nodes))
+
+
+class StyledLevels:
+    """Levels in other colours: those of a chunk are made when it is first drawn, and kept while there is room.
+
+    What is merged has the mean of the new colours of its Gaussians, as if the levels had been made of these.
+    """
+
+    def __init__(
+        self, levels: Levels, recolour: Callable[[Gaussians, Annotated[Tensor, "M"]], Annotated[Tensor, "M K 3"]]
+    ) -> None:
+        """`recolour` gives harmonics for Gaussians and their numbers in the scene."""
+        self._levels, self._recolour = levels, recolour
+        self._colours: OrderedDict[tuple[int, int], Tensor] = OrderedDict()
+        self._bytes = 0
+
+    def select(self, camera: Pinhole, pixels: float) -> Gaussians:
+        """Return what `Levels.select` would, recoloured."""
+        chunks, level = self._levels.visible(camera, pixels)
+        shown = self._levels.gather(chunks, level)
+        keys = list(zip(chunks.tolist(), level.tolist(), strict=True))
+        new = np.array([key not in self._colours for key in keys], bool)
+        for k in np.unique(level[new]):
+            here = chunks[new & (level == k)]
+            for first in range(0, len(here), _AT_ONCE):
+                self._add(here[first : first + _AT_ONCE], int(k))
+        parts = [self._colours[key] for key in keys]
+        for key in keys:
+            self._colours.move_to_end(key)
+        while self._bytes > _KEPT:
+            self._bytes -= self._colours.popitem(last=False)[1].nbytes
+        return shown.recoloured(torch.cat(parts)) if parts else shown
+
+    def _add(self, chunks: NDArray[np.int64], level: int) -> None:
+        """Recolour the Gaussians of chunks and merge them up to a level."""
+        levels = self._levels
+        gaussians = levels.gather(chunks, np.zeros_like(chunks))
+        index = np.concatenate([levels.order[_CHUNK * chunk : _CHUNK * (chunk + 1)] for chunk in chunks]).astype(np.int64)
+        harmonics = self._recolour(gaussians, torch.from_numpy(index))
+        for k in range(level):
+            if k:
+                gaussians = levels.gather(chunks, np.full_like(chunks, k))
+            harmonics = _merged_harmonics(harmonics, *_shares(gaussians)[:2]).float()
+        sizes = levels.begin[chunks, level + 1] - levels.begin[chunks, level]
+        for chunk, colours in zip(chunks.tolist(), torch.split(harmonics, sizes.tolist()), strict=True):
+            self._colours[chunk, level] = colours.clone()
+            self._bytes += colours.nbytes
 
 
 def in_view(
@@ -122,7 +186,7 @@ def make_levels_of_detail(gaussians: Gaussians) -> Levels:
         centre[chunk] = np.median(means[own], axis=0)
         away = np.linalg.norm(means[own] - centre[chunk], axis=1)
         radius[chunk], core[chunk] = (away + reach[own]).max(), np.quantile(away, _SPREAD)
-    return Levels(np.concatenate(parts), begin, spread, centre, radius, core)
+    return Levels(np.concatenate(parts), begin, spread, centre, radius, core, order.numpy().astype(np.int32))
 
 
 def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
@@ -132,16 +196,21 @@ def write_levels(folder: Path, gaussians: Gaussians, key: str) -> None:
     a whole. Raises DataError where the system refuses.
     """
     columns: list[tuple[NDArray[Any], ...]] = []
+    orders: list[NDArray[np.int32]] = []
     written = 0
     with atomic_path(folder / _FILE) as temporary, temporary.open("wb") as file:
         for first in range(0, len(gaussians), _PART):
             levels = make_levels_of_detail(gaussians.select(torch.arange(first, min(first + _PART, len(gaussians)))))
             file.write(levels.rows.tobytes())
             columns.append((levels.begin + written, levels.spread, levels.centre, levels.radius, levels.core))
+            orders.append(levels.order + np.int32(first))
             written += len(levels.rows)
+        for order in orders:
+            file.write(order.tobytes())
         parts = dict(zip(_TABLES, (np.concatenate(column) for column in zip(*columns, strict=True)), strict=True))
         tables = io.BytesIO()
-        np.savez(tables, allow_pickle=False, key=np.array(key), width=np.array(levels.rows.shape[1]), **parts)
+        width, count = np.array(levels.rows.shape[1]), np.array(len(gaussians))
+        np.savez(tables, allow_pickle=False, key=np.array(key), width=width, count=count, **parts)
         file.write(tables.getvalue() + len(tables.getvalue()).to_bytes(_LENGTH, "little"))
 
 
@@ -158,10 +227,12 @@ def open_levels(folder: Path, key: str) -> Levels | None:
             if str(tables["key"]) != key:
                 return None
             parts = {name: tables[name] for name in _TABLES}
-            rows = np.frombuffer(mapped, np.float32, begin // 4).reshape(-1, int(tables["width"]))
+            count = int(tables["count"])
+            rows = np.frombuffer(mapped, np.float32, begin // 4 - count).reshape(-1, int(tables["width"]))
+            order = np.frombuffer(mapped, np.int32, count, begin - 4 * count)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    return Levels(rows=rows, **parts, mapped=mapped)
+    return Levels(rows=rows, **parts, order=order, mapped=mapped)
 
 
 def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -175,16 +246,28 @@ def _chunks(position: Annotated[NDArray[np.float64], "N 3"], index: NDArray[np.i
     return _chunks(position, index[order[:half]]) + _chunks(position, index[order[half:]])
 
 
-def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
-    """Each `_GROUP` neighbours as one, and the standard deviation of their means along its longest axis."""
+def _shares(gaussians: Gaussians) -> tuple[Annotated[Tensor, "M*4"], Annotated[Tensor, "M 4 1"], Annotated[Tensor, "M 4 1"]]:
+    """Which Gaussians are merged, `_GROUP` after `_GROUP`, their shares of what they become, and their weights."""
     missing = -len(gaussians) % _GROUP
     index = torch.arange(len(gaussians) + missing).clamp_max(len(gaussians) - 1)
-    scales = gaussians.log_scales.double().exp()
-    weight = (gaussians.opacities.double() * scales.topk(2, dim=1).values.prod(1))[index].clamp_min(1e-30)
+    areas = gaussians.log_scales.double().exp().topk(2, dim=1).values.prod(1)
+    weight = (gaussians.opacities.double() * areas)[index].clamp_min(1e-30)
     if missing:
         weight[-missing:] = 0
     weight = weight.view(-1, _GROUP, 1)
-    share = weight / weight.sum(1, keepdim=True)
+    return index, weight / weight.sum(1, keepdim=True), weight
+
+
+def _merged_harmonics(
+    harmonics: Annotated[Tensor, "N K 3"], index: Annotated[Tensor, "M*4"], share: Annotated[Tensor, "M 4 1"]
+) -> Annotated[Tensor, "M K 3"]:
+    return (share[..., None] * harmonics.double()[index].view(len(share), _GROUP, -1, 3)).sum(1)
+
+
+def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
+    """Each `_GROUP` neighbours as one, and the standard deviation of their means along its longest axis."""
+    index, share, weight = _shares(gaussians)
+    scales = gaussians.log_scales.double().exp()
     means = gaussians.means.double()[index].view(-1, _GROUP, 3)
     mean = (share * means).sum(1)
     axes = rotations(gaussians.quaternions.double()) * scales[:, None]
@@ -196,7 +279,7 @@ def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
     values = values.clamp_min(1e-20)
     area = values[:, 1:].prod(1).sqrt()
     opacity = (weight.sum((1, 2)) / area).clamp(1e-6, _OPAQUE)
-    harmonics = (share[..., None] * gaussians.harmonics.double()[index].view(len(mean), _GROUP, -1, 3)).sum(1)
+    harmonics = _merged_harmonics(gaussians.harmonics, index, share)
     parts = (mean, _quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
     apart = torch.linalg.eigvalsh(between)[:, -1].clamp_min(0).sqrt()
     return Gaussians(*(part.float() for part in parts)), apart.numpy()
@@ -227,5 +310,6 @@ def _rows(gaussians: Gaussians) -> Annotated[Tensor, "N 11+3K"]:
 
 
 def _gaussians(rows: Annotated[Tensor, "N 11+3K"]) -> Gaussians:
-    parts = (rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10], rows[:, 11:].reshape(len(rows), -1, 3))
+    harmonics = rows[:, 11:].unflatten(1, ((rows.shape[1] - 11) // 3, 3))
+    parts = (rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10], harmonics)
     return Gaussians(*(part.contiguous() for part in parts))

@@ -60,7 +60,7 @@ def restyled_harmonics(
     directions = all_around(before.shape[1])
     for start in range(0, len(before), _ROWS):
         rows = slice(start, start + _ROWS)
-        change, weight = _change(look, means[rows], semantic[rows])
+        change, weight = _change(look, means[rows], semantic[rows].to(means))
         if kept > 0:  # what the map adds to luma is taken back from all channels alike
             change = change - kept * luma(change)
         out[rows] = recoloured(before[rows], change, weight, directions)

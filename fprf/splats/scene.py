@@ -18,7 +18,7 @@ from torch import Tensor
 from ..datamanagers.basis import Basis, fit_basis
 from ..datamanagers.config import GuidedConfig
 from ..errors import CheckpointError, DataError
-from ..interfaces import Encoder, Scene, SceneView, Stylizer
+from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
 from ..ops.guided import upsample
 from ..ops.rasterise import Pinhole, lift
 from ..plugins.stylizers.config import StylizerConfig
@@ -34,7 +34,7 @@ from ..style.scene import to_tensors as style_tensors
 from ..types import View
 from .config import LookConfig
 from .gaussians import Gaussians
-from .levels import Levels, make_levels_of_detail
+from .levels import Levels, StyledLevels
 from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
 from .views import SeenMeans, camera_of, draw, find_views, seen_means
@@ -62,6 +62,7 @@ class Semantics(NamedTuple):
     style: SceneStyle
     basis: Basis
     features: Annotated[Tensor, "N D"]
+    """Half precision."""
     encoder: str
     """Identity of the encoder."""
 
@@ -86,14 +87,14 @@ class SplatScene(Scene):
     background: tuple[float, float, float] = (0.5, 0.5, 0.5)
     resolution: float = 1.0
     """Share of a view's width and height that is rendered."""
-    harmonics: Annotated[Tensor, "N K 3"] | None = None
-    """Those of a look; None = as captured."""
+    look: Restyle | None = None
+    """None = as captured."""
     tone: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors of rendered colours, applied last."""
     merged: float | None = None
     """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are drawn."""
-    stored: Callable[[], Levels] | None = None
-    """Levels of detail of the Gaussians as captured, from files; None = they are made in memory."""
+    levels: Callable[[], Levels] | None = None
+    """Levels of detail of the Gaussians as captured, for scenes that are drawn merged."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -115,17 +116,32 @@ class SplatScene(Scene):
         """Identity of the encoder of the Gaussians' semantics."""
         return self.found().encoder
 
-    @property
+    @cached_property
     def shown(self) -> Gaussians:
-        """The Gaussians in the scene's look."""
-        return self.gaussians if self.harmonics is None else self.gaussians.recoloured(self.harmonics)
+        """The Gaussians in the scene's look, all in memory."""
+        return self.part(slice(0, len(self.gaussians)))
+
+    def part(self, rows: slice) -> Gaussians:
+        """Some of the Gaussians in the scene's look."""
+        gaussians = self.gaussians if rows == slice(0, len(self.gaussians)) else self.gaussians.part(rows)
+        if self.look is None:
+            return gaussians
+        features = self.found().features[rows]
+        return gaussians.recoloured(restyled_harmonics(gaussians.harmonics, gaussians.means, features, self.look))
 
     @cached_property
-    def levels(self) -> Levels:
+    def _detail(self) -> Levels | StyledLevels:
         """Levels of detail in the scene's look."""
-        if self.stored is not None and self.harmonics is None:
-            return self.stored()
-        return make_levels_of_detail(self.shown)
+        assert self.levels is not None  # by `merged`
+        levels, look = self.levels(), self.look
+        if look is None:
+            return levels
+        features = self.found().features
+
+        def recolour(gaussians: Gaussians, index: Tensor) -> Tensor:
+            return restyled_harmonics(gaussians.harmonics, gaussians.means, features[index], look)
+
+        return StyledLevels(levels, recolour)
 
     @cached_property
     def seen(self) -> SeenMeans:
@@ -140,7 +156,7 @@ class SplatScene(Scene):
             small = cameras.select(torch.tensor([view])).scaled(1 / share)
             return enlarged(self.render(small, 0, resolution=1.0), cameras.size[view].tolist())
         camera, place = cover(cameras, view, self.near)
-        shown = self.shown if self.merged is None else self.levels.select(camera, self.merged)
+        shown = self.shown if self.merged is None else self._detail.select(camera, self.merged)
         drawn = draw(shown, camera, antialiased=self.antialiased, background=self.background)
         layers = torch.cat([drawn.image, (drawn.depth * _ray_lengths(camera))[..., None], drawn.opacity[..., None]], -1)
         if place is not None:
@@ -155,7 +171,7 @@ class SplatScene(Scene):
         cameras: Cameras,
         view: int,
         pixel: Annotated[Tensor, "R 2"],
-        values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+        values: Values,
         *,
         semantic: bool = True,
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
@@ -163,7 +179,10 @@ class SplatScene(Scene):
         camera, place = cover(cameras, view, self.near)
         features = self.found().features
         drawn = draw(
-            self.gaussians, camera, antialiased=self.antialiased, features=values(features[:, : None if semantic else 0])
+            self.gaussians,
+            camera,
+            antialiased=self.antialiased,
+            features=values(features[:, : None if semantic else 0].float(), self.gaussians.means),
         )
         x, y = pixel.long().unbind(1)
         if place is not None:
@@ -174,10 +193,7 @@ class SplatScene(Scene):
 
     def restyled(self, look: Restyle | None) -> "SplatScene":
         """The same Gaussians in other colours."""
-        if look is None or look.idle:
-            return replace(self, harmonics=None)
-        gaussians = self.gaussians
-        return replace(self, harmonics=restyled_harmonics(gaussians.harmonics, gaussians.means, self.found().features, look))
+        return replace(self, look=None if look is None or look.idle else look)
 
     def cached(self, cameras: Cameras, view: int) -> "GaussianView":
         """A view, of which nothing is kept: drawing it again takes milliseconds."""
@@ -319,15 +335,14 @@ def find_semantics(
     if len(style.share) > 1:
         style = style._replace(contacts=region_contacts(style, ends[..., 3:], ends[..., :3]))
     features = _spread(gaussians.means, sums * _COARSER**2, weights * _COARSER**2, style.semantic_mean)
-    # Half precision is what a cache holds: a capture seen again must give the same colours.
-    return Semantics(style, basis, features.half().float(), encoder.identity)
+    return Semantics(style, basis, features.half(), encoder.identity)
 
 
 def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
     """Return semantics for a file of tensors."""
     parts = {"style": style_tensors(found.style), "basis": found.basis.tensors()}
     named = {f"{group}.{name}": tensor for group, tensors in parts.items() for name, tensor in tensors.items()}
-    return {**named, "semantic": found.features.half(), "encoder": torch.tensor([*found.encoder.encode()], dtype=torch.uint8)}
+    return {**named, "semantic": found.features, "encoder": torch.tensor([*found.encoder.encode()], dtype=torch.uint8)}
 
 
 def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
@@ -340,7 +355,7 @@ def load_semantics(tensors: dict[str, Tensor], count: int) -> Semantics:
         raise CheckpointError(f"what is known of a capture is incomplete ({error})") from error
     if features.shape != (count, basis.matrix.shape[1]):
         raise CheckpointError(f"what is known of a capture has features {tuple(features.shape)}; it is of another one")
-    return Semantics(style_from(_group(tensors, "style")), basis, features.float(), encoder)
+    return Semantics(style_from(_group(tensors, "style")), basis, features.half(), encoder)
 
 
 def scene_tensors(scene: SplatScene) -> dict[str, Tensor]:

@@ -35,7 +35,7 @@ from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points, surroundings
 from .learner import Learner, Step
-from .levels import Levels, open_levels, write_levels
+from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import Floats, make_levels
 from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
 
@@ -348,7 +348,7 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         resolution if quality.resolution is None else quality.resolution,
         tone=mixed_tone(_tones(saved, known.facts), known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
         merged=merged,
-        stored=cache(lambda: _stored(root / _LEVELS, gaussians, key)) if key and len(gaussians) >= _MANY else None,
+        levels=cache(lambda: _levels(root / _LEVELS, gaussians, key)),
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
 
@@ -387,8 +387,10 @@ def _some_views(known: Known, count: int, longest: int) -> Cameras:
     return views.scaled(max(1.0, float(views.size.amax()) / longest))
 
 
-def _stored(folder: Path, gaussians: Gaussians, key: str) -> Levels:
-    """Levels of detail of a run, written where there are none of its checkpoint."""
+def _levels(folder: Path, gaussians: Gaussians, key: str) -> Levels:
+    """Levels of detail of a run; those of many Gaussians lie in a file, written where there is none of its checkpoint."""
+    if len(gaussians) < _MANY:
+        return make_levels_of_detail(gaussians)
     levels = open_levels(folder, key)
     if levels is None:
         write_levels(folder, gaussians, key)

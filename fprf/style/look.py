@@ -4,8 +4,11 @@ A look is one stylizer with its strengths, or a mix of several: features, streng
 point, so that a style fades into another without either's edges showing.
 """
 
+import hashlib
+import io
+import pickle
 from dataclasses import dataclass, replace
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -15,7 +18,7 @@ from ..interfaces import Decoder, Stylizer
 from ..types import Want
 from .colours import ColourMaps
 from .config import Place
-from .controls import blend_strength, keep_luminance
+from .controls import blend_strength, keep_luminance, place_weight
 from .regional import RegionWeight
 
 Applied: TypeAlias = tuple[Annotated[Tensor, "N C"], float | Annotated[Tensor, "N 1"], float]
@@ -47,6 +50,13 @@ class Restyle:
     def parts(self) -> tuple["Restyle", ...]:
         """All parts of the mix, without their others."""
         return (replace(self, others=()), *self.others)
+
+    @property
+    def digest(self) -> str:
+        """A key of all that it does: of every number in it."""
+        file = io.BytesIO()
+        _Pickler(file).dump(self)
+        return hashlib.sha256(file.getvalue()).hexdigest()
 
     @property
     def idle(self) -> bool:
@@ -97,14 +107,20 @@ class Restyle:
         """The features with all strengths applied, and what a decoder must know besides."""
         return _mix([(part.share, part._alone(content, semantic)[0]) for part in self.parts if part.share > 0])
 
-    def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
+    def match(
+        self, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"] | None = None
+    ) -> Annotated[Tensor, "N T"]:
         """Share that each point takes of each style code, those of all parts one after the other; rows sum to 1 at most.
 
-        What is missing to 1 is what regions keep; the overall strength does not count.
+        What is missing to 1 is what regions keep; the overall strength does not count. Without `points` (world units) neither
+        do places.
         """
         taken = []
         for part in self.parts:
             own = part.stylizer.match(semantic)
+            if points is not None:
+                for place, other in part.places:
+                    own = torch.lerp(own, other.stylizer.match(semantic), place_weight(place, points)[:, None])
             taken.append(part.share * (own if part.regions is None else own * part.regions(semantic)))
         return torch.cat(taken, 1)
 
@@ -133,6 +149,15 @@ class Restyle:
             return None
         change: Tensor = self.colours(colour, semantic, belongs)
         return self.share * self._strength(colour, semantic, belongs) * change
+
+
+class _Pickler(pickle.Pickler):
+    """Tensors by their values alone."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return bytes, (value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes(),)
+        return NotImplemented
 
 
 def _mix(parts: list[tuple[float, Applied]]) -> Applied:

@@ -65,8 +65,8 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
     belongs = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
     centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
-    def values(semantic: Tensor) -> Tensor:
-        taken = look.match(semantic)
+    def values(semantic: Tensor, points: Tensor | None) -> Tensor:
+        taken = look.match(semantic, points)
         near = unit(semantic, centre) @ units.T if belongs.divided else taken.new_zeros(taken.shape)
         return torch.cat([taken, (taken * near).sum(1, keepdim=True), belongs(semantic)], 1)
 

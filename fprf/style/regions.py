@@ -91,7 +91,7 @@ def memberships(
 ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
     """Share of what pixels (centres) see that belongs to each region of a scene's style, and their opacity."""
     weight = RegionWeight(style, torch.eye(len(style.share))).to(scene.device)
-    return scene.paint(cameras, view, pixel, weight, semantic=weight.divided)
+    return scene.paint(cameras, view, pixel, lambda features, points: weight(features), semantic=weight.divided)
 
 
 def membership_view(regions: Regions, view: int, size: int) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:

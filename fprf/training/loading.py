@@ -15,7 +15,7 @@ from ..blocks.routing import Blend, chart_of
 from ..config import TrainConfig
 from ..datamanagers.basis import Basis
 from ..errors import CheckpointError, WeightsError
-from ..interfaces import Decoder, Scene, Stylizer
+from ..interfaces import Decoder, Scene, Stylizer, Values
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
 from ..style.colours import ColourMaps, colour_maps
@@ -144,7 +144,7 @@ class Trained(Scene):
         cameras: Cameras,
         view: int,
         pixel: Annotated[Tensor, "R 2"],
-        values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+        values: Values,
         *,
         semantic: bool = True,
     ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:

@@ -1,6 +1,6 @@
 """Whole images from a trained model, and views whose geometry and features are kept."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..config import RenderConfig
-from ..interfaces import Decoder, SceneView
+from ..interfaces import Decoder, SceneView, Values
 from ..memory import chunk_size, in_parts
 from ..ops.precision import float64_device
 from ..rendering.cameras import Cameras, grid_rays, rays_through
@@ -109,7 +109,7 @@ def paint_pixels(
     view: int,
     pixel: Annotated[Tensor, "R 2"],
     config: RenderConfig,
-    values: Callable[[Annotated[Tensor, "M D"]], Annotated[Tensor, "M X"]],
+    values: Values,
     *,
     semantic: bool = True,
 ) -> tuple[Annotated[Tensor, "R X"], Annotated[Tensor, "R"]]:
@@ -124,7 +124,7 @@ def paint_pixels(
         chunk = Rays(*(x[here] for x in rays))
         marched = march(chunk, model.parts, budget=config.budget)
         kept, field = marched.kept, model.semantic if semantic else None
-        painted = values(kept.point[:, :0] if field is None else field(kept.point))
+        painted = values(kept.point[:, :0] if field is None else field(kept.point), None)
         return composite_mean(kept, painted, len(chunk.near)), marched.opacity
 
     painted, opacity = zip(*in_parts(len(rays.near), chunk_size(config.chunk, rays.near.device), paint), strict=True)

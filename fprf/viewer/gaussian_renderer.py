@@ -72,7 +72,7 @@ class GaussianRenderer(SceneRenderer):
         if view.map == "matches":
             pictures["matches"] = np.full_like(pictures["look"], 128)
             if styled is not None:
-                taken = styled.restyle.match(scene.found().features)
+                taken = styled.restyle.match(scene.found().features.float(), scene.gaussians.means)
                 total = taken.sum(-1, keepdim=True)
                 attention, kept = taken / total.clamp_min(1e-10), (1 - total[:, 0]).clamp(0, 1)
                 codes = styled.codes

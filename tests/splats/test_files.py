@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from splat_ball import ball
 
 from fprf.errors import DataError
 from fprf.rendering.paths import look_at, pinhole
-from fprf.splats.files import ENDINGS, Capture, read_capture, write_capture, write_gaussians
+from fprf.splats.files import ENDINGS, Capture, read_capture, write_capture, write_gaussians, write_ply_parts
 from fprf.splats.files.base import spatial_order
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.views import camera_of, draw
@@ -160,6 +161,41 @@ def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path
     write_gaussians(tmp_path / "exact.ply", there, antialiased=True, views=views)
     exact = read_capture(tmp_path / "exact.ply")
     assert exact.antialiased and torch.equal(exact.gaussians.logits, there.logits)
+
+
+def test_a_ply_in_parts_is_the_same_file_and_goes_on_where_it_was_cut_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fprf.splats.files._ROWS", 64)
+    gaussians, path, asked = ball(300), tmp_path / "parts.ply", []
+    write_gaussians(tmp_path / "whole.ply", gaussians, antialiased=True)
+
+    def part(rows: slice) -> Gaussians:
+        if rows.start == stop:
+            raise KeyboardInterrupt
+        asked.append(rows.start)
+        return gaussians.part(rows)
+
+    for stop, begun in ((64, 0), (256, 0), (256, 192), (-1, 192)):
+        asked.clear()
+        if stop < 0:
+            write_ply_parts(path, part, len(gaussians), "a" * 64, antialiased=True)
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                write_ply_parts(path, part, len(gaussians), "a" * 64, antialiased=True)
+            assert not path.exists()
+        assert asked[1:] == list(range(begun, stop if stop > 0 else 300, 64))  # the first says what rows are like
+    assert path.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    stop = 256
+    with pytest.raises(KeyboardInterrupt):
+        write_ply_parts(path, part, len(gaussians), "b" * 64, antialiased=True)
+    assert path.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    # Another key begins anew, and removes what the first one left.
+    stop = -1
+    asked.clear()
+    write_ply_parts(path, part, len(gaussians), "c" * 64)
+    assert asked[1:] == list(range(0, 300, 64)) and not read_capture(path).antialiased
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["parts.ply", "whole.ply"]
 
 
 def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> None:

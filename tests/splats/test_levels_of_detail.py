@@ -9,7 +9,7 @@ from splat_ball import ball
 
 from fprf.ops.rasterise import Pinhole
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.levels import make_levels_of_detail, open_levels, write_levels
+from fprf.splats.levels import StyledLevels, make_levels_of_detail, open_levels, write_levels
 from fprf.splats.views import draw
 
 
@@ -68,6 +68,38 @@ def test_levels_in_files_show_the_same(tmp_path: Path) -> None:
     for damaged in (b"", whole[:-1], whole[: len(whole) // 2], bytes(len(whole))):
         file.write_bytes(damaged)
         assert open_levels(tmp_path, "key") is None
+
+
+def _inverted(gaussians: Gaussians, index: torch.Tensor) -> torch.Tensor:
+    """Harmonics that depend on colours and on which Gaussian it is."""
+    return -gaussians.harmonics * (index % 7)[:, None, None]
+
+
+@pytest.mark.parametrize("room", [1 << 28, 100_000])
+def test_a_look_shows_the_levels_of_recoloured_gaussians(room: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fprf.splats.levels._KEPT", room)
+    gaussians = _scattered(20_000)
+    index = torch.arange(len(gaussians))
+    wanted = make_levels_of_detail(gaussians.recoloured(_inverted(gaussians, index)))
+    write_levels(tmp_path, gaussians, "key")
+    stored = open_levels(tmp_path, "key")
+    assert stored is not None
+    asked = []
+
+    def recolour(part: Gaussians, which: torch.Tensor) -> torch.Tensor:
+        assert torch.equal(part.means, gaussians.means[which])
+        asked.append(len(which))
+        return _inverted(part, which)
+
+    styled = StyledLevels(stored, recolour)
+    for distance, pixels in ((100.0, 0.0), (100.0, 1.0), (300.0, 1.0), (5.0, 1.0), (100.0, 1.0)):
+        made = wanted.select(_camera(distance, 300.0), pixels)
+        shown = styled.select(_camera(distance, 300.0), pixels)
+        assert all(map(torch.equal, vars(made).values(), vars(shown).values()))
+    before = len(asked)
+    styled.select(_camera(100.0, 300.0), 1.0)
+    assert len(styled.select(_camera(-1e4, 300.0), 1.0)) == 0
+    assert (len(asked) == before) == (room > 1 << 20)  # what is kept is not computed again
 
 
 def test_levels_stay_those_of_before_where_writing_ends_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from fprf.splats.views import camera_of, draw, find_views
 from fprf.style.config import StyleConfig
 from fprf.style.controls import luma
 from fprf.style.files import StyleFile, write_style
+from fprf.style.match_maps import match_map
 from fprf.style.restyle import apply_style
 
 SMALL = ["--views", "4", "--size", "64", "48", "--regions", "3"]
@@ -123,6 +124,24 @@ def test_places_take_their_own_photograph(scene: SplatScene, photographs: list[P
         assert bool((share[free][from_axis[free].argsort()].diff() < 0.02).all()) and int(free.sum()) >= 100 * border
     elsewhere = styled(scene, *photographs, pin=(f"{place}=snow",))
     assert torch.equal(elsewhere[outside], styled(scene, *photographs)[outside])
+
+
+def test_maps_of_matches_heed_places(scene: SplatScene, photographs: list[Path]) -> None:
+    found = apply_style(scene, StyleFile(StyleConfig(references=tuple(photographs), stylizer=TONE, pin=("everywhere=snow",))))
+    taken = match_map(scene, found, 0).taken
+    dusk = found.codes.reference == found.codes.names.index("dusk.png")
+    assert float(taken[..., dusk].abs().max()) == 0 and float(taken.max()) > 0.5
+    view = scene.cached(scene.cameras, 0)
+    assert torch.allclose(view.match(found.restyle), taken.flatten(0, 1), atol=1e-6)
+
+
+def test_the_digest_of_a_look_is_that_of_its_numbers(scene: SplatScene, photographs: list[Path]) -> None:
+    def look(**wishes: object) -> str:
+        style = StyleConfig(references=tuple(photographs), stylizer=TONE, **wishes)  # type: ignore[arg-type]
+        return apply_style(scene, StyleFile(style)).restyle.digest
+
+    others = look(strength=0.5), look(pin=("everywhere=snow",)), look(pin=("box:0,0,0:1,1,1=snow",)), look(clusters=2)
+    assert look() == look() and len({look(), *others}) == 5
 
 
 @pytest.mark.parametrize("place", ["box:1,2:3", "box:1,2,3:4,5,nan", "path:0,0,0:1,1,1", "path:0,0,0:1,1,1:-1"])

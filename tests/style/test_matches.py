@@ -28,7 +28,7 @@ def styled_by(world: World, stylizer: StylizerConfig | None = None, **wishes: ob
 def test_what_is_taken_is_the_stylizers_match(world: World, stylizer: StylizerConfig) -> None:
     trained, styled = styled_by(world, stylizer)
     found = match_map(trained, styled, 0)
-    expected, _ = trained.paint(trained.cameras, 0, pixel_grid(trained.cameras, 0), styled.restyle.stylizer.match)
+    expected, _ = trained.paint(trained.cameras, 0, pixel_grid(trained.cameras, 0), styled.restyle.match)
     assert torch.allclose(found.taken.flatten(0, 1), expected, atol=1e-5) and float(found.kept.max()) < 1e-4
     picture = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render)
     assert torch.allclose(found.opacity, picture.opacity)
@@ -50,7 +50,7 @@ def test_the_score_is_the_mean_cosine_with_what_is_taken(world: World) -> None:
     centre, keys = styled.scene.semantic_mean.double(), styled.dictionary.keys.double()
     there = torch.nn.functional.normalize(keys - centre, dim=1)
 
-    def of_points(semantic: torch.Tensor) -> torch.Tensor:
+    def of_points(semantic: torch.Tensor, points: torch.Tensor | None) -> torch.Tensor:
         """Each code's share, and its share times its cosine, in float64."""
         cosine = torch.nn.functional.normalize(semantic.double() - centre, dim=1) @ there.T
         taken = styled.restyle.match(semantic).double()

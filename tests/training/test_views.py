@@ -135,6 +135,6 @@ def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_m
     parts = view_parts(trained.model, known.facts, known.cameras, 2, config)
     first = next(parts)
     assert first.rays == 100 and first.semantic is not None
-    wanted, _ = trained.paint(known.cameras, 2, pixel_grid(known.cameras, 2)[:100], stylizer.match)
+    wanted, _ = trained.paint(known.cameras, 2, pixel_grid(known.cameras, 2)[:100], lambda y, _: stylizer.match(y))
     assert torch.allclose(first.mean(stylizer.match(first.semantic)), wanted, atol=1e-6)
     assert 100 + sum(part.rays for part in parts) == 32 * 24

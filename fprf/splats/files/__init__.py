@@ -1,6 +1,10 @@
 """Files of 3D Gaussians, read and written: .ply, .compressed.ply, .splat, .spz, .sog and SOG folders (meta.json)."""
 
+import glob
+import os
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -8,17 +12,21 @@ import numpy as np
 from torch import Tensor
 
 from ...errors import DataError
-from ...io.atomic import write_bytes
+from ...io.atomic import unwritable, write_bytes
 from ...rendering.cameras import Cameras
+from ...training.run import held
 from ..gaussians import Gaussians
 from ..views import seen_means
 from .base import Capture
-from .ply import compressed_bytes, is_compressed, ply_bytes, read_ply
+from .ply import compressed_bytes, is_compressed, ply_bytes, ply_head, ply_rows, read_ply
 from .sog import read_sog, sog_bytes, unbundle
 from .splat import read_splat, splat_bytes
 from .spz import read_spz, spz_bytes
 
-__all__ = ["ENDINGS", "Capture", "read_capture", "write_capture", "write_gaussians"]
+__all__ = ["ENDINGS", "Capture", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
+
+_ROWS = 1 << 17
+"""Gaussians that are in memory at a time while a large scene is written."""
 
 
 class _Format(NamedTuple):
@@ -71,6 +79,39 @@ def write_gaussians(
         gaussians = seen.gaussians(gaussians) if form.plain else seen.plain(gaussians)
         antialiased = False
     _write(path, form.pack(gaussians, antialiased))
+
+
+def write_ply_parts(path: Path, part: Callable[[slice], Gaussians], count: int, key: str, *, antialiased: bool = False) -> None:
+    """Write the .ply of `count` Gaussians, whole or not at all; `part` gives slices of them, and no more is in memory.
+
+    Where writing was cut off, the next call with the same key goes on with what is there. Raises DataError where another
+    process is at it, or the system refuses.
+    """
+    first = part(slice(0, 1))
+    head, row = ply_head(first, antialiased, count), ply_rows(first).nbytes
+    unfinished = path.with_name(f".{path.stem[:40]}.{key[:16]}")
+    for other in path.parent.glob(f".{glob.escape(path.stem[:40])}.{'[0-9a-f]' * 16}"):
+        if other != unfinished:
+            with suppress(DataError), held(other):
+                shutil.rmtree(other)
+    with held(unfinished):
+        rows = unfinished / "rows"
+        try:
+            with rows.open("r+b" if rows.is_file() else "w+b") as file:
+                # All but the last of the whole parts there have reached the disk.
+                begun = max(0, (file.seek(0, os.SEEK_END) - len(head)) // (row * _ROWS) - 1)
+                file.seek(0)
+                if not begun:
+                    file.write(head)
+                file.truncate(len(head) + begun * row * _ROWS)
+                file.seek(0, os.SEEK_END)
+                for start in range(begun * _ROWS, count, _ROWS):
+                    file.write(ply_rows(part(slice(start, min(start + _ROWS, count)))).tobytes())
+                    file.flush()
+                    os.fsync(file.fileno())
+            os.replace(rows, path)
+        except OSError as error:
+            raise unwritable(path, error, len(head) + count * row) from error
 
 
 def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None) -> None:

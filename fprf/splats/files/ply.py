@@ -110,13 +110,26 @@ def read_ply(path: Path, data: bytes) -> Capture:
 
 def ply_bytes(gaussians: Gaussians, antialiased: bool, normals: Floats | None = None) -> bytes:
     """The INRIA file, exact. Normals [N 3] are 0 unless given."""
+    return ply_file({"vertex": ply_rows(gaussians, normals)}, _comments(antialiased))
+
+
+def ply_head(of: Gaussians, antialiased: bool, count: int) -> bytes:
+    """What stands before the rows of an INRIA file of `count` Gaussians such as these."""
+    return _head({"vertex": ply_rows(of)}, _comments(antialiased), [count])
+
+
+def ply_rows(gaussians: Gaussians, normals: Floats | None = None) -> NDArray[np.void]:
+    """Rows of the INRIA file."""
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * gaussians.harmonics.shape[1] - 3)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     means, turns, scales, logits, harmonics = _arrays(gaussians)
     parts = [means, np.zeros_like(means) if normals is None else normals, _flat(harmonics), logits[:, None], scales, turns]
-    table = np.ascontiguousarray(np.concatenate(parts, 1), "<f4").view([(name, "<f4") for name in names])[:, 0]
-    return ply_file({"vertex": table}, ["SplatRenderMode: mip"] if antialiased else [])
+    return np.ascontiguousarray(np.concatenate(parts, 1), "<f4").view([(name, "<f4") for name in names])[:, 0]
+
+
+def _comments(antialiased: bool) -> list[str]:
+    return ["SplatRenderMode: mip"] if antialiased else []
 
 
 def is_compressed(data: bytes) -> bool:
@@ -145,7 +158,7 @@ def compressed_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     if harmonics.shape[1] > 1:
         rest = _rest_bytes(_flat(harmonics)[:, 3:])
         tables["sh"] = rest.view([(f"f_rest_{i}", "u1") for i in range(rest.shape[1])])[:, 0]
-    return ply_file(tables, ["SplatRenderMode: mip"] if antialiased else [])
+    return ply_file(tables, _comments(antialiased))
 
 
 def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], antialiased: bool) -> Capture:
@@ -242,14 +255,19 @@ def ply_file(tables: dict[str, NDArray[np.void]], comments: Sequence[str] = ()) 
 
     trimesh would write meshes too, but keeps neither comments nor colours without alpha.
     """
+    head = _head(tables, comments, [len(table) for table in tables.values()])
+    return head + b"".join(table.tobytes() for table in tables.values())
+
+
+def _head(tables: dict[str, NDArray[np.void]], comments: Sequence[str], counts: Sequence[int]) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
-    for name, table in tables.items():
-        lines.append(f"element {name} {len(table)}")
+    for (name, table), count in zip(tables.items(), counts, strict=True):
+        lines.append(f"element {name} {count}")
         for field in table.dtype.names or ():
             kind = table.dtype[field]
             of = [kind] if kind.names is None else [kind[part].base for part in kind.names]
             lines.append(f"property {'list ' * (len(of) > 1)}{' '.join(_NAMES[each.str[1:]] for each in of)} {field}")
-    return "\n".join([*lines, "end_header", ""]).encode("ascii") + b"".join(table.tobytes() for table in tables.values())
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 def _arrays(gaussians: Gaussians) -> tuple[Floats, ...]:
