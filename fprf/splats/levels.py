@@ -31,6 +31,8 @@ _CHUNK, _GROUP, _LEVELS = 512, 4, 4
 """Gaussians of a chunk; those merged into one of the next level; levels, the finest included."""
 _DEVIATIONS = 3.0
 """How far a Gaussian reaches, in standard deviations."""
+_FARTHEST, _WIDENED = 3.5, 2.0
+"""The same where nothing may be left out, down to opacities of 1/255; pixels by which drawing widens them."""
 _OPAQUE = 0.995
 _TAIL = 0.02
 """Share of the means at either end that does not say how long a chunk is."""
@@ -152,6 +154,15 @@ def in_view(
     for along, slope in ((-x, cx / fx), (x, (camera.width - cx) / fx), (-y, cy / fy), (y, (camera.height - cy) / fy)):
         seen &= (along - slope * z) / math.hypot(1, slope) < radius
     return local, seen
+
+
+def seen_by(gaussians: Gaussians, camera: Pinhole) -> Annotated[Tensor, "M"]:
+    """Numbers of the Gaussians that a camera may see."""
+    means, pose = gaussians.means.double().numpy(), camera.world_to_camera.double()
+    away = np.linalg.norm(means + (pose[:3, :3].T @ pose[:3, 3]).numpy(), axis=1)
+    widened = _WIDENED / float(min(camera.intrinsics[0, 0], camera.intrinsics[1, 1])) * away
+    _, seen = in_view(camera, means, _FARTHEST * gaussians.log_scales.double().amax(1).exp().numpy() + widened)
+    return torch.from_numpy(np.flatnonzero(seen))
 
 
 def make_levels_of_detail(gaussians: Gaussians) -> Levels:

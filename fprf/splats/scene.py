@@ -34,7 +34,7 @@ from ..style.scene import to_tensors as style_tensors
 from ..types import View
 from .config import LookConfig
 from .gaussians import Gaussians
-from .levels import Levels, StyledLevels
+from .levels import Levels, StyledLevels, seen_by
 from .photographs import cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
 from .views import SeenMeans, camera_of, draw, find_views, seen_means
@@ -51,6 +51,8 @@ _SAMPLES = 65_536
 """Pixels of all views together that statistics are taken of, about."""
 _COARSER = 2
 """Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
+_ROWS = 1 << 17
+"""Gaussians of which there is a second copy of anything at a time."""
 _NEIGHBOURS, _LEVELS, _REACH = 1.0, 8, 0.02
 """Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the edge of the
 nearest one, as a share of the spread of the positions."""
@@ -291,7 +293,8 @@ def find_semantics(
     pictures, cells, solid = [], [], []
     for view in range(len(cameras)):
         progress(view, total)
-        drawn = draw(gaussians, camera_of(cameras, view, near), antialiased=antialiased)
+        camera = camera_of(cameras, view, near)
+        drawn = draw(gaussians.select(seen_by(gaussians, camera)), camera, antialiased=antialiased)
         pictures.append((drawn.image, drawn.opacity))
         behind = (1 - drawn.opacity)[..., None]
         filled = torch.stack([drawn.image + behind * grey for grey in _BACKDROPS]).clamp(0, 1)
@@ -313,11 +316,13 @@ def find_semantics(
         coarse = _reduced(torch.cat([image, opacity[..., None]], 2), small)
         fine = _pixel_features(basis, maps, coarse[..., :3], coarse[..., 3])
         trust = coarse[..., 3:] ** _TRUST
-        parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
-        pixels = torch.cat([fine * trust, trust], 2)
-        lifted = lift(*parts, camera_of(small, 0, near), pixels, antialiased=antialiased).features
-        sums += lifted[:, :dim]
-        weights += lifted[:, dim]
+        camera = camera_of(small, 0, near)
+        index = seen_by(gaussians, camera)
+        part = gaussians.select(index)
+        shape = (part.means, part.quaternions, part.log_scales, part.logits)
+        lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased).features
+        sums.index_add_(0, index, lifted[:, :dim])
+        weights.index_add_(0, index, lifted[:, dim])
         # Colours are those of single pixels of the whole picture: averages would have less contrast.
         height, width = fine.shape[:2]
         colour, seen = (each[::_COARSER, ::_COARSER][:height, :width].flatten(0, 1) for each in (image, opacity))
@@ -334,7 +339,9 @@ def find_semantics(
     ends = torch.cat(pairs)
     if len(style.share) > 1:
         style = style._replace(contacts=region_contacts(style, ends[..., 3:], ends[..., :3]))
-    features = _spread(gaussians.means, sums * _COARSER**2, weights * _COARSER**2, style.semantic_mean)
+    sums *= _COARSER**2
+    weights *= _COARSER**2
+    features = _spread(gaussians.means, sums, weights, style.semantic_mean)
     return Semantics(style, basis, features.half(), encoder.identity)
 
 
@@ -409,6 +416,7 @@ def _spread(
 
     A point far from whatever was seen takes `none`.
     """
+    parts = [slice(start, start + _ROWS) for start in range(0, len(points), _ROWS)]
     out, trust = sums.clone(), mass.clone()
     edge = _REACH * float(points.std()) if len(points) > 1 else 0.0
     for level in range(_LEVELS):
@@ -417,8 +425,14 @@ def _spread(
         total = sums.new_zeros(int(box.max()) + 1, sums.shape[1]).index_add_(0, box, sums)
         weight = sums.new_zeros(len(total)).index_add_(0, box, mass)
         share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)
-        out, trust = out + (total * share[:, None])[box], trust + (weight * share)[box]
-    return torch.where(trust[:, None] > 1e-6, out / trust.clamp_min(1e-12)[:, None], none)
+        total *= share[:, None]
+        trust += (weight * share)[box]
+        for rows in parts:
+            out[rows] += total[box[rows]]
+    for rows in parts:
+        some = trust[rows, None]
+        out[rows] = torch.where(some > 1e-6, out[rows] / some.clamp_min(1e-12), none)
+    return out
 
 
 def _ray_lengths(camera: Pinhole) -> Tensor:
