@@ -10,6 +10,7 @@ BENCHMARKS = {
     "cells": "captures in cells of Gaussians against one piece and blocks of fields",
     "decoders": "fidelity of decoders, and what a style loss buys",
     "district": "a district of 2000 images in cells: seconds, memory and killed workers",
+    "district_style": "a style on millions of Gaussians: seconds and memory, part by part, killed half-way",
     "evidence": "all pages of docs/evidence",
     "executors": "blocks on workers of Ray against one after the other",
     "exports": "exported files drawn again, against the field's own renders",
