@@ -4,6 +4,7 @@ import importlib
 import sys
 
 from fprf.errors import FprfError
+from fprf.process import keep_memory
 
 BENCHMARKS = {
     "blocks_scenes": "a capture in blocks against one field, for the same seconds",
@@ -57,6 +58,7 @@ def main(args: list[str]) -> int:
     if args[0] not in BENCHMARKS:
         print(f"error: {args[0]}: no such benchmark; allowed are {', '.join(BENCHMARKS)}", file=sys.stderr)
         return 2
+    keep_memory()  # as the command line does: else large gradients are mapped anew in every step
     try:
         return importlib.import_module(f".{args[0]}", __package__).main(args[1:]) or 0
     except FprfError as error:

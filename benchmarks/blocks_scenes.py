@@ -18,7 +18,6 @@ import torch
 from fprf.cli.parsing import load_method, parse
 from fprf.cli.train import train_scene
 from fprf.fields.layouts import SingleConfig
-from fprf.process import keep_memory
 from fprf.training.block_plan import lay_out, plan_scene
 from fprf.training.blocks import load_boxes
 from fprf.training.loading import load_run
@@ -38,7 +37,6 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
     own, flags_behind = split_flags(argv)
     options = parser.parse_args(own)
-    keep_memory()  # as the command line does: else large gradients are mapped anew in every step
     rest = flags_behind
     method, _ = load_method("fprf-lite")
     flags = ["--data", str(options.scene), "--minutes", str(options.minutes), *rest]

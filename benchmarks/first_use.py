@@ -29,7 +29,6 @@ from fprf.datamanagers.scene import Scene
 from fprf.evaluation.evaluate import judge
 from fprf.io.atomic import write_json
 from fprf.io.video import write_frames
-from fprf.process import keep_memory
 from fprf.training.loading import load_run
 
 from .common import arguments, origin, read_report, split_flags
@@ -46,7 +45,6 @@ def main(argv: list[str]) -> None:
     own, flags_behind = split_flags(argv)
     flags = flags_behind
     options = parser.parse_args(own)
-    keep_memory()
     for text in options.scenes:
         folder, _, count = text.partition(":")
         with tempfile.TemporaryDirectory() as scratch:

@@ -32,7 +32,6 @@ from fprf.fields.layouts import SingleConfig, StreetConfig
 from fprf.io.images import to_uint8, write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
-from fprf.process import keep_memory
 from fprf.style.config import StyleConfig
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
@@ -176,7 +175,6 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--scratch", type=Path, default=Path("runs/large_scene"))
     parser.add_argument("--output", type=Path, default=RESULTS / "large_scene.json")
     options = parser.parse_args(argv)
-    keep_memory()  # as the command line does: else large gradients are mapped anew in every step
     options.scratch = options.scratch.resolve()
     os.environ.setdefault("XDG_CACHE_HOME", str(options.scratch / "cache"))
     torch.manual_seed(0)

@@ -26,7 +26,6 @@ from fprf.cli.train import train_scene
 from fprf.config import TrainConfig
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.evaluation.evaluate import align, judge
-from fprf.process import keep_memory
 from fprf.rendering.cameras import Cameras
 from fprf.training.camera_optimizers import rotated
 from fprf.training.loading import load_run
@@ -121,7 +120,6 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
     own, flags_behind = split_flags(argv)
     options = parser.parse_args(own)
-    keep_memory()
     method, _ = load_method("fprf-lite")
     flags = ["--data", str(options.scene), "--steps", str(options.steps), "--device", "cpu", *flags_behind]
     base = with_downscale(parse(method, flags, prog="poses", description=""))

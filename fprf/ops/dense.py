@@ -50,8 +50,8 @@ def network_reference(
     if shared is not None and row is not None:
         x = torch.cat([x, shared.index_select(0, row)], -1)
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        x = torch.nn.functional.linear(x.relu() if layer > 0 else x, weight, bias)
-    return x.relu() if last == "relu" else x
+        x = torch.nn.functional.linear(x.relu_() if layer > 0 else x, weight, bias)
+    return x.relu_() if last == "relu" else x
 
 
 def network(

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from ...errors import PluginError
 from ...interfaces import Executor
+from ...process import keep_memory
 from .config import RayConfig
 
 Task = TypeVar("Task")
@@ -52,6 +53,7 @@ class RayExecutor(Executor):
             )
 
         def work(task: Task) -> Result:  # Ray takes functions alone, and not every callable is one
+            keep_memory()
             return function(task)
 
         remote = ray.remote(**resources(self.config))(work)
