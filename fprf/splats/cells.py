@@ -38,9 +38,9 @@ _LEAST, _ROOM = 64, 6
 _OUTLIERS = 0.01
 _DEVIATIONS = 3.0
 """A Gaussian is shown as far as so many standard deviations from its mean."""
-_RUN, _COARSER, _WEIGHT = 256, 4, 0.003
-"""Gaussians that are looked for together; windows are drawn at this part of their size to see what they show; the least that
-the weights of a Gaussian in all pixels of one sum to."""
+_RUN, _LOOKED, _COARSER, _WEIGHT = 256, 40, 4, 0.003
+"""Gaussians that are looked for together; windows that are drawn to see what they show, at most, evenly over all; the part of
+their size at which they are; the least that the weights of a Gaussian in all pixels of one sum to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,8 @@ class Cell:
         logits = gaussians.logits[order]
         logits.view(-1)[len(gaussians) :] = -math.inf  # the last one, repeated
         shown = torch.zeros(order.shape, dtype=torch.bool)
-        for view in self.windows:
+        views = list(self.windows)
+        for view in views[:: -(-len(views) // _LOOKED)]:
             camera = cover(cameras.select(torch.tensor([view])).scaled(_COARSER), 0, near)[0]
             runs = torch.from_numpy(in_view(camera, centre, radius)[1]).nonzero()[:, 0]
             mean, quaternion, log_scale = (x[runs].flatten(0, 1) for x in (means, quaternions, log_scales))
