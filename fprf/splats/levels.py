@@ -321,6 +321,6 @@ def _rows(gaussians: Gaussians) -> Annotated[Tensor, "N 11+3K"]:
 
 
 def _gaussians(rows: Annotated[Tensor, "N 11+3K"]) -> Gaussians:
-    harmonics = rows[:, 11:].unflatten(1, ((rows.shape[1] - 11) // 3, 3))
+    harmonics = rows[:, 11:].reshape(len(rows), (rows.shape[1] - 11) // 3, 3)
     parts = (rows[:, :3], rows[:, 3:7], rows[:, 7:10], rows[:, 10], harmonics)
     return Gaussians(*(part.contiguous() for part in parts))
