@@ -18,10 +18,15 @@ from ...interfaces import Stylizer
 from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
-from ...style.matching import Keys, Matching, match_keys
+from ...style.matching import Keys, Matching, match_keys, unit
 from ...style.scene import SceneStyle, check_fit, membership, own_style, region_units
 from ...style.statistics import deviation, monge
 from ...types import Want
+
+_UNMATCHED, _MATCHED = 0.1, 0.4
+"""Cosines with the nearest code, from the scene's mean: up to the first a region is unmatched, from the second on matched."""
+_SIMILAR = 0.2
+"""Squared distance of contents, in total variances of the scene, at which the weight of another region falls to 1/e."""
 
 
 def region_table(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:
@@ -171,7 +176,24 @@ def _matched(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching)
     if len(scene.keys) == 1 or scene.keys.shape[1] == 0:
         return odds.expand(len(scene.keys), -1)
     here, there = Keys(scene.keys, scene.share), Keys(dictionary.keys, odds)
-    return match_keys(here, there, matching, dictionary.weight, dictionary.origin)
+    table = match_keys(here, there, matching, dictionary.weight, dictionary.origin)
+    score = (unit(scene.keys, scene.semantic_mean) @ unit(dictionary.keys, scene.semantic_mean).T).amax(1)
+    return _replace_unmatched(table, scene, (double(score) - _UNMATCHED) / (_MATCHED - _UNMATCHED))
+
+
+def _replace_unmatched(
+    table: Annotated[Tensor, "K T"], scene: SceneStyle, trust: Annotated[Tensor, "K"]
+) -> Annotated[Tensor, "K T"]:
+    """Rows of regions that are not in the references, by those of matched regions of similar content.
+
+    The softmax gives such a region whichever code is the least unlike: sky between twigs the colour of a lamp.
+    """
+    trust = trust.clamp(0, 1)
+    mean = double(scene.region_mean)
+    distance = torch.cdist(mean, mean).square() / double(scene.covariance).trace().clamp_min(1e-12)
+    weight = torch.exp(-distance / _SIMILAR) * (trust * double(scene.share))
+    total = weight.sum(1, keepdim=True)
+    return torch.where(total > 0, torch.lerp(weight / total.clamp_min(1e-30) @ table, table, trust[:, None]), table)
 
 
 def _mixed(d: StyleDictionary, table: Tensor) -> Side:

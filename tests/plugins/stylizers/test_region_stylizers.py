@@ -95,6 +95,22 @@ def test_smoothness_makes_regions_alike_that_meet(config: Config) -> None:
     assert torch.equal(*alone), "what is pinned takes from no neighbour that is not"
 
 
+@pytest.mark.parametrize("like", [0, 1])
+def test_a_region_that_no_reference_shows_takes_the_codes_of_one_that_looks_like_it(like: int) -> None:
+    _, _, scene, d = setting()
+    other = 1 - like
+    near = d._replace(keys=scene.keys[torch.arange(len(d.keys)) % 2])
+    mean = scene.region_mean.clone()
+    mean[2] = mean[like]
+    mean[other] = mean[like] + 100.0
+    shown = region_table(scene._replace(region_mean=mean), near, Matching(0.4, "cosine"))
+    torch.testing.assert_close(shown[2], shown[like], rtol=0.0, atol=1e-6)
+    assert float((shown[2] - shown[other]).abs().sum()) > 0.5
+    torch.testing.assert_close(shown[:2], plain_table(scene, near, 0.4)[:2], rtol=1e-6, atol=1e-9)
+    alone = region_table(scene._replace(share=torch.tensor([0.0, 0.0, 1.0])), near, Matching(0.4, "cosine"))
+    assert bool(alone.isfinite().all()), "no region to take from"
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     st.integers(1, 25),
