@@ -51,8 +51,8 @@ _SAMPLES = 65_536
 """Pixels of all views together that statistics are taken of, about."""
 _COARSER = 2
 """Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
-_ROWS = 1 << 17
-"""Gaussians of which there is a second copy of anything at a time."""
+_TOGETHER = 8
+"""Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
 _NEIGHBOURS, _LEVELS, _REACH = 1.0, 8, 0.02
 """Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the edge of the
 nearest one, as a share of the spread of the positions."""
@@ -318,8 +318,7 @@ def find_semantics(
         trust = coarse[..., 3:] ** _TRUST
         camera = camera_of(small, 0, near)
         index = seen_by(gaussians, camera)
-        part = gaussians.select(index)
-        shape = (part.means, part.quaternions, part.log_scales, part.logits)
+        shape = (x[index] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits))
         lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased).features
         sums.index_add_(0, index, lifted[:, :dim])
         weights.index_add_(0, index, lifted[:, dim])
@@ -342,7 +341,7 @@ def find_semantics(
     sums *= _COARSER**2
     weights *= _COARSER**2
     features = _spread(gaussians.means, sums, weights, style.semantic_mean)
-    return Semantics(style, basis, features.half(), encoder.identity)
+    return Semantics(style, basis, features, encoder.identity)
 
 
 def semantics_tensors(found: Semantics) -> dict[str, Tensor]:
@@ -412,26 +411,26 @@ def _reduced(pixels: Annotated[Tensor, "H W C"], cameras: Cameras) -> Annotated[
 def _spread(
     points: Annotated[Tensor, "N 3"], sums: Annotated[Tensor, "N D"], mass: Annotated[Tensor, "N"], none: Annotated[Tensor, "D"]
 ) -> Annotated[Tensor, "N D"]:
-    """Means at points, drawn to those of ever larger neighbourhoods, which decide where little was seen.
+    """Means at points, drawn to those of ever larger neighbourhoods, which decide where little was seen: half precision.
 
     A point far from whatever was seen takes `none`.
     """
-    parts = [slice(start, start + _ROWS) for start in range(0, len(points), _ROWS)]
-    out, trust = sums.clone(), mass.clone()
+    trust, levels = mass.clone(), []
     edge = _REACH * float(points.std()) if len(points) > 1 else 0.0
     for level in range(_LEVELS):
         box = ((points - points.amin(0)) / max(edge * 2**level, 1e-30)).clamp_max(2.0**20).long()
         _, box = torch.unique((box[:, 0] << 42) + (box[:, 1] << 21) + box[:, 2], return_inverse=True)
-        total = sums.new_zeros(int(box.max()) + 1, sums.shape[1]).index_add_(0, box, sums)
-        weight = sums.new_zeros(len(total)).index_add_(0, box, mass)
+        weight = sums.new_zeros(int(box.max()) + 1).index_add_(0, box, mass)
         share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)
-        total *= share[:, None]
         trust += (weight * share)[box]
-        for rows in parts:
-            out[rows] += total[box[rows]]
-    for rows in parts:
-        some = trust[rows, None]
-        out[rows] = torch.where(some > 1e-6, out[rows] / some.clamp_min(1e-12), none)
+        levels.append((box.int(), share))
+    out = torch.empty(sums.shape, dtype=torch.float16)
+    for some in torch.arange(sums.shape[1]).split(_TOGETHER):
+        part = sums[:, some]
+        mean = part.clone()
+        for box, share in levels:
+            mean += (sums.new_zeros(len(share), len(some)).index_add_(0, box, part) * share[:, None])[box]
+        out[:, some] = torch.where(trust[:, None] > 1e-6, mean / trust.clamp_min(1e-12)[:, None], none[some]).half()
     return out
 
 
