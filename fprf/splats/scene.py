@@ -318,7 +318,7 @@ def find_semantics(
         trust = coarse[..., 3:] ** _TRUST
         camera = camera_of(small, 0, near)
         index = seen_by(gaussians, camera)
-        shape = (x[index] for x in (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits))
+        shape = (gaussians.means[index], gaussians.quaternions[index], gaussians.log_scales[index], gaussians.logits[index])
         lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased).features
         sums.index_add_(0, index, lifted[:, :dim])
         weights.index_add_(0, index, lifted[:, dim])
@@ -425,7 +425,7 @@ def _spread(
         trust += (weight * share)[box]
         levels.append((box.int(), share))
     out = torch.empty(sums.shape, dtype=torch.float16)
-    for some in torch.arange(sums.shape[1]).split(_TOGETHER):
+    for some in torch.split(torch.arange(sums.shape[1]), _TOGETHER):
         part = sums[:, some]
         mean = part.clone()
         for box, share in levels:
