@@ -40,12 +40,14 @@ from .learner import Learner
 from .photographs import make_levels
 from .training import CUT, Prepared, clear_of, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
 
-_FORMAT, _VIEWS = 5, "views.json"
+_FORMAT, _VIEWS = 6, "views.json"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
 _MOMENTS = "first", "second", "weight"
 _PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
+_RATE = 0.5
+"""Factor of the learning rates in cells, whose windows are seen more often than the photographs of the whole scene."""
 _VISITS = 10
 """Times that the whole scene sees each of them, at least, however few `steps` there are: cells do not make up for fewer."""
 
@@ -222,7 +224,8 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
         if _read_done(folder) == asked:
             return False
         _begin(folder, named)
-        own = replace(config, steps=max(1, round((1 - config.overview) * config.steps)), minutes=task.minutes)
+        steps = max(1, round((1 - config.overview) * config.steps))
+        own = replace(config, rate=_RATE * config.rate, steps=steps, minutes=task.minutes)
         facts = Run(root).load_known().facts
         train(own, _prepared(own, scene, facts, cell, start), Run(folder), report, spent=0.0)
         write_json(folder / "done.json", asked)

@@ -94,7 +94,7 @@ class GaussiansConfig(RunConfig):
     cells: int = 1
     """Parts of space that are trained apart, each with a part of the time and of the Gaussians; 1 = none. More need points of a
     reconstruction."""
-    overview: float = 0.8
+    overview: float = 0.9
     """Share of steps and minutes in which the whole scene is trained at half the size before its cells go on from there."""
     executor: ExecutorConfig = SerialConfig()
     """Executor that trains cells: one after the other, or several at a time."""
