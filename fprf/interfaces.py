@@ -165,6 +165,14 @@ class Stylizer(nn.Module, ABC):
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """Attention of each point to each style code; rows sum to 1."""
 
+    @property
+    def region_match(self) -> Annotated[Tensor, "K T"] | None:
+        """Share of each style code in each of the scene's regions; None where regions take what `match` says of their keys.
+
+        For stylizers that mix regions point by point: their keys, which belong to several regions, would be mixed twice.
+        """
+        return None
+
 
 Values: TypeAlias = Callable[[Annotated[Tensor, "M D"], Annotated[Tensor, "M 3"] | None], Annotated[Tensor, "M X"]]
 """Anything that follows from semantics, and from positions in the world where they are given."""

@@ -75,6 +75,22 @@ def test_colours_get_mean_and_covariance_of_their_match() -> None:
         assert torch.allclose(torch.cov(own.T), d.colour_covariance[taken].double(), atol=0.2 * float(own.var(0).max()))
 
 
+def test_regions_that_overlap_take_the_colours_that_they_match() -> None:
+    """Their keys belong to several regions: what the stylizer says of these is mixed already, and would be mixed again."""
+    content, semantic, _ = points(0)
+    semantic = semantic + 2 * torch.randn(COUNT, 4, generator=torch.Generator().manual_seed(5))
+    scene = scene_style(content, semantic, torch.ones(COUNT), None, 24, 0)
+    d = build_dictionary([reference(1)], clusters=KINDS, blend=0.0)
+    stylizer = RegionToneConfig(temperature=1e-3, features=0.0, smoothness=0.0).build(dictionary=d, scene=scene)
+    table = stylizer.region_match
+    assert table is not None and (stylizer.match(scene.keys) - table).abs().max() > 0.05
+    maps = colour_maps(stylizer, d, scene, Straight(), features=0.0)
+    assert maps is not None and d.colour_mean is not None
+    mean = scene.region_mean[:, :3]
+    moved = mean + torch.einsum("kc,kcd->kd", mean, maps.matrix) + maps.bias
+    assert torch.allclose(moved, table @ d.colour_mean, atol=2e-3)
+
+
 def test_nothing_asked_nothing_made() -> None:
     *_, scene, d = setting()
     stylizer = RegionToneConfig().build(dictionary=d, scene=scene)

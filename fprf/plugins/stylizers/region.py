@@ -150,6 +150,11 @@ class TwoSidedStylizer(Stylizer):
     def needs(self) -> Want:
         return Want.CONTENT if len(self.units) == 1 else Want.CONTENT | Want.SEMANTIC
 
+    @property
+    def region_match(self) -> Annotated[Tensor, "K T"]:
+        """The table of the plan."""
+        return self.table
+
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """Each point by the maps of the regions that it belongs to."""
         return self.shared(content, semantic)[0]
