@@ -1,7 +1,6 @@
 """`fprf train [METHOD|CONFIG.json]`: train a scene, or go on where a run stopped."""
 
 import contextlib
-import importlib.util
 import shlex
 import time
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from ..errors import UsageError
 from .blocks import train_blocks
 from .parsing import LIST_FLAGS, load_method, methods, parse
 from .progress import EventLog
+from .view import check_viewer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,10 +55,9 @@ def take_view(args: Sequence[str]) -> "tuple[list[str], ViewAddress | None]":
 
 def open_view(address: "ViewAddress") -> "LiveViewer":
     """Start the viewer's process. Raises UsageError where it cannot listen."""
+    check_viewer(VIEW, f", or train without {VIEW}")
     from ..viewer.live import LiveViewer
 
-    if importlib.util.find_spec("viser") is None:
-        raise UsageError(f"{VIEW}: needs viser; install it with pip install 'fprf[viewer]', or train without {VIEW}")
     return LiveViewer(address)
 
 

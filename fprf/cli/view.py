@@ -66,8 +66,7 @@ def run(args: list[str]) -> int:
     """Serve until interrupted."""
     description = "Look at a run in the browser; without one, make a scene there of photographs, a video or a capture."
     config = parse(ViewConfig(), args, prog="fprf view", description=description, positional=("run",))
-    if importlib.util.find_spec("viser") is None:
-        raise UsageError("fprf view: needs viser; install it with pip install 'fprf[viewer]'")
+    check_viewer("fprf view")
     from ..viewer.server import ViewerServer, make_access
 
     access = make_access(config.host, config.token)
@@ -93,6 +92,13 @@ def run(args: list[str]) -> int:
             last.start()
             raise
     return 0
+
+
+def check_viewer(asked: str, otherwise: str = "") -> None:
+    """Raise UsageError where packages of the extra `viewer` are missing."""
+    missing = [name for name in ("viser", "uvicorn", "websockets") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError(f"{asked}: needs {', '.join(missing)}; install with pip install 'fprf[viewer]'{otherwise}")
 
 
 def _photographs(references: Sequence[Path]) -> Sequence[Path]:

@@ -113,9 +113,16 @@ def test_a_cluster_is_started_with_a_token_and_without_usage_statistics(capsys: 
     assert all("RAY_USAGE_STATS_ENABLED=0" in line and "RAY_AUTH_MODE=token" in line for line in starts)
 
 
-def test_without_viser_view_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.parametrize("absent", [["uvicorn"], ["viser", "uvicorn", "websockets"]])
+def test_without_its_packages_view_says_what_to_install(
+    absent: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert cli.main(["view", str(tmp_path)]) == 2
-    assert "pip install 'fprf[viewer]'" in capsys.readouterr().err
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in absent else object())
+    for line in (
+        ["view", str(tmp_path)],
+        ["train", "fprf-splats", "--data", "town", "--output", str(tmp_path / "run"), "--view"],
+    ):
+        assert cli.main(line) == 2
+        told = capsys.readouterr().err
+        assert f"needs {', '.join(absent)};" in told and "pip install 'fprf[viewer]'" in told
+    assert not (tmp_path / "run").exists()

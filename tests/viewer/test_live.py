@@ -16,6 +16,8 @@ from stand_in_viewers import DEAD, DEAF, GREEDY, NONSENSE, QUIET, REFUSED, viewe
 from tiny_world import World
 
 from fprf.errors import UsageError
+
+pytest.importorskip("uvicorn", reason="the extra `viewer` is not installed")
 from fprf.training.loading import Trained
 from fprf.training.trainer import Report
 from fprf.viewer import live

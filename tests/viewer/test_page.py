@@ -11,6 +11,8 @@ from photographs import viewed
 from tiny_world import World
 
 from fprf.errors import DataError, UsageError
+
+pytest.importorskip("uvicorn", reason="the extra `viewer` is not installed")
 from fprf.viewer.cameras import CameraState
 from fprf.viewer.page import Page, described
 from fprf.viewer.server import Request, Response
