@@ -165,13 +165,13 @@ class Stylizer(nn.Module, ABC):
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         """Attention of each point to each style code; rows sum to 1."""
 
-    @property
-    def region_match(self) -> Annotated[Tensor, "K T"] | None:
-        """Share of each style code in each of the scene's regions; None where regions take what `match` says of their keys.
+    def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
+        """Share of each style code in each of the scene's regions, whose mean semantics are `keys`; rows sum to 1.
 
-        For stylizers that mix regions point by point: their keys, which belong to several regions, would be mixed twice.
+        A stylizer that mixes regions point by point returns what it mixes: `match` of the keys, which lie in several regions,
+        is mixed already.
         """
-        return None
+        return self.match(keys)
 
 
 Values: TypeAlias = Callable[[Annotated[Tensor, "M D"], Annotated[Tensor, "M 3"] | None], Annotated[Tensor, "M X"]]

@@ -54,7 +54,7 @@ def take_view(args: Sequence[str]) -> "tuple[list[str], ViewAddress | None]":
 
 
 def open_view(address: "ViewAddress") -> "LiveViewer":
-    """Start the viewer's process. Raises UsageError where it cannot listen."""
+    """Start the viewer's process. Raises UsageError where packages are missing or it cannot listen."""
     check_viewer(VIEW, f", or train without {VIEW}")
     from ..viewer.live import LiveViewer
 

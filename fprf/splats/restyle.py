@@ -18,7 +18,7 @@ from ..interfaces import Encoder, Stylizer
 from ..ops.harmonics import Directions, recoloured
 from ..ops.precision import double
 from ..plugins.stylizers.config import StylizerConfig
-from ..style.colours import ColourMaps, carried_colours, region_match
+from ..style.colours import ColourMaps, carried_colours
 from ..style.controls import luma, place_weight
 from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
@@ -120,7 +120,7 @@ def region_maps(
         return None
     # Matched with itself as with the photographs, the scene keeps its colours.
     mine = own_style(style, dictionary.blend)._replace(origin=dictionary.origin)
-    table = region_match(config.build(dictionary=mine, scene=style), style)
+    table = double(config.build(dictionary=mine, scene=style).region_match(style.keys))
     mean, covariances = table @ double(mine.mean), torch.einsum("kt,tij->kij", table, double(mine.covariance))
-    taken = region_match(stylizer, style)
+    taken = double(stylizer.region_match(style.keys))
     return ColourMaps(style, *carried_colours(mean, covariances, taken, dictionary), config.colours)

@@ -103,14 +103,8 @@ def colour_maps(
     mean, covariances = blend_codes(mean, covariances, *whole, at)
     if smoothing is not None:
         mean, covariances = smoothing.to(mean) @ mean, torch.einsum("kl,lij->kij", smoothing.to(mean), covariances)
-    table = region_match(stylizer, scene).to(mean)
+    table = double(stylizer.region_match(scene.keys.to(_device(stylizer, scene)))).to(mean)
     return ColourMaps(scene, *carried_colours(mean, covariances, table, dictionary), share)
-
-
-def region_match(stylizer: Stylizer, scene: SceneStyle) -> Annotated[Tensor, "K T"]:
-    """Share of each style code in each region, float64."""
-    known = stylizer.region_match
-    return double(stylizer.match(scene.keys.to(_device(stylizer, scene))) if known is None else known)
 
 
 def carried_colours(

@@ -149,11 +149,10 @@ def check_stylizer(config: StylizerConfig) -> None:
         tensor(match, (11, codes), f"{name}.match")
         whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(11), 1e-4)
         require(whole, f"{name}.match: rows must be shares that sum to 1")
-        known = stylizer.region_match
-        if known is not None:
-            tensor(known, (regions, codes), f"{name}.region_match")
-            whole = bool((known >= 0).all()) and close(known.sum(1), torch.ones(regions), 1e-4)
-            require(whole, f"{name}.region_match: rows must be shares that sum to 1")
+        match = stylizer.region_match(cases.scene(regions, 8, dims).keys)
+        tensor(match, (regions, codes), f"{name}.region_match")
+        whole = bool((match >= 0).all()) and close(match.sum(1), torch.ones(regions), 1e-4)
+        require(whole, f"{name}.region_match: rows must be shares that sum to 1")
         _stylizer_follows(stylizer.double(), content.double(), semantic.double(), name)
     if config.handles_allowed_references:
         both = cases.dictionary(4, 8, 4)._replace(reference=torch.tensor([0, 0, 1, 1]), names=("one", "other"))

@@ -82,8 +82,8 @@ def test_regions_that_overlap_take_the_colours_that_they_match() -> None:
     scene = scene_style(content, semantic, torch.ones(COUNT), None, 24, 0)
     d = build_dictionary([reference(1)], clusters=KINDS, blend=0.0)
     stylizer = RegionToneConfig(temperature=1e-3, features=0.0, smoothness=0.0).build(dictionary=d, scene=scene)
-    table = stylizer.region_match
-    assert table is not None and (stylizer.match(scene.keys) - table).abs().max() > 0.05
+    table = stylizer.region_match(scene.keys)
+    assert (stylizer.match(scene.keys) - table).abs().max() > 0.05
     maps = colour_maps(stylizer, d, scene, Straight(), features=0.0)
     assert maps is not None and d.colour_mean is not None
     mean = scene.region_mean[:, :3]

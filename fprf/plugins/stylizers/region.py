@@ -150,11 +150,6 @@ class TwoSidedStylizer(Stylizer):
     def needs(self) -> Want:
         return Want.CONTENT if len(self.units) == 1 else Want.CONTENT | Want.SEMANTIC
 
-    @property
-    def region_match(self) -> Annotated[Tensor, "K T"]:
-        """The table of the plan."""
-        return self.table
-
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """Each point by the maps of the regions that it belongs to."""
         return self.shared(content, semantic)[0]
@@ -171,6 +166,10 @@ class TwoSidedStylizer(Stylizer):
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         with full_precision(semantic):
             return self._membership(semantic) @ self.table
+
+    def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
+        """The table of the plan."""
+        return self.table
 
     def _membership(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N K"]:
         return membership(semantic.to(self.units), self.semantic_mean, self.units, self.softness)
