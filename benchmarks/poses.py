@@ -1,13 +1,13 @@
 """Poses that are off, and what refining them wins back.
 
-    python -m benchmarks poses [SCENE] [--steps 3000] [--degrees 0.5] [--share 0.005] [--output FILE] -- [any field]
+    python -m benchmarks poses [SCENE] [--method NAME] [--steps 3000] [--degrees 0.5] [--share 0.005] [--output FILE] -- [field]
 
 Without a scene, the embedded town. Its training views are turned by so many degrees about random axes and shifted by a share of
 the cameras' extent in random directions; then it is trained with its true poses, with the wrong ones, and with the wrong ones
 refined, for the same steps. A folder whose poses are not exact (`--as-given`) is trained as it is, with and without refining.
 
 Held-out views are judged where they were taken (true poses; the scene may lie a little elsewhere, where its training views put
-it) and with their own pose fitted to their image (`fprf.evaluation.evaluate`): both for all sides. Errors of poses are those
+it) and with their own pose fitted to their image (`fprf eval --fit-poses`): both for all sides. Errors of poses are those
 of the training views, after the similarity that brings their centres nearest to the true ones.
 """
 
@@ -21,15 +21,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fprf.cli.eval import EvalConfig
 from fprf.cli.parsing import load_method, parse
-from fprf.cli.train import train_scene
-from fprf.config import TrainConfig
+from fprf.config import RunConfig, TrainConfig
 from fprf.datamanagers.parsers.config import parse_scene
-from fprf.evaluation.evaluate import align, judge
 from fprf.rendering.cameras import Cameras
 from fprf.training.camera_optimizers import rotated
-from fprf.training.loading import load_run
-from fprf.training.prepare import with_downscale
+from fprf.training.loading import open_run
 
 from .common import add_entry, arguments, split_flags
 
@@ -85,23 +83,24 @@ def errors(found: Cameras, true: Cameras, views: Tensor) -> dict[str, float]:
     }
 
 
-def run_one(config: TrainConfig, true: Cameras | None) -> dict[str, Any]:
-    """Train and judge."""
+def run_one(config: RunConfig, method: str, true: Cameras | None) -> dict[str, Any]:
+    """Train and judge, by the verbs that users call."""
     assert config.output is not None
-    train_scene(config, "fprf-lite", quiet=True)
-    run = load_run(config.output, "cpu")
-    scene = parse_scene(config.data, config.downscale, config.datamanager.parser)
-    given, _ = judge(run, scene, scene.test.tolist(), lambda done, total, what: None)
-    fitted, moves = align(run, scene, scene.test.tolist())
-    after, _ = judge(fitted, scene, scene.test.tolist(), lambda done, total, what: None)
+    verbs = config.verbs()
+    verbs.train(method, quiet=True)
+    asked = EvalConfig(run=config.output, images=False, device="cpu")
+    given = verbs.evaluate(asked)
+    after: dict[str, Any] = verbs.evaluate(replace(asked, fit_poses=True))
     result = {
         "psnr": given["psnr"],
         "psnr_poses_fitted": after["psnr"],
-        "fitted_turn_degrees": math.degrees(statistics.mean(float(move[:3].norm()) for move in moves.values())),
-        "steps": run.step,
+        "fitted_turn_degrees": statistics.mean(move["turn_degrees"] for move in after["fitted_poses"].values()),
+        "steps": given["train_steps"],
+        "seconds": given["train_seconds"],
     }
     if true is not None:
-        result["training_views"] = errors(run.known.cameras, true, scene.train)
+        known = open_run(config.output, "cpu").known
+        result["training_views"] = errors(known.cameras, true, torch.tensor(known.train))
     print(config.output.name, json.dumps(result), flush=True)
     return result
 
@@ -110,6 +109,7 @@ def main(argv: list[str]) -> None:
     parser = arguments("poses", __doc__)
     parser.add_argument("scene", type=Path, nargs="?", default=Path("town"))
     parser.add_argument("--as-given", action="store_true", help="the scene's poses are refined as they are")
+    parser.add_argument("--method", default="fprf-lite")
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--rate", type=float, default=0.015, help="`--poses` of the refined side")
     parser.add_argument("--degrees", type=float, default=0.5)
@@ -120,17 +120,20 @@ def main(argv: list[str]) -> None:
     parser.add_argument("--output", type=Path, help="JSON file that the figures are added to, under the scene's name")
     own, flags_behind = split_flags(argv)
     options = parser.parse_args(own)
-    method, _ = load_method("fprf-lite")
-    flags = ["--data", str(options.scene), "--steps", str(options.steps), "--device", "cpu", *flags_behind]
-    base = with_downscale(parse(method, flags, prog="poses", description=""))
-    assert base.downscale is not None
-    source = parse_scene(base.data, 1, base.datamanager.parser).paths[0].parents[1]
+    method, _ = load_method(options.method)
+    flags = ["--data", str(options.scene), "--steps", str(options.steps), *flags_behind]
+    base = parse(method, flags, prog="poses", description="")
+    base = replace(base, downscale=base.downscale or 1)
+    source = base.read_scene().paths[0].parents[1]
     scratch = options.scratch.resolve() / source.name
     true = None if options.as_given else parse_scene(source, base.downscale, None).cameras
     data = (
         source if options.as_given else perturbed(source, scratch / "perturbed", options.degrees, options.share, options.seed)
     )
-    plain = replace(base, datamanager=replace(base.datamanager, parser=None))
+    if isinstance(base, TrainConfig):
+        plain: RunConfig = replace(base, device="cpu", datamanager=replace(base.datamanager, parser=None))
+    else:
+        plain = replace(base, parser=None)
     sides = {
         "true": replace(plain, data=source),
         "wrong": replace(plain, data=data),
@@ -145,6 +148,7 @@ def main(argv: list[str]) -> None:
     if true is not None:
         result |= {"degrees": options.degrees, "share_of_extent": options.share, "extent": extent(true)}
     for side in options.sides:
-        result[side] = run_one(replace(sides[side], output=scratch / side), true)
+        result[side] = run_one(replace(sides[side], output=scratch / options.method / side), options.method, true)
     if options.output is not None:
-        add_entry(options.output, source.name, result)
+        name = source.name if options.method == "fprf-lite" else f"{source.name} {options.method}"
+        add_entry(options.output, name, result)

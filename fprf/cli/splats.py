@@ -52,13 +52,12 @@ class SplatVerbs(Verbs):
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         import torch
 
-        from ..evaluation.evaluate import judge_views
-        from ..splats.training import load_tones, open_gaussians, scene_of
+        from ..evaluation.evaluate import described, judge_views
+        from ..splats.training import fit_poses, load_tones, open_gaussians, scene_of
+        from ..training.camera_optimizers import moved_cameras
         from ..training.run import view_names
         from .eval import store
 
-        if config.fit_poses:
-            raise UsageError("--fit-poses: is for runs of fields; leave it out")
         opened = open_gaussians(config.run, self.config, config)
         data, known = config.data or self.config.data, opened.known
         scene = scene_of(replace(self.config, data=data))
@@ -77,7 +76,13 @@ class SplatVerbs(Verbs):
             return replace(shown, tone=(red, green, blue)).render(known.cameras, view)
 
         with Display() as display:
+            if config.fit_poses:
+                display.say(f"fitting the poses of {len(views)} views")
+                moves = fit_poses(self.config, scene, opened, list(views))
+                known = replace(known, cameras=moved_cameras(known.cameras, moves))
             scores, images = judge_views(known, scene, views, draw, display.count, masks=self.config.masks)
+        if config.fit_poses:
+            scores["fitted_poses"] = {known.names[view]: described(moves[view]) for view in views}
         scores |= {"train_seconds": opened.seconds, "train_steps": opened.step, "gaussians": len(shown.gaussians)}
         return store(config, known, opened.method, views, scores, images)
 

@@ -73,7 +73,7 @@ def fit_gaussians(
             seconds = 60 * minutes
         else:
             before = learner
-            learner = Learner(replace(config, coarse=0.0), levels, reach, cap, colours_only=True)
+            learner = Learner(replace(config, coarse=0.0), levels, reach, cap, only="colours")
             learner.start_from(before.gaussians())
             seconds = 60 * minutes * _COLOURS
         start, step, share = time.perf_counter(), 0, 0.0

@@ -8,7 +8,7 @@ order on any number of threads.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg, var-annotated"
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -56,6 +56,8 @@ from .threads import on_threads
 SUMS = LANES
 GEOMETRY = 6
 """Sums of an entry that are about its shape; those of channels follow."""
+CAMERA = 6
+"""Degrees of freedom of a camera."""
 _LOG_MAX = math.log2(MAX_ALPHA)
 _HUGE = 1e16
 _BETAS = 0.9, 0.99
@@ -285,9 +287,11 @@ def _direction_slopes(x, y, z, bands, blocks, at, red, green, blue):
 
 
 def _block_gradient(blocks, at, bands, view, summed):
-    """The gradient of the parameters of a block, a vector a row, from sums: shape (6), colour, depth.
+    """The gradient of the parameters of a block, a vector a row, from sums: shape (6), colour, depth; and its part of the
+    gradient of the camera: the turn about its own centre (rotation vector in camera axes), and the shift in the world.
 
     Sigma' = -Sigma^-1 G Sigma^-1 turns the shape's sums into those of the covariance; then back through `footprint` and `axes`.
+    A camera that turns and shifts sees what it would see if all Gaussians did the opposite.
     """
     mean, centre, scales, (qw, qx, qy, qz, q_inverse), world, camera = axes(blocks, at, view)
     (u, v, near_u, near_v, inverse, fx, fy), (j00, j01, j02, j10, j11, j12), (xx0, yy0, xy, det0) = footprint(
@@ -328,6 +332,9 @@ def _block_gradient(blocks, at, bands, view, summed):
         for r in range(3)
     ]
     of_scales = [n[0][c] * world[c] + n[1][c] * world[3 + c] + n[2][c] * world[6 + c] for c in range(3)]
+    pairs = [(centre, (g_x, g_y, g_z))]
+    pairs += [(camera[c::3], g) for c, g in enumerate(((h00, h10, b0), (h01, h11, b1), (h02, h12, b2)))]
+    of_turn = [sum(g[(r + 1) % 3] * a[(r + 2) % 3] - g[(r + 2) % 3] * a[(r + 1) % 3] for a, g in pairs) for r in range(3)]
 
     # Quaternion: of the unit one, then across it.
     (n00, n01, n02), (n10, n11, n12), (n20, n21, n22) = ([each * s for each, s in zip(row, scales, strict=True)] for row in n)
@@ -351,17 +358,22 @@ def _block_gradient(blocks, at, bands, view, summed):
         for r, (g, d) in enumerate(((gx, dx), (gy, dy), (gz, dz)))
     ]
     of_shape = [where_greater(drawn, 0, each, 0) for each in (*of_means, *of_scales, *of_quaternion)]
-    return [*of_shape, s0 * (1 - opacity(load(blocks, at + 10 * LANES))), *(b * each for b in values for each in colours)]
+    of_camera = [where_greater(drawn, 0, each, 0) for each in (*of_turn, *(-each for each in of_means))]
+    of_colours = (b * each for b in values for each in colours)
+    return [*of_shape, s0 * (1 - opacity(load(blocks, at + 10 * LANES))), *of_colours], of_camera
 
 
 @traced
-def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates):
+def _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera):
     at = start * (FIXED + 3 * bands)
     w = load(weight, start)
     w = w + (1 - _BETAS[1]) * (1 - w)
     store(weight, start, w)
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 3]
-    for row, g in enumerate(_block_gradient(blocks, at, bands, view, [*summed, 0])):
+    rows, of_view = _block_gradient(blocks, at, bands, view, [*summed, 0])
+    for row, g in enumerate(of_view):
+        store(of_camera, start * CAMERA + row * LANES, g)
+    for row, g in enumerate(rows):
         o = at + row * LANES
         m, s = load(first, o), load(second, o)
         m = m + (1 - _BETAS[0]) * (g - m)
@@ -374,7 +386,7 @@ def _learn_block(blocks, first, second, weight, start, bands, view, memory, rate
 @traced
 def _write_gradient(blocks, at, bands, view, memory, out):
     summed = transposed([load(memory, lane * LANES) for lane in range(LANES)])[: GEOMETRY + 4]
-    for row, g in enumerate(_block_gradient(blocks, at, bands, view, summed)):
+    for row, g in enumerate(_block_gradient(blocks, at, bands, view, summed)[0]):
         store(out, at + row * LANES, g)
 
 
@@ -414,7 +426,7 @@ def _gradients(bands):
 
 def _adam(bands):
     @jit
-    def adam(counters, blocks, first, second, weight, count, view, found, first_slot, rates):
+    def adam(counters, blocks, first, second, weight, count, view, found, first_slot, rates, of_camera):
         memory = stack(_BLOCK)
         while True:
             begin = take(counters, 0) * BLOCKS * LANES
@@ -423,7 +435,7 @@ def _adam(bands):
             for start in range(begin, min(count, begin + BLOCKS * LANES), LANES):
                 if first_slot[start + LANES] > first_slot[start]:
                     _add_block(found, first_slot, start, memory)
-                    _learn_block(blocks, first, second, weight, start, bands, view, memory, rates)
+                    _learn_block(blocks, first, second, weight, start, bands, view, memory, rates, of_camera)
 
     return adam
 
@@ -448,14 +460,19 @@ def adam(
     found: Floats,
     first_slot: Any,
     rates: Floats,
-) -> None:
+) -> Annotated[np.ndarray[Any, np.dtype[np.float64]], "6"]:
     """One step of Adam, in place, for the blocks that have an entry; the others keep their moments as well.
+
+    Returns the gradient of the camera, float64: its turn about its own centre (rotation vector in camera axes) and its shift.
 
     found: sums of shape and colour. rates: a learning rate for each row of a block. weight: sum of the weights in the second
     moment of a Gaussian, 1 - 0.99^k after k steps: what is seen for the first time moves as it would have in the first step.
     The first moment is not corrected, so the rates rise over a Gaussian's first ten steps.
     """
-    on_threads(_ADAM[bands], blocks, first, second, weight, count, view, found, first_slot, rates)
+    of_camera = np.zeros((-(-count // LANES), CAMERA, LANES), np.float32)
+    on_threads(_ADAM[bands], blocks, first, second, weight, count, view, found, first_slot, rates, of_camera.reshape(-1))
+    gradient: np.ndarray[Any, np.dtype[np.float64]] = of_camera.sum((0, 2), dtype=np.float64)
+    return gradient
 
 
 def cache_path(bands: int) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import photometric, rasterise_gradient_kernels, rasterise_kernels
 from .rasterise_kernels import FIXED, SIDE, SLOTS
@@ -44,6 +45,9 @@ class Learnt(NamedTuple):
     """Planes like those of the target, times the factors."""
     pull: Annotated[Floats, "3"]
     """Gradient of the loss by the logarithms of the factors."""
+    of_camera: Annotated[NDArray[np.float64], "6"]
+    """Gradient of the loss by a turn of the camera about its own centre (radians about the camera's axes) and by a shift of
+    that centre (world axes)."""
 
 
 def learn(
@@ -70,7 +74,7 @@ def learn(
     shown, pull = _exposed(out, target, factors), np.zeros(3, np.float32)
     l1, similar, slope = photometric.loss(shown, planes, blurred, width, height, ssim)
     if not np.isfinite(l1 + similar):
-        return Learnt(l1, similar, shown, pull)
+        return Learnt(l1, similar, shown, pull, np.zeros(6))
     if valid is not None:
         slope *= valid
     if factors is not None:
@@ -81,10 +85,8 @@ def learn(
     gradients = rasterise_gradient_kernels.composite_back(
         3, entries, splats, splats, SLOTS, 6, width, height, out, left, slope, np.zeros_like(left)
     )
-    rasterise_gradient_kernels.adam(
-        blocks, *moments, count, bands, camera, gradients, entries.first_slot, rates
-    )  # fmt: skip
-    return Learnt(l1, similar, shown, pull)
+    of_camera = rasterise_gradient_kernels.adam(blocks, *moments, count, bands, camera, gradients, entries.first_slot, rates)
+    return Learnt(l1, similar, shown, pull, of_camera)
 
 
 def errors(

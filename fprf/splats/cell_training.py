@@ -1,6 +1,7 @@
 """Cells as tasks: idempotent, resumable, each in a folder of its own, so that they can run anywhere and again.
 
-The whole scene is trained first, on photographs of half the size, for most of the schedule. Each cell goes on from there.
+The whole scene is trained first, on photographs of half the size, for most of the schedule. Each cell goes on from there, with
+the poses that were refined there.
 
 RUN/cells.json                               the cut: boxes, and the windows of each
 RUN/views.json                               where images and masks lie, so that no cell reads the whole scene folder again
@@ -36,9 +37,21 @@ from ..training.trainer import Report
 from .cells import Cell, cut
 from .config import GaussiansConfig
 from .gaussians import Gaussians
-from .learner import Learner
+from .learner import MOVES, Learner
 from .photographs import make_levels
-from .training import CUT, Prepared, clear_of, gaussians_of, load_photographs, prepare, reach_of, scene_of, state_of, train
+from .training import (
+    CUT,
+    Prepared,
+    clear_of,
+    gaussians_of,
+    load_photographs,
+    prepare,
+    reach_of,
+    refined,
+    scene_of,
+    state_of,
+    train,
+)
 
 _FORMAT, _VIEWS = 6, "views.json"
 OVERVIEW = "overview"
@@ -199,7 +212,7 @@ def train_overview(
     small = replace(small, train=small.train[:: -(-pixels // (factor**2 * _PIXELS))])
     own = replace(own, steps=max(own.steps, _VISITS * len(small.train)))
     facts = Run(root).load_known().facts
-    facts = replace(facts, held=_others(small, small.train.tolist()) if facts.exposure else ())
+    facts = replace(facts, held=_others(small, small.train.tolist()) if facts.exposure or facts.centres else ())
     train(own, prepare(own, small, saved=facts), Run(folder), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})
     return True
@@ -234,6 +247,7 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
 
 def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved) -> Prepared:
     """A cell's windows, and the Gaussians of the whole scene that they show."""
+    scene = replace(scene, cameras=refined(scene.cameras, start))
     images, masks = load_photographs(config, scene, list(cell.windows))
     images = {view: cell.cut(view, image) for view, image in images.items()}
     masks = {view: cell.cut(view, mask) for view, mask in masks.items()}
@@ -332,7 +346,8 @@ def unite(root: Path, cells: Sequence[Cell]) -> int:
     gaussians = Gaussians(*(torch.cat(column) for column in zip(*parts, strict=True)))
     tones = _mean_tones(_tones_of(Run(root).load_known().facts, start), lights, cells)
     state = state_of(gaussians, float(start.model["near"]))
-    checkpoint.write(Run(root).checkpoints, state, tones, step=step, seconds=seconds)
+    moves = {name: each for name, each in start.optimizer.items() if name == MOVES}
+    checkpoint.write(Run(root).checkpoints, state, tones | moves, step=step, seconds=seconds)
     return len(gaussians)
 
 

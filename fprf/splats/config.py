@@ -70,6 +70,9 @@ class GaussiansConfig(RunConfig):
     tones: bool | None = None
     """Learn how bright and how coloured each view was taken, starting from its exposure; the scene is what they have in common.
     none = where exposures differ, as the capture says or as its sparse points show."""
+    poses: float = 0.0
+    """Refine the cameras' poses with the scene: how far a view may move whenever it is seen, in radians and in distances that
+    views commonly see. It falls to a tenth. 0 = they are as the capture says, 0.002 suits poses that are off by some pixels."""
     initial: int = 40_000
     """Gaussians at the start, at most: the reconstruction's points, else points matched between the posed views."""
     surroundings: int = 500
@@ -124,6 +127,7 @@ class GaussiansConfig(RunConfig):
         between("overview", self.overview, 0.0, 0.9)
         at_least("relocate_every", self.relocate_every, 1)
         positive("rate", self.rate)
+        between("poses", self.poses, 0.0, 1.0)
         for part in self.background:
             between("background", part, 0.0, 1.0)
 

@@ -5,24 +5,24 @@ a function of (seed, step), so parameters, moments and the step are all the stat
 """
 
 import math
-from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..ops.harmonics import HARMONIC
 from ..ops.rasterise_kernels import FIXED, SLOTS
-from ..ops.rasterise_training import errors, learn
+from ..ops.rasterise_training import Target, errors, learn
 from ..ops.simd import LANES, aligned
 from ..rendering.splines import rotations
-from ..training.camera_optimizers import Tones
+from ..training.camera_optimizers import Poses, Tones
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, spacing, spatial_order
-from .photographs import Floats, Level
+from .photographs import Floats, Level, moved_camera
 
 _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
@@ -53,7 +53,8 @@ class Learner:
 
     Only Gaussians whose means are `inside` are split or moved; None = all. Every `cut_every` steps `widest` tells the greatest
     logarithms of standard deviations from the blocks' means; None = none is limited.
-    With `tones` each view's factors are learnt as well; with `colours_only` nothing but harmonics is.
+    With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
+    alone, `only` poses neither Gaussians nor factors.
     """
 
     def __init__(
@@ -67,7 +68,8 @@ class Learner:
         *,
         cut_every: int = 10,
         tones: Tones | None = None,
-        colours_only: bool = False,
+        poses: Poses | None = None,
+        only: Literal["colours", "poses"] | None = None,
     ) -> None:
         self.inside, self.widest, self.cut_every = inside, widest, cut_every
         self.config, self.levels, self.reach = config, levels, reach
@@ -77,8 +79,13 @@ class Learner:
         self.blocks, self.first, self.second = (_blocks(np.zeros((self.rows, self.room), np.float32)) for _ in range(3))
         self.weight, self.splats = aligned(self.room), aligned(self.room * SLOTS)
         self.weight[:] = 0
-        self.tones, self.colours_only = tones, colours_only
-        self.tone_moments = {} if tones is None else _tone_moments(tones)
+        self.tones, self.poses, self.only = tones, poses, only
+        self.corrections = {
+            f"{kind}.{name}": (parameter.detach(), *_view_moments(parameter))
+            for kind, module in (("tones", tones), ("poses", poses))
+            for name, parameter in (module.named_parameters() if module is not None else ())
+        }
+        """What is learnt of each view: the parameter, its moments and the steps of each view."""
 
     @property
     def rows(self) -> int:
@@ -114,7 +121,7 @@ class Learner:
         views = list(level)
         epoch, turn = divmod(step, len(views))
         view = views[np.random.default_rng((self.config.seed, epoch)).permutation(len(views))[turn]]
-        target = level[view]
+        target = self._target(level, view)
         measured = learn(
             self.blocks, (self.first, self.second, self.weight), self.count, self.bands, self.splats, target,
             background=self.config.background, ssim=self.config.ssim, rates=self._rates(share),
@@ -126,7 +133,8 @@ class Learner:
             rows = self.blocks.reshape(-1, self.rows, LANES)
             np.minimum(rows[:, 3:6], self.widest(rows[:, :3]), out=rows[:, 3:6])
         self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)
-        moved = (step + 1) % self.config.relocate_every == 0 and not self.colours_only
+        self._learn_pose(view, target, torch.from_numpy(measured.of_camera), self.config.poses * 0.1**share)
+        moved = (step + 1) % self.config.relocate_every == 0 and self.only is None
         if moved and step >= _SETTLE and share < max(self.config.grow, _LAST):
             self._relocate(step, level, share)
         height, width = target.height, target.width
@@ -142,8 +150,8 @@ class Learner:
             [np.full(3, 2.5e-3 * self.reach), np.full(3, 0.08), np.full(4, 0.016), [0.1], np.full(3, 0.07), rest]
         )
         falls = np.where(np.arange(len(rates)) < 3, 0.05**share, 0.2**share)
-        if self.colours_only:
-            rates[:FIXED] = 0
+        if self.only is not None:
+            rates[: FIXED if self.only == "colours" else None] = 0
         scaled: Floats = (self.config.rate * rates * falls).astype(np.float32)
         return scaled
 
@@ -152,13 +160,32 @@ class Learner:
         """Move the exposure of a view by a step of Adam. Each view counts its own steps: with moments of all views together,
         one that is seen every thousandth step moved by the root of a thousand times the rate, and far scenes got worse.
         """
-        if self.tones is None:
+        if self.tones is None or self.only == "poses":
             return
-        first, second, steps = self.tone_moments["gain"]
-        _adam(self.tones.gain[view], pull, (first[view], second[view], steps[view]), _GAIN * rate)
+        _adam([each[view] for each in self.corrections["tones.gain"]], pull, _GAIN * rate)
         if self.tones.exponent.requires_grad:
             slope = pull.sum() * self.tones.exposure[view]
-            _adam(self.tones.exponent, slope, self.tone_moments["exponent"], _EXPONENT * rate)
+            _adam(self.corrections["tones.exponent"], slope, _EXPONENT * rate)
+
+    @torch.no_grad()
+    def _learn_pose(self, view: int, target: Target, gradient: Annotated[Tensor, "6"], rate: float) -> None:
+        """Move the pose of a view by a step of Adam, as `_learn_tones` does; `rate` is in radians and distances commonly seen.
+
+        The gradient of a rotation vector is taken for that of a further turn: exact to first order in how far views turn.
+        """
+        if self.poses is None:
+            return
+        axes = torch.from_numpy(target.camera[:9].reshape(3, 3)).double()
+        slope = torch.cat([axes.T @ gradient[:3], self.poses.reach * gradient[3:]]).float()
+        _adam([each[view] for each in self.corrections["poses.offset"]], slope, rate)
+
+    def _target(self, level: Level, view: int) -> Target:
+        """A photograph, taken from where its pose is now."""
+        target = level[view]
+        if self.poses is None:
+            return target
+        move = self.poses.moved_by()[view]
+        return target._replace(camera=moved_camera(target.camera, move[:3], move[3:]))
 
     def _factors(self, view: int) -> Floats | None:
         """Return the factors of renders of a view."""
@@ -177,7 +204,7 @@ class Learner:
         views = draw.permutation(list(level))[:_JUDGES]
         chance = np.zeros(self.count)
         for view in views:
-            target, background = level[view], self.config.background
+            target, background = self._target(level, view), self.config.background
             chance += errors(self.blocks, self.count, self.bands, self.splats, target, background, self._factors(view))
         parts = [each.reshape(-1, self.rows, LANES) for each in (self.blocks, self.first, self.second)]
         blocks, first, second = parts
@@ -227,14 +254,15 @@ class Learner:
         return Gaussians(*(part.contiguous() for part in parts))
 
     def moments(self) -> dict[str, Tensor]:
-        """Return the rest of a checkpoint: Adam's moments and the weight in the second, exposures, the number at the start."""
+        """Return the rest of a checkpoint: Adam's moments and the weight in the second, exposures, poses, the number at the
+        start."""
         first, second = (torch.from_numpy(_rows(x, self.rows)[:, : self.count].T.copy()) for x in (self.first, self.second))
         weight = torch.from_numpy(self.weight[: self.count].copy())
         tensors = {"first": first, "second": second, "weight": weight, "begun": torch.tensor(self.begun)}
-        if self.tones is not None:
-            for name, parameter in self.tones.named_parameters():
-                kept = zip(_TONE_STATE, (parameter.detach(), *self.tone_moments[name]), strict=True)
-                tensors |= {f"tones.{name}.{key}": each.clone() for key, each in kept}
+        for name, kept in self.corrections.items():
+            tensors |= {f"{name}.{key}": each.clone() for key, each in zip(_KEPT, kept, strict=True)}
+        if self.poses is not None:
+            tensors[MOVES] = self.poses.moved_by()
         return tensors
 
     def start_from(self, gaussians: Gaussians) -> None:
@@ -247,7 +275,7 @@ class Learner:
         self.blocks = _blocks(rows)
 
     def restore(self, gaussians: Gaussians, moments: dict[str, Tensor]) -> None:
-        """Go on from what a checkpoint holds; without their moments, tones go on as they are.
+        """Go on from what a checkpoint holds; without their moments, tones and poses go on as they are.
 
         Checkpoints of before have no weights: their second moments are taken as they are.
         """
@@ -258,24 +286,26 @@ class Learner:
             rows[:, : self.count] = moments[name].T.numpy()
             setattr(self, name, _blocks(rows))
         self.weight[: self.count] = moments["weight"].numpy() if "weight" in moments else 1
-        if self.tones is not None and "tones.gain.value" in moments:
-            for name, parameter in self.tones.named_parameters():
-                for key, each in zip(_TONE_STATE, (parameter.data, *self.tone_moments[name]), strict=True):
-                    if f"tones.{name}.{key}" in moments:
-                        each.copy_(moments[f"tones.{name}.{key}"])
+        for name, kept in self.corrections.items():
+            for key, each in zip(_KEPT, kept, strict=True):
+                if f"{name}.{key}" in moments:
+                    each.copy_(moments[f"{name}.{key}"])
 
 
-_TONE_STATE = "value", "first", "second", "steps"
+MOVES = "poses.moves"
+"""Name in checkpoints of where views were moved: `Poses.moved_by`."""
+_KEPT = "value", "first", "second", "steps"
+"""Names in checkpoints of what `Learner.corrections` holds."""
 
 
-def _tone_moments(tones: Tones) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-    """Room for the moments of each parameter, and for the steps of each view."""
-    return {name: (torch.zeros_like(p), torch.zeros_like(p), p.new_zeros(p.shape[:1])) for name, p in tones.named_parameters()}
+def _view_moments(parameter: nn.Parameter) -> tuple[Tensor, Tensor, Tensor]:
+    """Room for the moments of a parameter, and for the steps of each view."""
+    return torch.zeros_like(parameter), torch.zeros_like(parameter), parameter.new_zeros(parameter.shape[:1])
 
 
-def _adam(value: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor, Tensor], rate: float) -> None:
-    """One step of Adam, in place. The third of `moments` counts the steps."""
-    first, second, steps = moments
+def _adam(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
+    """One step of Adam, in place, on a value, its two moments and the number of steps."""
+    value, first, second, steps = kept
     steps += 1
     first.lerp_(gradient, 1 - 0.9)
     second.lerp_(gradient.square(), 1 - 0.999)

@@ -16,6 +16,7 @@ from ..ops.photometric import WINDOW, blurred, slack
 from ..ops.rasterise import Pinhole, camera_array
 from ..ops.rasterise_training import Target
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
+from ..training.camera_optimizers import rotated
 
 Floats = NDArray[np.float32]
 _PANORAMA = 3
@@ -114,6 +115,15 @@ def make_levels(scene: Scene, images: Mapping[int, Image], masks: Mapping[int, N
                 used = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
             level[view] = _target(small, reduced, used)
     return levels
+
+
+def moved_camera(camera: Floats, turn: Annotated[Tensor, "3"], shift: Annotated[Tensor, "3"]) -> Floats:
+    """A camera of `camera_array`, turned about its own centre by a rotation vector and shifted, both float64 in world axes."""
+    axes = rotated(torch.from_numpy(camera[:9].reshape(3, 3)).double(), turn.expand(3, 3))
+    centre = torch.from_numpy(camera[16:19]).double() + shift
+    out = camera.copy()
+    out[:9], out[9:12], out[16:19] = axes.reshape(-1), -axes @ centre, centre
+    return out
 
 
 def _target(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None) -> Target:

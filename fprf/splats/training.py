@@ -22,11 +22,12 @@ from ..interfaces import Encoder
 from ..rendering.cameras import Cameras, project
 from ..style.references import Encoders
 from ..training import checkpoint
-from ..training.camera_optimizers import Tones
+from ..training.camera_optimizers import Poses, Tones, moved_cameras
 from ..training.loading import LoadedRun
 from ..training.loop import held_back, progress
 from ..training.model import Facts, tones_of
 from ..training.prepare import exposure_of
+from ..training.prepare import reach_of as sight_distance
 from ..training.quality import PRESETS, QualityConfig, mixed_tone
 from ..training.run import Known, Run
 from ..training.trainer import REPORT_SECONDS, Report
@@ -34,7 +35,7 @@ from ..training.unfinished import UnfinishedRun
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points, surroundings
-from .learner import Learner, Step
+from .learner import MOVES, Learner, Step
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import Floats, make_levels
 from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
@@ -53,6 +54,8 @@ _WIDE = 0.2
 CUT, _CLEAR, _TOGETHER = 100, 0.25, 256
 """In scenes of cells: steps between cuts of what became too wide; greatest standard deviation, as a share of the distance to
 the nearest camera; Gaussians whose distances are taken together."""
+_FIT_RATE, _FIT_STEPS = 2e-3, 120
+"""Of the poses of views that the scene is not learnt from: `GaussiansConfig.poses`, and steps of each view."""
 _SOME = 4000
 """Points whose depths say how near to a camera things are."""
 _LEVELS, _MANY = "levels", 400_000
@@ -117,11 +120,11 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     room = max(config.cap, len(points.position) + config.surroundings)
     sphere = _Sphere.around(far) if far is not None else None
     inside = None if sphere is None else sphere.encloses
-    if config.cells > 1:
-        learner = Learner(config, levels, reach_of(scene), room, inside, clear_of(scene), cut_every=CUT, tones=tones_of(facts))
-    else:
-        widest = None if sphere is None else sphere.widest
-        learner = Learner(config, levels, reach_of(scene), room, inside, widest, tones=tones_of(facts))
+    widest = clear_of(scene) if config.cells > 1 else None if sphere is None else sphere.widest
+    cut_every = CUT if config.cells > 1 else 10
+    learner = Learner(
+        config, levels, reach_of(scene), room, inside, widest, cut_every=cut_every, tones=tones_of(facts), poses=poses_of(facts)
+    )
     learner.begin(points, draw, far)
     return Prepared(scene, learner, near, origin, facts=facts)
 
@@ -197,10 +200,20 @@ def reach_of(scene: Scene) -> float:
 
 
 def lit(facts: Facts, config: GaussiansConfig, scene: Scene, image: Callable[[int], Image]) -> Facts:
-    """Facts with the exposures of the views, where they are learnt; `image(view)` is a training view."""
+    """Facts with exposures and places of the views, where they are learnt; `image(view)` is a training view."""
     exposure = exposure_of(config.tones, scene, lambda view: torch.from_numpy(image(view)).float() / 255)
-    held = set(range(len(scene.paths))) - set(scene.train.tolist()) if exposure else ()
+    if config.poses:
+        centres = tuple((float(x), float(y), float(z)) for x, y, z in scene.cameras.pose[:, :, 3])
+        facts = replace(facts, centres=centres, reach=sight_distance(scene, facts.space))
+    held = set(range(len(scene.paths))) - set(scene.train.tolist()) if exposure or config.poses else ()
     return replace(facts, exposure=exposure, held=tuple(sorted(held)))
+
+
+def poses_of(facts: Facts) -> Poses | None:
+    """Poses as the capture says; None where they are not refined."""
+    if not facts.centres:
+        return None
+    return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=1.0)
 
 
 def facts_of(config: GaussiansConfig, scene: Scene) -> Facts:
@@ -332,6 +345,7 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
     if saved is None:
         raise CheckpointError(f"{root}: no checkpoint yet; go on with `fprf train {root / 'config.json'} --output {root}`")
     known, gaussians = run.load_known(), gaussians_of(saved)
+    known = replace(known, cameras=refined(known.cameras, saved))
     near = float(saved.model.get("near", torch.tensor(0.01)))
     resolution = preset.resolution if preset is not None else 1.0
     encoder = cache(config.semantic.encoder.build)
@@ -397,6 +411,34 @@ def _levels(folder: Path, gaussians: Gaussians, key: str) -> Levels:
         levels = open_levels(folder, key)
     assert levels is not None  # it was just written
     return levels
+
+
+def refined(cameras: Cameras, saved: checkpoint.Saved) -> Cameras:
+    """The cameras of all views where training put them."""
+    moves = saved.optimizer.get(MOVES)
+    return cameras if moves is None else moved_cameras(cameras, moves)
+
+
+def fit_poses(
+    config: GaussiansConfig, scene: Scene, opened: LoadedRun[SplatScene], views: list[int]
+) -> Annotated[Tensor, "V 6"]:
+    """Turns (radians) and shifts (world units), float64, that bring renders of some views nearest to their photographs.
+
+    Gaussians stay as they are; the other views' moves are 0.
+    """
+    cameras, facts, shown = opened.known.cameras, opened.known.facts, opened.scene
+    scene = replace(scene, cameras=cameras, train=torch.tensor(views))
+    images, masks = load_photographs(config, scene, views)
+    others = tuple(sorted(set(range(len(cameras))) - set(views)))
+    poses = Poses(cameras.pose[:, :, 3], others, reach=sight_distance(scene, facts.space), pace=1.0, still=True)
+    levels, tones = make_levels(scene, images, masks, shown.near), load_tones(opened.run)
+    config = replace(config, poses=_FIT_RATE, degree=shown.gaussians.degree)
+    learner = Learner(config, levels, 1.0, len(shown.gaussians), tones=tones, poses=poses, only="poses")
+    learner.start_from(shown.gaussians)
+    steps = _FIT_STEPS * len(views)
+    for step in range(steps):
+        learner.step(step, step / steps)
+    return poses.moved_by()
 
 
 def load_tones(run: Run) -> Tones | None:

@@ -32,9 +32,12 @@ class Poses(nn.Module):
     """int64 numbers of the views that are learnt from."""
     gauge: Tensor
 
-    def __init__(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...], *, reach: float, pace: float) -> None:
+    def __init__(
+        self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...], *, reach: float, pace: float, still: bool = False
+    ) -> None:
         """`centres` are the cameras' in the world; `held` are views that are not learnt from. One unit of the parameters is
-        `pace` radians, or reaches: how fast poses are learnt beside everything else.
+        `pace` radians, or reaches: how fast poses are learnt beside everything else. Where the scene is `still`, nothing is
+        taken out of the moves.
         """
         super().__init__()
         views = len(centres)
@@ -44,7 +47,8 @@ class Poses(nn.Module):
         self.offset = nn.Parameter(torch.zeros(views, 6))
         self.register_buffer("known", torch.zeros(views, 6))
         self.register_buffer("learned", learned.nonzero()[:, 0], persistent=False)
-        self.register_buffer("gauge", _gauge(centres[learned].double() / reach).float(), persistent=False)
+        gauge = _gauge(centres[learned].double() / reach).float()
+        self.register_buffer("gauge", gauge[:, :0] if still else gauge, persistent=False)
 
     def moves(self) -> Annotated[Tensor, "V 6"]:
         """Turn and shift of each view."""
@@ -60,11 +64,14 @@ class Poses(nn.Module):
         move = _like(self.moves(), origin).index_select(0, view.to(origin.device))
         return origin + self.reach * move[:, 3:], rotated(direction, move[:, :3])
 
+    @torch.no_grad()
+    def moved_by(self) -> Annotated[Tensor, "V 6"]:
+        """Turn (radians) and shift (world units) of each view, float64, on the CPU."""
+        return self.moves().cpu().double() * torch.tensor([1.0, 1, 1, self.reach, self.reach, self.reach], dtype=torch.float64)
+
     def refined(self, cameras: Cameras) -> Cameras:
         """The cameras where they are now."""
-        with torch.no_grad():
-            move = _like(self.moves(), cameras.pose)
-            return replace(cameras, pose=moved(cameras.pose, move[:, :3], self.reach * move[:, 3:]))
+        return moved_cameras(cameras, self.moved_by())
 
     def going_on(self, centres: Annotated[Tensor, "V 3"], held: tuple[int, ...]) -> "Poses":
         """Poses that start as these are now, and learn from other views."""
@@ -72,6 +79,12 @@ class Poses(nn.Module):
         with torch.no_grad():
             poses.known.copy_(self.moves())
         return poses
+
+
+def moved_cameras(cameras: Cameras, moves: Annotated[Tensor, "V 6"]) -> Cameras:
+    """Cameras, each turned about its own centre and shifted."""
+    moves = _like(moves, cameras.pose)
+    return replace(cameras, pose=moved(cameras.pose, moves[:, :3], moves[:, 3:]))
 
 
 def moved(

@@ -18,9 +18,11 @@ from fprf.splats.cell_training import CellTask, read_cells, train_cell
 from fprf.splats.cells import Cell, cut
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
+from fprf.splats.learner import MOVES
 from fprf.town.write import write_town
 from fprf.training.camera_optimizers import Tones
 from fprf.training.checkpoint import load_latest
+from fprf.training.loading import open_run
 from fprf.training.run import Run
 
 COUNT = 3
@@ -155,3 +157,20 @@ def test_cells_go_on_from_the_exposures_of_the_whole_scene(town: Path, tmp_path:
     torch.testing.assert_close(
         union.optimizer["tones.gain.value"], torch.where(mean.isnan(), start.gains().detach(), mean), atol=1e-6, rtol=1e-5
     )
+
+
+def test_cells_see_from_where_the_whole_scene_found_its_views(town: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    command = ["train", "fprf-splats", "--data", str(town), "--downscale", "1", "--steps", "60", "--cells", "2"]
+    assert main([*command, "--initial", "300", "--cap", "600", "--poses", "0.002", "--output", str(run)]) == 0
+    overview, union = (load_latest(folder / "checkpoints")[0] for folder in (run / "overview", run))
+    assert overview is not None and union is not None
+    moves, given = overview.optimizer[MOVES], Run(run).load_known()
+    assert torch.equal(union.optimizer[MOVES], moves)
+    assert (moves[list(given.train)] != 0).any(1).all() and not moves[list(given.test)].any()
+    start, cell = cell_training._load_overview(run), read_cells(run)[0]
+    config = Run(run).load_config()[0]
+    assert isinstance(config, GaussiansConfig)
+    seen = cell_training._prepared(config, parse_scene(town, 1, None), given.facts, cell, start).scene.cameras
+    shown = open_run(run, "cpu").known.cameras
+    assert torch.equal(seen.pose, shown.pose) and not torch.equal(shown.pose, given.cameras.pose)

@@ -1,0 +1,60 @@
+"""The gradient of a camera that a training step measures."""
+
+import numpy as np
+import pytest
+import torch
+from test_rasterise import ROUGH, camera, cloud
+
+from fprf.ops import photometric, rasterise, rasterise_kernels
+from fprf.ops.rasterise_reference import rasterise_reference, view_colours
+from fprf.ops.rasterise_training import Target, learn
+from fprf.ops.simd import LANES, aligned
+from fprf.training.camera_optimizers import rotated
+
+WIDTH, HEIGHT, SIDE = 40, 30, 16
+
+
+@pytest.mark.parametrize(("bands", "antialiased"), [(9, True), (1, False)])
+def test_the_gradient_of_the_camera_is_that_of_float64(bands: int, antialiased: bool) -> None:
+    """By a turn about the camera's own axes and centre, and by a shift of the centre, of the mean absolute error. Gaussians
+    behind the camera add nothing. The parts of the Gaussians cancel: each errs by ROUGH of itself for each of four factors
+    (tests/ops/test_rasterise.py); those of turns are as large as those of means times the distance."""
+    view = camera(WIDTH, HEIGHT)
+    means, quaternions, log_scales, logits, harmonics, _, background = cloud(count=60, bands=bands)
+    means[:16, 2] -= 40
+    beside = view.world_to_camera.clone()
+    beside[:3, 3] += torch.tensor([0.15, -0.1, 0.3])
+    shape = means, quaternions, log_scales, logits, harmonics
+    there = view._replace(world_to_camera=beside)
+    wanted = rasterise.rasterise(*shape, there, background=background, antialiased=antialiased).image.permute(2, 0, 1)
+    tall, wide = -(-HEIGHT // SIDE) * SIDE, -(-WIDTH // SIDE) * SIDE
+    planes = np.zeros(3 * tall * wide + photometric.slack(wide), np.float32)
+    planes[: 3 * tall * wide].reshape(3, tall, wide)[:, :HEIGHT, :WIDTH] = wanted.numpy()
+    blurred = photometric.blurred(planes, WIDTH, HEIGHT)
+    target = Target(WIDTH, HEIGHT, rasterise.camera_array(view, antialiased), planes, blurred, None)
+    rows, room = rasterise_kernels.FIXED + 3 * bands, -(-60 // LANES) * LANES
+    blocks, first, second = (aligned(rows * room) for _ in range(3))
+    for moment in (first, second):
+        moment[:] = 0
+    rasterise_kernels.pack(*(x.numpy() for x in shape), blocks)
+    splats = aligned(room * rasterise_kernels.SLOTS)
+    found = learn(
+        blocks, (first, second, np.zeros(room, np.float32)), 60, bands, splats, target,
+        background=tuple(background.tolist()), ssim=0.0, rates=np.zeros(rows, np.float32),
+    )  # fmt: skip
+
+    move = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    axes, shift = view.world_to_camera[:3, :3], view.world_to_camera[:3, 3]
+    turned, centre = rotated(axes, (axes.T @ move[:3]).expand(3, 3)), -axes.T @ shift + move[3:]
+    below = torch.tensor([[0.0, 0, 0, 1]], dtype=torch.float64)
+    moved = view._replace(world_to_camera=torch.cat([torch.cat([turned, (-turned @ centre)[:, None]], 1), below]))
+    exact = [x.double() for x in (means, quaternions, log_scales, logits)]
+    exact[0].requires_grad_()
+    colours = view_colours(exact[0], harmonics.double(), moved)[0]
+    image, _ = rasterise_reference(*exact, colours, moved, background.double(), antialiased=antialiased)
+    (image[..., :3] - wanted.permute(1, 2, 0)).abs().mean().backward()
+    assert move.grad is not None and exact[0].grad is not None
+    allowed = 4 * ROUGH * exact[0].grad.norm(dim=1)
+    apart, distance = torch.from_numpy(found.of_camera) - move.grad, (means - centre.detach()).norm(dim=1)
+    assert apart[3:].norm() < allowed.sum() < 0.05 * move.grad[3:].norm()
+    assert apart[:3].norm() < (allowed * distance).sum() < 0.05 * move.grad[:3].norm()
