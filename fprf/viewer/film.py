@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from queue import Full, Queue
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import torch
 
@@ -28,13 +28,14 @@ from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
 from ..style.keyframes import keyed_looks, read_keyframes
 from .cameras import CameraState, PageTransform
-from .render_worker import RenderWorker
+from .render_worker import RenderWorker, Steps
 from .renderer import RenderRequest, SceneRenderer
 from .state import FilmProgress, Key, Look, interpolate_looks, simplified, style_config
 
 if TYPE_CHECKING:
     from .session import Session
 
+Frames: TypeAlias = Queue[Picture | Exception | None]
 _MAX_SECONDS = 600.0
 PREVIEW_FPS = 8.0
 """Pictures a second of a flight that is played: as many as a processor makes."""
@@ -102,9 +103,13 @@ def write_film_files(
 
 
 def film_frames(
-    folder: Path, scene: Scene, renderer: SceneRenderer, out: "Queue[Picture | None]", progress: Callable[[int, int], None]
-) -> Iterator[None]:
-    """Render the frames of a film's folder into a queue, at last None, step by step; `progress(done, total)` of each."""
+    folder: Path, scene: Scene, renderer: SceneRenderer, out: Frames, progress: Callable[[int, int], None]
+) -> Steps:
+    """Render the frames of a film's folder into a queue, step by step; `progress(done, total)` of each.
+
+    At last comes None, or the error that it ends with.
+    """
+    end: Exception | None = None
     try:
         cameras, _ = read_camera_path(folder / "path.json")
         looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
@@ -113,14 +118,19 @@ def film_frames(
             while not _put(out, picture):
                 yield
             progress(frame + 1, len(cameras))
+    except Exception as error:
+        end = error
+        raise
     finally:
-        while not _put(out, None):
+        while not _put(out, end):
             out.get()
 
 
-def queued_frames(frames: "Queue[Picture | None]") -> Iterator[Picture]:
-    """The frames of a queue, up to None."""
+def queued_frames(frames: Frames) -> Iterator[Picture]:
+    """The frames of a queue, up to None. Raises the error in their place."""
     while (frame := frames.get()) is not None:
+        if isinstance(frame, Exception):
+            raise frame
         yield frame
 
 
@@ -132,18 +142,21 @@ class FilmRecorder:
         self._lock = threading.Lock()
         self._flights: dict[Hashable, threading.Event] = {}
 
-    def record(self, plan: FilmPlan, client: Hashable | None) -> None:
-        """Make a film, one at a time."""
+    def record(self, plan: FilmPlan) -> None:
+        """Make a film in the scene's folder while no client waits for a picture, one at a time."""
         session = self._session
         with self._lock:
             if session.state.film.busy:
-                session.notify("film: one is being made; wait for it", client)
+                session.notify("film: one is being made; wait for it")
                 return
             session.update(lambda state: replace(state, film=FilmProgress(0, 1)))
-        threading.Thread(target=self._record, args=(plan, client), name="fprf-film", daemon=True).start()
+        threading.Thread(target=self._record, args=(plan,), name="fprf-film", daemon=True).start()
 
     def play(self, client: Hashable, plan: FilmPlan, move: Callable[[CameraState], None]) -> None:
-        """Show a client the flight as the film will be, coarsely; a flight that is under way is ended."""
+        """Show a client the flight as the film will be, coarsely; a flight that is under way is ended.
+
+        `move` moves its camera, whose own moves are ignored until the end.
+        """
         self.stop(client)
         over = threading.Event()
         with self._lock:
@@ -179,7 +192,7 @@ class FilmRecorder:
                     if session.in_browser:
                         break
         except FprfError as error:
-            session.notify(str(error), client)
+            session.notify(str(error))
         finally:
             with self._lock:
                 if self._flights.get(client) is over:
@@ -188,7 +201,7 @@ class FilmRecorder:
             session.refresh(client)
             session.update(lambda state: replace(state, playing=flying))
 
-    def _record(self, plan: FilmPlan, client: Hashable | None) -> None:
+    def _record(self, plan: FilmPlan) -> None:
         session = self._session
 
         def progress(done: int, total: int) -> None:
@@ -199,34 +212,20 @@ class FilmRecorder:
                 raise UsageError("this scene has no folder to put a film in")
             folder = new_folder(session.viewed.root)
             write_film_files(folder, session.transform, plan, session.viewed.scene.semantic_encoder, session.viewed.stylizer)
-            frames: Queue[Picture | None] = Queue(2)
-            failed: list[Exception] = []
-            self._worker.run_when_idle(
-                _noting(film_frames(folder, session.viewed.scene, session.renderer, frames, progress), failed)
-            )
+            frames: Frames = Queue(2)
+            self._worker.run_when_idle(film_frames(folder, session.viewed.scene, session.renderer, frames, progress))
             write_video(folder / "film.mp4", queued_frames(frames), plan.fps)
-            if failed:
-                raise failed[0]
         except Exception as error:  # whatever it is, the next film can be made
             session.update(lambda state: replace(state, film=FilmProgress()))
-            session.notify(f"film: {error}", client)
+            session.notify(f"film: {error}")
             return
         session.update(lambda state: replace(state, film=replace(state.film, path=folder / "film.mp4")))
         session.notify(f"film: {folder / 'film.mp4'}")
 
 
-def _noting(frames: Iterator[None], failed: list[Exception]) -> Iterator[None]:
-    """The work; what it raises is also put into `failed`."""
+def _put(out: Frames, item: Picture | Exception | None) -> bool:
     try:
-        yield from frames
-    except Exception as error:
-        failed.append(error)
-        raise
-
-
-def _put(out: "Queue[Picture | None]", picture: Picture | None) -> bool:
-    try:
-        out.put(picture, timeout=0.05)
+        out.put(item, timeout=0.05)
     except Full:
         return False
     return True

@@ -1,8 +1,8 @@
 """The page made with viser: pictures behind its canvas, lines over it, controls, cameras and clicks from it."""
 
 import contextlib
+import io
 import ipaddress
-import os
 import secrets
 import socket
 import sys
@@ -54,7 +54,7 @@ class ViserFrontend(Frontend):
 
     def __init__(self, session: Session, page: Page) -> None:
         self._session, self._page = session, page
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):  # it prints an address that is not ours
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints an address that is not ours
             self._viser = _ViserServer(host=_random_loopback(), port=0, verbose=False)
         self.address = (self._viser.get_host(), self._viser.get_port())
         self._viser.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
@@ -71,7 +71,7 @@ class ViserFrontend(Frontend):
 
     def close(self) -> None:
         """End all connections."""
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        with contextlib.redirect_stdout(io.StringIO()):
             self._viser.stop()
 
     def show(self, client: Hashable, frame: RenderedFrame) -> None:
@@ -107,8 +107,7 @@ class ViserFrontend(Frontend):
                 self._enable_clicks(now.picking)
         self._page.wake()
 
-    def notify(self, text: str, client: Hashable | None = None) -> None:
-        """Show a line on all pages: one client's mistake is nothing to hide."""
+    def notify(self, text: str) -> None:
         self._page.notify(text)
 
     async def _connected(self, client: viser.ClientHandle) -> None:
@@ -178,9 +177,9 @@ class ViserFrontend(Frontend):
         pose = self._session.transform.cameras([state], (16, 16)).pose[0]
         return np.asarray(state.position) - _ORBIT * pose[:, 2].numpy()
 
-    def draw_lines(self, panel: Panel) -> None:
+    def draw_lines(self) -> None:
         """Draw the lines over the scene that the controls ask for."""
-        session = self._session
+        session, panel = self._session, self.panel
         viewed, transform = session.viewed, session.transform
         cameras = viewed.scene.cameras.select(torch.tensor(viewed.captured)) if panel.cameras and viewed.captured else None
         self._lines("cameras", None if cameras is None else camera_frustums(transform, cameras, 0.04), _BLUE)

@@ -3,7 +3,7 @@
 Browsers draw one colour each Gaussian, without compensation of its opacity: they get the means over the scene's views.
 """
 
-from collections.abc import Callable, Generator, Hashable, Iterator
+from collections.abc import Callable, Generator, Hashable
 from typing import Annotated, TypeAlias
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..io.images import Picture, to_uint8
-from ..io.maps import match_image
 from ..rendering.cameras import Cameras
 from ..rendering.splines import rotations
 from ..splats.gaussians import Gaussians
@@ -20,7 +19,8 @@ from ..splats.scene import SplatScene
 from ..style.look import Restyle
 from ..style.regional import RegionWeight
 from .cameras import PageTransform
-from .renderer import Layers, RenderRequest, SceneRenderer, composite_layers, region_colours
+from .render_worker import Steps
+from .renderer import NO_MATCH, Layers, RenderRequest, SceneRenderer, composite_layers, match_colours, region_colours
 from .restyler import Restyler
 from .state import State, ViewSettings
 
@@ -35,7 +35,7 @@ class GaussianRenderer(SceneRenderer):
         self._view: ViewSettings = State().view
         self._framed: tuple[Restyle | None, SplatScene] = (None, scene)
 
-    def render(self, client: Hashable, request: RenderRequest) -> Iterator[None]:
+    def render(self, client: Hashable, request: RenderRequest) -> Steps:
         """Show the colours that a request needs, unless they are shown already. Cameras move in the browsers alone."""
         view = request.view._replace(wipe=None)
         if view == self._view:
@@ -59,25 +59,22 @@ class GaussianRenderer(SceneRenderer):
     def _colours(self, view: ViewSettings) -> Colours:
         scene, styled = self._scene, self._restyler.styled(view.look)
         look = None if styled is None else styled.restyle
-        pictures = {"look": to_uint8(scene.seen.colours(scene.restyled(look).shown.harmonics).clamp(0, 1)[None])}
+        pictures = {"look": to_uint8(scene.seen.colours(scene.restyled(look).shown.harmonics).clamp(0, 1))}
         share: NDArray[np.float32] | None = None
-        solid = torch.ones(1, len(scene.gaussians))
+        solid = torch.ones(len(scene.gaussians))
         if view.shows_regions:
             style = self._restyler.encoders.scene
             memberships = RegionWeight(style, torch.eye(len(style.share)))(scene.found().features)
             if view.map == "regions":
-                pictures["regions"] = to_uint8(region_colours(memberships, solid[0])[None])
+                pictures["regions"] = to_uint8(region_colours(memberships, solid))
             if view.region is not None:
-                share = memberships[None, :, view.region].float().numpy()
-        if view.map == "matches":
-            pictures["matches"] = np.full_like(pictures["look"], 128)
-            if styled is not None:
-                taken = styled.restyle.match(scene.found().features.float(), scene.gaussians.means)
-                total = taken.sum(-1, keepdim=True)
-                attention, kept = taken / total.clamp_min(1e-10), (1 - total[:, 0]).clamp(0, 1)
-                codes = styled.codes
-                pictures["matches"] = match_image(attention[None], codes.reference, codes.names, solid, kept[None])
-        return np.asarray(composite_layers(Layers(pictures, share, solid), view)[0])
+                share = memberships[:, view.region].float().numpy()
+        if view.map == "matches" and styled is not None:
+            taken = styled.restyle.match(scene.found().features.float(), scene.gaussians.means)
+            pictures["matches"] = match_colours(styled, taken, solid)
+        elif view.map == "matches":
+            pictures["matches"] = np.full_like(pictures["look"], NO_MATCH)
+        return composite_layers(Layers(pictures, share, solid), view)
 
 
 def page_gaussians(gaussians: Gaussians, transform: PageTransform) -> tuple[Tensor, Tensor]:

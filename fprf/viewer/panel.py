@@ -3,9 +3,9 @@
 Values come from a browser: whatever does not fit a look or the state is refused there, and told.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from ..style.config import PRESETS, preset_flags
 from .cameras import CameraState, picture_size
@@ -18,7 +18,6 @@ from .state import (
     DropMode,
     FilmProgress,
     Key,
-    Map,
     State,
     add_key,
     apply_preset,
@@ -33,7 +32,17 @@ if TYPE_CHECKING:
 _NONE = "nothing"
 _DROP_MODES: tuple[DropMode, ...] = ("alone", "in the mix")
 _SIZES = {"small (480)": 480, "medium (960)": 960, "full HD (1920)": 1920}
+_LOOK: Mapping[str, tuple[str, float, float, float]] = {
+    "strength": ("strength", 0.0, 1.0, 0.01),
+    "temperature": ("temperature", 0.05, 2.0, 0.05),
+    "clusters": ("clusters", 1, 40, 1),
+    "blend": ("local ↔ global", 0.0, 1.0, 0.01),
+    "luminance": ("keep light", 0.0, 1.0, 0.01),
+    "smoothness": ("smoothness", 0, 256, 1),
+}
+"""Sliders of a look's fields: label, least and most value, step."""
 _HINTS = {
+    "strength": "0 = the scene as it was captured",
     "temperature": "how softly regions are matched: low = each takes from what is most like it, high = all take from all",
     "clusters": "local styles of each photograph",
     "blend": "0 = each region takes a local style, 1 = all take that of the whole photograph",
@@ -54,10 +63,11 @@ class Panel:
         session: Session,
         move_camera: Callable[["viser.ClientHandle", CameraState], None],
         camera_of: Callable[["viser.ClientHandle"], CameraState],
-        draw_lines: Callable[["Panel"], None],
+        draw_lines: Callable[[], None],
     ) -> None:
         self._gui, self._session = gui, session
         self._move_camera, self._camera_of, self._draw_lines = move_camera, camera_of, draw_lines
+        self._bound: list[tuple[Any, Callable[[State], object]]] = []
         self._add_look_controls(session.state)
         self._add_view_controls(session.state)
         self._add_saved_looks()
@@ -65,21 +75,15 @@ class Panel:
 
     def follow(self, before: State, now: State) -> None:
         """Set the controls to the state."""
-        for name in ("strength", "temperature", "clusters", "blend", "luminance", "smoothness", "at"):
-            self._set(self._looks[name], getattr(now.look, name))
-        self._set(self._drop_mode, now.drop_mode)
-        self._set(self._map, now.map)
-        self._set(self._map_opacity, now.map_opacity)
-        self._set(self._wipe, now.wipe is not None)
-        self._set(self._picking, now.picking)
-        self._set(self._pixels, now.pixels)
         names = [name for name, _ in now.saved]
         if [name for name, _ in before.saved] != names:
             self._towards.options = self._restore.options = (_NONE, *names)
-        towards = [name for name, look in now.saved if look == now.look.towards]
-        self._set(self._towards, towards[0] if towards else _NONE)
+        for control, read in self._bound:
+            value = read(now)
+            if control.value != value:
+                control.value = value
         if (before.keys, before.playing) != (now.keys, now.playing):
-            self._draw_lines(self)
+            self._draw_lines()
         if (before.keys, before.film) != (now.keys, now.film):
             self._progress.value = 100.0 * now.film.done / max(1, now.film.total)
             self._record.disabled = now.film.busy
@@ -104,52 +108,37 @@ class Panel:
         return FilmPlan(state.keys, float(self._seconds.value), float(self._fps.value), (width // 2 * 2, height // 2 * 2))
 
     def _add_look_controls(self, state: State) -> None:
-        look = state.look
         with self._gui.add_folder("Style"):
-            add = self._gui.add_slider
-            self._looks: dict[str, Any] = {
-                "strength": add("strength", 0.0, 1.0, 0.01, look.strength, hint="0 = the scene as it was captured"),
-                "temperature": add("temperature", 0.05, 2.0, 0.05, look.temperature, hint=_HINTS["temperature"]),
-                "clusters": add("clusters", 1, 40, 1, look.clusters, hint=_HINTS["clusters"]),
-                "blend": add("local ↔ global", 0.0, 1.0, 0.01, look.blend, hint=_HINTS["blend"]),
-                "luminance": add("keep light", 0.0, 1.0, 0.01, look.luminance, hint=_HINTS["luminance"]),
-                "smoothness": add("smoothness", 0, 256, 1, look.smoothness, hint=_HINTS["smoothness"]),
-            }
-            presets = {name: self._gui.add_button(name, hint=preset_flags(name)) for name in PRESETS}
-            self._drop_mode = self._gui.add_dropdown(
-                "new photo", _DROP_MODES, initial_value=state.drop_mode, hint=_HINTS["drop_mode"]
-            )
-        for name, control in self._looks.items():
-            self._on_look(name, control)
-        for name, button in presets.items():
-            self._on_press(button, self._preset(name))
-        self._on_change(self._drop_mode, lambda value: lambda state: replace(state, drop_mode=_drop_mode(value)))
+            for name, (label, low, high, step) in _LOOK.items():
+                value = getattr(state.look, name)
+                self._bind_look(name, self._gui.add_slider(label, low, high, step, value, hint=_HINTS[name]))
+            for name in PRESETS:
+                self._on_press(self._gui.add_button(name, hint=preset_flags(name)), self._preset(name))
+            drop = self._gui.add_dropdown("new photo", _DROP_MODES, initial_value=state.drop_mode, hint=_HINTS["drop_mode"])
+        self._bind(drop, lambda state: state.drop_mode, lambda state, value: replace(state, drop_mode=_drop_mode(value)))
 
     def _add_view_controls(self, state: State) -> None:
         names, drawn_there = self._session.viewed.scene.names, self._session.in_browser
         maps = MAPS[:-1] if drawn_there else MAPS
         with self._gui.add_folder("Show"):
-            self._map = self._gui.add_dropdown("map", maps, initial_value=state.map, hint=_HINTS["map"])
-            self._map_opacity = self._gui.add_slider("map covers", 0.0, 1.0, 0.05, state.map_opacity)
-            self._wipe = self._gui.add_checkbox("before/after", state.wipe is not None, hint="drag the line on the picture")
-            self._picking = self._gui.add_checkbox("pick a region", state.picking, hint=_HINTS["picking"])
+            map_ = self._gui.add_dropdown("map", maps, initial_value=state.map, hint=_HINTS["map"])
+            opacity = self._gui.add_slider("map covers", 0.0, 1.0, 0.05, state.map_opacity)
+            wipe = self._gui.add_checkbox("before/after", state.wipe is not None, hint="drag the line on the picture")
+            picking = self._gui.add_checkbox("pick a region", state.picking, hint=_HINTS["picking"])
             self._cameras = self._gui.add_checkbox("cameras", False, hint="where the images were taken")
             self._blocks = self._gui.add_checkbox("blocks", False, hint="the boxes that a large scene is cut into")
-            self._pixels = self._gui.add_slider(
-                "sharpness", MIN_PIXELS, MAX_PIXELS, 32, state.pixels, hint="longest side in pixels"
-            )
-            for control in (self._wipe, self._blocks, self._pixels):  # what needs pictures that are rendered here, or fields
+            pixels = self._gui.add_slider("sharpness", MIN_PIXELS, MAX_PIXELS, 32, state.pixels, hint="longest side in pixels")
+            for control in (wipe, self._blocks, pixels):  # what needs pictures that are rendered here, or fields
                 control.visible = not drawn_there
             view = self._gui.add_slider("fly to view", 0, max(1, len(names) - 1), 1, 0)
             save = self._gui.add_button("Save a picture", hint="of this view, as large as it is here; a PNG")
-        self._on_press(save, self._save_picture)
-        self._on_change(self._map, lambda value: lambda state: replace(state, map=cast(Map, value)))
-        self._on_change(self._map_opacity, lambda value: lambda state: replace(state, map_opacity=float(value)))
-        self._on_change(self._wipe, lambda value: lambda state: replace(state, wipe=_wipe(state, bool(value))))
-        self._on_change(self._picking, lambda value: lambda state: replace(state, picking=bool(value), picked=None))
-        self._on_change(self._pixels, lambda value: lambda state: replace(state, pixels=int(value)))
+        self._bind(map_, lambda state: state.map, lambda state, value: replace(state, map=value))
+        self._bind(opacity, lambda state: state.map_opacity, lambda state, value: replace(state, map_opacity=float(value)))
+        self._bind(wipe, lambda state: state.wipe is not None, lambda state, value: replace(state, wipe=_wipe(state, value)))
+        self._bind(picking, lambda state: state.picking, lambda state, value: replace(state, picking=bool(value), picked=None))
+        self._bind(pixels, lambda state: state.pixels, lambda state, value: replace(state, pixels=int(value)))
         for control in (self._cameras, self._blocks):
-            control.on_update(lambda event: self._draw_lines(self))
+            control.on_update(lambda event: self._draw_lines())
 
         def fly(event: Any) -> None:
             if event.client is not None and 0 <= int(view.value) < len(names):
@@ -157,33 +146,35 @@ class Panel:
                 self._move_camera(event.client, self._session.transform.camera_state(cameras, int(view.value)))
 
         view.on_update(fly)
+        self._on_press(save, self._save_picture)
 
     def _save_picture(self, client: "viser.ClientHandle") -> None:
         size = (client.camera.image_width, client.camera.image_height)
         share = min(1.0, MAX_PIXELS / max(size))
         width, height = (max(1, round(share * side)) for side in size)
-        self._session.save_picture(self._camera_of(client), (width, height), client.client_id)
+        self._session.save_picture(self._camera_of(client), (width, height))
 
     def _add_saved_looks(self) -> None:
         with self._gui.add_folder("Looks", expand_by_default=False):
             name = self._gui.add_text("name", "first look")
             keep = self._gui.add_button("Keep this look")
             self._towards = self._gui.add_dropdown("towards", (_NONE,), hint="the look at the other end of the slider")
-            self._looks["at"] = self._gui.add_slider("on the way", 0.0, 1.0, 0.01, 0.0)
+            at = self._gui.add_slider("on the way", 0.0, 1.0, 0.01, 0.0)
             self._restore = self._gui.add_dropdown("back to", (_NONE,))
-        self._on_look("at", self._looks["at"])
-        self._on_press(
-            keep, lambda client: self._session.update(lambda state: save_look(state, str(name.value)), client.client_id)
-        )
 
-        def towards(value: Any) -> Callable[[State], State]:
-            return lambda state: replace(state, look=replace(state.look, towards=dict(state.saved).get(str(value))))
+        def shown(state: State) -> str:
+            return next((name for name, look in state.saved if look == state.look.towards), _NONE)
 
-        def restore(value: Any) -> Callable[[State], State]:
-            return lambda state: replace(state, look=dict(state.saved).get(str(value), state.look))
+        def towards(state: State, value: Any) -> State:
+            return replace(state, look=replace(state.look, towards=dict(state.saved).get(str(value))))
 
-        self._on_change(self._towards, towards)
-        self._on_change(self._restore, restore)
+        def restore(state: State) -> State:
+            return replace(state, look=dict(state.saved).get(str(self._restore.value), state.look))
+
+        self._bind_look("at", at)
+        self._bind(self._towards, shown, towards)
+        self._restore.on_update(lambda event: self._session.update(restore))
+        self._on_press(keep, lambda client: self._session.update(lambda state: save_look(state, str(name.value))))
 
     def _add_film_controls(self) -> None:
         with self._gui.add_folder("Film", expand_by_default=False):
@@ -203,21 +194,21 @@ class Panel:
         def put(change: Callable[[State, Key], State]) -> Callable[["viser.ClientHandle"], None]:
             def pressed(client: "viser.ClientHandle") -> None:
                 camera, thumbnail = self._camera_of(client), session.thumbnail(client.client_id)
-                session.update(lambda state: change(state, Key(camera, state.look, thumbnail)), client.client_id)
+                session.update(lambda state: change(state, Key(camera, state.look, thumbnail)))
 
             return pressed
 
         def go(client: "viser.ClientHandle") -> None:
-            session.stop_flight(client.client_id)
+            session.films.stop(client.client_id)
             state = session.state
-            if session.update(restore_key, client.client_id) and state.selected_key is not None:
+            if session.update(restore_key) and state.selected_key is not None:
                 self._move_camera(client, state.keys[state.selected_key].camera)
 
         def fly(client: "viser.ClientHandle") -> None:
             if session.state.playing:
-                session.stop_flight(client.client_id)
+                session.films.stop(client.client_id)
             else:
-                session.play_flight(client.client_id, self.plan, lambda camera: self._move_camera(client, camera))
+                session.films.play(client.client_id, self.plan, lambda camera: self._move_camera(client, camera))
 
         def fly_along(event: Any) -> None:
             if event.client is None or not session.state.keys:
@@ -230,32 +221,27 @@ class Panel:
         self._on_press(swap, put(replace_key))
         self._on_press(back, go)
         self._on_press(play, fly)
-        self._on_press(self._record, lambda client: session.record_film(self.plan, client.client_id))
+        self._on_press(self._record, lambda client: session.films.record(self.plan))
         along.on_update(fly_along)
 
-    def _on_change(self, control: Any, change: Callable[[Any], Callable[[State], State]]) -> None:
-        control.on_update(lambda event: self._session.update(change(control.value), event.client_id))
+    def _bind(self, control: Any, read: Callable[[State], object], write: Callable[[State, Any], State]) -> None:
+        """Let a control show what `read` finds in the state; what a client makes of it is written by `write`."""
+        self._bound.append((control, read))
+        control.on_update(lambda event: self._session.update(lambda state: write(state, control.value)))
 
-    def _on_look(self, name: str, control: Any) -> None:
-        def change(value: Any) -> Callable[[State], State]:
+    def _bind_look(self, name: str, control: Any) -> None:
+        def write(state: State, value: Any) -> State:
             # The page counts in hundredths; equal looks must be equal exactly.
             values: dict[str, Any] = {name: int(value) if name == "clusters" else round(float(value), 4)}
-            return lambda state: replace(state, look=replace(state.look, **values))
+            return replace(state, look=replace(state.look, **values))
 
-        self._on_change(control, change)
+        self._bind(control, lambda state: getattr(state.look, name), write)
 
     def _preset(self, name: str) -> Callable[["viser.ClientHandle"], object]:
-        def change(state: State) -> State:
-            return replace(state, look=apply_preset(state.look, name))
-
-        return lambda client: self._session.update(change, client.client_id)
+        return lambda client: self._session.update(lambda state: replace(state, look=apply_preset(state.look, name)))
 
     def _on_press(self, button: Any, act: Callable[["viser.ClientHandle"], object]) -> None:
         button.on_click(lambda event: None if event.client is None else act(event.client))
-
-    def _set(self, control: Any, value: object) -> None:
-        if control.value != value:
-            control.value = value
 
 
 def _wipe(state: State, on: bool) -> float | None:

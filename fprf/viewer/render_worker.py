@@ -4,27 +4,27 @@ Work is an iterator that is advanced step by step (a chunk of rays). Before each
 older one, so stale pictures never queue, however fast a camera moves. Clients take turns step by step.
 """
 
+import contextlib
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Iterator
-from typing import Generic, TypeVar
+from collections.abc import Callable, Generator, Hashable
+from typing import Generic, TypeAlias, TypeVar
 
 Request = TypeVar("Request")
+Steps: TypeAlias = Generator[None, None, None]
 
 
 class RenderWorker(Generic[Request]):
     """`work(client, request)` yields between steps; `on_error` receives what a step raised, and the worker goes on."""
 
-    def __init__(
-        self, work: Callable[[Hashable, Request], Iterator[None]], on_error: Callable[[Hashable | None, Exception], None]
-    ) -> None:
+    def __init__(self, work: Callable[[Hashable, Request], Steps], on_error: Callable[[Exception], None]) -> None:
         self._work, self._on_error = work, on_error
         self._change = threading.Condition()
         self._fresh: dict[Hashable, Request] = {}
-        self._active: OrderedDict[Hashable, Iterator[None]] = OrderedDict()
+        self._active: OrderedDict[Hashable, Steps] = OrderedDict()
         self._left: set[Hashable] = set()
         self._jobs: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
-        self._idle_work: deque[Iterator[None]] = deque()
+        self._idle_work: deque[Steps] = deque()
         self._busy = self._closed = False
         self._thread = threading.Thread(target=self._run, name="fprf-render", daemon=True)
 
@@ -53,7 +53,7 @@ class RenderWorker(Generic[Request]):
             self._jobs[name] = job
             self._change.notify()
 
-    def run_when_idle(self, work: Iterator[None]) -> None:
+    def run_when_idle(self, work: Steps) -> None:
         """Advance `work` (a film) while no client waits."""
         with self._change:
             self._idle_work.append(work)
@@ -92,47 +92,38 @@ class RenderWorker(Generic[Request]):
                 self._busy = bool(fresh or job or self._active)
             self._drop(left | set(fresh))
             for client, request in fresh.items():
-                self._begin(client, request)
+                self._active[client] = self._work(client, request)
             if job is not None:
-                self._call(None, job)
+                self._call(job)
             else:
                 self._advance()
         self._drop(set(self._active))
-
-    def _begin(self, client: Hashable, request: Request) -> None:
-        def begin() -> None:
-            self._active[client] = self._work(client, request)
-
-        self._call(client, begin)
 
     def _advance(self) -> None:
         """Make one step for the next client in turn, else one of the work for idle times."""
         if self._active:
             client, work = self._active.popitem(last=False)
-            if self._call(client, lambda: next(work)):
+            if self._call(lambda: next(work)):
                 self._active[client] = work
         elif self._idle_work:
             work = self._idle_work[0]
-            if not self._call(None, lambda: next(work)):
+            if not self._call(lambda: next(work)):
                 self._idle_work.popleft()
 
     def _drop(self, clients: set[Hashable]) -> None:
         for client in clients:
             work = self._active.pop(client, None)
-            close = getattr(work, "close", None)  # generators give back what they hold; other iterators have nothing to
-            if close is not None:
-                self._call(client, close)
+            if work is not None:
+                self._call(work.close)
 
-    def _call(self, client: Hashable | None, call: Callable[[], object]) -> bool:
+    def _call(self, call: Callable[[], object]) -> bool:
         """Return whether there may be more to do; report what was raised."""
         try:
             call()
         except StopIteration:
             return False
         except Exception as error:
-            try:
-                self._on_error(client, error)
-            except Exception:  # reporting can fail too, as when the client has just disconnected
-                return False
+            with contextlib.suppress(Exception):  # reporting can fail too, as when the client has just disconnected
+                self._on_error(error)
             return False
         return True

@@ -9,9 +9,9 @@ of a client's last view are kept, so that a slider that is moved while the camer
 import time
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Generator, Hashable, Iterable, Iterator
+from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,6 +29,7 @@ from ..style.scene import SceneStyle
 from ..training.loading import Trained
 from ..training.views import Part, view_parts
 from .cameras import CameraState, PageTransform, picture_size
+from .render_worker import Steps
 from .restyler import Restyler
 from .state import ViewSettings
 
@@ -38,6 +39,8 @@ CHUNK = 4096
 """Rays of a step: after each one a newer request may take over."""
 FIRST_SECONDS = 0.1
 """Time for the first picture of a new camera."""
+NO_MATCH = 128
+"""Grey of the map of matches without a style."""
 _MIN_SIDE = 16
 """No picture's longer side is smaller, unless that of the largest is."""
 _DIM = 0.45
@@ -121,7 +124,7 @@ class SceneRenderer(ABC):
     """Serves the requests of all clients of one scene. Runs on the render worker."""
 
     @abstractmethod
-    def render(self, client: Hashable, request: RenderRequest) -> Iterator[None]:
+    def render(self, client: Hashable, request: RenderRequest) -> Steps:
         """Show a client what it requests, step by step; the client None is nobody."""
 
     @abstractmethod
@@ -142,7 +145,7 @@ class ProgressiveRenderer(SceneRenderer):
         restyler: Restyler,
         transform: PageTransform,
         show: Callable[[Hashable, RenderedFrame], None],
-        speeds: "tuple[Speed, Speed] | None" = None,
+        speeds: tuple[Speed, Speed] | None = None,
     ) -> None:
         self._trained, self._restyler, self._transform, self._show = trained, restyler, transform, show
         self._caches: OrderedDict[Hashable, _ClientCache] = OrderedDict()
@@ -159,7 +162,7 @@ class ProgressiveRenderer(SceneRenderer):
         width, height = (int(v) for v in cameras.size[view])
         return to_uint8(torch.cat(rows).view(height, width, 3))
 
-    def render(self, client: Hashable, request: RenderRequest) -> Iterator[None]:
+    def render(self, client: Hashable, request: RenderRequest) -> Steps:
         """Show ever sharper pictures, a step each chunk of rays."""
         start = time.perf_counter()
         cache = self._caches.setdefault(client, _ClientCache())
@@ -183,16 +186,17 @@ class ProgressiveRenderer(SceneRenderer):
         for size in sizes[first:]:
             begun = time.perf_counter()
             again = size in cache.parts
-            layers = LayerRenderer(self._trained.model.decoder, scene, styled, request.view, size)
+            chunks: list[dict[str, NDArray[Any]]] = []
             parts: list[Part] = []
             for part in cache.parts[size] if again else self._march(request.camera, size):
-                yield from layers.render([part])
+                chunks.append(render_layers(part, self._trained.model.decoder, scene, styled, request.view))
+                yield
                 if not again and sum(each.bytes for each in parts) + part.bytes <= CACHE_BYTES:
                     parts.append(part)
             (self._cached_speed if again else self._speed).update(size[0] * size[1], time.perf_counter() - begun)
             if not again and sum(part.rays for part in parts) == size[0] * size[1]:
                 self._keep(cache, size, tuple(parts))
-            final, done = size == sizes[-1], layers.finish()
+            final, done = size == sizes[-1], join_layers(chunks, request.view, size)
             if final:
                 cache.last = (request, done)
             show(done, final)
@@ -223,77 +227,51 @@ def _covers(before: RenderRequest, now: RenderRequest) -> bool:
     return same and before.view.layers >= now.view.layers
 
 
-@dataclass
-class LayerRenderer:
-    """Renders the layers of a view chunk by chunk."""
+@torch.inference_mode()
+def render_layers(
+    part: Part, decoder: Decoder, scene: SceneStyle | None, styled: Styled | None, view: ViewSettings
+) -> dict[str, NDArray[Any]]:
+    """The layers of a chunk of a view, its depth and its opacity. `styled` None = the scene as it is.
 
-    decoder: Decoder
-    scene: SceneStyle | None
-    """May be None where no region is shown."""
-    styled: Styled | None
-    """None = the scene as it is."""
-    view: ViewSettings
-    size: tuple[int, int]
-    """Width, height."""
-    _rows: dict[str, list[Picture]] = field(default_factory=dict)
-    _share: list[NDArray[np.float32]] = field(default_factory=list)
-    _depth: list[Tensor] = field(default_factory=list)
-    _opacity: list[Tensor] = field(default_factory=list)
+    `scene` may be None where no region is shown.
+    """
+    restyle = None if styled is None else styled.restyle
+    layers = {"look": to_uint8(part.colour(decoder, restyle)), "depth": part.depth.numpy(), "opacity": part.opacity.numpy()}
+    if view.wipe is not None:
+        layers["plain"] = to_uint8(part.colour(decoder, None))
+    if view.map == "matches" and styled is not None and part.semantic is not None:
+        layers["matches"] = match_colours(styled, part.mean(styled.restyle.match(part.semantic)), part.opacity)
+    elif view.map == "matches":
+        layers["matches"] = np.full_like(layers["look"], NO_MATCH)
+    if view.shows_regions:
+        assert scene is not None
+        weight = RegionWeight(scene, torch.eye(len(scene.share))).to(part.content.device)
+        memberships = part.mean(weight(part.content[:, :0] if part.semantic is None else part.semantic))
+        if view.map == "regions":
+            layers["regions"] = to_uint8(region_colours(memberships, part.opacity))
+        if view.region is not None:
+            layers["share"] = memberships[:, view.region].float().numpy()
+    return layers
 
-    def render(self, parts: Iterable[Part]) -> Iterator[None]:
-        """Add chunks of the view, a step each."""
-        for part in parts:
-            self._add_part(part)
-            yield
 
-    def finish(self) -> Layers:
-        """The layers of all chunks together."""
-        width, height = self.size
-        depth, opacity = (torch.cat(each).view(height, width) for each in (self._depth, self._opacity))
-        rows = {name: np.concatenate(each) for name, each in self._rows.items()}
-        share = np.concatenate(self._share).reshape(height, width) if self._share else None
-        pictures: dict[str, Picture] = {name: each.reshape(height, width, 3) for name, each in rows.items()}
-        if self.view.map == "depth":
-            pictures["depth"] = depth_image(depth, opacity)
-        solid = torch.where(opacity > 0.5, depth, torch.inf)
-        return Layers(pictures, share, solid)
+def join_layers(chunks: Sequence[Mapping[str, NDArray[Any]]], view: ViewSettings, size: tuple[int, int]) -> Layers:
+    """The layers of all chunks of a view of `size` (width, height)."""
+    width, height = size
+    whole = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
+    whole = {name: rows.reshape(height, width, *rows.shape[1:]) for name, rows in whole.items()}
+    depth, opacity = (torch.from_numpy(whole.pop(name)) for name in ("depth", "opacity"))
+    share = whole.pop("share", None)
+    if view.map == "depth":
+        whole["depth"] = depth_image(depth, opacity)
+    return Layers(whole, share, torch.where(opacity > 0.5, depth, torch.inf))
 
-    @torch.inference_mode()
-    def _add_part(self, part: Part) -> None:
-        restyle = None if self.styled is None else self.styled.restyle
-        self._add("look", _row(to_uint8(part.colour(self.decoder, restyle)[None])))
-        if self.view.wipe is not None:
-            self._add("plain", _row(to_uint8(part.colour(self.decoder, None)[None])))
-        if self.view.map == "matches":
-            self._add("matches", self._matches(part))
-        if self.view.map == "regions":
-            self._add("regions", self._regions(part))
-        if self.view.region is not None:
-            self._share.append(self._memberships(part)[:, self.view.region].float().numpy())
-        self._depth.append(part.depth)
-        self._opacity.append(part.opacity)
 
-    def _matches(self, part: Part) -> Picture:
-        if self.styled is None or part.semantic is None:
-            return np.full((part.rays, 3), 128, np.uint8)
-        codes, look = self.styled.codes, self.styled.restyle
-        taken = part.mean(look.match(part.semantic))
-        total = taken.sum(-1, keepdim=True)
-        attention, kept = taken / total.clamp_min(1e-10), 1 - total[:, 0]
-        return _row(match_image(attention[None], codes.reference, codes.names, part.opacity[None], kept.clamp(0, 1)[None]))
-
-    def _regions(self, part: Part) -> Picture:
-        return _row(to_uint8(region_colours(self._memberships(part), part.opacity)[None]))
-
-    def _memberships(self, part: Part) -> Tensor:
-        """Return the share of each pixel in each region."""
-        assert self.scene is not None
-        weight = RegionWeight(self.scene, torch.eye(len(self.scene.share))).to(part.content.device)
-        semantic = part.content[:, :0] if part.semantic is None else part.semantic
-        return part.mean(weight(semantic))
-
-    def _add(self, name: str, rows: Picture) -> None:
-        self._rows.setdefault(name, []).append(rows)
+def match_colours(styled: Styled, taken: Annotated[Tensor, "N T"], opacity: Annotated[Tensor, "N"]) -> Picture:
+    """Colours [N 3] of the references that each pixel takes its style from, by what it takes of each code."""
+    total = taken.sum(-1, keepdim=True)
+    attention, kept = taken / total.clamp_min(1e-10), (1 - total[:, 0]).clamp(0, 1)
+    codes = styled.codes
+    return np.asarray(match_image(attention[None], codes.reference, codes.names, opacity[None], kept[None])[0])
 
 
 def region_colours(memberships: Annotated[Tensor, "N K"], opacity: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N 3"]:
@@ -301,11 +279,6 @@ def region_colours(memberships: Annotated[Tensor, "N K"], opacity: Annotated[Ten
     most, region = memberships.max(-1)
     light = (_UNSURE + (1 - _UNSURE) * most) * opacity
     return palette(memberships.shape[1])[region] * light[:, None]
-
-
-def _row(picture: Picture) -> Picture:
-    """A picture of one row as its pixels."""
-    return np.asarray(picture[0])
 
 
 def composite_layers(layers: Layers, view: ViewSettings) -> Picture:

@@ -5,7 +5,7 @@ Calls come from any thread. What touches the model runs on the render worker; th
 
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from itertools import count
@@ -24,9 +24,9 @@ from ..splats.scene import SplatScene
 from ..training.loading import Trained
 from ..training.run import Known, Run
 from .cameras import CameraState, PageTransform, page_transform
-from .film import FilmPlan, FilmRecorder
+from .film import FilmRecorder
 from .gaussian_renderer import Colours, GaussianRenderer
-from .render_worker import RenderWorker
+from .render_worker import RenderWorker, Steps
 from .renderer import ProgressiveRenderer, RenderedFrame, RenderRequest, SceneRenderer, first_speeds
 from .restyler import OpenEncoders, Restyler, matching_regions
 from .state import Look, Photograph, State, Thumbnail, ViewSettings, add_photograph, only, renumber_regions
@@ -86,8 +86,8 @@ class Frontend(ABC):
         """Follow a change of the state."""
 
     @abstractmethod
-    def notify(self, text: str, client: Hashable | None = None) -> None:
-        """Show a line of text to one client or to all."""
+    def notify(self, text: str) -> None:
+        """Show a line of text to all clients: one's mistake is nothing to hide."""
 
 
 class Session:
@@ -107,9 +107,9 @@ class Session:
         self._worker: RenderWorker[RenderRequest] = RenderWorker(
             lambda client, request: self.renderer.render(client, request), self._on_error
         )
-        self._films = FilmRecorder(self, self._worker)
+        self.films = FilmRecorder(self, self._worker)
         self._pictures: dict[Hashable, Picture] = {}
-        self._thumbnails = 0
+        self._thumbnails = count(1)
         self.uploads = Uploads()
 
     def __enter__(self) -> "Session":
@@ -117,11 +117,7 @@ class Session:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End everything; a film that is being made is left unfinished."""
-        self._worker.close()
+        self._worker.close()  # a film that is being made is left unfinished
         self.uploads.close()
 
     def attach(self, frontend: Frontend) -> None:
@@ -132,7 +128,7 @@ class Session:
         """Prepare what the first photograph needs while nobody waits: decoder, encoders, kernels, a style."""
         threading.Thread(target=self.uploads.start_decoder, name="fprf-warm-up", daemon=True).start()
 
-        def work() -> Iterator[None]:
+        def work() -> Steps:
             self.restyler.encoders  # noqa: B018  they are opened by asking for them
             yield
             path = self.uploads.folder / "warm-up.png"
@@ -153,17 +149,16 @@ class Session:
     def move_camera(self, client: Hashable, camera: CameraState) -> None:
         """Render what a client's camera sees now."""
         with self._lock:
-            if self._films.playing(client):
-                return
-            self._cameras[client] = camera
-            self._worker.request(client, RenderRequest(camera, self.state.view, self.state.pixels))
+            if not self.films.playing(client):
+                self._cameras[client] = camera
+                self.refresh(client)
 
     def disconnect(self, client: Hashable) -> None:
         """Drop everything of a client."""
         with self._lock:
             self._cameras.pop(client, None)
             self._pictures.pop(client, None)
-        self._films.stop(client)
+        self.films.stop(client)
         self._worker.forget(client)
         self._worker.run(("forget", client), lambda: self.renderer.forget(client))
 
@@ -198,39 +193,40 @@ class Session:
             if self.state.picked is not None:
                 self.select_region(self.state.picked.region)
 
-        self._worker.run("reload", self._reporting(job, None))
+        self._worker.run("reload", job)
 
-    def notify(self, text: str, client: Hashable | None = None) -> None:
-        """Show a line of text to one client or to all."""
+    def notify(self, text: str) -> None:
+        """Show a line of text to all clients."""
         if self._frontend is not None:
-            self._frontend.notify(text, client)
+            self._frontend.notify(text)
 
-    def update(self, change: Callable[[State], State], client: Hashable | None = None) -> bool:
-        """Replace the state for all clients; return False and tell the client where that is not possible."""
+    def update(self, change: Callable[[State], State]) -> bool:
+        """Replace the state for all clients; return False and say why where that is not possible."""
         try:
-            with self._lock:
-                before, self.state = self.state, change(self.state)
-                now = self.state
-                if (before.view, before.pixels) != (now.view, now.pixels):
-                    self._request_all()
+            self.apply(change)
         except FprfError as error:
-            self.notify(str(error), client)
+            self.notify(str(error))
             return False
+        return True
+
+    def apply(self, change: Callable[[State], State]) -> None:
+        """Replace the state for all clients. Raises what `change` raises."""
+        with self._lock:
+            before, self.state = self.state, change(self.state)
+            now = self.state
+            if (before.view, before.pixels) != (now.view, now.pixels):
+                self._request_all()
         if now.picked is not None and now.look != before.look:
-            self.select_region(now.picked.region, client)  # what it takes has changed
+            self.select_region(now.picked.region)  # what it takes has changed
         if now != before and self._frontend is not None:
             self._frontend.changed(before, now)
-        return True
 
     def upload(self, data: bytes, name: str) -> Photograph:
         """Decode and encode a photograph and restyle the scene with it. Raises DataError for what is none."""
-        return self.add_photograph(self.uploads.store(data), shown_name(name))
-
-    def add_photograph(self, path: Path, name: str) -> Photograph:
-        """Encode a photograph of this machine and restyle the scene with it."""
+        path = self.uploads.store(data)
 
         def add() -> Photograph:
-            photograph = self.restyler.encode(path, _unused_name(name, self.state))
+            photograph = self.restyler.encode(path, _unused_name(shown_name(name), self.state))
             self.update(lambda state: add_photograph(state, photograph))
             self._delete_unused(photograph)
             return photograph
@@ -254,11 +250,11 @@ class Session:
 
         return self._result("gaussians", written)
 
-    def save_picture(self, camera: CameraState, size: tuple[int, int], client: Hashable | None = None) -> None:
+    def save_picture(self, camera: CameraState, size: tuple[int, int]) -> None:
         """Render what a camera sees, at a width and height, into the scene's folder while no client waits for a picture."""
         cameras, root = self.transform.cameras([camera], size), self.viewed.root or self.uploads.folder
 
-        def work() -> Iterator[None]:
+        def work() -> Steps:
             try:
                 picture = yield from self.renderer.frame(cameras, 0, self.restyler.restyle(self.state.look))
                 folder = root / "pictures"
@@ -266,7 +262,7 @@ class Session:
                 folder.mkdir(parents=True, exist_ok=True)
                 write_image(path, picture)
             except FprfError as error:
-                self.notify(f"picture: {error}", client)
+                self.notify(f"picture: {error}")
             else:
                 self.update(lambda state: replace(state, pictures=(*state.pictures, path)))
 
@@ -284,23 +280,11 @@ class Session:
             width, height = cameras.size[0].tolist()
             self._select(self.restyler.region_at(cameras, (place[0] * width, place[1] * height)))
 
-        self._worker.run(("pick", client), self._reporting(job, client))
+        self._worker.run(("pick", client), job)
 
-    def select_region(self, region: int | None, client: Hashable | None = None) -> None:
+    def select_region(self, region: int | None) -> None:
         """Select a region by number, or none."""
-        self._worker.run("select", self._reporting(lambda: self._select(region), client))
-
-    def record_film(self, plan: FilmPlan, client: Hashable | None = None) -> None:
-        """Make a film in the run's folder while no client waits for a picture, one at a time."""
-        self._films.record(plan, client)
-
-    def play_flight(self, client: Hashable, plan: FilmPlan, move: Callable[[CameraState], None]) -> None:
-        """Show a client the flight; `move` moves its camera, whose own moves are ignored until it ends."""
-        self._films.play(client, plan, move)
-
-    def stop_flight(self, client: Hashable) -> None:
-        """End a client's flight where it is."""
-        self._films.stop(client)
+        self._worker.run("select", lambda: self._select(region))
 
     def preview(self, client: Hashable, camera: CameraState, look: Look) -> None:
         """Show one client another look than that of all."""
@@ -310,7 +294,7 @@ class Session:
                 self._worker.request(client, RenderRequest(camera, ViewSettings(look), self.state.pixels))
 
     def refresh(self, client: Hashable) -> None:
-        """Show one client the look of all again."""
+        """Show one client what its camera sees, in the look of all."""
         with self._lock:
             if client in self._cameras:
                 self._worker.request(client, RenderRequest(self._cameras[client], self.state.view, self.state.pixels))
@@ -324,8 +308,7 @@ class Session:
         picture = self._pictures.get(client)
         if picture is None:
             return None
-        self._thumbnails += 1
-        return Thumbnail(self._thumbnails, shrink(picture, _THUMBNAIL))
+        return Thumbnail(next(self._thumbnails), shrink(picture, _THUMBNAIL))
 
     def _result(self, name: Hashable, call: Callable[[], T]) -> T:
         """Run a call on the worker and return its result. Raises what it raises."""
@@ -369,21 +352,10 @@ class Session:
         picked = None if region is None else self.restyler.region_info(self.state.look, region)
         self.update(lambda state: replace(state, picked=picked))
 
-    def _reporting(self, call: Callable[[], None], client: Hashable | None) -> Callable[[], None]:
-        """The call, with its errors told to the client."""
-
-        def reporting() -> None:
-            try:
-                call()
-            except FprfError as error:
-                self.notify(str(error), client)
-
-        return reporting
-
     def _request_all(self) -> None:
         with self._lock:
-            for client, camera in self._cameras.items():
-                self._worker.request(client, RenderRequest(camera, self.state.view, self.state.pixels))
+            for client in self._cameras:
+                self.refresh(client)
 
     def _show(self, client: Hashable, frame: RenderedFrame) -> None:
         if self._frontend is not None and client is not None:  # the warm-up has no client
@@ -394,9 +366,9 @@ class Session:
         if self._frontend is not None:
             self._frontend.recolour(colours)
 
-    def _on_error(self, client: Hashable | None, error: Exception) -> None:
+    def _on_error(self, error: Exception) -> None:
         expected = isinstance(error, FprfError)
-        self.notify(str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}", client)
+        self.notify(str(error) if expected else f"this should not have happened: {type(error).__name__}: {error}")
 
 
 def _unused_name(name: str, state: State) -> str:

@@ -13,11 +13,10 @@ from tiny_world import World
 
 from fprf.cli import main as cli
 from fprf.errors import ConfigError, UsageError
-from fprf.io.images import Picture
 from fprf.training.loading import load_run
 from fprf.viewer import film
 from fprf.viewer.cameras import CameraState, page_transform
-from fprf.viewer.film import FilmPlan, film_cameras, film_frames, new_folder, queued_frames, write_film_files
+from fprf.viewer.film import FilmPlan, Frames, film_cameras, film_frames, new_folder, queued_frames, write_film_files
 from fprf.viewer.renderer import ProgressiveRenderer
 from fprf.viewer.restyler import Restyler
 from fprf.viewer.session import Session
@@ -44,7 +43,7 @@ def test_the_film_is_what_fprf_render_makes_of_its_folder(world: World, tmp_path
     plan = plan_of(restyler, [Look(), one, between])
     folder = new_folder(tmp_path / "run")
     write_film_files(folder, page_transform(restyler.scene.known.cameras), plan, restyler.scene.known.facts.semantic_encoder)
-    out: Queue[Picture | None] = Queue()
+    out: Frames = Queue()
     told: list[tuple[int, int]] = []
     for _ in film_frames(folder, restyler.scene, drawn_by(restyler), out, lambda done, total: told.append((done, total))):
         pass
@@ -98,7 +97,7 @@ def test_films_that_cannot_be_are_refused(world: World, change: dict[str, object
 
 
 def test_a_film_that_fails_ends_its_frames(world: World, tmp_path: Path) -> None:
-    out: Queue[Picture | None] = Queue()
+    out: Frames = Queue()
     with pytest.raises(Exception, match="no such camera path"):
         restyler = Restyler(world.load())
         list(film_frames(tmp_path, restyler.scene, drawn_by(restyler), out, lambda done, total: None))
@@ -138,7 +137,7 @@ def test_a_flight_goes_from_the_first_key_to_the_last_for_one_client_alone(
     listener.frames.clear()
     flown: list[CameraState] = []
     plan = flight(session, [Look(), styled])
-    session.play_flight(1, plan, flown.append)
+    session.films.play(1, plan, flown.append)
     until(lambda: not session.state.playing and len(flown) > 1 and session.idle)
     for key, eye in ((plan.keys[0], flown[0]), (plan.keys[1], flown[-1])):
         assert eye.position == pytest.approx(key.camera.position, abs=1e-6)
@@ -153,20 +152,20 @@ def test_who_leaves_or_plays_again_ends_the_flight(opened: tuple[Session, Listen
     session, _ = opened
     session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 5))
     long, flown = flight(session, [Look(), Look()], seconds=300.0), list[CameraState]()
-    session.play_flight(1, long, flown.append)
+    session.films.play(1, long, flown.append)
     until(lambda: bool(flown))
-    session.play_flight(1, flight(session, [Look(), Look()]), flown.append)
+    session.films.play(1, flight(session, [Look(), Look()]), flown.append)
     until(lambda: not session.state.playing)
-    session.play_flight(1, long, flown.append)
+    session.films.play(1, long, flown.append)
     until(lambda: session.state.playing)
     session.disconnect(1)
     until(lambda: not session.state.playing)
-    assert not session._films._flights
+    assert not session.films._flights
 
 
 def test_a_flight_of_nothing_is_told(opened: tuple[Session, Listener]) -> None:
     session, listener = opened
     session.move_camera(1, session.transform.camera_state(session.viewed.scene.cameras, 5))
-    session.play_flight(1, FilmPlan((), 1.0, 24.0, (32, 24)), lambda eye: None)
+    session.films.play(1, FilmPlan((), 1.0, 24.0, (32, 24)), lambda eye: None)
     listener.until(lambda: any("no keys" in text for text in listener.said))
-    until(lambda: not session._films._flights)
+    until(lambda: not session.films._flights)

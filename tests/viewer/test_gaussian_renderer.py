@@ -84,7 +84,7 @@ def test_films_are_rasterised_here_into_the_scene_s_folder(opened: tuple[Session
     session, listener = opened
     keys = tuple(Key(session.transform.camera_state(scene.cameras, view), Look()) for view in (0, 1))
     plan = FilmPlan(keys, 0.1, 30.0, (32, 24))
-    session.record_film(plan)
+    session.films.record(plan)
     listener.until(lambda: session.state.film.path is not None)
     path = session.state.film.path
     assert path is not None
@@ -93,7 +93,7 @@ def test_films_are_rasterised_here_into_the_scene_s_folder(opened: tuple[Session
     cameras = session.transform.cameras([keys[0].camera], (32, 24))
     assert np.abs(shown - to_uint8(scene.render(cameras, 0).rgb)).mean() < 6  # what the codec leaves
     session.viewed = replace(session.viewed, root=None)
-    session.record_film(plan)
+    session.films.record(plan)
     listener.until(lambda: any("no folder" in text for text in listener.said))
 
 
@@ -120,7 +120,7 @@ def test_a_flight_moves_the_browser_s_camera(opened: tuple[Session, Listener], s
     session, listener = opened
     keys = tuple(Key(session.transform.camera_state(scene.cameras, view), Look()) for view in (0, 1))
     flown: list[object] = []
-    session.play_flight(1, FilmPlan(keys, 0.5, 24.0, (32, 24)), flown.append)
+    session.films.play(1, FilmPlan(keys, 0.5, 24.0, (32, 24)), flown.append)
     listener.until(lambda: any(state.playing for state in listener.states) and not session.state.playing)
     assert len(flown) > 2 and listener.frames == [] and session.thumbnail(1) is None
 

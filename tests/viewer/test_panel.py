@@ -56,7 +56,7 @@ class Room:
         found: CameraState = self.client.cameras[-1]
         return found
 
-    def draw(self, panel: Panel) -> None:
+    def draw(self) -> None:
         self.drawn += 1
 
     def move(self, label: str, value: object) -> None:

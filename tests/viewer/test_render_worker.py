@@ -5,9 +5,7 @@ from collections.abc import Hashable, Iterator
 import pytest
 from photographs import until
 
-from fprf.viewer.render_worker import RenderWorker
-
-Told = list[tuple[Hashable | None, str]]
+from fprf.viewer.render_worker import RenderWorker, Steps
 
 
 class Bench:
@@ -18,12 +16,10 @@ class Bench:
         self.permits = threading.Semaphore(0)
         self.log: list[tuple[Hashable, object, int]] = []
         self.closed: list[object] = []
-        self.faults: Told = []
-        self.worker: RenderWorker[object] = RenderWorker(
-            self.work, lambda client, error: self.faults.append((client, str(error)))
-        )
+        self.faults: list[str] = []
+        self.worker: RenderWorker[object] = RenderWorker(self.work, lambda error: self.faults.append(str(error)))
 
-    def work(self, client: Hashable, request: object) -> Iterator[None]:
+    def work(self, client: Hashable, request: object) -> Steps:
         try:
             for step in range(self.steps):
                 self.permits.acquire()
@@ -74,19 +70,19 @@ def test_a_fault_is_told_and_work_goes_on(bench: Bench) -> None:
     bench.worker.start()
     bench.worker.request("a", "bad")
     bench.let(2)
-    until(lambda: bench.faults == [("a", "it broke")])
+    until(lambda: bench.faults == ["it broke"])
     bench.worker.request("a", "good")
     bench.let(4)
     until(lambda: "good" in bench.closed)
 
 
 def test_even_where_telling_fails() -> None:
-    def fault(client: Hashable | None, error: Exception) -> None:
+    def fault(error: Exception) -> None:
         raise RuntimeError("nobody there")
 
     done = threading.Event()
 
-    def work(client: Hashable, request: object) -> Iterator[None]:
+    def work(client: Hashable, request: object) -> Steps:
         if request == "bad":
             raise ValueError
         done.set()

@@ -51,7 +51,7 @@ class Listener(Frontend):
             self.states.append(now)
             self.news.notify_all()
 
-    def notify(self, text: str, client: Hashable | None = None) -> None:
+    def notify(self, text: str) -> None:
         with self.news:
             self.said.append(text)
             self.news.notify_all()
@@ -90,7 +90,7 @@ def test_a_drop_restyles_what_every_client_sees(opened: tuple[Session, Listener]
 
 def test_a_state_that_cannot_be_is_told_to_who_wanted_it(opened: tuple[Session, Listener]) -> None:
     session, listener = opened
-    assert not session.update(lambda state: replace(state, wipe=7.0), 1)
+    assert not session.update(lambda state: replace(state, wipe=7.0))
     assert session.state.wipe is None and any("wipe" in text for text in listener.said)
     assert session.update(lambda state: replace(state, wipe=0.5)) and listener.states[-1].wipe == 0.5
 
@@ -105,7 +105,7 @@ def test_a_click_picks_a_region_and_what_it_takes_follows_the_look(opened: tuple
     session.upload(world.references[0].read_bytes(), "dusk.png")
     session.select_region(0)
     listener.until(lambda: session.state.picked is not None and session.state.picked.taken != ())
-    session.select_region(99, 1)
+    session.select_region(99)
     listener.until(lambda: any("region 99" in text for text in listener.said))
     session.pick(1, (7.0, 0.5))
     listener.until(lambda: any("outside" in text for text in listener.said))
@@ -117,7 +117,7 @@ def test_a_film_is_made_while_others_look(opened: tuple[Session, Listener]) -> N
     session, listener = opened
     cameras = session.viewed.scene.cameras
     keys = tuple(Key(session.transform.camera_state(cameras, view), Look()) for view in (0, 1))
-    session.record_film(FilmPlan(keys, 0.1, 30.0, (32, 24)))
+    session.films.record(FilmPlan(keys, 0.1, 30.0, (32, 24)))
     session.move_camera(1, session.transform.camera_state(cameras, 2))
     listener.until(lambda: session.state.film.path is not None)
     path = session.state.film.path
@@ -128,10 +128,9 @@ def test_a_film_is_made_while_others_look(opened: tuple[Session, Listener]) -> N
 
 def test_who_drops_while_the_viewer_ends_is_not_left_waiting(opened: tuple[Session, Listener], world: World) -> None:
     session, _ = opened
-    path = session.uploads.store(world.references[0].read_bytes())
     session._worker.close()
     with pytest.raises(UsageError, match="the viewer is ending"):
-        session.add_photograph(path, "dusk.png")
+        session.upload(world.references[0].read_bytes(), "dusk.png")
 
 
 def test_faults_of_ours_are_told_and_nothing_stops(opened: tuple[Session, Listener]) -> None:
