@@ -9,13 +9,12 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
-from importlib.resources import files
 from typing import Any
 
 from ..errors import UsageError
 from ..io.images import encode
 from ..io.maps import palette
-from .server import Handler, Request, Response, json_body, json_response
+from .server import Handler, Request, Response, asset, integer, json_body, json_response, number, text_response
 from .session import Session
 from .state import (
     Photograph,
@@ -58,8 +57,8 @@ class Page:
         """Handlers by method and path."""
         return {
             ("GET", "/"): self._index,
-            ("GET", "/fprf/page.js"): self._asset("page.js", "text/javascript; charset=utf-8"),
-            ("GET", "/fprf/page.css"): self._asset("page.css", "text/css; charset=utf-8"),
+            ("GET", "/fprf/page.js"): asset("page.js", "javascript"),
+            ("GET", "/fprf/page.css"): asset("page.css", "css"),
             ("GET", "/fprf/state"): self._state,
             ("GET", "/fprf/card"): self._thumbnail,
             ("GET", "/fprf/film"): self._film,
@@ -90,14 +89,8 @@ class Page:
     async def _index(self, request: Request) -> Response:
         return Response(200, "text/html; charset=utf-8", self._first)
 
-    def _asset(self, name: str, content_type: str) -> Handler:
-        async def asset(request: Request) -> Response:
-            return Response(200, content_type, (files(__package__) / name).read_bytes())
-
-        return asset
-
     async def _state(self, request: Request) -> Response:
-        after = _integer(request.query.get("after", "-1"))
+        after = integer({"after": -1, **request.query}, "after", -1)
         event = asyncio.Event()
         with self._lock:
             fresh = self._version != after
@@ -122,13 +115,13 @@ class Page:
     async def _film(self, request: Request) -> Response:
         path = self._session.state.film.path
         if path is None or not path.is_file():
-            return Response(404, "text/plain; charset=utf-8", b"no film yet\n")
+            return text_response(404, "no film yet")
         return self._download("video/mp4", path.read_bytes(), f"{path.parent.name}.mp4")
 
     async def _picture(self, request: Request) -> Response:
-        pictures, number = self._session.state.pictures, _integer(request.query.get("number", ""))
+        pictures, number = self._session.state.pictures, integer(request.query, "number")
         if not 0 <= number < len(pictures):
-            return Response(404, "text/plain; charset=utf-8", b"no such picture\n")
+            return text_response(404, "no such picture")
         return self._download("image/png", pictures[number].read_bytes(), pictures[number].name)
 
     async def _gaussians(self, request: Request) -> Response:
@@ -142,15 +135,15 @@ class Page:
         return Response(200, content_type, data, {"content-disposition": f'attachment; filename="{plain}"'})
 
     async def _key(self, request: Request) -> Response:
-        number = _integer(request.query.get("key", ""))
+        wanted = integer(request.query, "key")
         for key in self._session.state.keys:
-            if key.thumbnail is not None and key.thumbnail.number == number:
+            if key.thumbnail is not None and key.thumbnail.number == wanted:
                 return Response(200, "image/jpeg", encode(key.thumbnail.picture, "jpg"), _IMAGE)
-        return Response(404, "text/plain; charset=utf-8", b"no picture of this key\n")
+        return text_response(404, "no picture of this key")
 
     async def _edit_key(self, request: Request) -> Response:
         asked = json_body(request)
-        at, edit = _integer(str(asked.get("key"))), _EDITS.get(str(asked.get("action")))
+        at, edit = integer(asked, "key"), _EDITS.get(str(asked.get("action")))
         if edit is None:
             raise UsageError(f"keys: the action is none of {', '.join(_EDITS)}")
         return self._update(lambda state: edit(select_key(state, at)))
@@ -162,17 +155,17 @@ class Page:
 
     async def _edit_shelf(self, request: Request) -> Response:
         asked = json_body(request)
-        number, action = {"card": str(asked.get("card"))}, asked.get("action")
+        action = asked.get("action")
 
         def change(state: State) -> State:
-            photograph = _photograph(state, number)
+            photograph = _photograph(state, asked)
             if action == "remove":
                 return remove_photograph(state, photograph)
             if action == "alone":
                 return replace(state, look=only(state.look, photograph))
             if action == "weight":
-                weight = _number(asked, "weight", 4.0)
-                return replace(state, look=set_weight(state.look, photograph, weight, state.shelf))
+                look = set_weight(state.look, photograph, number(asked, "weight", 0, 4), state.shelf)
+                return replace(state, look=look)
             raise UsageError("shelf: the action is none of alone, weight, remove")
 
         return self._update(change)
@@ -191,7 +184,7 @@ class Page:
             if state.picked is None:
                 raise UsageError("region: none is picked")
             look = state.look
-            photograph = _photograph(state, {"card": str(asked.get("card"))}) if action in ("pin", "forbid") else None
+            photograph = _photograph(state, asked) if action in ("pin", "forbid") else None
             if photograph is not None and photograph not in dict(look.mix):
                 look = set_weight(look, photograph, 1.0, state.shelf)
             return replace(state, look=set_rule(look, state.picked.region, action, photograph))
@@ -199,23 +192,12 @@ class Page:
         return self._update(change)
 
     async def _move_wipe(self, request: Request) -> Response:
-        at = _number(json_body(request), "at", 1.0)
+        at = number(json_body(request), "at", 0, 1)
         return self._update(lambda state: replace(state, wipe=at) if state.wipe is not None else state)
 
     def _update(self, change: Callable[[State], State]) -> Response:
         """Change the session's state. Raises what `change` raises, which then is told to this client alone."""
-        faults: list[UsageError] = []
-
-        def guarded(state: State) -> State:
-            try:
-                return change(state)
-            except UsageError as fault:
-                faults.append(fault)
-                return state
-
-        self._session.update(guarded)
-        if faults:
-            raise faults[0]
+        self._session.apply(change)
         return json_response({})
 
 
@@ -254,22 +236,9 @@ def described(state: State) -> dict[str, Any]:
     }
 
 
-def _photograph(state: State, query: Mapping[str, str]) -> Photograph:
-    number = _integer(query.get("card", ""))
+def _photograph(state: State, asked: Mapping[str, Any]) -> Photograph:
+    wanted = integer(asked, "card")
     for photograph in state.shelf:
-        if photograph.number == number:
+        if photograph.number == wanted:
             return photograph
-    raise UsageError(f"card {number}: none of the shelf")
-
-
-def _integer(text: str) -> int:
-    if not (text.removeprefix("-").isdigit() and text.isascii() and len(text) <= 12):
-        raise UsageError(f"{text[:20]!r} is no number")
-    return int(text)
-
-
-def _number(asked: Mapping[str, Any], name: str, most: float) -> float:
-    value = asked.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
-        raise UsageError(f"{name}: must be a number from 0 to {most:g}")
-    return float(value)
+    raise UsageError(f"card {wanted}: none of the shelf")

@@ -17,6 +17,7 @@ import socket
 import threading
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import parse_qs, quote, urlsplit
@@ -214,7 +215,7 @@ class HttpServer:
             else:
                 response = await self._respond(request, receive)
         except _Refused as refused:
-            response = _text(refused.status, str(refused))
+            response = text_response(refused.status, str(refused))
         with contextlib.suppress(OSError, TimeoutError):  # the client has gone or is too slow
             await _send(send, response, "websocket.http.response" if websocket else "http.response")
 
@@ -228,7 +229,7 @@ class HttpServer:
             async with self._uploads:
                 return await handler(request._replace(body=await _body(request, receive)))
         except FprfError as error:
-            return _text(400, str(error))
+            return text_response(400, str(error))
 
     async def _relay(self, subprotocols: list[str], receive: _Receive, send: _Send) -> None:
         """Pass messages between a page and viser; the page's are checked first."""
@@ -279,7 +280,7 @@ class ViewerServer:
         self._session: Session | None = None
         self._start: Routes | None = None
         self._http = HttpServer(access, port, {("GET", "/"): self._loading_page})
-        self._closers: list[Callable[[], None]] = []
+        self._opened = contextlib.ExitStack()
 
     def __enter__(self) -> "ViewerServer":
         return self
@@ -329,12 +330,10 @@ class ViewerServer:
         from .state import State
 
         state = State(pixels=pixels, drop_mode="in the mix" if len(references) > 1 else "alone")
-        session = Session(viewed, state, open_encoders)
-        session.__enter__()
-        self._closers.append(session.close)
+        session = self._opened.enter_context(Session(viewed, state, open_encoders))
         page = Page(session, page_of(viewed.name), start=self._start is not None)
         frontend = ViserFrontend(session, page)
-        self._closers.append(frontend.close)
+        self._opened.callback(frontend.close)
         self._http.relay_to({**(self._start or {}), **page.routes}, frontend.address, check_message)
         for path in references:
             session.upload(path.read_bytes(), path.name)
@@ -344,9 +343,8 @@ class ViewerServer:
         return session
 
     def _close_session(self) -> None:
-        for close in reversed(self._closers):
-            close()
-        self._closers, self._session = [], None
+        self._opened.close()
+        self._session = None
 
     async def _loading_page(self, request: Request) -> Response:
         self.visited.set()
@@ -408,6 +406,20 @@ async def _send(send: _Send, response: Response, kind: str) -> None:
         await asyncio.wait_for(send(piece), _TIMEOUT)
 
 
+def asset(name: str, content_type: str) -> Handler:
+    """The handler of a file of this package."""
+
+    async def respond(request: Request) -> Response:
+        return Response(200, f"text/{content_type}; charset=utf-8", (files(__package__) / name).read_bytes())
+
+    return respond
+
+
+def text_response(status: int, text: str) -> Response:
+    """A line of plain text."""
+    return Response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+
 def json_response(value: object) -> Response:
     """A value as JSON."""
     return Response(200, "application/json", json.dumps(value).encode())
@@ -426,8 +438,20 @@ def json_body(request: Request) -> dict[str, Any]:
     return asked
 
 
-def _text(status: int, text: str) -> Response:
-    return Response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+def integer(asked: Mapping[str, Any], name: str, least: int = 0) -> int:
+    """A whole number of at most 12 characters in a query or an object. Raises UsageError for anything else."""
+    text = str(asked.get(name))
+    if not (text.removeprefix("-").isdigit() and text.isascii() and len(text) <= 12 and int(text) >= least):
+        raise UsageError(f"{name}: {text[:20]!r} is no number from {least}")
+    return int(text)
+
+
+def number(asked: Mapping[str, Any], name: str, least: float, most: float) -> float:
+    """A number in an object. Raises UsageError for anything else, or one out of its range."""
+    value = asked.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+        raise UsageError(f"{name}: must be a number from {least:g} to {most:g}")
+    return float(value)
 
 
 def _host_name(host: str) -> str:

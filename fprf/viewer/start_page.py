@@ -14,14 +14,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.resources import files
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from ..checks import between
 from ..errors import DataError, FprfError, UsageError
 from .scene_files import SceneFiles, Source, find_source, is_capture
-from .server import Handler, Request, Response, json_body, json_response
+from .server import Handler, Request, Response, asset, integer, json_body, json_response, number, text_response
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
@@ -78,9 +77,9 @@ class StartPage:
     def routes(self) -> dict[tuple[str, str], Handler]:
         """Handlers by method and path; those but `/` serve the viewer's page as well."""
         return {
-            ("GET", "/"): _asset("start.html", "text/html; charset=utf-8"),
-            ("GET", "/fprf/start.js"): _asset("start.js", "text/javascript; charset=utf-8"),
-            ("GET", "/fprf/start.css"): _asset("start.css", "text/css; charset=utf-8"),
+            ("GET", "/"): asset("start.html", "html"),
+            ("GET", "/fprf/start.js"): asset("start.js", "javascript"),
+            ("GET", "/fprf/start.css"): asset("start.css", "css"),
             ("GET", "/fprf/start"): self._state,
             ("GET", "/fprf/start/picture"): self._draw,
             ("POST", "/fprf/start/new"): self._new,
@@ -112,7 +111,7 @@ class StartPage:
     async def _draw(self, request: Request) -> Response:
         picture = await asyncio.to_thread(self._drawn, self._output / self._progress.name / _RUN)
         if not picture:
-            return Response(404, "text/plain; charset=utf-8", b"no picture yet\n")
+            return text_response(404, "no picture yet")
         return Response(200, "image/jpeg", picture)
 
     async def _new(self, request: Request) -> Response:
@@ -124,7 +123,7 @@ class StartPage:
     async def _piece(self, request: Request) -> Response:
         query = request.query
         upload = self._upload(query.get("scene"))
-        at, size = (_count(query.get(key, "")) for key in ("at", "size"))
+        at, size = integer(query, "at"), integer(query, "size")
         await asyncio.to_thread(upload.add, query.get("name", ""), at, size, request.body)
         return json_response({})
 
@@ -264,12 +263,13 @@ class StartPage:
         """A folder's name like the one asked for, that no other scene has."""
         last = asked.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
         plain = "".join(c if c.isalnum() or c in "-_" else "-" for c in last)[:40].strip("-") or "scene"
-        names = (plain if number == 1 else f"{plain}-{number}" for number in range(1, 10_000))
+        names = (plain if k == 1 else f"{plain}-{k}" for k in count(1))
         return next(name for name in names if name not in self._uploads and not (self._output / name).exists())
 
     def _recent(self) -> list[dict[str, str]]:
         """Scenes and runs on this machine, the newest first."""
-        scenes = [*_scenes(self._output), *((path, path.name) for path in _runs(Path("runs"))), (Path("demo/run"), "demo")]
+        runs = [(path.parent, path.parent.name) for path in Path("runs").glob("*/config.json") if _newest(path.parent) >= 0]
+        scenes = [*_scenes(self._output), *runs, (Path("demo/run"), "demo")]
         dated = [(path.stat().st_mtime, path, name) for path, name in scenes if path.is_dir()]
         return [
             {
@@ -303,13 +303,6 @@ def _render(run: Path) -> bytes:
     return encode(to_uint8(opened.scene.render(opened.known.cameras, view, resolution=small).rgb), "jpg")
 
 
-def _asset(name: str, content_type: str) -> Handler:
-    async def asset(request: Request) -> Response:
-        return Response(200, content_type, (files(__package__) / name).read_bytes())
-
-    return asset
-
-
 def _newest(run: Path) -> int:
     """Step of the newest whole checkpoint; -1 where there is none."""
     steps = (path.parent.name.removeprefix("step-") for path in run.glob("checkpoints/step-*/manifest.json"))
@@ -321,12 +314,6 @@ def _kind(path: Path) -> str:
     if path.name != _FILES:
         return "trained"
     return "capture" if any(is_capture(each) for each in (path, *path.iterdir())) else "not trained yet"
-
-
-def _runs(folder: Path) -> Iterator[Path]:
-    for config in folder.glob("*/config.json"):
-        if _newest(config.parent) >= 0:
-            yield config.parent
 
 
 def _scenes(output: Path) -> Iterator[tuple[Path, str]]:
@@ -345,14 +332,4 @@ def _end(process: "subprocess.Popen[str]") -> None:
 
 
 def _minutes(asked: dict[str, Any]) -> float:
-    minutes = asked.get("minutes", 2)
-    if isinstance(minutes, bool) or not isinstance(minutes, int | float):
-        raise UsageError("minutes: no number")
-    between("minutes", float(minutes), 0.05, 600.0)
-    return float(minutes)
-
-
-def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) <= 12):
-        raise UsageError(f"{text[:20]!r}: no number of bytes")
-    return int(text)
+    return number({"minutes": 2, **asked}, "minutes", 0.05, 600)

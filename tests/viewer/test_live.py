@@ -77,7 +77,7 @@ def told(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setattr(live.time, "monotonic", lambda: found.now)
     yield found
     if found.host.session is not None:
-        found.host.session.close()
+        found.host.session.__exit__()
 
 
 def settle(session: Session) -> None:
