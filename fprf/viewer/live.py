@@ -65,6 +65,7 @@ class LiveViewer:
     def __init__(self, address: ViewAddress, command: tuple[str, ...] = (sys.executable, "-m", "fprf.viewer.live")) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="fprf-train-")
         self._lines: Queue[dict[str, Any] | None] = Queue(64)
+        self._first: Queue[str] = Queue()
         self._looking = threading.Event()
         self._wanted = threading.Event()
         self._ended = threading.Event()
@@ -82,12 +83,12 @@ class LiveViewer:
         self._send(address._asdict())
         self._writer = threading.Thread(target=self._write, name="fprf-live-write", daemon=True)
         self._writer.start()
+        threading.Thread(target=self._read, name="fprf-live-read", daemon=True).start()
         try:
             self.address = self._first_answer()
         except BaseException:
             self.close()
             raise
-        threading.Thread(target=self._read, name="fprf-live-read", daemon=True).start()
 
     def __enter__(self) -> "LiveViewer":
         return self
@@ -194,12 +195,8 @@ class LiveViewer:
 
     def _first_answer(self) -> str:
         """The viewer's address, as soon as it has said it. Raises UsageError with what it says instead."""
-        first: Queue[str] = Queue()
-        stdout = self._process.stdout
-        assert stdout is not None
-        threading.Thread(target=lambda: first.put(stdout.readline()), daemon=True).start()
         try:
-            said = json.loads(first.get(timeout=_START_TIMEOUT))
+            said = json.loads(self._first.get(timeout=_START_TIMEOUT))
             if "address" in said:
                 return str(said["address"])
             why = str(said["error"])
@@ -211,6 +208,7 @@ class LiveViewer:
         """Read what the viewer says, on a thread."""
         assert self._process.stdout is not None
         with contextlib.suppress(OSError, ValueError, AttributeError):
+            self._first.put(self._process.stdout.readline())
             for line in self._process.stdout:
                 said = json.loads(line)
                 if said.get("looking") is not None:

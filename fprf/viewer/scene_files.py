@@ -11,14 +11,16 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal, NamedTuple, TypeAlias
 
-from ..datamanagers.images import IMAGE_SUFFIXES, MAX_PIXELS, header_of
+from ..datamanagers.images import IMAGE_SUFFIXES
 from ..datamanagers.parsers.config import recognise
 from ..errors import DataError, UsageError
 from ..reconstruction.images import VIDEO_SUFFIXES
+from .uploads import check_photograph
 
 CAPTURE_SUFFIXES = frozenset({".ply", ".splat", ".spz", ".sog"})
 """Files of 3D Gaussians, in lower case."""
 SourceKind: TypeAlias = Literal["run", "capture", "scene", "photographs", "video"]
+_SINGLE: tuple[tuple[SourceKind, frozenset[str]], ...] = (("capture", CAPTURE_SUFFIXES), ("video", VIDEO_SUFFIXES))
 _FEWEST = 3
 """Photographs that poses can be found for."""
 _MODEL = frozenset({"cameras", "images", "points3D", "rigs", "frames"})
@@ -68,12 +70,13 @@ def find_source(path: Path) -> Source:
     photographs = [each for each in files if each.suffix.lower() in IMAGE_SUFFIXES]
     if len(photographs) >= _FEWEST:
         return Source("photographs", path)
-    for kind, suffixes in (("capture", CAPTURE_SUFFIXES), ("video", VIDEO_SUFFIXES)):
+    for kind, suffixes in _SINGLE:
         single = [each for each in files if each.suffix.lower() in suffixes]
         if len(single) == 1 and not photographs:
-            return Source("capture" if kind == "capture" else "video", single[0])
+            return Source(kind, single[0])
         if len(single) > 1:
-            raise DataError(f"{len(single)} {kind}s; a scene is made of one: give {', or '.join(_some(single))}")
+            some = ", or ".join(path.name for path in single[:3])
+            raise DataError(f"{len(single)} {kind}s; a scene is made of one: give {some}")
     if photographs:
         few = "1 photograph is" if len(photographs) == 1 else f"{len(photographs)} photographs are"
         raise DataError(f"{few} no scene: take at least {_FEWEST}, better 20 to 60, from places around it")
@@ -84,11 +87,7 @@ def check_file(name: str, head: bytes, size: int) -> None:
     """Raise DataError for a file that no scene is made of, by its name, its first bytes and its size."""
     suffix, stem = Path(name).suffix.lower(), Path(name).stem
     if suffix in IMAGE_SUFFIXES:
-        header = header_of(head)
-        if header is None:
-            raise DataError(f"{name}: no photograph that can be read; export it again as JPEG or PNG")
-        if not 1 <= header.width * header.height <= MAX_PIXELS:
-            raise DataError(f"{name}: {header.width}x{header.height} pixels; 1 to {MAX_PIXELS:.0e} are taken: make it smaller")
+        check_photograph(head, name)
         return
     whole = {
         ".ply": head.startswith(b"ply"),
@@ -154,7 +153,3 @@ def _parts(name: str) -> Sequence[str]:
     if not parts or not plain or name.startswith("/") or len(parts) > _MAX_DEPTH:
         raise UsageError(f"{name[:80]!r}: no name of a file in a folder; rename it")
     return parts
-
-
-def _some(paths: Sequence[Path]) -> list[str]:
-    return [path.name for path in paths[:3]]

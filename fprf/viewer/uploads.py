@@ -31,15 +31,15 @@ _NAME = 48
 """Characters of a name that is shown."""
 
 
-def check_photograph(data: bytes) -> None:
+def check_photograph(data: bytes, name: str = "photograph") -> None:
     """Raise DataError for what is no photograph, or too large a one, by its first bytes."""
     if len(data) > MAX_BYTES:
-        raise DataError(f"photograph: {len(data)} bytes; at most {MAX_BYTES} are taken: make it smaller")
+        raise DataError(f"{name}: {len(data)} bytes; at most {MAX_BYTES} are taken: make it smaller")
     header = header_of(data)
     if header is None:
-        raise DataError("photograph: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF; convert it to one of these")
+        raise DataError(f"{name}: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF; convert it to one of these")
     if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
-        raise DataError(f"photograph: {header.width}x{header.height} pixels; 1 to {MAX_PIXELS:.0e} are taken: make it smaller")
+        raise DataError(f"{name}: {header.width}x{header.height} pixels; 1 to {MAX_PIXELS:.0e} are taken: make it smaller")
 
 
 def shown_name(text: str) -> str:
@@ -52,7 +52,7 @@ def shown_name(text: str) -> str:
 
 
 class Uploads:
-    """The folder of uploaded photographs and the decoder; both go with `close`. A context manager."""
+    """The folder of uploaded photographs and the decoder; both go with `close`."""
 
     def __init__(self, timeout: float = _TIMEOUT) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="fprf-view-")
@@ -61,12 +61,6 @@ class Uploads:
         self._process: subprocess.Popen[str] | None = None
         self._answers: Queue[str] = Queue()
         self._count = 0
-
-    def __enter__(self) -> "Uploads":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def folder(self) -> Path:
@@ -179,12 +173,9 @@ def _decode(source: Path, target: Path, side: int) -> None:
     import cv2
 
     from ..datamanagers.images import load_image
+    from ..io.images import shrink
 
-    photo = load_image(source, upright=True)
-    height, width = photo.shape[:2]
-    scale = min(1.0, side / max(height, width))
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+    small = shrink(load_image(source, upright=True), side)
     target.write_bytes(cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 

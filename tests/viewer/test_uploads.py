@@ -6,6 +6,7 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -31,7 +32,7 @@ def claimed(width: int, height: int) -> bytes:
 
 @pytest.fixture(scope="module")
 def uploaded() -> Iterator[Uploads]:
-    with Uploads(timeout=120) as found:
+    with closing(Uploads(timeout=120)) as found:
         yield found
 
 
@@ -87,7 +88,7 @@ def test_a_decoder_that_died_is_replaced(uploaded: Uploads) -> None:
 
 
 def test_one_that_takes_too_long_is_ended() -> None:
-    with Uploads(timeout=0.0) as hasty, pytest.raises(DataError, match="not decoded within"):
+    with closing(Uploads(timeout=0.0)) as hasty, pytest.raises(DataError, match="not decoded within"):
         hasty.store(png(20, 20))
     assert not hasty.folder.exists()
 
