@@ -45,7 +45,6 @@ class _ViserServer(viser.ViserServer):  # type: ignore[misc]  # viser is not the
     """viser that never asks a service elsewhere to share the scene, whatever a page requests."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Return None."""
         return None
 
 
@@ -70,7 +69,6 @@ class ViserFrontend(Frontend):
         session.attach(self)
 
     def close(self) -> None:
-        """End all connections."""
         with contextlib.redirect_stdout(io.StringIO()):
             self._viser.stop()
 

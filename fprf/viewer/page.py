@@ -14,7 +14,7 @@ from typing import Any
 from ..errors import UsageError
 from ..io.images import encode
 from ..io.maps import palette
-from .server import Handler, Request, Response, asset, integer, json_body, json_response, number, text_response
+from .routes import Handler, Request, Response, asset, integer, json_body, json_response, number, text_response
 from .session import Session
 from .state import (
     Photograph,
@@ -54,11 +54,10 @@ class Page:
 
     @property
     def routes(self) -> dict[tuple[str, str], Handler]:
-        """Handlers by method and path."""
         return {
             ("GET", "/"): self._index,
-            ("GET", "/fprf/page.js"): asset("page.js", "javascript"),
-            ("GET", "/fprf/page.css"): asset("page.css", "css"),
+            ("GET", "/fprf/page.js"): asset("page.js"),
+            ("GET", "/fprf/page.css"): asset("page.css"),
             ("GET", "/fprf/state"): self._state,
             ("GET", "/fprf/card"): self._thumbnail,
             ("GET", "/fprf/film"): self._film,

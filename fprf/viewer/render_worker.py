@@ -29,7 +29,6 @@ class RenderWorker(Generic[Request]):
         self._thread = threading.Thread(target=self._run, name="fprf-render", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def request(self, client: Hashable, request: Request) -> None:
@@ -67,7 +66,6 @@ class RenderWorker(Generic[Request]):
 
     @property
     def closed(self) -> bool:
-        """True after `close`."""
         return self._closed
 
     def close(self, timeout: float = 5.0) -> None:

@@ -10,22 +10,21 @@ import contextlib
 import hmac
 import importlib
 import ipaddress
-import json
 import logging
 import secrets
 import socket
 import threading
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..errors import DataError, FprfError, UsageError
+from .routes import Request, Response, Routes, text_response
 
 if TYPE_CHECKING:
     from .restyler import OpenEncoders
@@ -44,8 +43,6 @@ _UPLOADS = 4
 _MAX_BODY = 20 << 20
 _MAX_MESSAGE = 1 << 20
 """Bytes of a WebSocket message; the page sends a few hundred."""
-_MAX_JSON = 4096
-"""Bytes of a request that is JSON."""
 _PIECE = 1 << 16
 _HEADERS = {
     "x-content-type-options": "nosniff",
@@ -105,28 +102,6 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class Request(NamedTuple):
-    """An HTTP request."""
-
-    method: str
-    path: str
-    query: Mapping[str, str]
-    headers: Mapping[str, str]
-    body: bytes = b""
-
-
-class Response(NamedTuple):
-    """An HTTP response."""
-
-    status: int
-    content_type: str
-    body: bytes
-    headers: Mapping[str, str] = {}
-
-
-Handler = Callable[[Request], Awaitable[Response]]
-Routes = Mapping[tuple[str, str], Handler]
-"""Handlers by method and path."""
 _Event = MutableMapping[str, Any]
 _Receive = Callable[[], Awaitable[_Event]]
 _Send = Callable[[_Event], Awaitable[None]]
@@ -193,7 +168,6 @@ class HttpServer:
         self._routes, self._viser = routes, (f"ws://{address[0]}:{address[1]}", check)
 
     def close(self) -> None:
-        """Close all connections."""
         self._server.force_exit = self._server.should_exit = True
         self._thread.join(5)
 
@@ -404,54 +378,6 @@ async def _send(send: _Send, response: Response, kind: str) -> None:
         last = start + _PIECE >= len(response.body)
         piece = {"type": f"{kind}.body", "body": response.body[start : start + _PIECE], "more_body": not last}
         await asyncio.wait_for(send(piece), _TIMEOUT)
-
-
-def asset(name: str, content_type: str) -> Handler:
-    """The handler of a file of this package."""
-
-    async def respond(request: Request) -> Response:
-        return Response(200, f"text/{content_type}; charset=utf-8", (files(__package__) / name).read_bytes())
-
-    return respond
-
-
-def text_response(status: int, text: str) -> Response:
-    """A line of plain text."""
-    return Response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
-
-
-def json_response(value: object) -> Response:
-    """A value as JSON."""
-    return Response(200, "application/json", json.dumps(value).encode())
-
-
-def json_body(request: Request) -> dict[str, Any]:
-    """The object that a request holds. Raises UsageError where it holds none."""
-    if len(request.body) > _MAX_JSON:
-        raise UsageError("request: too long")
-    try:
-        asked = json.loads(request.body)
-    except (ValueError, RecursionError):
-        raise UsageError("request: not JSON") from None
-    if not isinstance(asked, dict):
-        raise UsageError("request: not an object")
-    return asked
-
-
-def integer(asked: Mapping[str, Any], name: str, least: int = 0) -> int:
-    """A whole number of at most 12 characters in a query or an object. Raises UsageError for anything else."""
-    text = str(asked.get(name))
-    if not (text.removeprefix("-").isdigit() and text.isascii() and len(text) <= 12 and int(text) >= least):
-        raise UsageError(f"{name}: {text[:20]!r} is no number from {least}")
-    return int(text)
-
-
-def number(asked: Mapping[str, Any], name: str, least: float, most: float) -> float:
-    """A number in an object. Raises UsageError for anything else, or one out of its range."""
-    value = asked.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-        raise UsageError(f"{name}: must be a number from {least:g} to {most:g}")
-    return float(value)
 
 
 def _host_name(host: str) -> str:

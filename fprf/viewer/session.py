@@ -196,7 +196,6 @@ class Session:
         self._worker.run("reload", job)
 
     def notify(self, text: str) -> None:
-        """Show a line of text to all clients."""
         if self._frontend is not None:
             self._frontend.notify(text)
 

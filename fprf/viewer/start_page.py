@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from ..errors import DataError, FprfError, UsageError
+from .routes import Handler, Request, Response, asset, integer, json_body, json_response, number, text_response
 from .scene_files import SceneFiles, Source, find_source, is_capture
-from .server import Handler, Request, Response, asset, integer, json_body, json_response, number, text_response
 
 METHOD = "fprf-splats"
 _FILES, _SCENE, _RUN = "files", "scene", "run"
@@ -77,9 +77,9 @@ class StartPage:
     def routes(self) -> dict[tuple[str, str], Handler]:
         """Handlers by method and path; those but `/` serve the viewer's page as well."""
         return {
-            ("GET", "/"): asset("start.html", "html"),
-            ("GET", "/fprf/start.js"): asset("start.js", "javascript"),
-            ("GET", "/fprf/start.css"): asset("start.css", "css"),
+            ("GET", "/"): asset("start.html"),
+            ("GET", "/fprf/start.js"): asset("start.js"),
+            ("GET", "/fprf/start.css"): asset("start.css"),
             ("GET", "/fprf/start"): self._state,
             ("GET", "/fprf/start/picture"): self._draw,
             ("POST", "/fprf/start/new"): self._new,
@@ -248,7 +248,9 @@ class StartPage:
         if process is not None:
             with contextlib.suppress(OSError):
                 process.send_signal(signal.SIGINT)
-            threading.Thread(target=_end, args=(process,), daemon=True).start()
+            last = threading.Timer(_EXIT_TIMEOUT, process.kill)
+            last.daemon = True
+            last.start()
 
     def _set(self, **changes: Any) -> None:
         self._progress = replace(self._progress, **changes)
@@ -322,13 +324,6 @@ def _scenes(output: Path) -> Iterator[tuple[Path, str]]:
         opened = folder / _RUN if _newest(folder / _RUN) >= 0 else folder / _FILES
         if opened.is_dir():
             yield opened, folder.name
-
-
-def _end(process: "subprocess.Popen[str]") -> None:
-    try:
-        process.wait(_EXIT_TIMEOUT)
-    except subprocess.TimeoutExpired:
-        process.kill()
 
 
 def _minutes(asked: dict[str, Any]) -> float:

@@ -17,9 +17,8 @@ class Client:
 class Control:
     """One control: `moved` is what a browser does, setting `value` what the program does."""
 
-    def __init__(self, value: Any = None, **more: Any) -> None:
-        self.value, self.content, self.disabled, self.options = value, value, False, more.get("options", ())
-        self.limits = (more.get("low"), more.get("high"))
+    def __init__(self, value: Any = None, options: Any = ()) -> None:
+        self.value, self.content, self.disabled, self.options = value, value, False, tuple(options)
         self._heard: list[Callable[[Any], object]] = []
 
     def on_update(self, act: Callable[[Any], object]) -> None:
@@ -46,10 +45,12 @@ class Gui:
     def __getitem__(self, label: str) -> Control:
         return self.all[label]
 
-    def _put(self, label: str, control: Control) -> Control:
+    def _add(self, label: str, value: Any = None, options: Any = (), **more: Any) -> Control:
         assert label not in self.all, "two controls of one name cannot be told from each other"
-        self.all[label] = control
-        return control
+        self.all[label] = Control(value, options)
+        return self.all[label]
+
+    add_button = add_checkbox = add_number = add_text = _add
 
     @contextmanager
     def add_folder(self, label: str, expand_by_default: bool = True) -> Iterator[None]:
@@ -57,25 +58,13 @@ class Gui:
 
     def add_slider(self, label: str, low: float, high: float, step: float, value: Any, hint: str = "") -> Control:
         assert low <= value <= high
-        return self._put(label, Control(value, low=low, high=high))
-
-    def add_number(self, label: str, value: Any, min: Any, max: Any, step: Any) -> Control:
-        return self._put(label, Control(value, low=min, high=max))
+        return self._add(label, value)
 
     def add_dropdown(self, label: str, options: Any, initial_value: Any = None, hint: str = "") -> Control:
-        return self._put(label, Control(options[0] if initial_value is None else initial_value, options=tuple(options)))
-
-    def add_checkbox(self, label: str, value: bool, hint: str = "") -> Control:
-        return self._put(label, Control(value))
-
-    def add_text(self, label: str, value: str) -> Control:
-        return self._put(label, Control(value))
-
-    def add_button(self, label: str, hint: str = "") -> Control:
-        return self._put(label, Control())
+        return self._add(label, options[0] if initial_value is None else initial_value, options)
 
     def add_markdown(self, text: str) -> Control:
-        return self._put("about", Control(text))
+        return self._add("about", text)
 
     def add_progress_bar(self, value: float) -> Control:
-        return self._put("progress", Control(value))
+        return self._add("progress", value)

@@ -21,6 +21,7 @@ from fprf.splats.training import gaussians_of
 from fprf.training import checkpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+PRESS = "(text) => [...document.querySelectorAll('button')].find((each) => each.textContent.trim() === text).click()"
 
 
 @pytest.fixture
@@ -85,8 +86,7 @@ def test_many_moves_and_drops_leave_no_memory_behind(opened: tuple[Front, int], 
 
 def test_keys_are_set_seen_put_in_another_order_and_played(opened: tuple[Front, int], world: World) -> None:
     found, _ = opened
-    press = "(text) => [...document.querySelectorAll('button')].find((each) => each.textContent.trim() === text).click()"
-    found.page.evaluate(press, "Add a key here")
+    found.page.evaluate(PRESS, "Add a key here")
     found.until(lambda state: len(state["keys"]) == 1)
     found.drop(world.references[0])
     found.rest()
@@ -115,8 +115,7 @@ def test_keys_are_set_seen_put_in_another_order_and_played(opened: tuple[Front, 
 
 def test_a_film_is_made_from_the_page_and_can_be_downloaded(opened: tuple[Front, int]) -> None:
     found, _ = opened
-    press = "(text) => [...document.querySelectorAll('button')].find((each) => each.textContent.trim() === text).click()"
-    found.page.evaluate(press, "Add a key here")
+    found.page.evaluate(PRESS, "Add a key here")
     found.until(lambda state: len(state["keys"]) == 1)
     found.page.locator("#fprf-flight").get_by_text("film").click()
     found.until(lambda state: state["film"]["ready"], 240)

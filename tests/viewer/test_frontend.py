@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from photographs import viewed
-from tiny_world import World
+from session_helpers import camera_of
 
 pytest.importorskip("viser", reason="the extra `viewer` is not installed")
 
@@ -16,19 +15,16 @@ from fprf.viewer.frontend import ViserFrontend, page_of
 from fprf.viewer.page import Page
 from fprf.viewer.renderer import RenderRequest
 from fprf.viewer.session import Session
-from fprf.viewer.state import State
 
 
 @pytest.fixture
-def served(world: World) -> Iterator[tuple[Session, ViserFrontend]]:
-    with Session(viewed(world.load()), State(pixels=64)) as session:
-        frontend = ViserFrontend(session, Page(session, b"<html>"))
-        yield session, frontend
-        frontend.close()
+def frontend(session: Session) -> Iterator[ViserFrontend]:
+    frontend = ViserFrontend(session, Page(session, b"<html>"))
+    yield frontend
+    frontend.close()
 
 
-def test_viser_listens_on_this_machine_and_shares_nothing(served: tuple[Session, ViserFrontend]) -> None:
-    _, frontend = served
+def test_viser_listens_on_this_machine_and_shares_nothing(frontend: ViserFrontend) -> None:
     host, port = frontend.address
     assert ipaddress.ip_address(host).is_loopback and port > 0
     assert frontend._viser.request_share_url() is None
@@ -39,19 +35,18 @@ def test_the_page_of_a_scene_is_viser_s_with_ours_in_it() -> None:
     assert page.index(b"/fprf/page.js") < page.index(b"</head>") and b"&lt;town&gt; - fprf" in page and len(page) > 10_000
 
 
-def test_controls_lines_and_clicks_follow_the_state(served: tuple[Session, ViserFrontend]) -> None:
-    session, frontend = served
+def test_controls_lines_and_clicks_follow_the_state(session: Session, frontend: ViserFrontend) -> None:
     session.update(lambda state: replace(state, map="depth", picking=True))
-    assert True
+    controls = {control.label: control.value for control, _ in frontend.panel._bound}
+    assert controls["map"] == "depth" and controls["pick a region"]
     session.update(lambda state: replace(state, picking=False))
     frontend.panel._cameras.value = frontend.panel._blocks.value = True  # the scene has no blocks
     frontend.draw_lines()
     frontend.notify("a line")
 
 
-def test_a_client_that_has_gone_is_shown_nothing(served: tuple[Session, ViserFrontend]) -> None:
-    session, frontend = served
-    camera = session.transform.camera_state(session.viewed.scene.cameras, 0)
+def test_a_client_that_has_gone_is_shown_nothing(session: Session, frontend: ViserFrontend) -> None:
+    camera = camera_of(session.viewed.scene, 0)
     frames: list[Any] = []
     session.renderer._show = lambda client, frame: frames.append(frame)
     for _ in session.renderer.render(9, RenderRequest(camera, session.state.view, 32)):

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from session_helpers import Listener, camera_of, plan_of
 from splat_ball import ball
-from test_session import Listener
 from tiny_world import World
 
 from fprf.io.images import to_uint8
@@ -21,10 +21,9 @@ from fprf.splats.scene import SplatScene, look_at_capture
 from fprf.style.files import StyleFile
 from fprf.style.restyle import apply_style
 from fprf.viewer.cameras import page_transform
-from fprf.viewer.film import FilmPlan
 from fprf.viewer.gaussian_renderer import page_gaussians
 from fprf.viewer.session import Session, Viewed
-from fprf.viewer.state import Key, Look, State, set_rule, style_config
+from fprf.viewer.state import Look, State, set_rule, style_config
 
 TONE = RegionToneConfig(centred=False)
 
@@ -35,29 +34,25 @@ def scene() -> SplatScene:
 
 
 @pytest.fixture
-def opened(scene: SplatScene, tmp_path: Path) -> Iterator[tuple[Session, Listener]]:
+def session(scene: SplatScene, tmp_path: Path, listener: Listener) -> Iterator[Session]:
     with Session(Viewed(scene, "ball", 0, root=tmp_path, stylizer=TONE), State(pixels=64)) as session:
-        listener = Listener()
         session.attach(listener)
-        session.move_camera(1, session.transform.camera_state(scene.cameras, 0))
-        yield session, listener
+        session.move_camera(1, camera_of(scene, 0))
+        yield session
 
 
-def test_a_drop_sends_the_colours_of_the_restyled_scene(
-    opened: tuple[Session, Listener], scene: SplatScene, world: World
+def test_a_photograph_sends_the_colours_of_the_restyled_scene(
+    session: Session, listener: Listener, scene: SplatScene, world: World
 ) -> None:
-    session, listener = opened
     photograph = session.upload(world.references[0].read_bytes(), "dusk.png")
     listener.until(lambda: len(listener.colours) == 1)
     wanted = scene.restyled(apply_style(scene, StyleFile(style_config(session.state.look, TONE))).restyle)
     colours = to_uint8(scene.seen.colours(wanted.shown.harmonics).clamp(0, 1)[None])[0]
     assert np.abs(listener.colours[0].astype(int) - colours).max() <= 1
-    session.move_camera(1, session.transform.camera_state(scene.cameras, 1))
+    session.move_camera(1, camera_of(scene, 1))
     session.update(lambda state: replace(state, look=set_rule(state.look, 0, "keep")))
     listener.until(lambda: len(listener.colours) == 2)  # none for the camera alone
-    belongs = torch.zeros(len(scene.gaussians), dtype=torch.bool)
-    belongs[(listener.colours[1] != listener.colours[0]).any(1)] = True
-    assert belongs.any()
+    assert (listener.colours[1] != listener.colours[0]).any()
     session.update(lambda state: replace(state, look=Look(mix=((photograph, 1.0),), strength=0.0)))
     listener.until(lambda: len(listener.colours) == 3)
     plain = scene.seen.gaussians(scene.gaussians)
@@ -65,8 +60,9 @@ def test_a_drop_sends_the_colours_of_the_restyled_scene(
     assert listener.frames == []
 
 
-def test_maps_and_a_picked_region_are_colours_too(opened: tuple[Session, Listener], scene: SplatScene) -> None:
-    session, listener = opened
+def test_maps_and_a_picked_region_are_colours_too(
+    session: Session, listener: Listener, scene: SplatScene, world: World
+) -> None:
     for number, name in enumerate(("regions", "matches"), 1):
         session.update(lambda state, name=name: replace(state, map=name, map_opacity=1.0))  # type: ignore[misc]
         listener.until(lambda number=number: len(listener.colours) == number)  # type: ignore[misc]
@@ -78,32 +74,31 @@ def test_maps_and_a_picked_region_are_colours_too(opened: tuple[Session, Listene
     plain = to_uint8(scene.gaussians.colours.clamp(0, 1)[None])[0]
     same = (np.abs(listener.colours[3].astype(int) - plain) <= 1).all(1)
     assert 0 < same.mean() < 1  # the region stands out, the others are dimmed
+    session.update(lambda state: replace(state, map="matches", picked=None))
+    session.upload(world.references[0].read_bytes(), "dusk.png")
+    listener.until(lambda: len(listener.colours) == 6)
+    shown = listener.colours[5].astype(int)
+    assert len(np.unique(shown, axis=0)) > 1 and (shown[:, 0] > shown[:, 2]).all()  # shades of the first hue, which is orange
 
 
-def test_films_are_rasterised_here_into_the_scene_s_folder(opened: tuple[Session, Listener], scene: SplatScene) -> None:
-    session, listener = opened
-    keys = tuple(Key(session.transform.camera_state(scene.cameras, view), Look()) for view in (0, 1))
-    plan = FilmPlan(keys, 0.1, 30.0, (32, 24))
+def test_films_are_rasterised_into_the_scene_s_folder(session: Session, listener: Listener, scene: SplatScene) -> None:
+    plan = plan_of(scene, [Look()] * 2)
     session.films.record(plan)
     listener.until(lambda: session.state.film.path is not None)
-    path = session.state.film.path
-    assert path is not None
-    film = cv2.VideoCapture(str(path))
-    shown = film.read()[1][..., ::-1].astype(int)
-    cameras = session.transform.cameras([keys[0].camera], (32, 24))
+    shown = cv2.VideoCapture(str(session.state.film.path)).read()[1][..., ::-1].astype(int)
+    cameras = session.transform.cameras([plan.keys[0].camera], (32, 24))
     assert np.abs(shown - to_uint8(scene.render(cameras, 0).rgb)).mean() < 6  # what the codec leaves
     session.viewed = replace(session.viewed, root=None)
     session.films.record(plan)
-    listener.until(lambda: any("no folder" in text for text in listener.said))
+    listener.until_said("no folder")
 
 
-def test_pictures_and_gaussians_in_the_look_of_now_are_files(
-    opened: tuple[Session, Listener], scene: SplatScene, world: World, tmp_path: Path
+def test_pictures_and_gaussians_in_the_present_look_are_files(
+    session: Session, listener: Listener, scene: SplatScene, world: World, tmp_path: Path
 ) -> None:
-    session, listener = opened
     session.upload(world.references[0].read_bytes(), "dusk.png")
     styled = scene.restyled(session.restyler.restyle(session.state.look))
-    camera = session.transform.camera_state(scene.cameras, 0)
+    camera = camera_of(scene, 0)
     session.save_picture(camera, (48, 36))
     listener.until(lambda: len(session.state.pictures) == 1)
     [path] = session.state.pictures
@@ -116,11 +111,9 @@ def test_pictures_and_gaussians_in_the_look_of_now_are_files(
     assert not torch.equal(again.harmonics, scene.gaussians.harmonics)
 
 
-def test_a_flight_moves_the_browser_s_camera(opened: tuple[Session, Listener], scene: SplatScene) -> None:
-    session, listener = opened
-    keys = tuple(Key(session.transform.camera_state(scene.cameras, view), Look()) for view in (0, 1))
+def test_a_flight_moves_the_browser_s_camera(session: Session, listener: Listener, scene: SplatScene) -> None:
     flown: list[object] = []
-    session.films.play(1, FilmPlan(keys, 0.5, 24.0, (32, 24)), flown.append)
+    session.films.play(1, plan_of(scene, [Look()] * 2, 0.5), flown.append)
     listener.until(lambda: any(state.playing for state in listener.states) and not session.state.playing)
     assert len(flown) > 2 and listener.frames == [] and session.thumbnail(1) is None
 

@@ -33,11 +33,9 @@ CLICK = {
 }
 
 
-@pytest.mark.parametrize(
-    "message", [CAMERA, CONTROL, CLICK, *({**CONTROL, "updates": {"value": v}} for v in ("a", True, 3, None))]
-)
-def test_what_the_page_sends_passes(message: dict[str, Any]) -> None:
-    check_message(msgspec.msgpack.encode(message))
+def test_what_the_page_sends_passes() -> None:
+    for message in (CAMERA, CONTROL, CLICK, *({**CONTROL, "updates": {"value": v}} for v in ("a", True, 3, None))):
+        check_message(msgspec.msgpack.encode(message))
 
 
 WRONG: dict[str, list[dict[str, Any]]] = {
@@ -53,23 +51,16 @@ WRONG: dict[str, list[dict[str, Any]]] = {
     "click": [{"event_type": "rect-select"}, {"ray_origin": [0, 0]}, {"screen_pos": [[0.0, 0.0]] * 65}],
 }  # fmt: skip
 KINDS = ["ShareUrlRequest", "FileTransferStartUpload", "RunJavascriptMessage", ["GuiUpdateMessage"]]
+BYTES = [b"", b"\xff", b"x" * 100, b"\x81", b"\x93\x01\x02\x03", b"\x91" * 100_000, b"\x81\xa1\xff\x00"]
 
 
 def test_anything_else_does_not() -> None:
     others: list[object] = [None, [], "text", {}, {1: 2}, *({"type": kind, "size_bytes": 10**12} for kind in KINDS)]
     for base, changes in zip((CAMERA, CONTROL, CLICK), WRONG.values(), strict=True):
         others += [{**base, **change} for change in changes]
-    for message in others:
+    for payload in (*BYTES, *map(msgspec.msgpack.encode, others)):
         with pytest.raises(DataError):
-            check_message(msgspec.msgpack.encode(message))
-
-
-@pytest.mark.parametrize(
-    "payload", [b"", b"\xff", b"x" * 100, b"\x81", b"\x93\x01\x02\x03", b"\x91" * 100_000, b"\x81\xa1\xff\x00"]
-)
-def test_bytes_that_are_no_message_are_refused(payload: bytes) -> None:
-    with pytest.raises(DataError):
-        check_message(payload)
+            check_message(payload)
 
 
 values = st.recursive(

@@ -19,7 +19,8 @@ from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
 from fprf.viewer import server
-from fprf.viewer.server import COOKIE, Access, HttpServer, Request, Response, ViewerServer, make_access
+from fprf.viewer.routes import Request, Response
+from fprf.viewer.server import COOKIE, Access, HttpServer, ViewerServer, make_access
 
 HERE = Access("127.0.0.1", None)
 TOKEN = "a-token-of-sixteen-characters"
@@ -47,16 +48,13 @@ def test_from_elsewhere_a_token_is_needed_in_one_of_three_places() -> None:
     assert THERE.refusal({**host, "origin": "http://evil.example", "cookie": f"{COOKIE}={TOKEN}"}) is not None
 
 
-def test_tokens_are_made_where_they_are_needed() -> None:
+def test_tokens_are_made_where_they_are_needed_and_weak_ones_are_refused() -> None:
     assert make_access("127.0.0.1", None).token is None and make_access("localhost", TOKEN).token == TOKEN
     one, two = (make_access("0.0.0.0", None).token for _ in range(2))
     assert one is not None and two is not None and one != two and len(one) >= 32
-
-
-@pytest.mark.parametrize("token", ["short", "", "with spaces in its midst", "tökentökentökentök", "line\nbreak-in-a-long"])
-def test_weak_tokens_are_refused(token: str) -> None:
-    with pytest.raises(UsageError, match="--token"):
-        make_access("127.0.0.1", token)
+    for token in ("short", "", "with spaces in its midst", "tökentökentökentök", "line\nbreak-in-a-long"):
+        with pytest.raises(UsageError, match="--token"):
+            make_access("127.0.0.1", token)
 
 
 async def hello(request: Request) -> Response:
@@ -87,8 +85,13 @@ def http(monkeypatch: pytest.MonkeyPatch) -> Iterator[HttpServer]:
     found.close()
 
 
+def connected(http: HttpServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", http.port), timeout=30)
+
+
 def talk(http: HttpServer, data: bytes) -> bytes:
-    with socket.create_connection(("127.0.0.1", http.port), timeout=30) as wire:
+    """The answer to some bytes, as soon as the server hangs up."""
+    with connected(http) as wire:
         wire.sendall(data)
         answer = b""
         while piece := wire.recv(65536):
@@ -96,29 +99,27 @@ def talk(http: HttpServer, data: bytes) -> bytes:
     return answer
 
 
-def request(http: HttpServer, line: str, *headers: str, body: bytes = b"", host: str | None = None) -> bytes:
-    name = f"127.0.0.1:{http.port}" if host is None else host
-    return talk(http, "\r\n".join([f"{line} HTTP/1.1", f"Host: {name}", *headers, "", ""]).encode() + body)
+def request(http: HttpServer, line: str, *headers: str, body: bytes = b"") -> bytes:
+    return talk(http, "\r\n".join([f"{line} HTTP/1.1", f"Host: 127.0.0.1:{http.port}", *headers, "", ""]).encode() + body)
 
 
-def status(answer: bytes) -> int:
-    return int(answer.split(b" ", 2)[1])
+def status(http: HttpServer, line: str, *headers: str, body: bytes = b"") -> int:
+    return int(request(http, line, *headers, body=body).split(b" ", 2)[1])
 
 
 def test_a_page_comes_with_headers_that_keep_it_to_itself(http: HttpServer) -> None:
     answer = request(http, "GET /")
-    assert status(answer) == 200 and answer.endswith(b"\r\n\r\nhello")
+    assert answer.startswith(b"HTTP/1.1 200 ") and answer.endswith(b"\r\n\r\nhello")
     for header in (b"x-frame-options: DENY", b"x-content-type-options: nosniff", b"connection: close"):
         assert header in answer
 
 
-@pytest.mark.parametrize("headers", [("Content-Length: 100000",), ("Transfer-Encoding: chunked",)])
-def test_bodies_and_queries_arrive(http: HttpServer, headers: tuple[str, ...]) -> None:
+def test_bodies_and_queries_arrive(http: HttpServer) -> None:
     body = b"x" * 100_000
-    if "chunked" in headers[0]:
-        body = f"{len(body):x}\r\n".encode() + body + b"\r\n0\r\n\r\n"
-    answer = request(http, "POST /echo?name=a%20b&x=1", *headers, body=body)
-    assert json.loads(answer.rpartition(b"\r\n\r\n")[2]) == {"size": 100_000, "query": {"name": "a b", "x": "1"}}
+    chunked = f"{len(body):x}\r\n".encode() + body + b"\r\n0\r\n\r\n"
+    for header, sent in (("Content-Length: 100000", body), ("Transfer-Encoding: chunked", chunked)):
+        answer = request(http, "POST /echo?name=a%20b&x=1", header, body=sent)
+        assert json.loads(answer.rpartition(b"\r\n\r\n")[2]) == {"size": 100_000, "query": {"name": "a b", "x": "1"}}
 
 
 @pytest.mark.parametrize(
@@ -137,43 +138,32 @@ def test_bodies_and_queries_arrive(http: HttpServer, headers: tuple[str, ...]) -
         ("GET /", ("Origin: http://127.0.0.1", "Origin: http://evil.example"), b"", 400),
         ("GET /", ("Host: evil.example",), b"", 400),
         ("GET /?" + "a=1&" * 20, (), b"", 400),
-        ("GET / extra", (), b"", 400),
-        ("GET /", ("no colon",), b"", 400),
     ],
 )
 def test_what_is_wrong_is_refused(http: HttpServer, line: str, headers: tuple[str, ...], body: bytes, expected: int) -> None:
-    assert status(request(http, line, *headers, body=body)) == expected
-    assert status(request(http, "GET /")) == 200
+    assert status(http, line, *headers, body=body) == expected
+    assert status(http, "GET /") == 200
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"\x16\x03\x01\x02\x00",
-        b"\0" * 100 + b"\r\n\r\n",
-        b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000,
-    ],
-)
-def test_nonsense_and_half_heads_end_their_own_connection_alone(http: HttpServer, data: bytes) -> None:
-    talk(http, data)  # returns when the server hangs up
-    assert status(request(http, "GET /")) == 200
+def test_nonsense_and_half_heads_end_their_own_connection_alone(http: HttpServer) -> None:
+    for data in (b"", b"\x16\x03\x01\x02\x00", b"\0" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\nX: " + b"y" * 20_000):
+        talk(http, data)
+        assert status(http, "GET /") == 200
 
 
 def test_idle_connections_are_closed_and_do_not_shut_others_out(http: HttpServer) -> None:
-    wires = [socket.create_connection(("127.0.0.1", http.port)) for _ in range(80)]
+    wires = [connected(http) for _ in range(80)]
     deadline = time.monotonic() + 30
-    while status(request(http, "GET /")) != 200:
+    while status(http, "GET /") != 200:
         assert time.monotonic() < deadline
         time.sleep(0.05)
     for wire in wires:
-        wire.settimeout(30)
         assert wire.recv(1) == b""
         wire.close()
 
 
-def test_who_does_not_read_is_dropped(http: HttpServer) -> None:
-    with socket.create_connection(("127.0.0.1", http.port), timeout=30) as wire:
+def test_a_client_that_does_not_read_is_dropped(http: HttpServer) -> None:
+    with connected(http) as wire:
         wire.sendall(f"GET /film HTTP/1.1\r\nHost: 127.0.0.1:{http.port}\r\n\r\n".encode())
         time.sleep(1.5)
         size = 0
@@ -185,14 +175,13 @@ def test_who_does_not_read_is_dropped(http: HttpServer) -> None:
 def test_a_token_in_the_address_becomes_a_cookie() -> None:
     http = HttpServer(Access("127.0.0.1", TOKEN), 0, ROUTES)
     try:
-        assert status(request(http, "GET /")) == 403
-        assert status(request(http, "GET /?token=wrong")) == 403
+        assert status(http, "GET /") == status(http, "GET /?token=wrong") == 403
         answer = request(http, f"GET /?token={TOKEN}")
-        assert status(answer) == 303 and b"location: /\r\n" in answer
+        assert answer.startswith(b"HTTP/1.1 303 ") and b"location: /\r\n" in answer
         assert f"set-cookie: {COOKIE}={TOKEN}; Path=/; HttpOnly; SameSite=Strict".encode() in answer
-        assert status(request(http, "GET /", f"Cookie: {COOKIE}={TOKEN}")) == 200
-        assert status(request(http, "POST /echo", f"Cookie: {COOKIE}={TOKEN}", "Content-Length: 0")) == 200
-        assert status(request(http, "POST /echo", "Content-Length: 0")) == 403
+        assert status(http, "GET /", f"Cookie: {COOKIE}={TOKEN}") == 200
+        assert status(http, "POST /echo", f"Cookie: {COOKIE}={TOKEN}", "Content-Length: 0") == 200
+        assert status(http, "POST /echo", "Content-Length: 0") == 403
     finally:
         http.close()
 
@@ -249,22 +238,7 @@ def test_messages_that_are_too_long_or_text_end_the_connection(
     with opened(http) as client, pytest.raises(ConnectionClosed):
         client.send(message)
         client.recv()
-    assert inner == [] and status(request(http, "GET /")) == 200
-
-
-@pytest.mark.parametrize("frame", [b"\x82\xfe\xff\xff" + b"x" * 70_000, b"\x82\x04good", b"\xf2\x80abcd", b"\x00\x84abcdgood"])
-def test_frames_that_break_the_protocol_end_the_connection(http: HttpServer, inner: list[bytes], frame: bytes) -> None:
-    head = f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{http.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    head += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-    with socket.create_connection(("127.0.0.1", http.port), timeout=30) as wire:
-        wire.sendall(head.encode())
-        assert wire.recv(4096).startswith(b"HTTP/1.1 101")
-        wire.sendall(frame)
-        wire.shutdown(socket.SHUT_WR)
-        while wire.recv(65536):
-            pass
-    assert inner == [] or inner == [b"x" * 65535]
-    assert status(request(http, "GET /")) == 200
+    assert inner == [] and status(http, "GET /") == 200
 
 
 def test_websockets_of_other_sites_and_before_the_scene_is_there_are_refused(http: HttpServer) -> None:
@@ -275,7 +249,7 @@ def test_websockets_of_other_sites_and_before_the_scene_is_there_are_refused(htt
     http.relay_to(ROUTES, ("127.0.0.1", 9), check)
     with pytest.raises(InvalidStatus), opened(http):  # nobody listens inside
         pass
-    assert status(request(http, "GET /")) == 200
+    assert status(http, "GET /") == 200
 
 
 def page_of(address: str) -> bytes:
@@ -299,6 +273,8 @@ def test_before_the_scene_is_there_a_page_says_so_and_a_visit_is_known() -> None
         assert b"Loading" in page_of(address)
         with pytest.raises(UsageError, match="choose another port"):
             ViewerServer(HERE, int(address.rstrip("/").rpartition(":")[2]), preload=False)
+        found.show_start(ROUTES)
+        assert page_of(address) == b"hello"
     with pytest.raises(OSError):
         page_of(address)
 

@@ -1,6 +1,5 @@
 """The start page without a browser: the programs that find poses and train are stood in for by a script."""
 
-import asyncio
 import json
 import sys
 import time
@@ -9,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("uvicorn", reason="the extra `viewer` is not installed")
+from session_helpers import ask, post
 
 from fprf.errors import DataError, FprfError, UsageError
 from fprf.viewer import start_page
-from fprf.viewer.server import Request, Response
 from fprf.viewer.start_page import StartPage
 
 PROGRAM = f"""#!{sys.executable}
@@ -75,21 +72,10 @@ def photographs(tmp_path: Path) -> Path:
     return folder
 
 
-def ask(page: StartPage, method: str, where: str, body: bytes = b"", **query: object) -> Response:
-    async def answered() -> Response:
-        return await page.routes[(method, where)](Request(method, where, {k: str(v) for k, v in query.items()}, {}, body))
-
-    return asyncio.run(answered())
-
-
-def post(page: StartPage, where: str, **asked: object) -> Any:
-    return json.loads(ask(page, "POST", where, json.dumps(asked).encode()).body)
-
-
 def until(page: StartPage, **wanted: object) -> Any:
     end = time.monotonic() + 60
     while True:
-        state = json.loads(ask(page, "GET", "/fprf/start").body)
+        state = json.loads(ask(page.routes, "GET", "/fprf/start").body)
         if all(state[key] == value for key, value in wanted.items()):
             return state
         assert time.monotonic() < end, state
@@ -99,14 +85,14 @@ def until(page: StartPage, **wanted: object) -> Any:
 def test_photographs_are_posed_trained_and_shown(
     page: StartPage, photographs: Path, tmp_path: Path, shown: list[tuple[Path, str]]
 ) -> None:
-    post(page, "/fprf/start/open", path=f' "{photographs}" ', minutes=1)
+    post(page.routes, "/fprf/start/open", path=f' "{photographs}" ', minutes=1)
     state = until(page, stage="open")
     assert shown == [(tmp_path / "made" / "yard" / "run", "yard")] and state["error"] is None
     assert state["lines"] == ["hello from process", "hello from train"]
-    post(page, "/fprf/start/leave")
+    post(page.routes, "/fprf/start/leave")
     recent = until(page, stage="idle")["recent"]
     assert shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained")]
-    post(page, "/fprf/start/open", path=recent[0]["path"])
+    post(page.routes, "/fprf/start/open", path=recent[0]["path"])
     until(page, stage="open")
     assert shown == [(tmp_path / "made" / "yard" / "run", "yard")]
 
@@ -115,33 +101,33 @@ def test_photographs_are_posed_trained_and_shown(
 def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(
     page: StartPage, photographs: Path, shown: list[tuple[Path, str]], then: str
 ) -> None:
-    post(page, "/fprf/start/open", path=str(photographs), minutes=2)
+    post(page.routes, "/fprf/start/open", path=str(photographs), minutes=2)
     state = until(page, stage="training", share=0.5)
     assert state["picture"] == 7 and state["detail"] == "step 7 · 20.0 dB · 1:01 left"
     with pytest.raises(UsageError, match="yard is being made"):
-        post(page, "/fprf/start/open", path=str(photographs))
-    post(page, "/fprf/start/stop", then=then)
+        post(page.routes, "/fprf/start/open", path=str(photographs))
+    post(page.routes, "/fprf/start/stop", then=then)
     until(page, stage="open" if then == "show" else "idle")
     assert len(shown) == (then == "show")
 
 
 def test_a_failure_is_told_and_nothing_is_lost(page: StartPage, photographs: Path, tmp_path: Path) -> None:
     (photographs / "bad.jpg").touch()
-    post(page, "/fprf/start/open", path=str(photographs))
+    post(page.routes, "/fprf/start/open", path=str(photographs))
     until(page, stage="poses", error="3 photographs show nothing in common")
-    post(page, "/fprf/start/stop")
+    post(page.routes, "/fprf/start/stop")
     until(page, stage="idle", error=None)
-    scene = post(page, "/fprf/start/new", name="../../x/My capture.ply")["scene"]
+    scene = post(page.routes, "/fprf/start/new", name="../../x/My capture.ply")["scene"]
     assert scene == "My-capture-ply"
-    ask(page, "POST", "/fprf/start/piece", b"ply\n", scene=scene, name="x.ply", at=0, size=4)
-    post(page, "/fprf/start/make", scene=scene)
+    ask(page.routes, "POST", "/fprf/start/piece", b"ply\n", scene=scene, name="x.ply", at=0, size=4)
+    post(page.routes, "/fprf/start/make", scene=scene)
     until(page, error="of two dimensions")
     assert (tmp_path / "made" / scene / "files" / "x.ply").read_bytes() == b"ply\n"
-    assert post(page, "/fprf/start/new", name="My capture.ply")["scene"] == "My-capture-ply-2"
+    assert post(page.routes, "/fprf/start/new", name="My capture.ply")["scene"] == "My-capture-ply-2"
 
 
 def test_requests_that_make_no_sense_are_refused(page: StartPage, photographs: Path) -> None:
-    empty = post(page, "/fprf/start/new", name="")["scene"]
+    empty = post(page.routes, "/fprf/start/new", name="")["scene"]
     place = str(photographs)
     refused: list[tuple[str, dict[str, object]]] = [
         ("make", {"scene": empty}),
@@ -153,8 +139,8 @@ def test_requests_that_make_no_sense_are_refused(page: StartPage, photographs: P
     ]
     for path, asked in refused:
         with pytest.raises(FprfError):
-            post(page, f"/fprf/start/{path}", **asked)
+            post(page.routes, f"/fprf/start/{path}", **asked)
     with pytest.raises(UsageError):
-        ask(page, "POST", "/fprf/start/piece", b"x", scene=empty, name="a.ply", at="-1", size=4)
-    assert ask(page, "GET", "/fprf/start/picture").status == 404
+        ask(page.routes, "POST", "/fprf/start/piece", b"x", scene=empty, name="a.ply", at="-1", size=4)
+    assert ask(page.routes, "GET", "/fprf/start/picture").status == 404
     assert until(page, stage="idle")["folder"] == ""
