@@ -32,7 +32,7 @@ def plan_of(scene: Scene, looks: Sequence[Look], seconds: float = 0.1, fps: floa
     return FilmPlan(keys, seconds, fps, (32, 24))
 
 
-def ask(routes: Routes, method: str, path: str, body: bytes = b"", **query: object) -> Response:
+def ask(routes: Routes, method: str, path: str, body: bytes = b"", /, **query: object) -> Response:
     """The answer of a page's handler."""
 
     async def answered() -> Response:
@@ -42,7 +42,7 @@ def ask(routes: Routes, method: str, path: str, body: bytes = b"", **query: obje
     return asyncio.run(answered())
 
 
-def post(routes: Routes, path: str, **asked: object) -> Any:
+def post(routes: Routes, path: str, /, **asked: object) -> Any:
     return json.loads(ask(routes, "POST", path, json.dumps(asked).encode()).body)
 
 

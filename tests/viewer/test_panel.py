@@ -1,6 +1,7 @@
 """Every control of the panel on a real session, moved as a browser would move it."""
 
 from dataclasses import replace
+from operator import attrgetter
 
 import pytest
 from fake_gui import Client, Gui
@@ -60,36 +61,15 @@ def controls(session: Session) -> Controls:
     return Controls(session)
 
 
-def test_sliders_of_the_look(controls: Controls) -> None:
+def test_controls_change_the_state(controls: Controls) -> None:
     for label, value, name, wanted in (
-        ("strength", 0.4, "strength", 0.4),
-        ("temperature", 0.7000000001, "temperature", 0.7),
-        ("clusters", 5.0, "clusters", 5),
-        ("local ↔ global", 0.3, "blend", 0.3),
-        ("keep light", 1.0, "luminance", 1.0),
-        ("smoothness", 40.0, "smoothness", 40.0),
-    ):
-        controls.move(label, value)
-        found = getattr(controls.state.look, name)
-        assert found == wanted and type(found) is type(wanted)
-    before = controls.state
-    controls.move("strength", 7.0)
-    assert controls.state == before and any("strength" in text for text in controls.said)
-
-
-def test_a_preset_moves_the_sliders(controls: Controls) -> None:
-    controls.move("clusters", 5.0)
-    controls.press("gentle")
-    wanted = with_preset(StyleConfig(), "gentle")
-    assert style_config(controls.state.look) == replace(wanted, clusters=5)
-    shown = [controls.gui[name].value for name in ("strength", "keep light", "local ↔ global", "smoothness", "temperature")]
-    kind = wanted.stylizer
-    assert isinstance(kind, RegionToneConfig)
-    assert shown == [wanted.strength, wanted.luminance, wanted.blend, kind.smoothness, kind.temperature]
-
-
-def test_controls_of_what_is_shown(controls: Controls) -> None:
-    for label, value, name, wanted in (
+        ("strength", 0.4, "look.strength", 0.4),
+        ("temperature", 0.7000000001, "look.temperature", 0.7),
+        ("clusters", 5.0, "look.clusters", 5),
+        ("local ↔ global", 0.3, "look.blend", 0.3),
+        ("keep light", 1.0, "look.luminance", 1.0),
+        ("smoothness", 40.0, "look.smoothness", 40.0),
+        ("strength", 7.0, "look.strength", 0.4),
         ("map", "depth", "map", "depth"),
         ("map", "nonsense", "map", "depth"),
         ("map covers", 0.5, "map_opacity", 0.5),
@@ -101,11 +81,24 @@ def test_controls_of_what_is_shown(controls: Controls) -> None:
         ("new photo", "nonsense", "drop_mode", "alone"),
     ):
         controls.move(label, value)
-        assert getattr(controls.state, name) == wanted, label
+        found = attrgetter(name)(controls.state)
+        assert found == wanted and type(found) is type(wanted), label
+    assert [text.partition(":")[0] for text in controls.said] == ["strength", "map"]
     drawn = controls.drawn
     controls.move("cameras", True)
     controls.move("blocks", True)
     assert controls.drawn == drawn + 2 and controls.panel.cameras and controls.panel.blocks
+
+
+def test_a_preset_moves_the_sliders(controls: Controls) -> None:
+    controls.move("clusters", 5.0)
+    controls.press("gentle")
+    wanted = with_preset(StyleConfig(), "gentle")
+    assert style_config(controls.state.look) == replace(wanted, clusters=5)
+    shown = [controls.gui[name].value for name in ("strength", "keep light", "local ↔ global", "smoothness", "temperature")]
+    kind = wanted.stylizer
+    assert isinstance(kind, RegionToneConfig)
+    assert shown == [wanted.strength, wanted.luminance, wanted.blend, kind.smoothness, kind.temperature]
 
 
 def test_controls_follow_what_others_change(controls: Controls) -> None:

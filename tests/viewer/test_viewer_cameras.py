@@ -91,7 +91,7 @@ def test_pictures_have_the_shape_asked_for_and_are_never_huge(aspect: float, lon
     assert abs(width / aspect - height) <= 1 + 1 / aspect
 
 
-def test_pyramids_stand_where_the_cameras_are_and_look_their_way(world: World) -> None:
+def test_pyramids_and_paths_are_where_the_cameras_are(world: World) -> None:
     cameras = world.load().known.cameras
     transform = page_transform(cameras)
     lines = camera_frustums(transform, cameras, 0.1)
@@ -104,6 +104,9 @@ def test_pyramids_stand_where_the_cameras_are_and_look_their_way(world: World) -
         assert np.allclose((own[:4, 1] - tip) @ ahead, 0.1, atol=1e-5)
         up = cameras.pose[view, :, 1].numpy()
         assert ((own[8, 1] - tip) @ up) > 0 and np.allclose(own[8, 1], own[9, 0])  # the roof
+    path = path_segments(transform, cameras)
+    assert path.shape == (len(cameras) - 1, 2, 3) and np.array_equal(path[:-1, 1], path[1:, 0])
+    assert path_segments(transform, cameras.select(torch.tensor([0]))).shape == (0, 2, 3)
 
 
 def test_boxes_have_twelve_edges_of_their_own_sides() -> None:
@@ -126,14 +129,6 @@ def test_boxes_have_twelve_edges_of_their_own_sides() -> None:
     assert inside.min() == pytest.approx(0, abs=1e-5) and inside.max(1) == pytest.approx([1, 2, 3], abs=1e-4)
     shared = {tuple(np.round(p, 4)) for p in corners[0]} & {tuple(np.round(p, 4)) for p in corners[1]}
     assert len(shared) == 4  # neighbours share a face
-
-
-def test_a_path_goes_from_frame_to_frame(world: World) -> None:
-    cameras = world.load().known.cameras
-    transform = page_transform(cameras)
-    lines = path_segments(transform, cameras)
-    assert lines.shape == (len(cameras) - 1, 2, 3) and np.array_equal(lines[:-1, 1], lines[1:, 0])
-    assert path_segments(transform, cameras.select(torch.tensor([0]))).shape == (0, 2, 3)
 
 
 @pytest.mark.parametrize(("aspect", "height"), [(0.5, 1.0), (2.0, 0.5), (0.25, 1.0)])
