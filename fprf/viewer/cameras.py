@@ -7,6 +7,7 @@ clients send is checked, then bounded.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from ..errors import UsageError
 from ..rendering.cameras import Cameras
-from ..rendering.lens import PINHOLE
+from ..rendering.paths import pinhole
 from ..rendering.space import Space
 from ..rendering.splines import quaternions, rotations
 from ..types import Boxes
@@ -81,15 +82,8 @@ class PageTransform(NamedTuple):
         turn = rotations(torch.tensor([state.wxyz for state in states], dtype=torch.float64)) @ _FLIP
         place = torch.tensor([state.position for state in states], dtype=torch.float64) / self.scale + self.centre
         focal = torch.tensor([height / 2 / math.tan(state.fov / 2) for state in states], dtype=torch.float64)
-        count = len(states)
-        return Cameras(
-            pose=torch.cat([turn, place[:, :, None]], -1),
-            focal=focal[:, None].repeat(1, 2),
-            centre=torch.tensor([width / 2, height / 2], dtype=torch.float64).repeat(count, 1),
-            size=torch.tensor([width, height]).repeat(count, 1),
-            distortion=torch.zeros(count, 6, dtype=torch.float64),
-            lens=torch.full((count,), PINHOLE),
-        )
+        frames = pinhole(torch.cat([turn, place[:, :, None]], -1), width=width, height=height, fov=90.0)
+        return replace(frames, focal=focal[:, None].repeat(1, 2))
 
 
 def page_transform(cameras: Cameras) -> PageTransform:
