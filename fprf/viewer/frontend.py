@@ -74,7 +74,7 @@ class ViserFrontend(Frontend):
 
     def show(self, client: Hashable, frame: RenderedFrame) -> None:
         """Put a picture behind a client's canvas; with its depth, where lines are to disappear behind things."""
-        handle = self._viser.get_clients().get(client) if isinstance(client, int) else None
+        handle = self._viser.get_clients().get(client)
         if handle is None:
             return
         lined = self.panel.cameras or self.panel.blocks or bool(self._session.state.keys)

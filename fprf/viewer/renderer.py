@@ -98,12 +98,11 @@ class Speed:
 
     def update(self, pixels: int, seconds: float) -> None:
         """Learn that a picture of so many pixels took so long."""
-        if pixels > 0:
-            self.seconds += 0.3 * (seconds / pixels - self.seconds)
+        self.seconds += 0.3 * (seconds / pixels - self.seconds)
 
-    def first(self, sizes: list[tuple[int, int]], limit: float = FIRST_SECONDS) -> int:
-        """Index of the finest of `sizes` (coarse to fine) that should take at most `limit` seconds; at least 0."""
-        fits = [i for i, (width, height) in enumerate(sizes) if width * height * self.seconds <= limit]
+    def first(self, sizes: list[tuple[int, int]]) -> int:
+        """Index of the finest of `sizes` (coarse to fine) that should take at most `FIRST_SECONDS`; at least 0."""
+        fits = [i for i, (width, height) in enumerate(sizes) if width * height * self.seconds <= FIRST_SECONDS]
         return max(fits, default=0)
 
 

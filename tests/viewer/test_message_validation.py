@@ -11,26 +11,14 @@ msgspec = pytest.importorskip("msgspec", reason="the extra `viewer` is not insta
 check_message = pytest.importorskip("fprf.viewer.message_validation").check_message
 
 CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": [1.0, 0, 0, 0],
-    "position": [0, 0.5, 1],
-    "fov": 1.2,
-    "near": 0.01,
-    "far": 1000.0,
-    "image_height": 720,
-    "image_width": 1280,
-    "look_at": [0, 0, 0],
-    "up_direction": [0, 0, 1],
-}
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0, 0.5, 1], "look_at": [0, 0, 0],
+    "up_direction": [0, 0, 1], "fov": 1.2, "near": 0.01, "far": 1000.0, "image_height": 720, "image_width": 1280,
+}  # fmt: skip
 CONTROL = {"type": "GuiUpdateMessage", "uuid": "a-b-c", "updates": {"value": 0.5}}
 CLICK = {
-    "type": "ScenePointerMessage",
-    "event_type": "click",
-    "ray_origin": [0, 0, 0],
-    "ray_direction": [0, 0, 1],
-    "screen_pos": [[0.5, 0.5]],
-    "modifier": None,
-}
+    "type": "ScenePointerMessage", "event_type": "click", "ray_origin": [0, 0, 0], "ray_direction": [0, 0, 1],
+    "screen_pos": [[0.5, 0.5]], "modifier": None,
+}  # fmt: skip
 
 
 def test_what_the_page_sends_passes() -> None:

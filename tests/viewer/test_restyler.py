@@ -29,7 +29,6 @@ def test_between_two_looks(restyler: Restyler, encoded: tuple[Photograph, Photog
     one, two = (Look(mix=((photograph, 1.0),), clusters=3) for photograph in encoded)
     half, from_plain = replace(one, towards=two, at=0.5), replace(Look(), towards=two, at=0.5)
     ends = [restyler.restyle(each) for each in (one, two)]
-    assert ends[0] is not None and ends[1] is not None
     assert torch.equal(rendered(restyler, restyler.restyle(half)), rendered(restyler, ends[0].mixed(ends[1], 0.5)))
     assert {name for name, _ in restyler.region_info(half, 0).taken} == {"dusk.png", "snow.png"}
     wanted = rendered(restyler, ends[1].faded.mixed(ends[1], 0.5))

@@ -198,7 +198,6 @@ def inner(http: HttpServer) -> Iterator[list[bytes]]:
 
     def handle(connection: ServerConnection) -> None:
         for message in connection:
-            assert isinstance(message, bytes)
             received.append(message)
             connection.send(message[::-1])
 
@@ -254,8 +253,7 @@ def test_websockets_of_other_sites_and_before_the_scene_is_there_are_refused(htt
 
 def page_of(address: str) -> bytes:
     with urllib.request.urlopen(address, timeout=60) as answer:
-        body: bytes = answer.read()
-        return body
+        return answer.read()
 
 
 def test_before_the_scene_is_there_a_page_says_so_and_a_visit_is_known() -> None:

@@ -2,16 +2,16 @@
 
 import json
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from session_helpers import ask, post
+from session_helpers import ask, post, until
 
 from fprf.errors import DataError, FprfError, UsageError
 from fprf.viewer import start_page
+from fprf.viewer.routes import Response
 from fprf.viewer.start_page import StartPage
 
 PROGRAM = f"""#!{sys.executable}
@@ -40,27 +40,41 @@ if args[args.index("--minutes") + 1] != "1":
 """
 
 
-@pytest.fixture
-def shown() -> list[tuple[Path, str]]:
-    return []
+class ShownPage(StartPage):
+    """A start page that notes what it would open the viewer on."""
+
+    def __init__(self, output: Path) -> None:
+        self.shown: list[tuple[Path, str]] = []
+        super().__init__(output, self.open, self.shown.clear)
+
+    def open(self, path: Path, name: str) -> None:
+        if path.suffix == ".ply":
+            raise DataError("of two dimensions")
+        self.shown.append((path, name))
+
+    def reached(self, **wanted: object) -> Any:
+        """The state, as soon as it is so."""
+        state: dict[str, Any] = {}
+        until(lambda: wanted.items() <= state.items(), lambda: state.update(json.loads(self.ask("GET", "").body)))
+        return state
+
+    def ask(self, method: str, path: str, body: bytes = b"", /, **query: object) -> Response:
+        return ask(self.routes, method, f"/fprf/start{path}", body, **query)
+
+    def post(self, path: str, /, **asked: object) -> Any:
+        return post(self.routes, f"/fprf/start/{path}", **asked)
 
 
 @pytest.fixture
-def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shown: list[tuple[Path, str]]) -> Iterator[StartPage]:
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ShownPage]:
     program = tmp_path / "python"
     program.write_text(PROGRAM)
     program.chmod(0o755)
     monkeypatch.setattr(start_page.sys, "executable", str(program))
     monkeypatch.chdir(tmp_path)
-
-    def show(path: Path, name: str) -> None:
-        if path.suffix == ".ply":
-            raise DataError("of two dimensions")
-        shown.append((path, name))
-
-    made = StartPage(tmp_path / "made", show, shown.clear)
-    yield made
-    made.close()
+    page = ShownPage(tmp_path / "made")
+    yield page
+    page.close()
 
 
 @pytest.fixture
@@ -72,62 +86,48 @@ def photographs(tmp_path: Path) -> Path:
     return folder
 
 
-def until(page: StartPage, **wanted: object) -> Any:
-    end = time.monotonic() + 60
-    while True:
-        state = json.loads(ask(page.routes, "GET", "/fprf/start").body)
-        if all(state[key] == value for key, value in wanted.items()):
-            return state
-        assert time.monotonic() < end, state
-        time.sleep(0.02)
-
-
-def test_photographs_are_posed_trained_and_shown(
-    page: StartPage, photographs: Path, tmp_path: Path, shown: list[tuple[Path, str]]
-) -> None:
-    post(page.routes, "/fprf/start/open", path=f' "{photographs}" ', minutes=1)
-    state = until(page, stage="open")
-    assert shown == [(tmp_path / "made" / "yard" / "run", "yard")] and state["error"] is None
+def test_photographs_are_posed_trained_and_shown(page: ShownPage, photographs: Path, tmp_path: Path) -> None:
+    page.post("open", path=f' "{photographs}" ', minutes=1)
+    state = page.reached(stage="open")
+    assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")] and state["error"] is None
     assert state["lines"] == ["hello from process", "hello from train"]
-    post(page.routes, "/fprf/start/leave")
-    recent = until(page, stage="idle")["recent"]
-    assert shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained")]
-    post(page.routes, "/fprf/start/open", path=recent[0]["path"])
-    until(page, stage="open")
-    assert shown == [(tmp_path / "made" / "yard" / "run", "yard")]
+    page.post("leave")
+    recent = page.reached(stage="idle")["recent"]
+    assert page.shown == [] and [(row["name"], row["kind"]) for row in recent] == [("yard", "trained")]
+    page.post("open", path=recent[0]["path"])
+    page.reached(stage="open")
+    assert page.shown == [(tmp_path / "made" / "yard" / "run", "yard")]
 
 
 @pytest.mark.parametrize("then", ["show", "leave"])
-def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(
-    page: StartPage, photographs: Path, shown: list[tuple[Path, str]], then: str
-) -> None:
-    post(page.routes, "/fprf/start/open", path=str(photographs), minutes=2)
-    state = until(page, stage="training", share=0.5)
+def test_training_is_stopped_to_show_what_there_is_or_to_leave_it(page: ShownPage, photographs: Path, then: str) -> None:
+    page.post("open", path=str(photographs), minutes=2)
+    state = page.reached(stage="training", share=0.5)
     assert state["picture"] == 7 and state["detail"] == "step 7 · 20.0 dB · 1:01 left"
     with pytest.raises(UsageError, match="yard is being made"):
-        post(page.routes, "/fprf/start/open", path=str(photographs))
-    post(page.routes, "/fprf/start/stop", then=then)
-    until(page, stage="open" if then == "show" else "idle")
-    assert len(shown) == (then == "show")
+        page.post("open", path=str(photographs))
+    page.post("stop", then=then)
+    page.reached(stage="open" if then == "show" else "idle")
+    assert len(page.shown) == (then == "show")
 
 
-def test_a_failure_is_told_and_nothing_is_lost(page: StartPage, photographs: Path, tmp_path: Path) -> None:
+def test_a_failure_is_told_and_nothing_is_lost(page: ShownPage, photographs: Path, tmp_path: Path) -> None:
     (photographs / "bad.jpg").touch()
-    post(page.routes, "/fprf/start/open", path=str(photographs))
-    until(page, stage="poses", error="3 photographs show nothing in common")
-    post(page.routes, "/fprf/start/stop")
-    until(page, stage="idle", error=None)
-    scene = post(page.routes, "/fprf/start/new", name="../../x/My capture.ply")["scene"]
+    page.post("open", path=str(photographs))
+    page.reached(stage="poses", error="3 photographs show nothing in common")
+    page.post("stop")
+    page.reached(stage="idle", error=None)
+    scene = page.post("new", name="../../x/My capture.ply")["scene"]
     assert scene == "My-capture-ply"
-    ask(page.routes, "POST", "/fprf/start/piece", b"ply\n", scene=scene, name="x.ply", at=0, size=4)
-    post(page.routes, "/fprf/start/make", scene=scene)
-    until(page, error="of two dimensions")
+    page.ask("POST", "/piece", b"ply\n", scene=scene, name="x.ply", at=0, size=4)
+    page.post("make", scene=scene)
+    page.reached(error="of two dimensions")
     assert (tmp_path / "made" / scene / "files" / "x.ply").read_bytes() == b"ply\n"
-    assert post(page.routes, "/fprf/start/new", name="My capture.ply")["scene"] == "My-capture-ply-2"
+    assert page.post("new", name="My capture.ply")["scene"] == "My-capture-ply-2"
 
 
-def test_requests_that_make_no_sense_are_refused(page: StartPage, photographs: Path) -> None:
-    empty = post(page.routes, "/fprf/start/new", name="")["scene"]
+def test_requests_that_make_no_sense_are_refused(page: ShownPage, photographs: Path) -> None:
+    empty = page.post("new", name="")["scene"]
     place = str(photographs)
     refused: list[tuple[str, dict[str, object]]] = [
         ("make", {"scene": empty}),
@@ -139,8 +139,8 @@ def test_requests_that_make_no_sense_are_refused(page: StartPage, photographs: P
     ]
     for path, asked in refused:
         with pytest.raises(FprfError):
-            post(page.routes, f"/fprf/start/{path}", **asked)
+            page.post(path, **asked)
     with pytest.raises(UsageError):
-        ask(page.routes, "POST", "/fprf/start/piece", b"x", scene=empty, name="a.ply", at="-1", size=4)
-    assert ask(page.routes, "GET", "/fprf/start/picture").status == 404
-    assert until(page, stage="idle")["folder"] == ""
+        page.ask("POST", "/piece", b"x", scene=empty, name="a.ply", at="-1", size=4)
+    assert page.ask("GET", "/picture").status == 404
+    assert page.reached(stage="idle")["folder"] == ""

@@ -77,7 +77,6 @@ def test_damaged_ones_are_told_and_the_next_one_goes(uploaded: Uploads, data: by
 def test_a_decoder_that_died_is_replaced(uploaded: Uploads) -> None:
     uploaded.store(png(20, 20))
     process = uploaded._process
-    assert process is not None
     process.kill()
     process.wait()
     assert uploaded.store(png(20, 20)).is_file() and uploaded._process is not process

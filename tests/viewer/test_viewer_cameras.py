@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.errors import UsageError
-from fprf.rendering.cameras import Cameras, project
+from fprf.rendering.cameras import project
+from fprf.rendering.paths import pinhole
 from fprf.rendering.space import Space
 from fprf.types import Boxes
 from fprf.viewer.cameras import (
@@ -43,14 +44,7 @@ def test_far_from_the_origin_nothing_is_lost(world: World) -> None:
 
 
 def test_the_page_looks_along_plus_z_with_y_down() -> None:
-    one = Cameras(
-        pose=torch.eye(4, dtype=torch.float64)[None, :3],
-        focal=torch.full((1, 2), 50.0, dtype=torch.float64),
-        centre=torch.full((1, 2), 50.0, dtype=torch.float64),
-        size=torch.tensor([[100, 100]]),
-        distortion=torch.zeros(1, 6, dtype=torch.float64),
-        lens=torch.zeros(1, dtype=torch.int64),
-    )
+    one = pinhole(torch.eye(4, dtype=torch.float64)[None, :3], width=100, height=100, fov=90.0)
     transform = page_transform(one)._replace(scale=1.0)
     state = checked_camera((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), math.pi / 2, 100, 100)
     cameras = transform.cameras([state], (100, 100))

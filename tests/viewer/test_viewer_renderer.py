@@ -112,7 +112,6 @@ def test_layers_are_what_the_command_line_renders(restyler: Restyler, encoded: P
     look = set_rule(Look(mix=((a, 1.0), (b, 1.0)), clusters=3), 0, "keep")
     layers = layers_of(restyler, ViewSettings(look, "matches", wipe=0.5))
     trained, styled = restyler.scene, restyler.styled(look)
-    assert styled is not None
     for name, restyle in (("look", styled.restyle), ("plain", None)):
         view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render, restyle)
         assert np.abs(layers.pictures[name].astype(int) - to_uint8(view.rgb)).max() <= 1
