@@ -103,11 +103,16 @@ def write_film_files(
 
 
 def film_frames(
-    folder: Path, scene: Scene, renderer: SceneRenderer, out: Frames, progress: Callable[[int, int], None]
+    folder: Path,
+    scene: Scene,
+    renderer: SceneRenderer,
+    out: Frames,
+    progress: Callable[[int, int], None],
+    abandoned: Callable[[], bool] = lambda: False,
 ) -> Steps:
     """Render the frames of a film's folder into a queue, step by step; `progress(done, total)` of each.
 
-    At last comes None, or the error that it ends with.
+    At last comes None, or the error that it ends with. Ends early once nobody takes frames any more (`abandoned`).
     """
     end: Exception | None = None
     try:
@@ -116,6 +121,8 @@ def film_frames(
         for frame in range(len(cameras)):
             picture = yield from renderer.frame(cameras, frame, looks(frame))
             while not _put(out, picture):
+                if abandoned():
+                    return
                 yield
             progress(frame + 1, len(cameras))
     except Exception as error:
@@ -207,15 +214,18 @@ class FilmRecorder:
         def progress(done: int, total: int) -> None:
             session.update(lambda state: replace(state, film=FilmProgress(done, total)))
 
+        abandoned = threading.Event()
         try:
             if session.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
             folder = new_folder(session.viewed.root)
             write_film_files(folder, session.transform, plan, session.viewed.scene.semantic_encoder, session.viewed.stylizer)
             frames: Frames = Queue(2)
-            self._worker.run_when_idle(film_frames(folder, session.viewed.scene, session.renderer, frames, progress))
+            rendered = film_frames(folder, session.viewed.scene, session.renderer, frames, progress, abandoned.is_set)
+            self._worker.run_when_idle(rendered)
             write_video(folder / "film.mp4", queued_frames(frames), plan.fps)
         except Exception as error:  # whatever it is, the next film can be made
+            abandoned.set()
             session.update(lambda state: replace(state, film=FilmProgress()))
             session.notify(f"film: {error}")
             return

@@ -17,7 +17,7 @@ import torch
 import viser
 from numpy.typing import NDArray
 
-from ..errors import FprfError
+from ..errors import FprfError, UsageError
 from ..interfaces import Scene
 from ..io.images import to_uint8
 from ..rendering.cameras import pixel_grid
@@ -188,7 +188,12 @@ class ViserFrontend(Frontend):
             self.notify("this scene is not cut into blocks")
         self._lines("blocks", boxes, _YELLOW)
         keys = () if session.state.playing else session.state.keys  # in a flight they would be in the way
-        path = path_segments(transform, film_cameras(transform, panel.plan)) if len(keys) > 1 else None
+        path = None
+        if len(keys) > 1:
+            try:
+                path = path_segments(transform, film_cameras(transform, panel.plan))
+            except UsageError as error:  # the flight is too long
+                self.notify(str(error))
         self._lines("film", path, _PINK)
         places = transform.cameras([key.camera for key in keys], (160, 90)) if keys else None
         self._lines("keys", None if places is None else camera_frustums(transform, places, 0.08, behind=True), _PINK)

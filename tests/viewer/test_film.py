@@ -1,4 +1,5 @@
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from queue import Queue
 
@@ -115,3 +116,21 @@ def test_another_flight_or_leaving_ends_a_flight(session: Session, listener: Lis
     session.films.play(1, FilmPlan((), 1.0, 24.0, (32, 24)), flown.append)
     listener.until_said("no keys")
     until(lambda: not session.films.playing(1))
+
+
+def test_a_film_that_cannot_be_written_leaves_room_for_the_next(
+    session: Session, listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More frames than wait in the queue are rendered while nobody takes them."""
+
+    def full(path: Path, frames: Iterator[object], fps: float) -> None:
+        next(frames)
+        raise OSError("disk full")
+
+    long = plan_of(session.viewed.scene, [Look()] * 2, seconds=1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(film, "write_video", full)
+        session.films.record(long)
+        listener.until_said("disk full")
+    session.films.record(plan_of(session.viewed.scene, [Look()] * 2, seconds=0.2))
+    until(lambda: session.state.film.path is not None)

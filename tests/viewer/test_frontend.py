@@ -15,6 +15,7 @@ from fprf.viewer.frontend import ViserFrontend, page_of
 from fprf.viewer.page import Page
 from fprf.viewer.renderer import RenderRequest
 from fprf.viewer.session import Session
+from fprf.viewer.state import Key, Look
 
 
 @pytest.fixture
@@ -43,6 +44,13 @@ def test_controls_lines_and_clicks_follow_the_state(session: Session, frontend: 
     frontend.panel._cameras.value = frontend.panel._blocks.value = True  # the scene has no blocks
     frontend.draw_lines()
     frontend.notify("a line")
+
+
+def test_a_flight_that_is_too_long_is_told_and_draws_no_path(session: Session, frontend: ViserFrontend) -> None:
+    keys = tuple(Key(camera_of(session.viewed.scene, view % 5), Look()) for view in range(12))
+    frontend.panel._seconds.value = 60.0
+    assert session.update(lambda state: replace(state, keys=keys, map="depth"))
+    assert next(control.value for control, _ in frontend.panel._bound if control.label == "map") == "depth"
 
 
 def test_a_client_that_has_gone_is_shown_nothing(session: Session, frontend: ViserFrontend) -> None:
