@@ -28,7 +28,7 @@ from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
 from .features import FeatureStore, Progress, extract
-from .images import load_image, load_images, load_mask
+from .images import WHITE, load_image, load_images, load_mask
 from .scene import Scene, find_sightings
 
 HELD = 512 * 2**20
@@ -46,19 +46,15 @@ def allocate_pixels(pixels: int, folder: Path, held: int = HELD) -> Annotated[Te
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
-            _reserve(file.fileno(), size)
+            if hasattr(os, "posix_fallocate"):
+                # Blocks for all of it now: a write to a mapped file that the disk has no room for would end the process.
+                os.posix_fallocate(file.fileno(), 0, size)
+            else:
+                os.ftruncate(file.fileno(), size)
             mapped = np.memmap(file, dtype=np.uint8, mode="r+", shape=(pixels, 3))
     except OSError as error:
         raise unwritable(folder, error, size) from error
     return torch.from_numpy(np.asarray(mapped))
-
-
-def _reserve(file: int, size: int) -> None:
-    """Blocks for the whole file now: a write to a mapped file that the disk has no room for would end the process."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file, 0, size)
-    else:
-        os.ftruncate(file, size)
 
 
 class PixelRuns:
@@ -71,8 +67,8 @@ class PixelRuns:
         self._count = int(self._after[-1]) if len(start) else 0
 
     @staticmethod
-    def of(masks: Iterable[tuple[int, Annotated[Tensor, "P"]]]) -> "PixelRuns":
-        """Of masks, each with the number of its first entry, which rise; a run may go on from one mask to the next."""
+    def of(masks: Iterable[tuple[int, Tensor]]) -> "PixelRuns":
+        """Of masks of any shape, each with the number of its first entry, which rise; a run may go on in the next mask."""
         starts, ends = [], []
         for first, mask in masks:
             edge = torch.zeros(1, dtype=torch.bool)
@@ -112,7 +108,6 @@ class PixelRuns:
 
 # Images decoded at a time (in threads) before they are copied together.
 DECODE = 16
-WHITE = (1.0, 1.0, 1.0)
 
 
 def generator_of(seed: int, step: int, device: torch.device | None = None, *, purpose: str = "pixels") -> torch.Generator:
@@ -191,8 +186,10 @@ class RayBatches(DataManager):
         self._slots = {view: slot for slot, view in enumerate(self._views)}
         self._pixels = self._load(cache)
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
-        self._chosen = None if seen is None and not masks else self._choose(seen, masks)
-        sky = self._skies(skies) if skies else None
+        self._chosen = None if seen is None and not masks else self._runs(masks, unmasked=True, seen=seen)
+        if self._chosen is not None and not len(self._chosen):
+            raise DataError(f"{scene.name}: none of {len(self._views)} training views shows what is to be learnt")
+        sky = self._runs(skies, unmasked=False) if skies else None
         marks = self._marked() if config.depth_share > 0 else None
         self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marks)
         self.content_store: FeatureStore | None = None
@@ -268,34 +265,20 @@ class RayBatches(DataManager):
         end = int(self._ends[slot])
         return self._pixels[end - width * height : end].reshape(height, width, 3)
 
-    def _choose(self, seen: Callable[[int], Tensor] | None, masks: Sequence[Path | None]) -> PixelRuns:
-        """The pixels that `seen` and the capture's masks allow."""
+    def _runs(self, paths: Sequence[Path | None], *, unmasked: bool, seen: Callable[[int], Tensor] | None = None) -> PixelRuns:
+        """The training pixels that are bright in their view's mask, and that `seen` allows; of a view without a mask
+        they are as `unmasked` says.
+        """
 
-        def allowed(view: int, width: int, height: int) -> Tensor:
-            mask = torch.ones(height, width, dtype=torch.bool) if seen is None else seen(view)
-            path = masks[view] if masks else None
-            return mask if path is None else mask & torch.from_numpy(load_mask(path, (width, height)))
+        def masks() -> Iterator[tuple[int, Tensor]]:
+            for slot, view in enumerate(self._views):
+                width, height = self._sizes[slot].tolist()
+                path = paths[view] if paths else None
+                mask = torch.full((height, width), unmasked)
+                mask = mask if path is None else torch.from_numpy(load_mask(path, (width, height)))
+                yield int(self._ends[slot]) - width * height, mask if seen is None else mask & seen(view)
 
-        runs = PixelRuns.of(self._each(allowed))
-        if not len(runs):
-            raise DataError(f"{self._scene.name}: none of {len(self._views)} training views shows what is to be learnt")
-        return runs
-
-    def _skies(self, skies: Sequence[Path | None]) -> PixelRuns:
-        """The pixels that show sky."""
-
-        def sky(view: int, width: int, height: int) -> Tensor:
-            path = skies[view]
-            none = torch.zeros(height, width, dtype=torch.bool)
-            return none if path is None else torch.from_numpy(load_mask(path, (width, height)))
-
-        return PixelRuns.of(self._each(sky))
-
-    def _each(self, mask: Callable[[int, int, int], Tensor]) -> Iterator[tuple[int, Annotated[Tensor, "P"]]]:
-        """Mask of each training view, of its width and height, by the number of its first pixel."""
-        for slot, view in enumerate(self._views):
-            width, height = self._sizes[slot].tolist()
-            yield int(self._ends[slot]) - width * height, mask(view, width, height).reshape(-1)
+        return PixelRuns.of(masks())
 
     def _marked(self) -> _Marks | None:
         """Sightings of sparse points in the training views, among the pixels that are learnt from.
@@ -322,14 +305,8 @@ class RayBatches(DataManager):
         pixels = allocate_pixels(int(self._ends[-1]), cache)
         filled = 0
         for first in range(0, len(self._views), DECODE):
-            views = self._views[first : first + DECODE]
-            part = replace(
-                self._scene,
-                paths=tuple(self._scene.paths[view] for view in views),
-                cameras=self._scene.cameras.select(torch.tensor(views)),
-            )
-            for image in load_images(part, self.background):
-                rows = torch.from_numpy(np.ascontiguousarray(image)).reshape(-1, 3)
+            for image in load_images(self._scene, self.background, self._views[first : first + DECODE]):
+                rows = torch.from_numpy(image).reshape(-1, 3)
                 pixels[filled : filled + len(rows)] = rows
                 filled += len(rows)
         return pixels

@@ -212,7 +212,8 @@ MAX_PIXELS = 100_000_000
 """Files that claim more are refused before they are decoded."""
 
 Image: TypeAlias = NDArray[np.uint8]
-_WHITE = (1.0, 1.0, 1.0)
+WHITE = (1.0, 1.0, 1.0)
+"""What transparent pixels show by default."""
 
 
 def load_image(
@@ -228,10 +229,7 @@ def load_image(
     by default). `upright` obeys EXIF orientation, except in files with transparency. Raises DataError where the file is
     absent, truncated, damaged, of no known format or over 1e8 pixels.
     """
-    header = read_header(path)
-    if header.width * header.height > MAX_PIXELS:
-        raise DataError(f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the image")
-    pixels = _to_rgb(path, _decode(path, header, upright), _WHITE if background is None else background)
+    pixels = _to_rgb(path, _decode(path, upright), WHITE if background is None else background)
     if size is None or size == (pixels.shape[1], pixels.shape[0]):
         return pixels
     smaller = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
@@ -243,12 +241,11 @@ def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     """A mask [H W] of `size` (width, height): true where the file's first channel is bright (above a half; of files that hold
     but 0 and 1, where it is 1). The nearest pixel is taken. Raises DataError as `load_image` does.
     """
-    header = read_header(path)
-    if header.width * header.height > MAX_PIXELS:
-        raise DataError(f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the mask")
-    if abs(size[0] * header.height - size[1] * header.width) > header.width + header.height + size[0] + size[1]:
-        raise DataError(f"{path}: {header.width}x{header.height} pixels do not fit an image of {size[0]}x{size[1]}; mend it")
-    grey = _decode(path, header).reshape(header.height, header.width, -1)[:, :, 0].astype(np.int64)
+    pixels = _decode(path)
+    height, width = pixels.shape[:2]
+    if abs(size[0] * height - size[1] * width) > width + height + size[0] + size[1]:
+        raise DataError(f"{path}: {width}x{height} pixels do not fit an image of {size[0]}x{size[1]}; mend it")
+    grey = pixels.reshape(height, width, -1)[:, :, 0].astype(np.int64)
     half = 0 if grey.max() <= 1 else 127 if grey.max() <= 255 else 32767
     mask = np.asarray(cv2.resize((grey > half).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
     return mask.astype(np.bool_)
@@ -259,10 +256,9 @@ def load_images(scene: "Scene", background: Sequence[float] | None = None, views
 
     Raises DataError as `load_image` does, and where a file's shape has changed since the scene was parsed.
     """
-    sizes = [(int(width), int(height)) for width, height in scene.cameras.size.tolist()]
 
     def load(view: int) -> Image:
-        path, (width, height) = scene.paths[view], sizes[view]
+        path, (width, height) = scene.paths[view], scene.cameras.size[view].tolist()
         header = read_header(path)
         # Both sides were rounded to whole pixels: a larger deviation is another shape, not another scale.
         if abs(width * header.height - height * header.width) > 0.5 * (header.width + header.height) + 1e-6:
@@ -273,7 +269,7 @@ def load_images(scene: "Scene", background: Sequence[float] | None = None, views
         return load_image(path, (width, height), background)
 
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(load, range(len(sizes)) if views is None else views))
+        return list(pool.map(load, range(len(scene.paths)) if views is None else views))
 
 
 def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Path]:
@@ -310,8 +306,11 @@ def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
     return [path for path in images if not faults[path]]
 
 
-def _decode(path: Path, header: ImageHeader, upright: bool = False) -> NDArray[np.generic]:
+def _decode(path: Path, upright: bool = False) -> NDArray[np.generic]:
     """Pixels as OpenCV orders them, BGR; EXIF orientation is obeyed on request, and not where there is transparency."""
+    header = read_header(path)
+    if header.width * header.height > MAX_PIXELS:
+        raise DataError(f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the image")
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -348,7 +347,7 @@ def _decode_heic(path: Path, data: bytes) -> NDArray[np.generic]:
         ) from None
     try:
         return np.asarray(pillow_heif.open_heif(data, bgr_mode=True))
-    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError) as error:
+    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError, IndexError) as error:
         raise DataError(f"{path}: the heic data cannot be decoded; copy or export the image again") from error
 
 

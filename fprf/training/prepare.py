@@ -13,9 +13,9 @@ from torch import Tensor
 
 from ..config import RunConfig, TrainConfig
 from ..datamanagers.basis import Basis
-from ..datamanagers.batches import WHITE
 from ..datamanagers.bounds import find_space
 from ..datamanagers.features import FeatureStore
+from ..datamanagers.images import WHITE
 from ..datamanagers.parsers.config import parse_scene, recognise
 from ..datamanagers.scene import Scene, exposures_differ, find_sightings, with_exposure
 from ..errors import CheckpointError, DataError, PluginError, UsageError, WeightsError
