@@ -6,6 +6,7 @@ anything else                                                                   
 """
 
 import math
+from dataclasses import replace
 from typing import Annotated
 
 import torch
@@ -123,18 +124,17 @@ def _contraction(scene: Scene) -> Space:
         radius = max(radius, min(spread, 3 * radius if radius > 0 else spread))
     if radius <= ROUNDING * float(position.abs().amax()):
         raise DataError(f"{scene.name}: all cameras stand in one place and there are no points; capture from several places")
-    depth = _depths(scene)
-    near = NEAR
-    if scene.depths is not None:
-        near = min(NEAR, 0.5 * float(scene.depths[:, 0].amin()) / radius)
-    elif depth is not None:
-        near = min(NEAR, 0.5 * float(depth.quantile(_share(depth, 0.001))) / radius)
+    nearest = _nearest(scene)
+    near = NEAR if nearest is None else min(NEAR, 0.5 * nearest / radius)
     return Space("contraction", _three(centre), _rows(rotation), 1 / radius, max(near, 1e-3), FAR)
 
 
-def _share(values: Tensor, share: float) -> float:
-    """Fewer values than 1/share give their smallest."""
-    return share if len(values) * share >= 1 else 0.0
+def _nearest(scene: Scene) -> float | None:
+    """Nearest depth that the capture says, else that of its sparse points but for a thousandth, which may be wrong."""
+    if scene.depths is not None:
+        return float(scene.depths[:, 0].amin())
+    depth = _depths(scene)
+    return None if depth is None else float(depth.quantile(0.001 if len(depth) >= 1000 else 0.0))
 
 
 def _box(scene: Scene) -> Space:
@@ -157,36 +157,31 @@ def _ndc(scene: Scene) -> Space:
     right = right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(back, right), back])
     centre = pose[:, :, 3].mean(0)
-    depth = _depths(scene)
-    assert depth is not None  # find_kind asked
-    nearest = depth.quantile(_share(depth, 0.001)) if scene.depths is None else scene.depths[:, 0].amin()
+    nearest = _nearest(scene)
+    assert nearest is not None  # find_kind asked
     size = cameras.size.double().mean(0)
     focal = 2 * cameras.focal.mean(0) / size
-    first = Space(
-        "ndc", _three(centre), _rows(rotation), 1.0, 0.9 * float(nearest), 1.0, focal=(float(focal[0]), float(focal[1]))
-    )
-    low, high = _span(first, cameras)
-    return Space(
-        "ndc", first.centre, first.rotation, 1.0, first.near, 1.0, (low[0], low[1], -1.0), (high[0], high[1], 1.0), first.focal
-    )
+    whole = Space("ndc", _three(centre), _rows(rotation), 1.0, 0.9 * nearest, 1.0, focal=(float(focal[0]), float(focal[1])))
+    low, high = _span(whole, cameras)
+    return replace(whole, low=(low[0], low[1], -1.0), high=(high[0], high[1], 1.0))
 
 
 def _span(space: Space, cameras: Cameras) -> tuple[list[float], list[float]]:
     """Range of all image corners in NDC x and y, from the near plane to infinity, a little widened."""
     ends = []
     for view in range(len(cameras)):
-        w, h = (float(v) for v in cameras.size[view])
+        w, h = cameras.size[view].tolist()
         corner = torch.tensor([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]], dtype=torch.float64)
         rays = space.rays(*rays_through(cameras, torch.full((4,), view), corner))
         ends += [rays.origin, rays.origin + rays.direction]
     spread = torch.cat(ends).double()
     low, high = spread.amin(0), spread.amax(0)
     middle, half = (low + high) / 2, (high - low) / 2 * MARGIN
-    return [float(v) for v in middle - half], [float(v) for v in middle + half]
+    return (middle - half).tolist(), (middle + half).tolist()
 
 
 def _three(x: Tensor) -> tuple[float, float, float]:
-    a, b, c = (float(v) for v in x)
+    a, b, c = x.tolist()
     return a, b, c
 
 

@@ -15,7 +15,6 @@ Half precision keeps 11 bits of each number, so numbers are made small first: b 
 import contextlib
 import copy
 import hashlib
-import importlib.util
 import os
 import time
 import zlib
@@ -94,11 +93,6 @@ def digest(*parts: str | bytes) -> str:
     return state.hexdigest()[:32]
 
 
-def write_entry(folder: Path, key: str, entry: Entry) -> None:
-    """Keep an entry under its key, whole or not at all."""
-    write_tensors(folder, key, entry._asdict())
-
-
 def read_entry(folder: Path, key: str) -> Entry | None:
     """The memory-mapped entry of a key; None where it is absent or not what it should be."""
     tensors = read_tensors(folder, key)
@@ -106,7 +100,7 @@ def read_entry(folder: Path, key: str) -> Entry | None:
 
 
 def write_tensors(folder: Path, key: str, tensors: Mapping[str, Tensor]) -> None:
-    """Named tensors in FOLDER/KEY.safetensors with key and checksum."""
+    """Named tensors in FOLDER/KEY.safetensors with key and checksum, whole or not at all."""
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with atomic_path(folder / f"{key}.safetensors") as temporary:
         safetensors.torch.save_file(plain, temporary, metadata={"key": key, "crc32": str(_checksum(plain))})
@@ -177,7 +171,6 @@ CACHED_BYTES = 1 << 30
 """Most bytes of the files in a folder; those of the views at hand stay whatever they take."""
 # A and b move within a window's fifth: measured on photographs, a coarser grid costs more than 1.5 % of the features' spread.
 CELLS_PER_WINDOW = 5
-_COMPILED = importlib.util.find_spec("numba") is not None
 
 
 class FeatureStore:
@@ -197,7 +190,7 @@ class FeatureStore:
         """Mean over all channels, and root mean square over the channels' standard deviations, over all pixels."""
         self._magnitude = max(float(e.centre.abs().max()) for e in self._entries.values())
         self._slots = {view: slot for slot, view in enumerate(self._entries)}
-        self._table = _table(list(self._entries.values())) if _COMPILED else None
+        self._table = _table(list(self._entries.values()))
         self._packed: guided.Packed | None = None
         self._numbers = torch.zeros(0, dtype=torch.int64)
 
@@ -235,6 +228,8 @@ class FeatureStore:
         image's own colour there. Raises DataError for a view that is not in the store; on the device of `to` views are not
         checked, since the host would wait.
         """
+        from ..ops.guided_kernels import gather_views
+
         if self._packed is not None and view.device == self._numbers.device:
             return guided.apply_packed(self._packed, self._numbers[view], pixel, rgb, grey=GREY)
         views, place = np.unique(view.detach().cpu().numpy(), return_inverse=True)
@@ -244,20 +239,8 @@ class FeatureStore:
         slot = torch.tensor([self._slots[v] for v in views.tolist()], dtype=torch.int64)[torch.from_numpy(place)]
         positions, colours = pixel.detach().cpu().float().contiguous(), rgb.detach().cpu().float().contiguous()
         out = torch.empty(len(view), self.channels)
-        (self._compiled if _COMPILED else self._plain)(slot, positions, colours, out)
+        gather_views(self._table, slot.numpy(), positions.numpy(), (colours - GREY).numpy(), out.numpy())
         return out.to(view.device)
-
-    def _compiled(self, slot: Tensor, pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
-        from ..ops.guided_kernels import gather_views
-
-        assert self._table is not None
-        gather_views(self._table, slot.numpy(), pixel.numpy(), (rgb - GREY).numpy(), out.numpy())
-
-    def _plain(self, slot: Tensor, pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
-        for number, entry in enumerate(self._entries.values()):
-            rows = (slot == number).nonzero()[:, 0]
-            height, width = entry.size.tolist()
-            out[rows] = guided.apply(entry.plain(), pixel[rows], rgb[rows], (height, width))
 
 
 def extract(
@@ -300,7 +283,7 @@ def extract(
             features = remembered.get(view)
             features = _encode(encoder, pixels, view) if features is None else features
             made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)
-            write_entry(folder, key, made)
+            write_tensors(folder, key, made._asdict())
             # Read back: what trains is what lies on disk, mapped rather than held in memory.
             entry = read_entry(folder, key) or made
         remembered.pop(view, None)
