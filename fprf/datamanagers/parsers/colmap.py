@@ -7,25 +7,26 @@ COLMAP's lenses become ours; its world-to-camera poses in OpenCV axes become cam
 is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that it observes (LLFF's rule).
 """
 
-import math
 import struct
 import zipfile
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
 from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
+from ...rendering.splines import rotations
 from ..scene import Scene
 from .config import ColmapConfig
 from .files import path_inside, read_bytes, read_npz
-from .views import View, assemble_scene, rigid_pose
+from .views import View, assemble_scene, pixel_size, quaternion_rotation, rigid_pose
 
 MODELS = (
     ("SIMPLE_PINHOLE", 3),
@@ -79,20 +80,13 @@ class ColmapModel:
 def read_model(folder: Path) -> ColmapModel:
     """The model in a folder: `cameras` and `images`, and `points3D` if it is there, .bin before .txt."""
     if (folder / "cameras.bin").is_file():
-        cloud = folder / "points3D.bin"
-        cameras = _cameras_bin(folder / "cameras.bin")
-        images = _images_bin(folder / "images.bin")
-        ids, points = _points_bin(cloud) if cloud.is_file() else _no_points()
+        suffix, cameras_of, images_of, points_of = "bin", _cameras_bin, _images_bin, _points_bin
     else:
-        cloud = folder / "points3D.txt"
-        cameras = _cameras_txt(folder / "cameras.txt")
-        images = _images_txt(folder / "images.txt")
-        ids, points = _points_txt(cloud) if cloud.is_file() else _no_points()
+        suffix, cameras_of, images_of, points_of = "txt", _cameras_txt, _images_txt, _points_txt
+    cloud = folder / f"points3D.{suffix}"
+    cameras, images = cameras_of(folder / f"cameras.{suffix}"), images_of(folder / f"images.{suffix}")
+    ids, points = points_of(cloud) if cloud.is_file() else (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
     return ColmapModel(cameras, images, ids, points)
-
-
-def _no_points() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
 
 
 def _bad(path: Path, place: str, finding: str) -> DataError:
@@ -139,10 +133,6 @@ _POINT = struct.Struct("<Q3d3Bd")
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
-def _camera(model: str, numbers: tuple[float, ...], params: tuple[float, ...]) -> ColmapCamera:
-    return ColmapCamera(model, int(numbers[0]), int(numbers[1]), params)
-
-
 def _cameras_bin(path: Path) -> dict[int, ColmapCamera]:
     file = _Bytes(path)
     cameras: dict[int, ColmapCamera] = {}
@@ -153,7 +143,8 @@ def _cameras_bin(path: Path) -> dict[int, ColmapCamera]:
         if id_ in cameras:
             raise file.error(f"camera {id_} occurs twice")
         name, params = MODELS[int(model)]
-        cameras[int(id_)] = _camera(name, (width, height), file.take(struct.Struct(f"<{params}d"), "its parameters"))
+        numbers = file.take(struct.Struct(f"<{params}d"), "its parameters")
+        cameras[int(id_)] = ColmapCamera(name, int(width), int(height), numbers)
     file.end()
     return cameras
 
@@ -233,7 +224,7 @@ def _cameras_txt(path: Path) -> dict[int, ColmapCamera]:
         id_, width, height = _ints(path, place, [words[0], *words[2:4]])
         if id_ in cameras:
             raise _bad(path, place, f"camera {id_} occurs twice")
-        cameras[id_] = _camera(words[1], (width, height), _floats(path, place, words[4:]))
+        cameras[id_] = ColmapCamera(words[1], width, height, _floats(path, place, words[4:]))
     return cameras
 
 
@@ -278,19 +269,30 @@ Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 """Finite points [P 3], and pairs [O 2] where known."""
 
 
-def cloud_of_images(model: ColmapModel, images: Sequence[ColmapImage]) -> Cloud:
-    """Finite points of a model, and the pairs of its images in the order given."""
-    finite = np.isfinite(model.points).all(1)
-    ids = model.point_ids[finite]
-    order = np.argsort(ids, kind="stable")
-    records = []
-    for view, image in enumerate(images):
-        at = np.searchsorted(ids, image.observed, sorter=order)
-        inside = at < len(ids)
-        point = order[at[inside]]
-        point = np.unique(point[ids[point] == image.observed[inside]])
-        records.append(np.stack([np.full(len(point), view), point], 1))
-    return model.points[finite], np.concatenate(records).astype(np.int64) if records else np.zeros((0, 2), np.int64)
+def observed_points(model: ColmapModel, images: Sequence[ColmapImage]) -> list[NDArray[np.int64]]:
+    """Rows of the model's points that each image observes; ids that are not in the model are left out."""
+    order = np.argsort(model.point_ids, kind="stable")
+    observed = []
+    for image in images:
+        at = np.searchsorted(model.point_ids, image.observed, sorter=order)
+        inside = at < len(order)
+        row = order[at[inside]]
+        observed.append(row[model.point_ids[row] == image.observed[inside]])
+    return observed
+
+
+def cloud_of_images(model: ColmapModel, observed: Sequence[NDArray[np.int64]]) -> Cloud:
+    """Finite points of a model, and the pairs of views, in the order of `observed`, and points, each once."""
+    views = [np.unique(rows) for rows in observed]
+    pairs = np.stack([np.repeat(np.arange(len(views)), [len(rows) for rows in views]), np.concatenate(views)], 1)
+    return _finite(model.points, pairs.astype(np.int64))
+
+
+def _finite(points: NDArray[np.float64], seen: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The points that are finite, and their pairs."""
+    finite = np.asarray(np.isfinite(points).all(1))
+    view, point = seen[finite[seen[:, 1]]].T
+    return points[finite], np.stack([view, (np.cumsum(finite) - 1)[point]], 1)
 
 
 def cloud_of_model(folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float64]]) -> Cloud | None:
@@ -302,10 +304,12 @@ def cloud_of_model(folder: Path, names: Sequence[str], poses: Sequence[NDArray[n
         return None
     ordered = [images[file] for file in files]
     here = np.stack([pose[:, 3] for pose in poses])
+    turn = rotations(torch.tensor([image.quaternion for image in ordered], dtype=torch.float64)).numpy()
+    offset = np.array([image.translation for image in ordered])
     with np.errstate(over="ignore", invalid="ignore"):
-        apart = np.abs(np.stack([_centre(image) for image in ordered]) - here).max()
+        apart = np.abs(-np.einsum("vji,vj->vi", turn, offset) - here).max()
     extent = np.ptp(here, axis=0).max() if len(here) > 1 else 1.0
-    return cloud_of_images(model, ordered) if apart <= _APART * extent else None
+    return cloud_of_images(model, observed_points(model, ordered)) if apart <= _APART * extent else None
 
 
 def read_cloud(path: Path, views: int) -> Cloud:
@@ -313,25 +317,13 @@ def read_cloud(path: Path, views: int) -> Cloud:
     xyz = read_npz(path, "xyz")
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise DataError(f"{path}: xyz has shape {xyz.shape}, not [P 3]; write it again or remove the file")
-    finite = np.asarray(np.isfinite(xyz).all(1))
     with zipfile.ZipFile(path) as archive:
         if "seen.npy" not in archive.namelist():
-            return xyz[finite], None
+            return xyz[np.asarray(np.isfinite(xyz).all(1))], None
     seen = read_npz(path, "seen")
     if seen.ndim != 2 or seen.shape[1] != 2 or not ((seen >= 0) & (seen < (views, len(xyz)))).all():
         raise DataError(f"{path}: seen is no [O 2] of {views} views and {len(xyz)} points; write it again or leave it out")
-    kept = seen.astype(np.int64)
-    kept = kept[finite[kept[:, 1]]]
-    kept[:, 1] = (np.cumsum(finite) - 1)[kept[:, 1]]
-    return xyz[finite], kept
-
-
-def _centre(image: ColmapImage) -> NDArray[np.float64]:
-    w, x, y, z = np.array(image.quaternion) / max(1e-9, float(np.linalg.norm(image.quaternion)))
-    axis, t = np.array([x, y, z]), np.array(image.translation)
-    # The inverse rotation of -t: quaternions turn a vector by two cross products.
-    twice = 2 * np.cross(-axis, -t)
-    return np.asarray(-t + w * twice + np.cross(-axis, twice))
+    return _finite(xyz, seen.astype(np.int64))
 
 
 _Lens: TypeAlias = tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float, float, float], int]
@@ -360,17 +352,17 @@ class ColmapParser(DataParser):
         if not model.images:
             raise DataError(f"{folder}: the model has no images; run COLMAP's mapper again")
         name, root = path_inside(data, "parser.images", self.config.images)
-        index = dict(zip(model.point_ids.tolist(), range(len(model.point_ids)), strict=True))
         lenses = {id_: _lens(f"{folder}: camera {id_}", camera) for id_, camera in model.cameras.items()}
-        images = sorted(model.images, key=lambda image: path_inside(root, f"{folder}: image {image.name!r}", image.name)[0])
+        named = [(*path_inside(root, f"{folder}: image {image.name!r}", image.name), image) for image in model.images]
+        named.sort(key=lambda each: each[0])
+        observed = observed_points(model, [image for _, _, image in named])
         views = []
-        for image in images:
+        for (inner, path, image), rows in zip(named, observed, strict=True):
             where = f"{folder}: image {image.name!r}"
             if image.camera not in lenses:
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
             camera = model.cameras[image.camera]
             focal, centre, distortion, lens = lenses[image.camera]
-            inner, path = path_inside(root, where, image.name)
             pose = _pose(where, image)
             views.append(
                 View(
@@ -382,30 +374,18 @@ class ColmapParser(DataParser):
                     centre=centre,
                     distortion=distortion,
                     lens=lens,
-                    depths=_depths(model, index, image, pose),
+                    depths=_depths(model.points[rows], pose),
                 )
             )
-        twice = [inner for inner, times in Counter(view.name for view in views).items() if times > 1]
+        twice = [a.name for a, b in pairwise(views) if a.name == b.name]
         if twice:
             raise DataError(f"{folder}: the image {twice[0]!r} is registered twice; export the model again")
-        points, seen = cloud_of_images(model, images)
+        points, seen = cloud_of_images(model, observed)
         return assemble_scene(data, views, downscale=downscale, points=points, seen=seen, reduced=name != "images")
 
 
 def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
-    q = np.array(image.quaternion)
-    length = math.hypot(*image.quaternion)
-    if not 0.9 < length < 1.1:
-        raise DataError(f"{where}: the quaternion {q.tolist()} has not length 1; export the model again")
-    w, x, y, z = q / length
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    back = rotation.T
+    back = quaternion_rotation(where, image.quaternion).T
     # A damaged translation may overflow; `rigid_pose` refuses what is not finite.
     with np.errstate(over="ignore", invalid="ignore"):
         centre = -back @ np.array(image.translation)
@@ -415,8 +395,7 @@ def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
 def _lens(where: str, camera: ColmapCamera) -> _Lens:
     """Focal lengths, principal point, k1 k2 k3 k4 p1 p2 and lens of a COLMAP camera."""
     p = camera.params
-    if not (1 <= camera.width <= 10**6 and 1 <= camera.height <= 10**6):
-        raise DataError(f"{where}: {camera.width}x{camera.height} pixels; export the model again")
+    pixel_size(where, camera.width, camera.height)
     shared = camera.model.startswith("SIMPLE") or camera.model in ("RADIAL", "RADIAL_FISHEYE")
     focal, centre, k = ((p[0], p[0]), (p[1], p[2]), p[3:]) if shared else ((p[0], p[1]), (p[2], p[3]), p[4:])
     match camera.model:
@@ -440,14 +419,11 @@ def _lens(where: str, camera: ColmapCamera) -> _Lens:
     return focal, centre, bent, FISHEYE if camera.model.endswith("FISHEYE") else OPENCV if any(bent) else PINHOLE
 
 
-def _depths(
-    model: ColmapModel, index: dict[int, int], image: ColmapImage, pose: NDArray[np.float64]
-) -> tuple[float, float] | None:
+def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float] | None:
     """Bounds of the depths of the points that an image observes; None where they are too few for a percentile."""
-    rows = [index[point] for point in image.observed.tolist() if point in index]
     # Damaged coordinates may overflow; what is not finite is left out.
     with np.errstate(over="ignore", invalid="ignore"):
-        depth = (model.points[rows] - pose[:, 3]) @ -pose[:, 2]
+        depth = (points - pose[:, 3]) @ -pose[:, 2]
     depth = depth[np.isfinite(depth) & (depth > 0)]
     near, far = np.percentile(depth, (0.1, 99.9)) if len(depth) >= 8 else (0.0, 0.0)
     return (float(near), float(far)) if 0 < near < far else None

@@ -198,15 +198,10 @@ class Record:
     def matrix(self, key: str) -> NDArray[np.float64]:
         """A list of 3 or 4 rows of 4 numbers."""
         value = self.get(key)
-        rows = value if isinstance(value, list) else []
-        numbers: list[float] = []
-        for row in rows:
-            cells = row if isinstance(row, list) else []
-            real = [c for c in cells if isinstance(c, int | float) and not isinstance(c, bool) and abs(c) < 1e300]
-            numbers += [float(c) for c in real] if len(real) == len(cells) == 4 else [np.nan]
-        if len(numbers) not in (12, 16) or len(numbers) != 4 * len(rows) or not np.isfinite(numbers).all():
+        rows = table_of(value, 4)
+        if rows is None or len(rows) not in (3, 4):
             raise DataError(f"{self.where}: {key} is {_short(value)}, not 3 or 4 rows of 4 numbers; correct it")
-        return np.array(numbers, dtype=np.float64).reshape(-1, 4)
+        return rows
 
     def records(self, key: str) -> "list[Record]":
         """A list of objects, each falling back to this one."""
@@ -214,6 +209,19 @@ class Record:
         if not isinstance(value, list) or not value:
             raise DataError(f"{self.where}: no list of {key}, or an empty one; an entry for each image is needed")
         return [as_record(f"{self.where}: {key}[{k}]", item, self.own) for k, item in enumerate(value)]
+
+
+def numbers_of(value: Json, count: int) -> list[float] | None:
+    """The numbers of a list of `count`; None for anything else."""
+    cells = value if isinstance(value, list) else []
+    numbers = [float(c) for c in cells if isinstance(c, int | float) and not isinstance(c, bool) and abs(c) < 1e300]
+    return numbers if len(numbers) == len(cells) == count else None
+
+
+def table_of(value: Json, width: int) -> NDArray[np.float64] | None:
+    """The numbers [R width] of a list of one or more such lists; None for anything else."""
+    rows = [numbers_of(row, width) for row in value] if isinstance(value, list) else []
+    return np.array(rows, dtype=np.float64) if rows and None not in rows else None
 
 
 def as_record(where: str | Path, value: Json, common: _Object | None = None) -> Record:

@@ -14,7 +14,7 @@ from ...interfaces import DataParser
 from ..scene import Scene
 from .config import LlffConfig
 from .files import image_names, path_inside, read_bytes, read_npy
-from .views import View, assemble_scene, rigid_pose
+from .views import View, assemble_scene, pixel_size, rigid_pose
 
 
 class LlffParser(DataParser):
@@ -41,14 +41,13 @@ class LlffParser(DataParser):
             height, width, focal = row[:15].reshape(3, 5)[:, 4]
             matrix = row[:15].reshape(3, 5)[:, :4]
             turned = np.stack([matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]], 1)
-            if not (1 <= width <= 1e6 and 1 <= height <= 1e6):
-                raise DataError(f"{file}: row {number} says {width:g}x{height:g} pixels; run the reconstruction again")
-            size = (round(float(width)), round(float(height)))
+            where = f"{file}: row {number} ({name})"
+            size = pixel_size(where, width, height)
             views.append(
                 View(
                     name=name,
                     path=folder / name,
-                    pose=rigid_pose(f"{file}: row {number} ({name})", turned),
+                    pose=rigid_pose(where, turned),
                     size=size,
                     focal=(float(focal), float(focal)),
                     centre=(size[0] / 2, size[1] / 2),

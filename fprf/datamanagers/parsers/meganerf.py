@@ -17,7 +17,7 @@ from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
 from .config import MegaNerfConfig
 from .files import name_of
-from .views import View, assemble_scene, index_tensor, rigid_pose
+from .views import View, assemble_scene, pixel_size, rigid_pose, split_by
 
 _LARGEST = 1 << 24
 """Bytes of a file of metadata."""
@@ -46,9 +46,8 @@ class MegaNerfParser(DataParser):
         twice = [a for a, b in pairwise(order) if views[a].name == views[b].name]
         if twice:
             raise DataError(f"{name_of(data)}: {views[twice[0]].name} is in train and in val; remove it from one")
-        held = [held[k] for k in order]
-        split_of = (index_tensor([not each for each in held]), index_tensor(held)) if any(held) else None
-        return assemble_scene(data, [views[k] for k in order], downscale=downscale, split=split_of, reduced=True)
+        parts = split_by([held[k] for k in order])
+        return assemble_scene(data, [views[k] for k in order], downscale=downscale, split=parts, reduced=True)
 
 
 def _unit(data: Path) -> float:
@@ -88,19 +87,17 @@ def _first_line(error: Exception) -> str:
 def _view(file: Path, images: Path, unit: float) -> View:
     metadata = _load(file)
     try:
-        width, height = int(metadata["W"]), int(metadata["H"])
+        size = pixel_size(str(file), int(metadata["W"]), int(metadata["H"]))
         pose = np.asarray(torch.as_tensor(metadata["c2w"]).double().numpy())
         fx, fy, cx, cy = (float(v) for v in torch.as_tensor(metadata["intrinsics"]).reshape(-1).tolist())
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         told = f"{file}: W, H, c2w [3 4] and intrinsics [4] are needed ({_first_line(error)}); copy the file again"
         raise DataError(told) from error
-    if pose.shape not in ((3, 4), (4, 4)) or width < 1 or height < 1:
-        raise DataError(f"{file}: c2w is {pose.shape} and the image {width}x{height}; copy the file again")
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise DataError(f"{file}: c2w is {pose.shape}, not 3x4 or 4x4; copy the file again")
     pose = pose.copy()
     pose[:3, 3] *= unit
     path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
     if path is None:
         raise DataError(f"{file}: no image {images / file.stem}.jpg beside it; copy the images there")
-    return View(
-        name=file.stem, path=path, pose=rigid_pose(str(file), pose), size=(width, height), focal=(fx, fy), centre=(cx, cy)
-    )
+    return View(name=file.stem, path=path, pose=rigid_pose(str(file), pose), size=size, focal=(fx, fy), centre=(cx, cy))

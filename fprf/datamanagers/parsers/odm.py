@@ -21,7 +21,7 @@ from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ..images import read_header
 from ..scene import Scene
 from .config import OdmConfig
-from .files import Json, Record, as_record, path_inside, read_json
+from .files import Record, as_record, numbers_of, path_inside, read_json
 from .views import View, assemble_scene, check_images_exist, rigid_pose
 
 _RECONSTRUCTION, _SHOTS = "opensfm/reconstruction.json", "odm_report/shots.geojson"
@@ -79,9 +79,9 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
         key = record.text("camera") or ""
         if key not in cameras:
             raise DataError(f"{record.where}: its camera {key!r} is none of cameras; run ODM again")
-        turn, offset = _turn(record), _numbers(record, "translation", record.get("translation"))
+        turn, offset = _turn(record), _vector(record, "translation")
         shots.append(_Shot(name, cameras[key], turn, -turn.T @ offset))
-    points = [_numbers(point, "coordinates", point.get("coordinates")) for point in _objects(largest, "points").values()]
+    points = [_vector(point, "coordinates") for point in _objects(largest, "points").values()]
     return shots, np.array(points).reshape(-1, 3)
 
 
@@ -99,7 +99,7 @@ def _shots(data: Path, file: Path) -> list[_Shot]:
             key = next(iter(cameras))
         if key is None or key not in cameras:
             raise DataError(f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {_RECONSTRUCTION}")
-        place = _numbers(record, "translation", record.get("translation"))
+        place = _vector(record, "translation")
         shots.append(_Shot(name, cameras[key], _turn(record), place))
     if len({shot.name for shot in shots}) < len(shots):
         raise DataError(f"{file}: an image occurs twice; remove one of its shots")
@@ -138,16 +138,15 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
 
 
 def _turn(record: Record) -> NDArray[np.float64]:
-    vector = _numbers(record, "rotation", record.get("rotation"))
+    vector = _vector(record, "rotation")
     if np.abs(vector).max() > _TURN:
         raise DataError(f"{record.where}: rotation is {vector.tolist()}, not an axis times an angle; run ODM again")
     return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
 
 
-def _numbers(record: Record, key: str, value: Json) -> NDArray[np.float64]:
-    cells = value if isinstance(value, list) else []
-    numbers = [float(c) for c in cells if isinstance(c, int | float) and not isinstance(c, bool) and abs(c) < 1e300]
-    if len(numbers) != 3 or len(cells) != 3:
+def _vector(record: Record, key: str) -> NDArray[np.float64]:
+    numbers = numbers_of(record.get(key), 3)
+    if numbers is None:
         raise DataError(f"{record.where}: {key} is not three numbers; run ODM again")
     return np.array(numbers)
 

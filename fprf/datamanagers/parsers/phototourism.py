@@ -15,6 +15,8 @@ from ...interfaces import DataParser
 from ..scene import Scene
 from .colmap import ColmapParser, model_folder
 from .config import ColmapConfig, PhotoTourismConfig
+from .files import name_of
+from .views import index_tensor
 
 
 class PhotoTourismParser(DataParser):
@@ -30,8 +32,8 @@ class PhotoTourismParser(DataParser):
         scene = ColmapParser(ColmapConfig()).parse(inner, downscale)
         roles = read_list(table)
         named = [roles.get(path.name) for path in scene.paths]
-        kept = torch.tensor([k for k, role in enumerate(named) if role is not None], dtype=torch.int64)
-        train = torch.tensor([k for k, role in enumerate(named) if role == "train"], dtype=torch.int64)
+        kept = index_tensor([role is not None for role in named])
+        train = index_tensor([role == "train" for role in named])
         if not len(train):
             raise DataError(f"{table}: none of its training photographs is in the model of {inner}; is it another scene's?")
         place = torch.full((len(scene.paths),), -1, dtype=torch.int64)
@@ -40,14 +42,13 @@ class PhotoTourismParser(DataParser):
         if seen is not None:
             seen = torch.stack([place[seen[:, 0]], seen[:, 1]], 1)
             seen = seen[seen[:, 0] >= 0]
-        held = torch.tensor([k for k, role in enumerate(named) if role == "test"], dtype=torch.int64)
         return replace(
             scene,
-            name=data.resolve().name or "scene",
+            name=name_of(data),
             paths=tuple(scene.paths[k] for k in kept.tolist()),
             cameras=scene.cameras.select(kept),
             train=place[train],
-            test=place[held],
+            test=place[index_tensor([role == "test" for role in named])],
             depths=None if scene.depths is None else scene.depths[kept],
             seen=seen,
             masks=tuple(scene.masks[k] for k in kept.tolist()) if scene.masks else (),

@@ -14,11 +14,9 @@ from ...interfaces import DataParser
 from ..scene import Scene
 from .config import PolycamConfig
 from .files import Record, as_record, image_names, read_json
-from .views import View, assemble_scene, rigid_pose
+from .views import View, assemble_scene, pixel_size, rigid_pose
 
 _PAIRS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
-_MOST = 1e6
-"""Pixels of a side."""
 
 
 def keyframes(data: Path) -> tuple[Path, Path] | None:
@@ -53,13 +51,11 @@ def _view(image: Path, file: Path) -> View:
     record = as_record(file, read_json(file))
     rows = [[_number(record, f"t_{row}{column}") for column in range(4)] for row in range(3)]
     width, height, fx, fy, cx, cy = (_number(record, key) for key in ("width", "height", "fx", "fy", "cx", "cy"))
-    if not (1 <= width <= _MOST and 1 <= height <= _MOST):
-        raise DataError(f"{file}: an image of {width:g}x{height:g} pixels; export the raw data again")
     return View(
         name=image.name,
         path=image,
         pose=rigid_pose(str(file), np.array(rows)),
-        size=(round(width), round(height)),
+        size=pixel_size(str(file), width, height),
         focal=(fx, fy),
         centre=(cx, cy),
     )

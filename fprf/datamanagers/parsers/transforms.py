@@ -23,7 +23,7 @@ from ..scene import Scene
 from .colmap import cloud_of_model, read_cloud
 from .config import TransformsConfig
 from .files import Record, as_record, path_inside, read_json
-from .views import View, assemble_scene, check_images_exist, index_tensor, rigid_pose
+from .views import View, assemble_scene, check_images_exist, index_tensor, pixel_size, rigid_pose
 
 _LENSES = {
     "PINHOLE": PINHOLE,
@@ -112,12 +112,7 @@ def _view(entry: _Entry) -> View:
     record = entry.record
     header = read_header(entry.path)
     width, height = record.number("w"), record.number("h")
-    size = (
-        header.width if width is None else round(width),
-        header.height if height is None else round(height),
-    )
-    if min(size) < 1:
-        raise DataError(f"{record.where}: w and h are {size[0]} and {size[1]}; both must be at least 1")
+    size = pixel_size(record.where, header.width if width is None else width, header.height if height is None else height)
     near, far = record.number("near"), record.number("far")
     cx, cy = record.number("cx"), record.number("cy")
     distortion, lens = _lens(record)

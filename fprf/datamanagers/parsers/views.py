@@ -5,6 +5,7 @@ of images/a/0001.jpg is masks/a/0001.jpg.png (as COLMAP has it), masks/a/0001.pn
 used whole; a folder in which no mask carries an image's name is none.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...rendering.cameras import Cameras
+from ...rendering.splines import rotations
 from ..images import read_header
 from ..scene import Scene
 from .files import name_of
@@ -63,6 +65,11 @@ def index_tensor(members: Sequence[bool]) -> Tensor:
     return torch.tensor([k for k, member in enumerate(members) if member], dtype=torch.int64)
 
 
+def split_by(held: Sequence[bool]) -> tuple[Tensor, Tensor] | None:
+    """Indices (train, test), int64, of views of which some are held out; None where all or none are."""
+    return (index_tensor([not each for each in held]), index_tensor(held)) if len({*held}) > 1 else None
+
+
 _LOOSE = 1e-3
 """Largest deviation of RᵀR from 1 that counts as rounding and is repaired."""
 _FAR = 1e12
@@ -98,6 +105,22 @@ def check_images_exist(root: Path, paths: Sequence[Path]) -> None:
             f"{root}: {len(missing)} of {len(paths)} images are missing, the first is {missing[0]}; "
             "copy them there or remove their entries"
         )
+
+
+def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
+    """Width and height as whole numbers. Raises DataError, opened by `where`, unless both lie in 1 to 1e6."""
+    size = round(float(width)), round(float(height))
+    if min(size) < 1 or max(size) > 10**6:
+        raise DataError(f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again")
+    return size
+
+
+def quaternion_rotation(where: str, quaternion: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation [3 3] of a quaternion w x y z. Raises DataError, opened by `where`, unless its length is about 1."""
+    length = math.hypot(*quaternion)
+    if not 0.9 < length < 1.1:
+        raise DataError(f"{where}: a quaternion of length {length:.3g} is no rotation; export the capture again")
+    return rotations(torch.tensor(quaternion, dtype=torch.float64)[None])[0].numpy()
 
 
 def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
