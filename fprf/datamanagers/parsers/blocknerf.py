@@ -18,10 +18,13 @@ import json
 import re
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
@@ -31,7 +34,7 @@ from ...rendering.lens import OPENCV
 from ..scene import Scene
 from .config import BlockNerfConfig
 from .town import cache_folder
-from .views import View, assemble_scene, index_tensor, rigid_pose
+from .views import View, assemble_scene, rigid_pose, split_by
 
 _POLYNOMIAL = 0x82F63B78
 _MASK = 0xA282EAD8
@@ -283,18 +286,18 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     (fx, cx), (fy, cy) = (np.polyfit(plane[:, a], pixel[:, a], 1) for a in range(2))
     if not (fx > 0 and fy > 0):
         raise ValueError("rays of a mirrored image")
-    best = _refine(ray, pixel, turn, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
-    turned = _rotation(best[:3]) @ turn
-    residual = _project(ray @ turned.T, best) - pixel
+    best = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
+    turned = cv2.Rodrigues(best[:3])[0] @ turn
     place = origin.reshape(-1, 3).astype(np.float64)
     middle = place.mean(0)
     axes = np.stack([turned[0], -turned[1], -turned[2]], 1)
+    fx, fy, cx, cy, k1, k2, p1, p2 = best[3:].tolist()
     return RayCamera(
         np.concatenate([axes, middle[:, None]], 1),
-        (float(best[3]), float(best[4])),
-        (float(best[5]), float(best[6])),
-        (float(best[7]), float(best[8]), 0.0, 0.0, float(best[9]), float(best[10])),
-        float(np.sqrt((residual**2).sum(1).mean())),
+        (fx, fy),
+        (cx, cy),
+        (k1, k2, 0.0, 0.0, p1, p2),
+        float(np.sqrt(((_project(local, best)[0] - pixel) ** 2).sum(1).mean())),
         float(np.linalg.norm(place - middle, axis=1).max()),
     )
 
@@ -315,25 +318,22 @@ def _axes(ray: Array, grid: NDArray[np.int64]) -> Array:
     return np.stack([across, np.cross(ahead, across), ahead])
 
 
-def _refine(ray: Array, pixel: Array, turn: Array, start: Array) -> Array:
-    """Levenberg and Marquardt's steps with differences for slopes: eleven numbers, a few hundred rays."""
+def _refine(local: Array, pixel: Array, value: Array) -> Array:
+    """Levenberg and Marquardt's steps: eleven numbers, a few hundred rays."""
 
-    def miss(value: Array) -> Array:
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            out = (_project(ray @ (_rotation(value[:3]) @ turn).T, value) - pixel).reshape(-1)
-        return np.nan_to_num(out, nan=1e6, posinf=1e6, neginf=-1e6)
+    def miss(value: Array) -> tuple[Array, Array]:
+        pixels, slope = _project(local, value)
+        return np.nan_to_num(pixels - pixel, nan=1e6, posinf=1e6, neginf=-1e6).reshape(-1), slope
 
-    value, damping = start, 1e-3
-    error = miss(value)
-    scale = np.array([1e-6] * 3 + [1e-3 * start[3] / 1e3] * 4 + [1e-6] * 4)
+    damping = 1e-3
+    error, slope = miss(value)
     for _ in range(_ROUNDS):
-        slope = np.stack([(miss(value + np.eye(11)[k] * scale[k]) - error) / scale[k] for k in range(11)], 1)
         normal = slope.T @ slope
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(11), -slope.T @ error)
-        tried = miss(value + step)
+        tried, slope_tried = miss(value + step)
         if (tried**2).sum() < (error**2).sum():
             gained = 1 - (tried**2).sum() / max((error**2).sum(), 1e-300)
-            value, error, damping = value + step, tried, damping / 10
+            value, error, slope, damping = value + step, tried, slope_tried, damping / 10
             if gained < 1e-9:
                 break
         else:
@@ -343,26 +343,13 @@ def _refine(ray: Array, pixel: Array, turn: Array, start: Array) -> Array:
     return value
 
 
-def _project(local: Array, value: Array) -> Array:
-    """Pixels of rays in OpenCV's camera axes, by fx fy cx cy k1 k2 p1 p2 from the fourth number on."""
-    fx, fy, cx, cy, k1, k2, p1, p2 = value[3:]
-    x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2 * r2
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.stack([fx * u + cx, fy * v + cy], 1)
-
-
-def _rotation(vector: Array) -> Array:
-    """Rodrigues' formula."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    if angle < 1e-12:
-        return np.asarray(np.eye(3) + cross)
-    s, c = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2
-    return np.asarray(np.eye(3) + s * cross + c * (cross @ cross))
+def _project(local: Array, value: Array) -> tuple[Array, Array]:
+    """Pixels [N 2] of rays in OpenCV's camera axes, and their slopes [2N 11], by rotation vector, fx fy cx cy, k1 k2 p1 p2."""
+    fx, fy, cx, cy = value[3:7]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    pixels, slope = cv2.projectPoints(local[:, None], value[:3], np.zeros(3), matrix, value[7:])
+    slope = np.delete(slope, (3, 4, 5), axis=1)  # those of the translation
+    return pixels[:, 0].astype(np.float64), slope.astype(np.float64)
 
 
 _FORMAT = 1
@@ -399,29 +386,15 @@ class BlockNerfParser(DataParser):
             present = sorted({e["camera"] for e in entries})
             raise DataError(f"{data}: no images of cameras {list(self.config.cameras)}; parser.cameras may name {present}")
         chosen.sort(key=lambda entry: str(entry["name"]))
-        self._check(data, chosen)
-        views = [_view(folder, entry) for entry in chosen]
-        held = [bool(entry["held"]) for entry in chosen]
-        split = (index_tensor([not each for each in held]), index_tensor(held)) if any(held) and not all(held) else None
-        exposure = [float(entry["exposure"]) for entry in chosen]
-        scene = assemble_scene(data, views, downscale=downscale, split=split)
-        return _exposed(scene, exposure)
-
-    def _check(self, data: Path, entries: list[dict[str, Any]]) -> None:
-        worst = max(entries, key=lambda entry: float(entry["error"]))
+        worst = max(chosen, key=lambda entry: float(entry["error"]))
         if worst["error"] > self.config.tolerance:
             raise DataError(
                 f"{data}: the rays of {worst['name']} are {worst['error']:.2g} pixels from those of any camera, "
                 f"parser.tolerance is {self.config.tolerance:g}; raise it, or leave out its camera with parser.cameras"
             )
-
-
-def _exposed(scene: Scene, exposure: list[float]) -> Scene:
-    from dataclasses import replace
-
-    import torch
-
-    return replace(scene, exposure=torch.tensor(exposure, dtype=torch.float64))
+        views, split = [_view(folder, entry) for entry in chosen], split_by([entry["held"] for entry in chosen])
+        scene = assemble_scene(data, views, downscale=downscale, split=split)
+        return replace(scene, exposure=torch.tensor([entry["exposure"] for entry in chosen], dtype=torch.float64))
 
 
 def _key(data: Path, files: list[Path]) -> str:
@@ -474,24 +447,19 @@ def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
         "held": held,
         "exposure": exposure,
         "size": [width, height],
+        **camera._asdict(),
         "pose": camera.pose.tolist(),
-        "focal": camera.focal,
-        "centre": camera.centre,
-        "distortion": camera.distortion,
-        "error": camera.error,
-        "drift": camera.drift,
     }
 
 
 def _view(folder: Path, entry: dict[str, Any]) -> View:
-    k1, k2, k3, k4, p1, p2 = (float(v) for v in entry["distortion"])
     return View(
-        name=str(entry["name"]),
+        name=entry["name"],
         path=folder / "images" / f"{entry['name']}.png",
-        pose=rigid_pose(str(entry["name"]), np.array(entry["pose"], dtype=np.float64)),
-        size=(int(entry["size"][0]), int(entry["size"][1])),
-        focal=(float(entry["focal"][0]), float(entry["focal"][1])),
-        centre=(float(entry["centre"][0]), float(entry["centre"][1])),
-        distortion=(k1, k2, k3, k4, p1, p2),
+        pose=rigid_pose(entry["name"], np.array(entry["pose"])),
+        size=tuple(entry["size"]),
+        focal=tuple(entry["focal"]),
+        centre=tuple(entry["centre"]),
+        distortion=tuple(entry["distortion"]),
         lens=OPENCV,
     )
