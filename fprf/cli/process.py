@@ -39,9 +39,9 @@ def run(args: list[str]) -> int:
     if find_spec("pycolmap") is None:
         raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
     from ..io.atomic import write_json
-    from ..reconstruction.colmap import MatchTables, find_features, find_matches, find_poses
+    from ..reconstruction.colmap import find_features, find_matches, find_poses
     from ..reconstruction.images import gather_images
-    from ..reconstruction.scene_folder import SceneFolder, State, report
+    from ..reconstruction.scene_folder import MatchTables, SceneFolder, State, report
 
     place = SceneFolder(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
     state = State.load(place)

@@ -1,7 +1,6 @@
 """The steps of COLMAP, one process each. A step that was done from the same images and settings is not done again.
 
-Features and matches go into a database as they are found: a step that was cut off goes on where it stood. The database, an
-SQLite file, is only read here, while COLMAP may be writing it.
+Features and matches go into a database as they are found: a step that was cut off goes on where it stood.
 
 Which images look alike is told before they are matched by one vector each (VLAD, Jégou et al., 2010), from a vocabulary of the
 scene's own features: descriptors are assigned to visual words, k-means centres of a sample of all; the differences to the
@@ -9,15 +8,15 @@ centres are summed word by word, tamed by a square root and scaled to length 1, 
 """
 
 import contextlib
+import itertools
 import json
 import shutil
-import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -26,48 +25,13 @@ from numpy.typing import NDArray
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json, write_text
 from .config import SfmConfig
-from .scene_folder import SceneFolder, State, step_key
+from .scene_folder import Progress, SceneFolder, State, count_rows, reading, step_key
 from .worker import NO_MODEL, NO_PYCOLMAP
-
-_MAX_IMAGES = 2147483647
-"""A pair of images is stored as _MAX_IMAGES * smaller id + larger id."""
-
-
-class MatchTables:
-    """Features and matches in a database, by image. Raises sqlite3.Error for what is no database of COLMAP's."""
-
-    def __init__(self, path: Path) -> None:
-        with _reading(path) as base:
-            self.ids: dict[str, int] = dict(base.execute("SELECT name, image_id FROM images"))
-            self.features: dict[int, int] = dict(base.execute("SELECT image_id, rows FROM keypoints"))
-            rows = base.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
-        names = {id_: name for name, id_ in self.ids.items()}
-        self.matches: dict[tuple[str, str], int] = {}
-        for pair, count in rows:
-            a, b = divmod(pair, _MAX_IMAGES)
-            if a in names and b in names:
-                self.matches[names[a], names[b]] = count
-
-    def features_of(self, name: str) -> int:
-        """Features found in an image; 0 for one that is not there."""
-        return self.features.get(self.ids.get(name, -1), 0)
-
-    def partners(self, name: str, least: int) -> int:
-        """Images that share at least `least` verified matches with an image."""
-        return sum(count >= least for pair, count in self.matches.items() if name in pair)
-
-
-def count_rows(path: Path) -> tuple[int, int]:
-    """Images with features and pairs that were tried so far; zeros while the database cannot be read."""
-    with contextlib.suppress(sqlite3.Error, OSError), _reading(path) as base:
-        features = base.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0]
-        return int(features), int(base.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
-    return 0, 0
 
 
 def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
     """SIFT descriptors [N 128] of an image; none for an image without."""
-    with _reading(path) as base:
+    with reading(path) as base:
         row = base.execute(
             "SELECT rows, cols, data FROM descriptors JOIN images USING (image_id) WHERE name = ?", (name,)
         ).fetchone()
@@ -76,21 +40,12 @@ def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
     return np.frombuffer(row[2], np.uint8).reshape(row[0], row[1])
 
 
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[sqlite3.Connection]:
-    base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
-    try:
-        yield base
-    finally:
-        base.close()
-
-
 Pair: TypeAlias = tuple[int, int]
 
 
 def exhaustive_pairs(count: int) -> list[Pair]:
     """All with all: count (count - 1) / 2."""
-    return [(a, b) for a in range(count) for b in range(a + 1, count)]
+    return list(itertools.combinations(range(count), 2))
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
@@ -109,11 +64,6 @@ def similar_pairs(vectors: Annotated[NDArray[np.float32], "V X"], nearest: int) 
     best = np.argsort(-likeness, axis=1, kind="stable")[:, :count]
     pairs = {(min(a, b), max(a, b)) for a, row in enumerate(best.tolist()) for b in row if np.isfinite(likeness[a, b])}
     return sorted(pairs)
-
-
-def union_of_pairs(*parts: Sequence[Pair]) -> list[Pair]:
-    """Pairs of any of the parts."""
-    return sorted({pair for part in parts for pair in part})
 
 
 _SAMPLE = 40_000
@@ -178,9 +128,8 @@ _ALL_PAIRS = 120
 _WORDS = 64
 _POLL = 0.2
 """Seconds between looks at a running step."""
+_TITLES = {"features": "finding features", "matches": "matching", "mapping": "finding poses"}
 _COMMAND = (sys.executable, "-m", "fprf.reconstruction.worker")
-
-Progress = Callable[[int, int, str], None]
 
 
 def find_features(place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
@@ -192,7 +141,6 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
     if not grown:
         for old in place.work.glob("database.db*"):
             old.unlink()
-        write_json(place.work / "features.json", {"settings": settings, "hashes": hashes})
     key = step_key(settings, hashes)
     if state.done.get("features") == key and place.database.is_file():
         return
@@ -208,13 +156,7 @@ def find_features(place: SceneFolder, state: State, config: SfmConfig, progress:
         "features": config.features,
         "side": config.side,
     }
-    _run(
-        place,
-        state,
-        config,
-        job,
-        _Watch(lambda: count_rows(place.database)[0], len(state.images), "finding features", progress),
-    )
+    _run(place, state, config, job, lambda: count_rows(place.database)[0], len(state.images), progress)
     state.done["features"] = key
     state.save(place)
 
@@ -235,11 +177,11 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     else:
         # Neighbours by name help where things look alike everywhere; in a video they are neighbours for certain.
         near = sequential_pairs(len(names), config.overlap if video else 2)
-        chosen = union_of_pairs(near, _similar_images(place, names, config))
+        chosen = sorted({*near, *_similar_images(place, names, config)})
     listed = place.work / "pairs.txt"
     write_text(listed, "".join(f"{names[a]} {names[b]}\n" for a, b in chosen))
     job = {"step": "matches", "pairs": str(listed)}
-    _run(place, state, config, job, _Watch(lambda: count_rows(place.database)[1], len(chosen), "matching", progress))
+    _run(place, state, config, job, lambda: count_rows(place.database)[1], len(chosen), progress)
     state.done["matches"] = key
     state.save(place)
     return kind
@@ -253,7 +195,7 @@ def find_poses(place: SceneFolder, state: State, config: SfmConfig, progress: Pr
         return list(json.loads(described.read_text(encoding="utf-8")))
     shutil.rmtree(described.parent, ignore_errors=True)
     job = {"step": "mapping", "models": str(described.parent)}
-    _run(place, state, config, job, _Watch(lambda: _registered(place), len(state.images), "finding poses", progress))
+    _run(place, state, config, job, lambda: _registered(place), len(state.images), progress)
     fresh = place.root / "sparse" / ".fresh"
     shutil.rmtree(fresh, ignore_errors=True)
     shutil.copytree(described.parent / "best", fresh)
@@ -274,18 +216,20 @@ def _similar_images(place: SceneFolder, names: Sequence[str], config: SfmConfig)
     return similar_pairs(vlad_vectors(read, len(names), vocabulary), config.neighbours)
 
 
-class _Watch(NamedTuple):
-    """Progress of a step for the parent process."""
-
-    seen: Callable[[], int]
-    total: int
-    what: str
-    progress: Progress
-
-
-def _run(place: SceneFolder, state: State, config: SfmConfig, job: dict[str, Any], watch: _Watch) -> None:
-    """One step in its process. Raises UsageError where pycolmap is absent, DataError where COLMAP fails."""
+def _run(
+    place: SceneFolder,
+    state: State,
+    config: SfmConfig,
+    job: dict[str, Any],
+    count: Callable[[], int],
+    total: int,
+    progress: Progress,
+) -> None:
+    """One step in its process, which is `count()` of `total` far. Raises UsageError where pycolmap is absent, DataError
+    where COLMAP fails.
+    """
     name, start = job["step"], time.perf_counter()
+    what = _TITLES[name]
     path = place.work / f"{name}.job.json"
     common = {
         "database": str(place.database),
@@ -295,11 +239,11 @@ def _run(place: SceneFolder, state: State, config: SfmConfig, job: dict[str, Any
         "seed": config.seed,
     }
     write_json(path, {**common, **job})
-    with place.log.open("ab") as log, _progress_file(place).open("wb") as out:
+    with place.log.open("ab") as log, place.progress.open("wb") as out:
         process = subprocess.Popen([*_COMMAND, str(path)], stdout=out, stderr=log, stdin=subprocess.DEVNULL)
         try:
             while process.poll() is None:
-                watch.progress(max(0, min(watch.total - 1, watch.seen())), watch.total, watch.what)
+                progress(max(0, min(total - 1, count())), total, what)
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(_POLL)
         finally:
@@ -316,17 +260,13 @@ def _run(place: SceneFolder, state: State, config: SfmConfig, job: dict[str, Any
         )
     if code:
         raise DataError(f"{place.root}: COLMAP's {name} ended with {code}: {_last(place.log)}; {place.log} has the rest")
-    watch.progress(watch.total, watch.total, watch.what)
+    progress(total, total, what)
     state.seconds[name] = round(time.perf_counter() - start, 2)
-
-
-def _progress_file(place: SceneFolder) -> Path:
-    return place.work / "progress.jsonl"
 
 
 def _registered(place: SceneFolder) -> int:
     """Images with a pose so far."""
-    lines = [line for line in _progress_file(place).read_text(encoding="utf-8").splitlines() if line.startswith("{")]
+    lines = [line for line in place.progress.read_text(encoding="utf-8").splitlines() if line.startswith("{")]
     return len(lines) + 1 if lines else 0
 
 

@@ -8,7 +8,7 @@ import hashlib
 import re
 import shutil
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from itertools import pairwise
@@ -22,7 +22,7 @@ from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image
 from ..errors import DataError, UsageError
 from ..io.atomic import atomic_path, write_bytes
 from .config import SfmConfig
-from .scene_folder import SceneFolder, State, step_key
+from .scene_folder import Progress, SceneFolder, State, step_key
 
 _SIDE = 960
 """Longest side at which sharpness is measured: finer detail is mostly noise, and larger images take long."""
@@ -77,8 +77,6 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"})
 """Suffixes of videos, in lower case."""
 
 _QUALITY = 95
-
-Progress = Callable[[int, int, str], None]
 
 
 def frame_name(frame: int) -> str:

@@ -6,50 +6,41 @@ process.json       what came of every image
 sfm/               database.db, state.json, log.txt and the jobs: only needed to go on
 """
 
+import contextlib
 import hashlib
 import json
+import sqlite3
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json
 
 _FORMAT = 1
 
+Progress = Callable[[int, int, str], None]
+"""Told (done, total, what)."""
 
-@dataclass(frozen=True)
+
 class SceneFolder:
-    """The folder."""
+    """Where the parts of a scene folder lie."""
 
-    root: Path
-
-    @property
-    def images(self) -> Path:
-        """Folder of the images."""
-        return self.root / "images"
-
-    @property
-    def work(self) -> Path:
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.images = root / "images"
+        self.work = root / "sfm"
         """Folder of what is needed to go on."""
-        return self.root / "sfm"
-
-    @property
-    def database(self) -> Path:
+        self.database = self.work / "database.db"
         """Features and matches."""
-        return self.work / "database.db"
-
-    @property
-    def log(self) -> Path:
+        self.log = self.work / "log.txt"
         """Everything that COLMAP said."""
-        return self.work / "log.txt"
-
-    @property
-    def model(self) -> Path:
+        self.progress = self.work / "progress.jsonl"
+        """What a running step said of how far it is."""
+        self.model = root / "sparse" / "0"
         """The finished model."""
-        return self.root / "sparse" / "0"
 
 
 @dataclass
@@ -94,18 +85,54 @@ def step_key(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
+_MAX_IMAGES = 2147483647
+"""A pair of images is stored as _MAX_IMAGES * smaller id + larger id."""
+
+
 _LEAST = 15
 """Verified matches from which on COLMAP takes two images for neighbours."""
 
 
-class Matches(Protocol):
-    """Features and matches of the images."""
+class MatchTables:
+    """Features and matches in a database, by image. Raises sqlite3.Error for what is no database of COLMAP's."""
+
+    def __init__(self, path: Path) -> None:
+        with reading(path) as base:
+            self.ids: dict[str, int] = dict(base.execute("SELECT name, image_id FROM images"))
+            self.features: dict[int, int] = dict(base.execute("SELECT image_id, rows FROM keypoints"))
+            rows = base.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
+        names = {id_: name for name, id_ in self.ids.items()}
+        self.matches: dict[tuple[str, str], int] = {}
+        for pair, count in rows:
+            a, b = divmod(pair, _MAX_IMAGES)
+            if a in names and b in names:
+                self.matches[names[a], names[b]] = count
 
     def features_of(self, name: str) -> int:
-        """Features found in an image."""
+        """Features found in an image; 0 for one that is not there."""
+        return self.features.get(self.ids.get(name, -1), 0)
 
-    def partners(self, name: str, least: int) -> int:
-        """Images that share at least `least` matches with it."""
+    def partners(self, name: str) -> int:
+        """Images that share enough verified matches with an image."""
+        return sum(count >= _LEAST for pair, count in self.matches.items() if name in pair)
+
+
+def count_rows(path: Path) -> tuple[int, int]:
+    """Images with features and pairs that were tried so far; zeros while the database cannot be read."""
+    with contextlib.suppress(sqlite3.Error, OSError), reading(path) as base:
+        features = base.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0]
+        return int(features), int(base.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
+    return 0, 0
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[sqlite3.Connection]:
+    """A database open for reading only: COLMAP may be writing it."""
+    base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
+    try:
+        yield base
+    finally:
+        base.close()
 
 
 class Drop(NamedTuple):
@@ -118,7 +145,7 @@ class Drop(NamedTuple):
 
 
 def dropped_images(
-    names: Sequence[str], unused: Mapping[str, str], matches: Matches, models: Sequence[Mapping[str, Any]]
+    names: Sequence[str], unused: Mapping[str, str], matches: MatchTables, models: Sequence[Mapping[str, Any]]
 ) -> list[Drop]:
     """Every image without a pose in the first of the `models`, in the order of the steps."""
     posed = set(models[0]["images"]) if models else set()
@@ -128,8 +155,8 @@ def dropped_images(
     return drops + sorted(lost, key=lambda drop: order.index(drop.step))
 
 
-def _lost(name: str, matches: Matches, models: Sequence[Mapping[str, Any]]) -> Drop:
-    features, partners = matches.features_of(name), matches.partners(name, _LEAST)
+def _lost(name: str, matches: MatchTables, models: Sequence[Mapping[str, Any]]) -> Drop:
+    features, partners = matches.features_of(name), matches.partners(name)
     if not features:
         return Drop(name, "features", "nothing with texture in it, or COLMAP cannot decode it")
     if not partners:
@@ -142,7 +169,7 @@ def _lost(name: str, matches: Matches, models: Sequence[Mapping[str, Any]]) -> D
 
 
 def report(
-    state: Mapping[str, Any], matching: str, matches: Matches, models: Sequence[Mapping[str, Any]], version: str
+    state: Mapping[str, Any], matching: str, matches: MatchTables, models: Sequence[Mapping[str, Any]], version: str
 ) -> dict[str, Any]:
     """The content of process.json. `state` is that of `place.State`, as a mapping."""
     images = state["images"]
