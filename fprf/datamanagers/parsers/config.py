@@ -56,7 +56,6 @@ class LlffConfig(DataParserConfig):
     """Image folder; empty = `images`, else the `images_N` that is reduced least."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By `poses_bounds.npy`."""
         return Recognised(0.8, "poses_bounds.npy") if (data / "poses_bounds.npy").is_file() else None
 
     def build(self) -> DataParser:
@@ -95,7 +94,6 @@ class ColmapConfig(DataParserConfig):
     """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their size."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By a model in one of these places."""
         from .colmap import model_folder
 
         folder = model_folder(data)
@@ -174,7 +172,6 @@ class MegaNerfConfig(DataParserConfig):
     """Mega-NeRF's layout: `train` and `val`, each with `metadata/*.pt` and `rgbs`."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By `train/metadata`."""
         return Recognised(0.7, "train/metadata") if (data / "train/metadata").is_dir() else None
 
     def build(self) -> DataParser:
@@ -209,7 +206,6 @@ class PolycamConfig(DataParserConfig):
     """Polycam's raw data: `keyframes` with images and a JSON file for each camera, corrected ones first."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By folders of images and cameras."""
         from .polycam import keyframes
 
         record = keyframes(data)
@@ -232,7 +228,6 @@ class Record3DConfig(DataParserConfig):
         at_least("parser.frames", self.frames, 1)
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By the metadata and the folder of images."""
         from .record3d import recording
 
         record = recording(data)
@@ -252,7 +247,6 @@ class OdmConfig(DataParserConfig):
     """Folder of the photographs, of any size."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        """By the reconstruction or the report."""
         from .odm import project_file
 
         record = project_file(data)

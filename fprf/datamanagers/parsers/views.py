@@ -29,19 +29,15 @@ MASKS, SKY_MASKS = "masks", "sky_masks"
 
 def find_masks(data: Path, images: Sequence[Path], name: str) -> tuple[Path | None, ...]:
     """The mask of each image, None where there is none; nothing at all where the capture has none of that name."""
-    known: dict[Path, bool] = {}
-    masks = tuple(_mask(data, image, name, known) for image in images)
+    masks = tuple(_mask(data, image, name) for image in images)
     return masks if any(mask is not None for mask in masks) else ()
 
 
-def _mask(data: Path, image: Path, name: str, known: dict[Path, bool]) -> Path | None:
+def _mask(data: Path, image: Path, name: str) -> Path | None:
     """Beside the image's folder, or beside a folder around that, up to the scene's."""
     for above in image.parents[1:]:
-        folder = above / name
-        if folder not in known:
-            known[folder] = folder.is_dir()
-        if known[folder]:
-            inner = folder.joinpath(*image.relative_to(above).parts[1:])
+        if (above / name).is_dir():
+            inner = (above / name).joinpath(*image.relative_to(above).parts[1:])
             for path in (inner.with_name(inner.name + ".png"), inner.with_suffix(".png"), inner):
                 if path.is_file():
                     return path
