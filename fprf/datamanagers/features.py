@@ -23,7 +23,6 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-import numpy as np
 import safetensors
 import safetensors.torch
 import torch
@@ -181,18 +180,19 @@ class FeatureStore:
             raise DataError("feature store: no views; a scene needs at least one training view")
         self.basis = basis
         """Basis that the encoder's features were projected on; None = kept raw."""
-        self._entries = dict(entries)
-        first = next(iter(self._entries.values()))
-        self.channels = len(first.scale)
-        self.bytes = sum(e.coefs.numel() * 2 for e in self._entries.values())
+        self._entries = list(entries.values())
+        self._views = torch.tensor(list(entries))
+        self._numbers = torch.zeros(int(self._views.max()) + 1, dtype=torch.int64)
+        """The entry of each view; 0 as well for those that have none."""
+        self._numbers[self._views] = torch.arange(len(entries))
+        self.channels = len(self._entries[0].scale)
+        self.bytes = sum(entry.coefs.numel() * 2 for entry in self._entries)
         """Size of the coefficients."""
-        self.mean, self.std = _spread(list(self._entries.values()))
+        self.mean, self.std = _spread(self._entries)
         """Mean over all channels, and root mean square over the channels' standard deviations, over all pixels."""
-        self._magnitude = max(float(e.centre.abs().max()) for e in self._entries.values())
-        self._slots = {view: slot for slot, view in enumerate(self._entries)}
-        self._table = _table(list(self._entries.values()))
-        self._packed: guided.Packed | None = None
-        self._numbers = torch.zeros(0, dtype=torch.int64)
+        self._magnitude = max(float(entry.centre.abs().max()) for entry in self._entries)
+        self._table = _table(self._entries)
+        self._packed: tuple[guided.Packed, Tensor] | None = None
 
     @property
     def scale(self) -> float:
@@ -201,24 +201,21 @@ class FeatureStore:
 
     def to(self, device: torch.device) -> "FeatureStore":
         """The same targets, with the coefficients on a device as well: `at` of tensors there computes there."""
-        entries = list(self._entries.values())
-        coefs = [entry.coefs.flatten(0, 1) for entry in entries]
+        coefs = [entry.coefs.flatten(0, 1) for entry in self._entries]
         ends = torch.tensor([len(part) for part in coefs]).cumsum(0)
         packed = torch.empty(int(ends[-1]), *coefs[0].shape[1:], dtype=torch.float16, device=device)
         for part, end in zip(coefs, ends.tolist(), strict=True):
             packed[end - len(part) : end].copy_(part)
-        shapes = torch.tensor([entry.coefs.shape[:2] for entry in entries])
+        shapes = torch.tensor([entry.coefs.shape[:2] for entry in self._entries])
         small = (
             ends - shapes.prod(1),
             shapes,
-            torch.stack([entry.size for entry in entries]),
-            torch.stack([entry.scale for entry in entries]),
-            torch.stack([entry.centre for entry in entries]),
+            torch.stack([entry.size for entry in self._entries]),
+            torch.stack([entry.scale for entry in self._entries]),
+            torch.stack([entry.centre for entry in self._entries]),
         )
-        numbers = torch.zeros(max(self._slots) + 1, dtype=torch.int64)
-        numbers[list(self._slots)] = torch.arange(len(self._slots))
         there = copy.copy(self)
-        there._packed, there._numbers = guided.Packed(packed, *(part.to(device) for part in small)), numbers.to(device)
+        there._packed = guided.Packed(packed, *(part.to(device) for part in small)), self._numbers.to(device)
         return there
 
     def at(
@@ -230,13 +227,16 @@ class FeatureStore:
         """
         from ..ops.guided_kernels import gather_views
 
-        if self._packed is not None and view.device == self._numbers.device:
-            return guided.apply_packed(self._packed, self._numbers[view], pixel, rgb, grey=GREY)
-        views, place = np.unique(view.detach().cpu().numpy(), return_inverse=True)
-        missing = [v for v in views.tolist() if v not in self._slots]
-        if missing:
-            raise DataError(f"feature store: view {missing[0]} has no features; {len(self._entries)} training views have")
-        slot = torch.tensor([self._slots[v] for v in views.tolist()], dtype=torch.int64)[torch.from_numpy(place)]
+        if self._packed is not None and view.device == self._packed[1].device:
+            packed, numbers = self._packed
+            return guided.apply_packed(packed, numbers[view], pixel, rgb, grey=GREY)
+        asked = view.detach().cpu()
+        slot = self._numbers[asked.clamp(0, len(self._numbers) - 1)]
+        missing = asked[self._views[slot] != asked]
+        if len(missing):
+            raise DataError(
+                f"feature store: view {int(missing.min())} has no features; {len(self._entries)} training views have"
+            )
         positions, colours = pixel.detach().cpu().float().contiguous(), rgb.detach().cpu().float().contiguous()
         out = torch.empty(len(view), self.channels)
         gather_views(self._table, slot.numpy(), positions.numpy(), (colours - GREY).numpy(), out.numpy())

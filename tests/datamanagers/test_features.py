@@ -45,7 +45,7 @@ def test_half_precision_keeps_eleven_bits_of_the_largest_coefficient(
 def make(folder: Path) -> tuple[str, store_files.Entry]:
     entry = store_files.pack(torch.randn(3, 4, 5, 4), (30, 40))
     key = store_files.digest("some", "inputs")
-    store_files.write_entry(folder, key, entry)
+    store_files.write_tensors(folder, key, entry._asdict())
     return key, entry
 
 
