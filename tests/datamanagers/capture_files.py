@@ -7,6 +7,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
+
+from fprf.datamanagers.parsers.colmap import MODELS
+from fprf.rendering.cameras import Cameras
 
 
 @dataclass(frozen=True)
@@ -30,17 +34,38 @@ class Capture:
         names = tuple(f"{k:04d}.png" for k in range(count))
         return Capture(names, np.concatenate([turn, place], 2), points, **fields)  # type: ignore[arg-type]
 
+    @property
+    def centre(self) -> tuple[float, float]:
+        return self.size[0] / 2, self.size[1] / 2
+
+    def cameras(self) -> Cameras:
+        count, (k1, k2, p1, p2) = len(self.names), self.k
+        return Cameras(
+            pose=torch.from_numpy(self.poses),
+            focal=torch.tensor([self.focal], dtype=torch.float64).expand(count, 2),
+            centre=torch.tensor([self.centre], dtype=torch.float64).expand(count, 2),
+            size=torch.tensor([self.size]).expand(count, 2),
+            distortion=torch.tensor([[k1, k2, 0.0, 0.0, p1, p2]], dtype=torch.float64).expand(count, 6),
+            lens=torch.full((count,), int(any(self.k))),
+        )
+
 
 def rotations(vectors: np.ndarray) -> np.ndarray:
     return np.stack([cv2.Rodrigues(v)[0] for v in vectors])
 
 
-def write_image(path: Path, size: tuple[int, int], channels: int = 3, seed: int = 0) -> np.ndarray:
+def write_image(path: Path, size: tuple[int, int] = (24, 16), channels: int = 3, seed: int = 0) -> np.ndarray:
     """A PNG of noise; returns it as written, in OpenCV's channel order."""
     path.parent.mkdir(parents=True, exist_ok=True)
     image = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], channels), dtype=np.uint8)
     assert cv2.imwrite(str(path), image)
     return image
+
+
+def _write(path: Path, content: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
 
 
 def _images(folder: Path, capture: Capture) -> None:
@@ -51,16 +76,15 @@ def _images(folder: Path, capture: Capture) -> None:
 def write_transforms(folder: Path, capture: Capture, *, per_frame: bool = False, **top: object) -> dict[str, object]:
     """transforms.json with images and points; returns what was written."""
     _images(folder / "images", capture)
-    width, height = capture.size
-    lens = dict(zip(("k1", "k2", "p1", "p2"), capture.k, strict=True))
-    camera = {"w": width, "h": height, "fl_x": capture.focal[0], "fl_y": capture.focal[1], "cx": width / 2, "cy": height / 2}
+    camera = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), (*capture.size, *capture.focal, *capture.centre), strict=True))
+    camera |= dict(zip(("k1", "k2", "p1", "p2"), capture.k, strict=True))
     frames = []
     for name, pose in zip(capture.names, capture.poses, strict=True):
         frame = {"file_path": f"images/{name}", "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]}
-        frames.append(frame | camera | lens if per_frame else frame)
-    content = {**({} if per_frame else camera | lens), "frames": frames, **top}
-    (folder / "transforms.json").write_text(json.dumps(content))
-    np.savez(folder / "points.npz", xyz=capture.points.astype(np.float32))
+        frames.append(frame | camera if per_frame else frame)
+    content = {**({} if per_frame else camera), "frames": frames, **top}
+    _write(folder / "transforms.json", content)
+    np.savez(folder / "points.npz", xyz=capture.points)
     return content
 
 
@@ -96,7 +120,7 @@ def write_colmap(
     capture: Capture,
     *,
     binary: bool = True,
-    model: tuple[int, str] = (1, "PINHOLE"),
+    model: str = "PINHOLE",
     params: tuple[float, ...] | None = None,
     images: str = "images",
 ) -> Path:
@@ -104,97 +128,89 @@ def write_colmap(
     _images(folder / images, capture)
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True, exist_ok=True)
-    width, height = capture.size
-    params = params or (*capture.focal, width / 2, height / 2)
-    poses = [_world_to_camera(pose) for pose in capture.poses]
+    params = params or (*capture.focal, *capture.centre)
+    posed = [
+        (k, name, *_world_to_camera(pose)) for k, (name, pose) in enumerate(zip(capture.names, capture.poses, strict=True))
+    ]
+    points = list(enumerate(capture.points))
     if binary:
-        count = struct.pack("<Q", 1) + struct.pack("<IiQQ", 7, model[0], width, height)
-        (sparse / "cameras.bin").write_bytes(count + struct.pack(f"<{len(params)}d", *params))
-        features = struct.pack("<Q", len(capture.points))
-        features += b"".join(struct.pack("<ddq", 1.0, 2.0, k) for k in range(len(capture.points)))
-        parts = [struct.pack("<Q", len(poses))]
-        for k, (name, (q, t)) in enumerate(zip(capture.names, poses, strict=True)):
-            parts.append(struct.pack("<I7dI", k + 1, *q, *t, 7) + name.encode() + b"\0" + features)
-        (sparse / "images.bin").write_bytes(b"".join(parts))
-        parts = [struct.pack("<Q", len(capture.points))]
-        for k, point in enumerate(capture.points):
-            parts.append(struct.pack("<Q3d3BdQ", k, *point, 1, 2, 3, 0.5, 2) + struct.pack("<4I", 1, 0, 2, 0))
-        (sparse / "points3D.bin").write_bytes(b"".join(parts))
+        id_ = [name for name, _ in MODELS].index(model)
+        cameras = struct.pack("<QIiQQ", 1, 7, id_, *capture.size) + struct.pack(f"<{len(params)}d", *params)
+        features = struct.pack("<Q", len(points)) + b"".join(struct.pack("<ddq", 1.0, 2.0, k) for k, _ in points)
+        rows = [struct.pack("<I7dI", k + 1, *q, *t, 7) + name.encode() + b"\0" + features for k, name, q, t in posed]
+        cloud = [struct.pack("<Q3d3BdQ4I", k, *point, 1, 2, 3, 0.5, 2, 1, 0, 2, 0) for k, point in points]
+        (sparse / "cameras.bin").write_bytes(cameras)
+        (sparse / "images.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
+        (sparse / "points3D.bin").write_bytes(struct.pack("<Q", len(cloud)) + b"".join(cloud))
         return sparse
-    numbers = " ".join(repr(float(value)) for value in params)
-    (sparse / "cameras.txt").write_text(f"# cameras\n7 {model[1]} {width} {height} {numbers}\n")
-    lines = ["# images"]
-    for k, (name, (q, t)) in enumerate(zip(capture.names, poses, strict=True)):
-        lines.append(f"{k + 1} {' '.join(repr(float(v)) for v in (*q, *t))} 7 {name}")
-        lines.append(" ".join(f"1.0 2.0 {index}" for index in range(len(capture.points))))
-    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
-    rows = [f"{k} {' '.join(repr(float(v)) for v in point)} 1 2 3 0.5 1 0 2 0" for k, point in enumerate(capture.points)]
-    (sparse / "points3D.txt").write_text("\n".join(["# points", *rows]) + "\n")
+
+    def text(values: object) -> str:
+        return " ".join(repr(float(value)) for value in values)  # type: ignore[attr-defined]
+
+    features = " ".join(f"1.0 2.0 {k}" for k, _ in points)
+    lines = [f"{k + 1} {text((*q, *t))} 7 {name}\n{features}\n" for k, name, q, t in posed]
+    _write(sparse / "cameras.txt", f"# cameras\n7 {model} {capture.size[0]} {capture.size[1]} {text(params)}\n")
+    _write(sparse / "images.txt", "# images\n" + "".join(lines))
+    _write(sparse / "points3D.txt", "# points\n" + "".join(f"{k} {text(point)} 1 2 3 0.5 1 0 2 0\n" for k, point in points))
     return sparse
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """x y z w."""
-    vector = cv2.Rodrigues(rotation)[0][:, 0]
-    angle = float(np.linalg.norm(vector))
-    return np.append(np.sin(angle / 2) * vector / max(angle, 1e-12), np.cos(angle / 2))
 
 
 def write_polycam(folder: Path, capture: Capture, *, corrected: bool = False, **more: object) -> Path:
     """Raw data with images and cameras; returns the folder of cameras."""
-    prefix, (width, height) = "corrected_" if corrected else "", capture.size
-    cameras = folder / f"{prefix}cameras"
-    cameras.mkdir(parents=True)
-    for seed, (name, pose) in enumerate(zip(capture.names, capture.poses, strict=True)):
-        write_image(folder / f"{prefix}images" / name, capture.size, seed=seed)
+    prefix = "corrected_" if corrected else ""
+    _images(folder / f"{prefix}images", capture)
+    names = ("fx", "fy", "cx", "cy", "width", "height")
+    lens = dict(zip(names, (*capture.focal, *capture.centre, *capture.size), strict=True))
+    for name, pose in zip(capture.names, capture.poses, strict=True):
         rows = {f"t_{r}{c}": float(pose[r, c]) for r in range(3) for c in range(4)}
-        lens = {
-            "fx": capture.focal[0],
-            "fy": capture.focal[1],
-            "cx": width / 2,
-            "cy": height / 2,
-            "width": width,
-            "height": height,
-        }
-        document = {**rows, **lens, "blur_score": 100.0, "timestamp": 1.0, **more}
-        (cameras / f"{Path(name).stem}.json").write_text(json.dumps(document))
-    return cameras
+        _write(folder / f"{prefix}cameras" / f"{Path(name).stem}.json", rows | lens | {"blur_score": 100.0} | more)
+    return folder / f"{prefix}cameras"
 
 
 def write_record3d(folder: Path, capture: Capture, *, packed: bool = False, **more: object) -> Path:
     """An export as JPG and EXR, or what is in a .r3d; images are numbered. Returns the metadata's path."""
-    width, height = capture.size
     for seed in range(len(capture.names)):
         write_image(folder / ("rgbd" if packed else "rgb") / f"{seed}.png", capture.size, seed=seed)
-    poses = [[*quaternion(pose[:, :3]).tolist(), *pose[:, 3].tolist()] for pose in capture.poses]
-    fx, fy = capture.focal
-    k = [fx, 0, 0, 0, fy, 0, width / 2, height / 2, 1]
-    file = folder / ("metadata" if packed else "metadata.json")
-    file.write_text(json.dumps({"w": width, "h": height, "fps": 30, "K": k, "poses": poses, **more}))
-    return file
+    poses = [[*np.roll(_quaternion(pose[:, :3]), -1).tolist(), *pose[:, 3].tolist()] for pose in capture.poses]
+    k = [capture.focal[0], 0, 0, 0, capture.focal[1], 0, *capture.centre, 1]
+    content = {"w": capture.size[0], "h": capture.size[1], "fps": 30, "K": k, "poses": poses, **more}
+    return _write(folder / ("metadata" if packed else "metadata.json"), content)
 
 
-def write_odm(folder: Path, capture: Capture, *, report: bool = False, reduced: int = 1, **camera: object) -> Path:
-    """A project with a reconstruction whose cameras are `reduced`, or a report. Returns what holds the shots."""
+def write_odm(folder: Path, capture: Capture, *, report: bool = False, **camera: object) -> Path:
+    """A project with a reconstruction, or a report. Returns what holds the shots."""
+    _images(folder / "images", capture)
     (width, height), longest = capture.size, max(capture.size)
-    lens: dict[str, object] = {"projection_type": "brown", "width": width // reduced, "height": height // reduced}
-    lens |= {"focal_x": capture.focal[0] / longest, "focal_y": capture.focal[1] / longest, "c_x": 0.0, "c_y": 0.0}
+    lens: dict[str, object] = {"projection_type": "brown", "width": width, "height": height, "c_x": 0.0, "c_y": 0.0}
+    lens |= {"focal_x": capture.focal[0] / longest, "focal_y": capture.focal[1] / longest}
     lens |= dict(zip(("k1", "k2", "p1", "p2"), capture.k, strict=True)) | camera
     shots, features = {}, []
-    for seed, (name, pose) in enumerate(zip(capture.names, capture.poses, strict=True)):
-        write_image(folder / "images" / name, capture.size, seed=seed)
+    for name, pose in zip(capture.names, capture.poses, strict=True):
         turn = (pose[:, :3] * [1, -1, -1]).T
         rotation = cv2.Rodrigues(turn)[0][:, 0].tolist()
         shots[name] = {"camera": "v2 phone", "rotation": rotation, "translation": (-turn @ pose[:, 3]).tolist()}
-        features.append(
-            {"type": "Feature", "properties": {"filename": name, "rotation": rotation, "translation": pose[:, 3].tolist()}}
-        )
-    points = {str(k): {"coordinates": point.tolist(), "color": [1.0, 2.0, 3.0]} for k, point in enumerate(capture.points)}
-    file = folder / ("odm_report/shots.geojson" if report else "opensfm/reconstruction.json")
-    file.parent.mkdir()
+        features.append({"properties": {"filename": name, "rotation": rotation, "translation": pose[:, 3].tolist()}})
     if report:
-        (folder / "cameras.json").write_text(json.dumps({"v2 phone": lens}))
-        file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    else:
-        file.write_text(json.dumps([{"cameras": {"v2 phone": lens}, "shots": shots, "points": points}]))
-    return file
+        _write(folder / "cameras.json", {"v2 phone": lens})
+        return _write(folder / "odm_report/shots.geojson", {"type": "FeatureCollection", "features": features})
+    points = {str(k): {"coordinates": point.tolist(), "color": [1.0, 2.0, 3.0]} for k, point in enumerate(capture.points)}
+    whole = [{"cameras": {"v2 phone": lens}, "shots": shots, "points": points}]
+    return _write(folder / "opensfm/reconstruction.json", whole)
+
+
+def write_meganerf(folder: Path, capture: Capture, held: tuple[int, ...] = (2, 5), unit: float | None = None) -> None:
+    for k, name in enumerate(capture.names):
+        part = folder / ("val" if k in held else "train")
+        (part / "metadata").mkdir(parents=True, exist_ok=True)
+        write_image(part / "rgbs" / name, capture.size, seed=k)
+        lens = {"W": capture.size[0], "H": capture.size[1], "intrinsics": torch.tensor([*capture.focal, *capture.centre])}
+        torch.save(lens | {"c2w": torch.from_numpy(capture.poses[k])}, part / "metadata" / f"{Path(name).stem}.pt")
+    if unit is not None:
+        torch.save({"origin_drb": torch.zeros(3), "pose_scale_factor": unit}, folder / "coordinates.pt")
+
+
+def write_phototourism(folder: Path, capture: Capture, rows: list[tuple[str, str, str]] | None = None) -> None:
+    """A model in dense/, and the table of rows (file name, id, split); by default all are for training."""
+    write_colmap(folder / "dense", capture)
+    rows = [(name, str(k), "train") for k, name in enumerate(capture.names)] if rows is None else rows
+    _write(folder / "gate.tsv", "".join("\t".join(row) + "\n" for row in [("filename", "id", "split"), *rows]))

@@ -1,30 +1,26 @@
 """Training batches: pure in (seed, step), uniform over the pixels that masks leave, right at every pixel, through points."""
 
 import errno
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from capture_files import Capture, write_transforms
 from hypothesis import given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World
-from torch import Tensor
 
 import fprf.datamanagers.batches as pixel_file
 from fprf.datamanagers.batches import PixelRuns, RayBatches, allocate_pixels
 from fprf.datamanagers.config import RayBatchesConfig
 from fprf.datamanagers.images import load_mask
-from fprf.datamanagers.parsers.config import TransformsConfig
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
-from fprf.interfaces import DataManager, Encoder
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.rendering.cameras import Cameras, rays_through
 
@@ -60,22 +56,18 @@ def make_scene(folder: Path, channels: int = 3) -> tuple[Scene, list[np.ndarray]
     return scene, images
 
 
+def write_mask(path: Path, pixels: np.ndarray) -> Path:
+    assert cv2.imwrite(str(path), pixels)
+    return path
+
+
 def make(
-    scene: Scene,
-    cache: Path,
-    *,
-    seed: int = 0,
-    rays: int = 512,
-    share: float = 1.0,
-    content: Encoder | None = None,
-    semantic: Encoder | None = None,
+    scene: Scene, cache: Path, *, seed: int = 0, content: bool = False, semantic: bool = False, **fields: Any
 ) -> RayBatches:
-    config = RayBatchesConfig(rays=rays, semantic_share=share)
-    return RayBatches(config, scene=scene, content=content, semantic=semantic, dim=4, cache=cache, seed=seed)
-
-
-def same(one: Tensor | None, two: Tensor | None) -> bool:
-    return (one is None and two is None) or (one is not None and two is not None and torch.equal(one, two))
+    config = RayBatchesConfig(**{"rays": 512} | fields)
+    encoders = (RandomConfig(channels=3, stride=2).build(), RandomConfig(channels=6, stride=4).build())
+    one, two = (encoder if asked else None for encoder, asked in zip(encoders, (content, semantic), strict=True))
+    return RayBatches(config, scene=scene, content=one, semantic=two, dim=4, cache=cache, seed=seed)
 
 
 def test_colours_are_those_of_the_files_at_the_pixel_centres(tmp_path: Path) -> None:
@@ -91,18 +83,17 @@ def test_colours_are_those_of_the_files_at_the_pixel_centres(tmp_path: Path) -> 
 
 def test_a_batch_is_a_function_of_seed_and_step(tmp_path: Path) -> None:
     scene, _ = make_scene(tmp_path)
-    content, semantic = RandomConfig(channels=3, stride=2).build(), RandomConfig(channels=6, stride=4).build()
-    one = make(scene, tmp_path, content=content, semantic=semantic)
+    one = make(scene, tmp_path, content=True, semantic=True)
     torch.randn(7)
-    two = make(scene, tmp_path, content=content, semantic=semantic)
+    two = make(scene, tmp_path, content=True, semantic=True)
     for _ in range(3):
         two.batch(5)
-    assert all(same(a, b) for a, b in zip(one.batch(7), two.batch(7), strict=True))
+    before = torch.get_rng_state()
+    for a, b in zip(one.batch(7), two.batch(7), strict=True):
+        assert (a is None and b is None) or torch.equal(a, b)
+    assert torch.equal(before, torch.get_rng_state())
     assert not torch.equal(one.batch(7).pixel, one.batch(8).pixel)
     assert not torch.equal(one.batch(7).pixel, make(scene, tmp_path, seed=1).batch(7).pixel)
-    before = torch.get_rng_state()
-    one.batch(1)
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_every_training_pixel_is_as_likely(tmp_path: Path) -> None:
@@ -120,8 +111,7 @@ def test_every_training_pixel_is_as_likely(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("share", "expected"), [(1.0, 512), (0.25, 128), (0.001, 1), (0.0, None)])
 def test_the_share_of_semantic_rays(tmp_path: Path, share: float, expected: int | None) -> None:
     scene, _ = make_scene(tmp_path)
-    content, semantic = RandomConfig(channels=3, stride=2).build(), RandomConfig(channels=6, stride=4).build()
-    manager = make(scene, tmp_path, share=share, content=content, semantic=semantic)
+    manager = make(scene, tmp_path, semantic_share=share, content=True, semantic=True)
     batch = manager.batch(2)
     assert batch.content is not None and batch.content.shape == (512, 3)
     if expected is None:
@@ -136,16 +126,14 @@ def test_the_share_of_semantic_rays(tmp_path: Path, share: float, expected: int 
 def test_a_device_draws_what_the_host_draws(tmp_path: Path) -> None:
     """Pixels, colours, features, masks, sky and depths; its generator is the CPU's here, which on a card is another one."""
     scene, _ = make_scene(tmp_path)
-    masks = tuple(tmp_path / f"half-{view}.png" for view in range(len(SIZES)))
-    for mask, (width, height) in zip(masks, SIZES, strict=True):
-        half = np.zeros((height, width), np.uint8)
-        half[: height // 2 + 1] = 255
-        assert cv2.imwrite(str(mask), half)
+    masks = tuple(
+        write_mask(tmp_path / f"half-{view}.png", np.uint8(255) * (np.arange(height)[:, None] <= height // 2).repeat(width, 1))
+        for view, (width, height) in enumerate(SIZES)
+    )
     points = torch.tensor([[0.1, 0.2, -2.0], [-0.3, 0.1, -3.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
     scene = replace(scene, masks=masks, sky_masks=(None, None, *masks[2:]), points=points)
-    config = RayBatchesConfig(rays=200, semantic_share=0.5, depth_share=0.2)
-    encoder = RandomConfig().build()
-    manager = RayBatches(config, scene=scene, content=encoder, semantic=encoder, dim=4, cache=tmp_path, seed=3)
+    fields = {"rays": 200, "semantic_share": 0.5, "depth_share": 0.2}
+    manager = make(scene, tmp_path, seed=3, content=True, semantic=True, **fields)
     with pretend_cuda() as seen:
         assert manager.to(CUDA, room=manager.held_bytes - 1) is manager is manager.to(torch.device("mps"), room=1 << 40)
         there = manager.to(CUDA, room=manager.held_bytes)
@@ -191,17 +179,11 @@ def test_a_full_disk_is_told_before_anything_is_written(tmp_path: Path, monkeypa
         allocate_pixels(1000, tmp_path, held=0)
 
 
-def manager(world: World, folder: Path, share: float, **fields: object) -> DataManager:
-    """Of the tiny town, whose points any view may see."""
-    config = RayBatchesConfig(rays=64, depth_share=share)
-    scene = fields.pop("scene", replace(world.prepared.scene, seen=None))
-    return config.build(scene=scene, content=None, semantic=None, dim=4, cache=folder, seed=3, **fields)  # type: ignore[arg-type]
-
-
 def test_marked_rays_pass_their_points_at_the_distance_told(world: World, tmp_path: Path) -> None:
     scene = world.prepared.scene
     assert scene.points is not None
-    batch = manager(world, tmp_path, 0.25).batch(7)
+    # Points that any view may see.
+    batch = make(replace(scene, seen=None), tmp_path, rays=64, depth_share=0.25).batch(7)
     assert batch.distance is not None
     known = torch.isfinite(batch.distance)
     assert known.tolist() == [False] * 48 + [True] * 16
@@ -219,36 +201,12 @@ def test_points_of_a_reconstruction_count_where_two_views_saw_them(world: World,
     held = int(scene.test[0])
     both = torch.tensor([[first, 0], [second, 0]])
     alone = torch.tensor([[first, point] for point in range(1, 50)] + [[held, point] for point in range(1, 50)])
-    marks = manager(world, tmp_path, 0.5, scene=replace(scene, seen=torch.cat([both, alone]))).batch(0)
-    expected = manager(world, tmp_path, 0.5, scene=replace(scene, seen=both)).batch(0)
-    assert marks.distance is not None and expected.distance is not None
-    torch.testing.assert_close(marks.distance, expected.distance, equal_nan=True)
-    assert manager(world, tmp_path, 0.5, scene=replace(scene, seen=alone)).batch(0).distance is None
-
-
-def write_mask(path: Path, pixels: np.ndarray) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), pixels)
-    return path
-
-
-def test_frames_name_their_masks(tmp_path: Path) -> None:
-    content = write_transforms(tmp_path, Capture.make(4))
-    frames = content["frames"]
-    assert isinstance(frames, list)
-    frames[1]["mask_path"], frames[3]["sky_mask_path"] = "people/a.png", "sky/b.png"
-    write_mask(tmp_path / "people/a.png", np.ones((16, 24), np.uint8))
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(DataError, match=r"b\.png"):
-        TransformsConfig().build().parse(tmp_path, 1)
-    write_mask(tmp_path / "sky/b.png", np.ones((16, 24), np.uint8))
-    scene = TransformsConfig().build().parse(tmp_path, 1)
-    assert scene.masks == (None, tmp_path / "people/a.png", None, None)
-    assert scene.sky_masks == (None, None, None, tmp_path / "sky/b.png")
-    frames[1]["mask_path"] = "../a.png"
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(DataError, match="leaves"):
-        TransformsConfig().build().parse(tmp_path, 1)
+    pairs, wanted, none = (
+        make(replace(scene, seen=seen), tmp_path, rays=64, depth_share=0.5).batch(0).distance
+        for seen in (torch.cat([both, alone]), both, alone)
+    )
+    assert pairs is not None and wanted is not None and none is None
+    torch.testing.assert_close(pairs, wanted, equal_nan=True)
 
 
 @pytest.mark.parametrize(
@@ -276,9 +234,7 @@ def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
     for view in (0, 2, 4):
         assert np.array_equal(seen[view], allowed[view])
     assert seen[3].all() and batch.sky is None
-    plain = RayBatchesConfig(rays=64, masks=False)
-    build = {"content": None, "semantic": None, "dim": 4, "cache": tmp_path, "seed": 0}
-    ours, theirs = (plain.build(scene=each, **build).batch(1) for each in (masked, scene))  # type: ignore[arg-type]
+    ours, theirs = (make(each, tmp_path, masks=False).batch(1) for each in (masked, scene))
     assert torch.equal(ours.pixel, theirs.pixel)
 
 
@@ -299,10 +255,3 @@ def test_scenes_that_leave_nothing_to_learn_are_refused(tmp_path: Path) -> None:
     for wrong in ({"train": scene.train[:0]}, {"masks": dark}, {"masks": (other,) * len(SIZES)}):
         with pytest.raises(DataError):
             make(replace(scene, **wrong), tmp_path)  # type: ignore[arg-type]
-
-
-def test_masks_beside_the_images_are_found(tmp_path: Path) -> None:
-    write_transforms(tmp_path, Capture.make(5))
-    write_mask(tmp_path / "masks" / "0002.png.png", np.zeros((16, 24), np.uint8))
-    scene = TransformsConfig().build().parse(tmp_path, 1)
-    assert [path is not None for path in scene.masks] == [False, False, True, False, False] and scene.sky_masks == ()
