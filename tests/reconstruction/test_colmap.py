@@ -7,22 +7,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.reconstruction.colmap import (
-    MatchTables,
     build_vocabulary,
-    count_rows,
     descriptors,
     exhaustive_pairs,
     sequential_pairs,
     similar_pairs,
     vlad_vectors,
 )
+from fprf.reconstruction.scene_folder import MatchTables, count_rows, report, summary_rows
 
 MOST = 2147483647
 
 
 @pytest.fixture
 def database(tmp_path: Path) -> Path:
-    """Images a, b, c and e; b has no features; a-c fit by 30 matches, c-e by 5."""
+    """Images a, sub/c and odd fit by 30 matches; b has no features, lonely fits one by 5, too few."""
     path = tmp_path / "the database.db"
     base = sqlite3.connect(path)
     base.executescript(
@@ -30,20 +29,19 @@ def database(tmp_path: Path) -> Path:
         CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB);
         CREATE TABLE descriptors (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB);
         CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY, rows INTEGER);
-        INSERT INTO images VALUES (1, 'a', 1), (2, 'b', 1), (5, 'sub/c', 1), (9, 'e', 1);
-        INSERT INTO keypoints VALUES (1, 70, 6, ''), (2, 0, 6, ''), (5, 60, 6, '');"""
+        INSERT INTO images VALUES (1, 'a', 1), (2, 'b', 1), (5, 'sub/c', 1), (9, 'lonely', 1), (10, 'odd', 1);
+        INSERT INTO keypoints VALUES (1, 70, 6, ''), (2, 0, 6, ''), (5, 60, 6, ''), (9, 50, 6, ''), (10, 40, 6, '');"""
     )
     base.execute("INSERT INTO descriptors VALUES (1, 2, 128, ?)", (bytes(range(128)) * 2,))
-    base.executemany(
-        "INSERT INTO two_view_geometries VALUES (?, ?)", [(1 * MOST + 5, 30), (5 * MOST + 9, 5), (7 * MOST + 8, 50)]
-    )
+    pairs = {(1, 5): 30, (5, 9): 5, (1, 10): 30, (5, 10): 30, (7, 8): 50}
+    base.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", [(a * MOST + b, n) for (a, b), n in pairs.items()])
     base.commit()
     base.close()
     return path
 
 
 def test_progress_and_descriptors(database: Path, tmp_path: Path) -> None:
-    assert count_rows(database) == (3, 3)
+    assert count_rows(database) == (5, 5)
     assert np.array_equal(descriptors(database, "a"), np.arange(128, dtype=np.uint8)[None].repeat(2, 0))
     assert descriptors(database, "b").shape == (0, 128)
     assert count_rows(tmp_path / "absent.db") == (0, 0) and not (tmp_path / "absent.db").exists()
@@ -51,6 +49,33 @@ def test_progress_and_descriptors(database: Path, tmp_path: Path) -> None:
     assert count_rows(tmp_path / "other.db") == (0, 0)
     with pytest.raises(sqlite3.Error):
         MatchTables(tmp_path / "other.db")
+
+
+def test_every_image_has_its_reason(database: Path) -> None:
+    images = dict.fromkeys(["a", "apart", "b", "sub/c", "lonely", "odd"])
+    state = {"source": "/photos", "images": images, "dropped": {"x.jpg": "the JPEG is truncated"}, "seconds": {}}
+    models = [
+        {"images": ["a"], "points": 10, "error_pixels": 0.5, "track_length": 3.0},
+        {"images": ["sub/c", "elsewhere"], "points": 4, "error_pixels": 0.7, "track_length": 2.0},
+    ]
+    content = report(state, "exhaustive", MatchTables(database), models, "1.0")
+    assert content["images"] == {"given": 7, "used": 6, "posed": 1} and content["parts"] == [1, 2]
+    rows = summary_rows(content)
+    assert [(step, image) for step, image, _ in rows] == [
+        ("choosing", "x.jpg"),
+        ("features", "apart"),
+        ("features", "b"),
+        ("matching", "lonely"),
+        ("mapping", "sub/c"),
+        ("mapping", "odd"),
+    ]
+    assert rows[0][2] == "the JPEG is truncated" and "no other image" in rows[3][2]
+    assert rows[4][2] == "in part 2 (2 images), apart from the rest; take views in between"
+    assert rows[5][2] == "fits 2 images, but no pose was found for it"
+    few = summary_rows(content, most=1)
+    assert [row[:2] for row in few] == [
+        ("choosing", "x.jpg"), ("features", "2 images"), ("matching", "lonely"), ("mapping", "2 images"),
+    ]  # fmt: skip
 
 
 def proper(pairs: list[tuple[int, int]], count: int) -> bool:

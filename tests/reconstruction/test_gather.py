@@ -3,7 +3,6 @@ import struct
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,18 +18,19 @@ from fprf.reconstruction.config import SfmConfig
 from fprf.reconstruction.images import (
     Lens,
     choose_frames,
-    frame_scores,
     gather_images,
     lens_of,
     natural_order,
     read_lens,
     save_frames,
 )
-from fprf.reconstruction.scene_folder import SceneFolder, State, dropped_images
+from fprf.reconstruction.scene_folder import SceneFolder, State
 
 
-def noise(height: int = 60, width: int = 80, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+def photo(path: Path, seed: int = 0, size: tuple[int, int] = (24, 16)) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8))
+    return path
 
 
 @settings(deadline=None)
@@ -40,15 +40,6 @@ def test_every_frame_is_chosen_or_has_a_reason(scores: list[float], count: int, 
     assert sorted([*choice.chosen, *choice.dropped]) == list(range(len(scores)))
     assert len(choice.chosen) <= count and choice.chosen == sorted(choice.chosen)
     assert all(choice.dropped.values())
-
-
-def test_what_is_no_video_is_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    write_video(tmp_path / "clip.mp4", [noise(32, 48)] * 3, 24, h264=False)
-    (tmp_path / "no.mp4").write_bytes(b"nothing of the kind" * 100)
-    with pytest.raises(DataError, match=r"no\.mp4: no video that can be opened"):
-        frame_scores(tmp_path / "no.mp4", lambda *_: None)
-    with pytest.raises(DataError, match="frame 99 was there before"):
-        save_frames(tmp_path / "clip.mp4", [2, 99], tmp_path / "out", lambda *_: None)
 
 
 def tiff(order: str, model: bytes = b"Phone 9\0", focal: tuple[int, int] = (425, 100), short: int = 26) -> bytes:
@@ -69,16 +60,13 @@ def with_exif(block: bytes) -> bytes:
     return JPEG[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block + JPEG[2:]
 
 
-def photo_of(path: Path, block: bytes | None) -> Path:
-    path.write_bytes(JPEG if block is None else with_exif(block))
-    return path
-
-
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_model_and_focal_length_in_both_byte_orders(order: str, tmp_path: Path) -> None:
-    path = photo_of(tmp_path / "a.jpg", tiff(order))
+    path = tmp_path / "a.jpg"
+    path.write_bytes(with_exif(tiff(order)))
     assert read_lens(path) == Lens("Phone 9", 4.25, 26)
     assert cv2.imread(str(path)).shape == (8, 8, 3), "still a photograph"
+    assert read_lens(photo(path)) == read_lens(photo(tmp_path / "a.png")) == read_lens(tmp_path / "gone") == Lens()
 
 
 @settings(deadline=None)
@@ -88,12 +76,6 @@ def test_no_damage_makes_it_fail(noise: bytes) -> None:
     for block in (noise, whole[: len(noise)], whole[:20] + noise, whole[:8] + noise + whole[8:]):
         assert isinstance(lens_of(with_exif(block)), Lens)
     assert isinstance(lens_of(noise), Lens) and lens_of(b"") == Lens()
-
-
-def photo(path: Path, seed: int = 0, size: tuple[int, int] = (24, 16)) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8))
-    return path
 
 
 @pytest.fixture
@@ -149,12 +131,8 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
     place = SceneFolder(tmp_path / "scene")
     state = gathered(source, place)
     assert names(place) == list(state.images) == [f"IMG_{k}.HEIC.jpg" for k in range(3)]
-    assert state.images["IMG_0.HEIC.jpg"] | {"sha256": ""} == {
-        "sha256": "",
-        "width": 48,
-        "height": 64,
-        "lens": ["Phone 9", 0.0, 0],
-    }
+    told = state.images["IMG_0.HEIC.jpg"]
+    assert (told["width"], told["height"], told["lens"]) == (48, 64, ["Phone 9", 0.0, 0])
     jpeg = place.images / "IMG_0.HEIC.jpg"
     assert np.array_equal(load_image(jpeg), load_image(jpeg, upright=True)), "it is upright already"
     assert abs(load_image(jpeg).astype(int) - load_image(source / "IMG 0.HEIC")).mean() < 3
@@ -185,8 +163,8 @@ def test_images_may_lie_in_the_scene_already(tmp_path: Path) -> None:
 
 
 def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
-    drawn = np.random.default_rng(0)
-    base = cv2.resize(drawn.integers(0, 256, (30, 40, 3), dtype=np.uint8), (160, 120), interpolation=cv2.INTER_NEAREST)
+    coarse = cv2.imread(str(photo(tmp_path / "a.png", size=(40, 30))))
+    base = cv2.resize(coarse, (160, 120), interpolation=cv2.INTER_NEAREST)
     frames = [np.roll(base, 3 * k, 1) for k in range(12)]
     frames = [frame if k % 3 == 1 else cv2.GaussianBlur(frame, (0, 0), 3) for k, frame in enumerate(frames)]
     write_video(tmp_path / "clip.mp4", frames, 12, h264=False)
@@ -198,23 +176,25 @@ def test_a_video_gives_its_sharp_frames(tmp_path: Path) -> None:
     gathered(tmp_path / "clip.mp4", place, frames=4)
     assert (place.images / "frame_000004.jpg").stat().st_mtime_ns == stamp
     assert len(gathered(tmp_path / "clip.mp4", place, frames=6, blurred=0.0).images) == len(names(place)) == 6
+    with pytest.raises(DataError, match="frame 99 was there before"):
+        save_frames(tmp_path / "clip.mp4", [2, 99], tmp_path / "out", lambda *_: None)
 
 
 def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
     place = SceneFolder(tmp_path / "scene")
-    with pytest.raises(UsageError, match="neither a folder of images nor a video"):
-        gathered(tmp_path / "absent", place)
-    with pytest.raises(UsageError, match="neither a folder of images nor a video"):
-        gathered(photos / "IMG_1.jpg", place)
-    (tmp_path / "few").mkdir()
+    for source in (tmp_path / "absent", photos / "IMG_1.jpg"):
+        with pytest.raises(UsageError, match="neither a folder of images nor a video"):
+            gathered(source, place)
     photo(tmp_path / "few" / "a.jpg")
     (tmp_path / "few" / "b.jpg").write_bytes(b"")
     with pytest.raises(DataError, match=r"1 usable images, at least 3 are needed; b\.jpg: the file is empty"):
         gathered(tmp_path / "few", place)
+    (tmp_path / "few" / "no.mp4").write_bytes(b"nothing of the kind" * 100)
+    with pytest.raises(DataError, match=r"no\.mp4: no video that can be opened"):
+        gathered(tmp_path / "few" / "no.mp4", place)
     gathered(photos, place)
-    (tmp_path / "other").mkdir()
     with pytest.raises(UsageError, match=f"was begun with {photos}"):
-        gathered(tmp_path / "other", place)
+        gathered(tmp_path / "few", place)
     with pytest.raises(UsageError, match="holds something else"):
         State.load(SceneFolder(tmp_path))
     (place.work / "state.json").write_text(json.dumps({"format": 1, "wrong": 3}))
@@ -223,52 +203,3 @@ def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
     for knob, value in {"frames": 2, "blurred": 1.5, "features": 5, "side": 9, "overlap": 0, "threads": 0}.items():
         with pytest.raises(ConfigError, match=knob):
             SfmConfig(**{knob: value})
-
-
-class Matches:
-    """Features and partners of images by name."""
-
-    def __init__(self, **known: tuple[int, int]) -> None:
-        self.known = known
-
-    def features_of(self, name: str) -> int:
-        return self.known[name][0]
-
-    def partners(self, name: str, least: int) -> int:
-        assert least > 0
-        return self.known[name][1]
-
-
-FOUND = Matches(a=(900, 3), b=(900, 2), bare=(0, 0), lonely=(50, 0), apart=(80, 1), odd=(70, 4))
-MODELS: list[dict[str, Any]] = [
-    {"images": ["a", "b"], "points": 10, "error_pixels": 0.5, "track_length": 3.0},
-    {"images": ["apart", "elsewhere"], "points": 4, "error_pixels": 0.7, "track_length": 2.0},
-]
-STATE = {
-    "source": "/photos",
-    "images": dict.fromkeys(["a", "apart", "b", "bare", "lonely", "odd"]),
-    "dropped": {"broken.jpg": "the JPEG is truncated"},
-    "seconds": {"features": 1.5},
-}
-
-
-def test_every_image_has_its_reason() -> None:
-    found = dropped_images(list(STATE["images"]), STATE["dropped"], FOUND, MODELS)
-    assert [(drop.image, drop.step) for drop in found] == [
-        ("broken.jpg", "choosing"),
-        ("bare", "features"),
-        ("lonely", "matching"),
-        ("apart", "mapping"),
-        ("odd", "mapping"),
-    ]
-    reasons = {drop.image: drop.reason for drop in found}
-    assert reasons["broken.jpg"] == "the JPEG is truncated" and "no other image" in reasons["lonely"]
-    assert reasons["apart"] == "in part 2 (2 images), apart from the rest; take views in between"
-    assert reasons["odd"] == "fits 4 images, but no pose was found for it"
-
-
-def test_files_that_say_nothing(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
-    assert (
-        read_lens(tmp_path / "a.png") == read_lens(photo_of(tmp_path / "a.jpg", None)) == read_lens(tmp_path / "gone") == Lens()
-    )
