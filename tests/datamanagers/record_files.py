@@ -2,11 +2,11 @@
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from fprf.datamanagers.parsers.blocknerf import crc32c, masked
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
@@ -28,10 +28,10 @@ def chunk(number: int, data: bytes) -> bytes:
     return varint(number << 3 | 2) + varint(len(data)) + data
 
 
-def example(features: dict[str, bytes | list[int] | NDArray[np.float32]], packed: bool = True) -> bytes:
+def example(values: dict[str, Any], packed: bool = True) -> bytes:
     """A serialised Example; lists of integers, arrays of floats, bytes."""
     entries = b""
-    for name, value in features.items():
+    for name, value in values.items():
         if isinstance(value, bytes):
             body = chunk(1, chunk(1, value))
         elif isinstance(value, list):
@@ -43,6 +43,23 @@ def example(features: dict[str, bytes | list[int] | NDArray[np.float32]], packed
             body = chunk(2, chunk(1, raw) if packed else b"".join(parts))
         entries += chunk(1, chunk(1, name.encode()) + chunk(2, body))
     return chunk(1, entries)
+
+
+def features(image: np.ndarray, origin: np.ndarray, direction: np.ndarray, **more: object) -> dict[str, object]:
+    """Those of an image [H W 3] and its rays [H W 3]."""
+    done, png = cv2.imencode(".png", image)
+    assert done
+    given: dict[str, object] = {
+        "image": png.tobytes(),
+        "image_hash": [99],
+        "cam_idx": [5],
+        "height": [image.shape[0]],
+        "width": [image.shape[1]],
+        "equivalent_exposure": np.array([1.0], np.float32),
+        "ray_origins": np.float32(origin).reshape(-1),
+        "ray_dirs": np.float32(direction).reshape(-1),
+    }
+    return given | more
 
 
 def record(data: bytes) -> bytes:
@@ -75,21 +92,8 @@ def town_records(
         picture = render(town, view, look).rgb
         picture = (picture * (1.0 if k % 2 == 0 else 0.75)).astype(np.uint8)
         origin, direction = rays_through(cameras, torch.full((size[0] * size[1],), k), pixel_grid(cameras, k))
-        done, image = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
-        assert done
-        whole = example(
-            {
-                "image": image.tobytes(),
-                "image_hash": [-(k + 1) * 7919],
-                "cam_idx": [k % 2],
-                "height": [size[1]],
-                "width": [size[0]],
-                "equivalent_exposure": np.array([exposure], np.float32),
-                "ray_origins": origin.float().numpy().reshape(-1),
-                "ray_dirs": direction.float().numpy().reshape(-1),
-                "intrinsics": cameras.focal[k].float().numpy(),
-            }
-        )
+        more = {"image_hash": [-(k + 1) * 7919], "cam_idx": [k % 2], "equivalent_exposure": np.array([exposure], np.float32)}
+        whole = example(features(picture[..., ::-1], origin.numpy(), direction.numpy(), **more))
         (held if k % 4 == 3 else learned).append(record(whole))
     folder.mkdir(parents=True, exist_ok=True)
     half = len(learned) // 2

@@ -97,9 +97,10 @@ def test_heic_comes_upright_and_needs_its_package(tmp_path: Path, monkeypatch: p
         assert loaded.shape == (64, 48, 3)
         for (y, x), colour in {(15, 24): (200, 40, 30), (50, 12): (20, 60, 220), (50, 36): (30, 180, 60)}.items():
             assert abs(loaded[y, x] - colour).max() < 8
-    (tmp_path / "a.heic").write_bytes(HEIC[:-40])
-    with pytest.raises(DataError, match="cannot be decoded"):
-        load_image(tmp_path / "a.heic")
+    for damaged in (HEIC[:-40], HEIC[:452] + b"\x83" + HEIC[453:]):  # the second one without any image
+        (tmp_path / "a.heic").write_bytes(damaged)
+        with pytest.raises(DataError, match="cannot be decoded"):
+            load_image(tmp_path / "a.heic")
 
 
 def test_folders_of_photographs_are_listed_without_what_cannot_be_read(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from record_files import example, record, town_records
+from record_files import example, features, record, town_records
 
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, read_examples, read_records
@@ -38,12 +38,12 @@ values = st.one_of(
 @given(st.lists(st.dictionaries(names, values, max_size=4), max_size=3), st.booleans())
 def test_what_was_written_is_read(tmp_path_factory, written, packed: bool) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path_factory.mktemp("records") / "a.tfrecord"
-    path.write_bytes(b"".join(record(example(features, packed)) for features in written))
+    path.write_bytes(b"".join(record(example(values, packed)) for values in written))
     found = list(read_examples(path))
     assert len(found) == len(written)
-    for one, features in zip(found, written, strict=True):
-        assert one.features.keys() == features.keys()
-        for name, value in features.items():
+    for one, wanted in zip(found, written, strict=True):
+        assert one.features.keys() == wanted.keys()
+        for name, value in wanted.items():
             if isinstance(value, bytes):
                 assert one.blob(name) == value
             elif isinstance(value, list):
@@ -154,32 +154,19 @@ def test_some_cameras(bay: tuple[Path, Cameras]) -> None:
         BlockNerfConfig(cameras=(-1,))
 
 
+X, Y = np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5)
+RAYS = np.stack([(X - 16) / 30, -(Y - 12) / 30, -np.ones_like(X)], -1)
+GREY, ORIGIN = np.full((24, 32, 3), 90, np.uint8), np.zeros((24, 32, 3))
+
+
 def test_rays_of_no_camera_are_refused_unless_told(tmp_path: Path) -> None:
     folder = tmp_path / "data"
     town_records(folder, views=4)
-    features = good_features()
-    rays = np.asarray(features["ray_dirs"]).reshape(24, 32, 3) + np.random.default_rng(0).normal(0, 0.1, (24, 32, 3))
-    (folder / "odd_train.tfrecord").write_bytes(record(example(features | {"ray_dirs": rays.astype(np.float32).reshape(-1)})))
+    rays = RAYS + np.random.default_rng(0).normal(0, 0.1, RAYS.shape)
+    (folder / "odd_train.tfrecord").write_bytes(record(example(features(GREY, ORIGIN, rays))))
     with pytest.raises(DataError, match=r"the rays of cam05-0000000000000063 are .* pixels .*parser.tolerance is 1"):
         parse_scene(folder, 1, None)
     assert len(parse_scene(folder, 1, BlockNerfConfig(tolerance=50)).paths) == 5
-
-
-def good_features() -> dict[str, bytes | list[int] | np.ndarray]:
-    x, y = np.meshgrid(np.arange(32) + 0.5, np.arange(24) + 0.5)
-    rays = np.stack([(x - 16) / 30, -(y - 12) / 30, -np.ones_like(x)], -1).astype(np.float32)
-    done, image = cv2.imencode(".png", np.full((24, 32, 3), 90, np.uint8))
-    assert done
-    return {
-        "image": image.tobytes(),
-        "image_hash": [99],
-        "cam_idx": [5],
-        "height": [24],
-        "width": [32],
-        "equivalent_exposure": np.array([1.0], np.float32),
-        "ray_origins": np.zeros(24 * 32 * 3, np.float32),
-        "ray_dirs": rays.reshape(-1),
-    }
 
 
 @pytest.mark.parametrize(
@@ -196,7 +183,7 @@ def good_features() -> dict[str, bytes | list[int] | np.ndarray]:
 def test_records_that_cannot_be_are_named(tmp_path: Path, change: dict[str, object], said: str) -> None:
     folder = tmp_path / "data"
     folder.mkdir()
-    (folder / "a_train.tfrecord").write_bytes(record(example(good_features() | change)))  # type: ignore[arg-type]
+    (folder / "a_train.tfrecord").write_bytes(record(example(features(GREY, ORIGIN, RAYS) | change)))
     with pytest.raises(DataError, match=said) as caught:
         parse_scene(folder, 1, None)
     assert "a_train.tfrecord: record 0" in str(caught.value)

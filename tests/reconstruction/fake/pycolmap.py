@@ -19,38 +19,11 @@ CREATE TABLE IF NOT EXISTS descriptors (image_id INTEGER PRIMARY KEY, rows INTEG
 CREATE TABLE IF NOT EXISTS two_view_geometries (pair_id INTEGER PRIMARY KEY, rows INTEGER);"""
 
 
-class CameraMode(Enum):
-    SINGLE = 1
-
-
-class Device(Enum):
-    auto = 0
-    cpu = 1
-
-
-class FeatureExtractionOptions:
-    def __init__(self):
-        self.max_image_size, self.num_threads, self.sift = -1, -1, SimpleNamespace(max_num_features=0)
-
-
-class ImageReaderOptions:
-    camera_model, existing_camera_id = "", -1
-
-
-class FeatureMatchingOptions:
-    num_threads = -1
-
-
-class ImportedPairingOptions:
-    match_list_path = ""
-
-
-class TwoViewGeometryOptions:
-    pass
-
-
-class IncrementalPipelineOptions:
-    num_threads, random_seed, min_model_size = -1, -1, 10
+Device = Enum("Device", ["auto", "cpu"])
+CameraMode = Enum("CameraMode", ["SINGLE"])
+FeatureExtractionOptions = lambda: SimpleNamespace(max_image_size=-1, num_threads=-1, sift=SimpleNamespace())  # noqa: E731
+ImageReaderOptions = FeatureMatchingOptions = ImportedPairingOptions = SimpleNamespace
+TwoViewGeometryOptions = IncrementalPipelineOptions = SimpleNamespace
 
 
 def set_random_seed(seed):
