@@ -2,12 +2,14 @@
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from fprf.datamanagers.parsers.colmap import MODELS
 from fprf.rendering.cameras import Cameras
@@ -39,15 +41,27 @@ class Capture:
         return self.size[0] / 2, self.size[1] / 2
 
     def cameras(self) -> Cameras:
-        count, (k1, k2, p1, p2) = len(self.names), self.k
-        return Cameras(
-            pose=torch.from_numpy(self.poses),
-            focal=torch.tensor([self.focal], dtype=torch.float64).expand(count, 2),
-            centre=torch.tensor([self.centre], dtype=torch.float64).expand(count, 2),
-            size=torch.tensor([self.size]).expand(count, 2),
-            distortion=torch.tensor([[k1, k2, 0.0, 0.0, p1, p2]], dtype=torch.float64).expand(count, 6),
-            lens=torch.full((count,), int(any(self.k))),
-        )
+        k1, k2, p1, p2 = self.k
+        return cameras_of(torch.from_numpy(self.poses), self.size, self.focal, k=(k1, k2, 0.0, 0.0, p1, p2))
+
+
+def cameras_of(
+    pose: Tensor,
+    size: Sequence[object],
+    focal: Sequence[object],
+    centre: Sequence[object] | None = None,
+    k: tuple[float, ...] = (0.0,) * 6,
+) -> Cameras:
+    """Of poses [V 3 4]; sizes, focal lengths and centres are pairs, one for all or one a view."""
+    sides, focals = torch.as_tensor(size).expand(len(pose), 2), torch.as_tensor(focal, dtype=torch.float64)
+    return Cameras(
+        pose=pose,
+        focal=focals.expand(len(pose), 2),
+        centre=sides.double() / 2 if centre is None else torch.tensor(centre, dtype=torch.float64).expand(len(pose), 2),
+        size=sides,
+        distortion=torch.tensor([k], dtype=torch.float64).expand(len(pose), 6),
+        lens=torch.full((len(pose),), int(any(k))),
+    )
 
 
 def rotations(vectors: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from capture_files import cameras_of
 
 from fprf.datamanagers.parsers.blocknerf import crc32c, masked
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
@@ -67,24 +68,21 @@ def record(data: bytes) -> bytes:
     return head + struct.pack("<I", masked(crc32c(head))) + data + struct.pack("<I", masked(crc32c(data)))
 
 
-def town_records(
-    folder: Path, *, views: int = 16, size: tuple[int, int] = (32, 24), bend: tuple[float, float] = (-0.05, 0.01)
-) -> Cameras:
+def town_records(folder: Path, *, views: int = 16) -> Cameras:
     """Two cameras of different focal length and exposure in turn along a town, in three files; the cameras, by record.
 
     Brightness goes with the exposure; every fourth record is for validation.
     """
+    size = (32, 24)
     town, look = build_town(0, 0.0), palette("day")
     walked = walk(seed=0, views=views, width=size[0], height=size[1])
-    lens = torch.tensor([[bend[0], bend[1], 0.0, 0.0, 0.001, -0.001]], dtype=torch.float64).expand(views, 6)
-    scale = torch.tensor([1.0 if k % 2 else 1.25 for k in range(views)], dtype=torch.float64)
-    cameras = Cameras(
-        pose=torch.stack([torch.from_numpy(view.pose) for view in walked]),
-        focal=torch.tensor([[view.focal, view.focal] for view in walked], dtype=torch.float64) * scale[:, None],
-        centre=torch.tensor([[size[0] / 2 + 0.7, size[1] / 2 - 0.4]], dtype=torch.float64).expand(views, 2),
-        size=torch.tensor([size]).expand(views, 2),
-        distortion=lens,
-        lens=torch.ones(views, dtype=torch.int64),
+    focal = torch.tensor([[view.focal * (1 if k % 2 else 1.25)] * 2 for k, view in enumerate(walked)], dtype=torch.float64)
+    cameras = cameras_of(
+        torch.stack([torch.from_numpy(view.pose) for view in walked]),
+        size,
+        focal,  # type: ignore[arg-type]
+        (size[0] / 2 + 0.7, size[1] / 2 - 0.4),
+        (-0.05, 0.01, 0.0, 0.0, 0.001, -0.001),
     )
     held, learned = [], []
     for k, view in enumerate(walked):

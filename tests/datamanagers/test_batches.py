@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from capture_files import cameras_of, write_image
 from hypothesis import given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
@@ -22,36 +23,22 @@ from fprf.datamanagers.images import load_mask
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
-from fprf.rendering.cameras import Cameras, rays_through
+from fprf.rendering.cameras import rays_through
 
 SIZES = [(24, 16), (30, 20), (18, 26), (24, 16), (12, 10)]
 """Width, height; views 0, 2, 3, 4 are for training."""
 
 
-def make_scene(folder: Path, channels: int = 3) -> tuple[Scene, list[np.ndarray]]:
-    """A scene of PNG files of noise, and the files as RGB(A)."""
-    images, paths = [], []
-    for view, (width, height) in enumerate(SIZES):
-        image = np.random.default_rng(view).integers(0, 256, (height, width, channels), dtype=np.uint8)
-        paths.append(folder / f"{view}.png")
-        assert cv2.imwrite(str(paths[-1]), image)
-        images.append(image[..., [2, 1, 0, 3][:channels]])
-    count = len(SIZES)
-    cameras = Cameras(
-        pose=torch.eye(4, dtype=torch.float64)[:3].repeat(count, 1, 1),
-        focal=torch.full((count, 2), 20.0, dtype=torch.float64),
-        centre=torch.tensor(SIZES, dtype=torch.float64) / 2,
-        size=torch.tensor(SIZES),
-        distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.zeros(count, dtype=torch.long),
-    )
+def make_scene(folder: Path) -> tuple[Scene, list[np.ndarray]]:
+    """A scene of PNG files of noise, and the files as RGB."""
+    paths = [folder / f"{view}.png" for view in range(len(SIZES))]
+    images = [write_image(path, size, seed=view)[..., ::-1] for view, (path, size) in enumerate(zip(paths, SIZES, strict=True))]
     scene = Scene(
         name="noise",
         paths=tuple(paths),
-        cameras=cameras,
+        cameras=cameras_of(torch.eye(4, dtype=torch.float64)[:3].repeat(len(SIZES), 1, 1), SIZES, (20.0, 20.0)),
         train=torch.tensor([0, 2, 3, 4]),
         test=torch.tensor([1]),
-        alpha=channels == 4,
     )
     return scene, images
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from capture_files import cameras_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch import Tensor
 from fprf.datamanagers.bounds import find_kind, find_space, focus
 from fprf.datamanagers.scene import Scene
 from fprf.errors import DataError
-from fprf.rendering.cameras import Cameras, rays_through
+from fprf.rendering.cameras import rays_through
 from fprf.rendering.space import Space
 
 F64 = torch.float64
@@ -28,26 +29,15 @@ def look(place: Tensor, direction: Tensor, up: Tensor = UP) -> Tensor:
     return torch.stack([right, torch.linalg.cross(back, right), back, place], -1)
 
 
-def scene_of(pose: Tensor, points: Tensor | None = None, depths: Tensor | None = None, alpha: bool = False) -> Scene:
-    count = len(pose)
-    cameras = Cameras(
-        pose=pose,
-        focal=torch.full((count, 2), 80.0, dtype=F64),
-        centre=torch.tensor([[50.0, 40.0]], dtype=F64).repeat(count, 1),
-        size=torch.tensor([[100, 80]]).repeat(count, 1),
-        distortion=torch.zeros(count, 6, dtype=F64),
-        lens=torch.zeros(count, dtype=torch.int64),
-    )
-    paths = tuple(Path(f"{i}.png") for i in range(count))
-    everything = torch.arange(count)
+def scene_of(pose: Tensor, points: Tensor | None = None, alpha: bool = False) -> Scene:
+    everything = torch.arange(len(pose))
     return Scene(
         name="rig",
-        paths=paths,
-        cameras=cameras,
+        paths=tuple(Path(f"{k}.png") for k in everything),
+        cameras=cameras_of(pose, (100, 80), (80.0, 80.0)),
         train=everything,
         test=everything[:0],
         points=points,
-        depths=depths,
         alpha=alpha,
     )
 

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from capture_files import cameras_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from record_files import example, features, record, town_records
@@ -75,22 +76,12 @@ def rays_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
     return (x.float().numpy().reshape(height, width, 3) for x in (origin, direction))  # type: ignore[return-value]
 
 
-def camera(turn: np.ndarray, k: tuple[float, ...] = (0.0,) * 6, focal: tuple[float, float] = (40.0, 42.0)) -> Cameras:
-    pose = np.concatenate([turn, np.array([[100.0], [-20.0], [3.0]])], 1)
-    return Cameras(
-        pose=torch.from_numpy(pose)[None],
-        focal=torch.tensor([focal], dtype=torch.float64),
-        centre=torch.tensor([[31.0, 25.5]], dtype=torch.float64),
-        size=torch.tensor([[64, 48]]),
-        distortion=torch.tensor([k], dtype=torch.float64),
-        lens=torch.tensor([1 if any(k) else 0]),
-    )
-
-
 @settings(max_examples=25, deadline=None)
 @given(number, number, number, number, number)
 def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p1: float) -> None:
-    truth = camera(cv2.Rodrigues(3 * np.array([x, y, z]))[0], (0.1 * k1, -0.02 * k1, 0.0, 0.0, 0.002 * p1, 0.001))
+    pose = np.concatenate([cv2.Rodrigues(3 * np.array([x, y, z]))[0], [[100.0], [-20.0], [3.0]]], 1)
+    k = (0.1 * k1, -0.02 * k1, 0.0, 0.0, 0.002 * p1, 0.001)
+    truth = cameras_of(torch.from_numpy(pose)[None], (64, 48), (40.0, 42.0), (31.0, 25.5), k)
     found = fit_camera(*rays_of(truth))
     assert found.error < 2e-3 and found.drift < 1e-4
     np.testing.assert_allclose(found.pose, truth.pose[0].numpy(), atol=3e-4)
