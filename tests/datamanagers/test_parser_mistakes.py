@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capture_files import Capture, write_llff, write_odm, write_polycam, write_record3d, write_transforms
+from capture_files import Capture, write_colmap, write_llff, write_odm, write_polycam, write_record3d, write_transforms
 
 from fprf.datamanagers.parsers import config as parsers
 from fprf.datamanagers.parsers.config import parse_scene
@@ -28,13 +28,15 @@ WRONG = {
     "odm": """projection_type="spherical" focal_x=null&focal_y=null focal_x=-0.5 width=24&height=24 k1="x" """,
     "shot": 'rotation=[1,2] rotation=[1e9,0,0] translation=null camera="none"',
     "reconstruction": '=[] ={} =[{}] =[{"shots":{}}] =[3] =[{"shots":3}]',
+    "colmap": """cameras.0="8" cameras.1="FOO" cameras.1="RADIAL" cameras.2="0" cameras.4="-1" cameras.4="x" images.1="9"
+        images.4="x" images.9="../x.png" images.9="0001.png" images.9="a\\u202eb.png" points3D.0="x" points3D.1="x" """,
     "llff": "0=NaN 15=Infinity 1=3.0 4=0.0 9=1e30 14=-5.0 15=10.0 9=16.0",
     "rows": "=[] =[[1,2,3]] =[1,2,3]",
 }
-"""Changes `key=value` by what they are made to, several at once joined by &."""
+"""Changes `key=value` by what they are made to, several at once joined by &; of COLMAP's files the words of the first line."""
 
 
-def changed(folder: Path, file: Path, change: Callable[[Any], object]) -> None:
+def changed(file: Path, change: Callable[[Any], object]) -> None:
     content = json.loads(file.read_text())
     replaced = change(content)
     file.write_text(json.dumps(content if replaced is None else replaced))
@@ -55,7 +57,15 @@ def test_wrong_values_are_refused_in_one_line(tmp_path: Path, what: str, change:
     elif what in ("transforms", "frame"):
         write_transforms(tmp_path, capture)
         place = (lambda c: c["frames"][1].update(values)) if what == "frame" else (lambda c: c.update(values))
-        changed(tmp_path, tmp_path / "transforms.json", place)
+        changed(tmp_path / "transforms.json", place)
+    elif what == "colmap":
+        sparse = write_colmap(tmp_path, capture, binary=False)
+        for key, value in values.items():
+            name, _, word = key.partition(".")
+            comment, line, *rest = (sparse / f"{name}.txt").read_text().splitlines()
+            words = line.split()
+            words[int(word)] = value
+            (sparse / f"{name}.txt").write_text("\n".join([comment, " ".join(words), *rest]))
     elif what == "polycam":
         write_polycam(tmp_path / "keyframes", capture, **values)
     elif what == "record3d":
@@ -63,9 +73,9 @@ def test_wrong_values_are_refused_in_one_line(tmp_path: Path, what: str, change:
     else:
         file = write_odm(tmp_path, capture, **(values if what == "odm" else {}))
         if what == "shot":
-            changed(tmp_path, file, lambda c: c[0]["shots"]["0001.png"].update(values))
+            changed(file, lambda c: c[0]["shots"]["0001.png"].update(values))
         if what == "reconstruction":
-            changed(tmp_path, file, lambda c: values[""])
+            changed(file, lambda c: values[""])
     with pytest.raises(DataError) as fault:
         parse_scene(tmp_path, 1, None)
     assert "\n" not in str(fault.value) and str(tmp_path) in str(fault.value)
