@@ -43,11 +43,6 @@ def descriptors(path: Path, name: str) -> NDArray[np.uint8]:
 Pair: TypeAlias = tuple[int, int]
 
 
-def exhaustive_pairs(count: int) -> list[Pair]:
-    """All with all: count (count - 1) / 2."""
-    return list(itertools.combinations(range(count), 2))
-
-
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     """Each with the next `overlap` ones, and with those at distances 2, 4, 8, ... up to 2 ** overlap."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(overlap + 1))})
@@ -171,7 +166,7 @@ def find_matches(place: SceneFolder, state: State, config: SfmConfig, progress: 
     if state.done.get("matches") == key and place.database.is_file():
         return kind
     if kind == "exhaustive":
-        chosen = exhaustive_pairs(len(names))
+        chosen = list(itertools.combinations(range(len(names)), 2))
     elif kind == "sequential":
         chosen = sequential_pairs(len(names), config.overlap)
     else:

@@ -7,13 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from capture_files import cameras_of
+from capture_files import Capture, cameras_of
 
 from fprf.datamanagers.parsers.blocknerf import crc32c, masked
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
-from fprf.town.layout import build_town
-from fprf.town.palettes import palette
-from fprf.town.render import render, walk
 
 
 def varint(value: int) -> bytes:
@@ -68,30 +65,22 @@ def record(data: bytes) -> bytes:
     return head + struct.pack("<I", masked(crc32c(head))) + data + struct.pack("<I", masked(crc32c(data)))
 
 
-def town_records(folder: Path, *, views: int = 16) -> Cameras:
-    """Two cameras of different focal length and exposure in turn along a town, in three files; the cameras, by record.
-
-    Brightness goes with the exposure; every fourth record is for validation.
-    """
+def bay_records(folder: Path, views: int = 16) -> Cameras:
+    """Two cameras of different focal length and exposure in turn, in three files; every fourth record is for validation."""
     size = (32, 24)
-    town, look = build_town(0, 0.0), palette("day")
-    walked = walk(seed=0, views=views, width=size[0], height=size[1])
-    focal = torch.tensor([[view.focal * (1 if k % 2 else 1.25)] * 2 for k, view in enumerate(walked)], dtype=torch.float64)
     cameras = cameras_of(
-        torch.stack([torch.from_numpy(view.pose) for view in walked]),
+        torch.from_numpy(Capture.make(views).poses),
         size,
-        focal,  # type: ignore[arg-type]
-        (size[0] / 2 + 0.7, size[1] / 2 - 0.4),
+        [[30.0 if k % 2 else 24.0] * 2 for k in range(views)],
+        (16.7, 11.6),
         (-0.05, 0.01, 0.0, 0.0, 0.001, -0.001),
     )
     held, learned = [], []
-    for k, view in enumerate(walked):
-        exposure = 0.5 if k % 2 else 1.0
-        picture = render(town, view, look).rgb
-        picture = (picture * (1.0 if k % 2 == 0 else 0.75)).astype(np.uint8)
-        origin, direction = rays_through(cameras, torch.full((size[0] * size[1],), k), pixel_grid(cameras, k))
-        more = {"image_hash": [-(k + 1) * 7919], "cam_idx": [k % 2], "equivalent_exposure": np.array([exposure], np.float32)}
-        whole = example(features(picture[..., ::-1], origin.numpy(), direction.numpy(), **more))
+    for k in range(views):
+        rays = rays_through(cameras, torch.full((size[0] * size[1],), k), pixel_grid(cameras, k))
+        exposure = np.array([0.5 if k % 2 else 1.0], np.float32)
+        more = {"image_hash": [-(k + 1) * 7919], "cam_idx": [k % 2], "equivalent_exposure": exposure}
+        whole = example(features(np.full((size[1], size[0], 3), k, np.uint8), *(ray.numpy() for ray in rays), **more))
         (held if k % 4 == 3 else learned).append(record(whole))
     folder.mkdir(parents=True, exist_ok=True)
     half = len(learned) // 2

@@ -29,18 +29,18 @@ SIZES = [(24, 16), (30, 20), (18, 26), (24, 16), (12, 10)]
 """Width, height; views 0, 2, 3, 4 are for training."""
 
 
-def make_scene(folder: Path) -> tuple[Scene, list[np.ndarray]]:
-    """A scene of PNG files of noise, and the files as RGB."""
-    paths = [folder / f"{view}.png" for view in range(len(SIZES))]
-    images = [write_image(path, size, seed=view)[..., ::-1] for view, (path, size) in enumerate(zip(paths, SIZES, strict=True))]
-    scene = Scene(
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """A scene of PNG files of noise."""
+    for view, size in enumerate(SIZES):
+        write_image(tmp_path / f"{view}.png", size, seed=view)
+    return Scene(
         name="noise",
-        paths=tuple(paths),
+        paths=tuple(tmp_path / f"{view}.png" for view in range(len(SIZES))),
         cameras=cameras_of(torch.eye(4, dtype=torch.float64)[:3].repeat(len(SIZES), 1, 1), SIZES, (20.0, 20.0)),
         train=torch.tensor([0, 2, 3, 4]),
         test=torch.tensor([1]),
     )
-    return scene, images
 
 
 def write_mask(path: Path, pixels: np.ndarray) -> Path:
@@ -57,19 +57,18 @@ def make(
     return RayBatches(config, scene=scene, content=one, semantic=two, dim=4, cache=cache, seed=seed)
 
 
-def test_colours_are_those_of_the_files_at_the_pixel_centres(tmp_path: Path) -> None:
-    scene, images = make_scene(tmp_path)
+def test_colours_are_those_of_the_files_at_the_pixel_centres(scene: Scene, tmp_path: Path) -> None:
+    images = [cv2.imread(str(path))[..., ::-1].copy() for path in scene.paths]
     batch = make(scene, tmp_path).batch(0)
     assert batch.view.dtype == torch.int64 and batch.rgb.dtype == torch.float32
     assert batch.content is None and batch.semantic is None
     assert set(batch.view.tolist()) == {0, 2, 3, 4}
     for view, (x, y), rgb in zip(batch.view.tolist(), batch.pixel.tolist(), batch.rgb, strict=True):
         assert x % 1 == 0.5 and y % 1 == 0.5
-        assert torch.equal(rgb, torch.from_numpy(images[view][int(y), int(x)].copy()).float() / 255)
+        assert torch.equal(rgb, torch.from_numpy(images[view])[int(y), int(x)].float() / 255)
 
 
-def test_a_batch_is_a_function_of_seed_and_step(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
+def test_a_batch_is_a_function_of_seed_and_step(scene: Scene, tmp_path: Path) -> None:
     one = make(scene, tmp_path, content=True, semantic=True)
     torch.randn(7)
     two = make(scene, tmp_path, content=True, semantic=True)
@@ -83,8 +82,7 @@ def test_a_batch_is_a_function_of_seed_and_step(tmp_path: Path) -> None:
     assert not torch.equal(one.batch(7).pixel, make(scene, tmp_path, seed=1).batch(7).pixel)
 
 
-def test_every_training_pixel_is_as_likely(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
+def test_every_training_pixel_is_as_likely(scene: Scene, tmp_path: Path) -> None:
     batch = make(scene, tmp_path, rays=200_000).batch(3)
     flat = batch.view * 10_000 + batch.pixel[:, 1].long() * 100 + batch.pixel[:, 0].long()
     _, counts = flat.unique(return_counts=True)
@@ -96,8 +94,7 @@ def test_every_training_pixel_is_as_likely(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("share", "expected"), [(1.0, 512), (0.25, 128), (0.001, 1), (0.0, None)])
-def test_the_share_of_semantic_rays(tmp_path: Path, share: float, expected: int | None) -> None:
-    scene, _ = make_scene(tmp_path)
+def test_the_share_of_semantic_rays(scene: Scene, tmp_path: Path, share: float, expected: int | None) -> None:
     manager = make(scene, tmp_path, semantic_share=share, content=True, semantic=True)
     batch = manager.batch(2)
     assert batch.content is not None and batch.content.shape == (512, 3)
@@ -110,9 +107,8 @@ def test_the_share_of_semantic_rays(tmp_path: Path, share: float, expected: int 
     assert torch.equal(batch.semantic, store.at(batch.view[:expected], batch.pixel[:expected], batch.rgb[:expected]))
 
 
-def test_a_device_draws_what_the_host_draws(tmp_path: Path) -> None:
+def test_a_device_draws_what_the_host_draws(scene: Scene, tmp_path: Path) -> None:
     """Pixels, colours, features, masks, sky and depths; its generator is the CPU's here, which on a card is another one."""
-    scene, _ = make_scene(tmp_path)
     masks = tuple(
         write_mask(tmp_path / f"half-{view}.png", np.uint8(255) * (np.arange(height)[:, None] <= height // 2).repeat(width, 1))
         for view, (width, height) in enumerate(SIZES)
@@ -209,8 +205,7 @@ def test_bright_is_true(tmp_path: Path, low: int, high: int, kind: type, channel
     assert np.array_equal(double, mask.repeat(2, 0).repeat(2, 1))
 
 
-def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
+def test_pixels_that_are_left_out_are_never_drawn(scene: Scene, tmp_path: Path) -> None:
     allowed = [np.random.default_rng(9 + view).random((height, width)) > 0.7 for view, (width, height) in enumerate(SIZES)]
     paths = [write_mask(tmp_path / f"mask{view}.png", np.uint8(255) * mask) for view, mask in enumerate(allowed)]
     masked = replace(scene, masks=(paths[0], None, paths[2], None, paths[4]))
@@ -221,22 +216,15 @@ def test_pixels_that_are_left_out_are_never_drawn(tmp_path: Path) -> None:
     for view in (0, 2, 4):
         assert np.array_equal(seen[view], allowed[view])
     assert seen[3].all() and batch.sky is None
+    sky = make(replace(scene, sky_masks=(paths[0], None, None, None, None)), tmp_path, rays=3000).batch(0)
+    places = zip(sky.view.tolist(), sky.pixel.long().tolist(), strict=True)
+    wanted = [view == 0 and bool(allowed[0][y, x]) for view, (x, y) in places]
+    assert sky.sky is not None and sky.sky.tolist() == wanted and any(wanted)
     ours, theirs = (make(each, tmp_path, masks=False).batch(1) for each in (masked, scene))
     assert torch.equal(ours.pixel, theirs.pixel)
 
 
-def test_rays_know_whether_they_look_into_the_sky(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
-    upper = np.zeros((16, 24), np.uint8)
-    upper[:5] = 1
-    path = write_mask(tmp_path / "sky.png", upper)
-    batch = make(replace(scene, sky_masks=(path, None, None, None, None)), tmp_path, rays=3000).batch(0)
-    assert batch.sky is not None and batch.sky.dtype == torch.bool
-    assert torch.equal(batch.sky, (batch.view == 0) & (batch.pixel[:, 1] < 5)) and bool(batch.sky.any())
-
-
-def test_scenes_that_leave_nothing_to_learn_are_refused(tmp_path: Path) -> None:
-    scene, _ = make_scene(tmp_path)
+def test_scenes_that_leave_nothing_to_learn_are_refused(scene: Scene, tmp_path: Path) -> None:
     dark = tuple(write_mask(tmp_path / f"n{k}.png", np.zeros((h, w), np.uint8)) for k, (w, h) in enumerate(SIZES))
     other = write_mask(tmp_path / "m.png", np.ones((40, 10), np.uint8))
     for wrong in ({"train": scene.train[:0]}, {"masks": dark}, {"masks": (other,) * len(SIZES)}):

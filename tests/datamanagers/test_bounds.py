@@ -145,6 +145,8 @@ def test_ndc_frames_all_rays_and_starts_before_the_nearest_point() -> None:
     assert 0.9 < float(inside[:, :2].abs().max()) <= 1.0
     given = find_space(replace(forward(points=False), depths=torch.tensor([[4.0, 30.0]], dtype=F64).repeat(12, 1)))
     assert given.kind == "ndc" and given.near == pytest.approx(3.6)
+    behind = scene.points * torch.tensor([1.0, -1.0, 1.0], dtype=F64)
+    assert find_kind(replace(scene, points=behind)) == "contraction", "points that no camera sees say nothing"
 
 
 @pytest.mark.parametrize("offset", [0.0, 4.5e6])
@@ -172,10 +174,3 @@ def test_any_rig_has_a_space(count: int, seed: int, alpha: bool, exponent: float
     inside = located(scene, space)
     assert inside.isfinite().all()
     assert space.kind == "box" or inside.abs().max() <= 1 + 1e-5
-
-
-def test_points_behind_every_camera_say_nothing() -> None:
-    scene = forward()
-    assert scene.points is not None
-    behind = scene.points * torch.tensor([1.0, -1.0, 1.0], dtype=F64)
-    assert find_kind(replace(scene, points=behind)) == "contraction"

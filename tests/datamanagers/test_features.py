@@ -117,12 +117,10 @@ def picture(view: int) -> Tensor:
 def draw(count: int = 300) -> tuple[Tensor, Tensor, Tensor]:
     """Random pixels of the views with their colours."""
     view = torch.tensor(list(SIZES))[torch.randint(len(SIZES), (count,))]
-    pixel, rgb = torch.empty(count, 2), torch.empty(count, 3)
-    for i, v in enumerate(view.tolist()):
-        height, width = SIZES[v]
-        x, y = int(torch.randint(width, ())), int(torch.randint(height, ()))
-        pixel[i], rgb[i] = torch.tensor([x + 0.5, y + 0.5]), picture(v)[y, x].float() / 255
-    return view, pixel, rgb
+    size = torch.tensor([SIZES[v] for v in view.tolist()])
+    y, x = (torch.rand(count, 2) * size).long().unbind(1)
+    rgb = torch.stack([picture(v)[at] for v, at in zip(view.tolist(), zip(y, x, strict=True), strict=True)]).float() / 255
+    return view, torch.stack([x, y], 1) + 0.5, rgb
 
 
 def build(folder: Path, encoder: Encoder, config: GuidedConfig | None = None, dim: int | None = None) -> FeatureStore:
@@ -153,6 +151,10 @@ def test_the_store_answers_what_the_filter_says(tmp_path: Path, channels: int) -
     found = store.at(*where)
     assert found.dtype == torch.float32
     assert (found - expected).abs().max() <= 4e-3 * expected.std()
+    assert store.at(*(part[:0] for part in where)).shape == (0, channels)
+    for view in (7, 10, -1):
+        with pytest.raises(DataError, match=f"view {view} has no features"):
+            store.at(torch.tensor([0, view]), torch.zeros(2, 2), torch.zeros(2, 3))
 
 
 def test_coefficients_on_a_device_answer_as_those_of_the_host(tmp_path: Path) -> None:
@@ -243,12 +245,3 @@ def test_encoders_that_break_their_promise_are_named(tmp_path: Path) -> None:
     with pytest.raises(PluginError, match="promises"):
         build(tmp_path, Liar(2))
     assert not list(tmp_path.glob("*"))
-
-
-def test_a_view_without_features_is_named(tmp_path: Path) -> None:
-    store = build(tmp_path, Counting())
-    with pytest.raises(DataError, match="view 7 has no features"):
-        store.at(torch.tensor([0, 7]), torch.zeros(2, 2), torch.zeros(2, 3))
-    assert store.at(torch.zeros(0, dtype=torch.long), torch.zeros(0, 2), torch.zeros(0, 3)).shape == (0, 5)
-    with pytest.raises(DataError, match="no views"):
-        FeatureStore({})

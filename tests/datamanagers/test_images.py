@@ -24,13 +24,8 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 def png(size: tuple[int, int], bits: int, colour: int, rows: list[bytes], extra: bytes = b"") -> bytes:
     """A PNG by hand, for kinds that OpenCV cannot write."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", *size, bits, colour, 0, 0, 0))
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + head
-        + extra
-        + chunk(b"IDAT", zlib.compress(b"".join(b"\0" + r for r in rows)))
-        + chunk(b"IEND", b"")
-    )
+    data = chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows)))
+    return b"\x89PNG\r\n\x1a\n" + head + extra + data + chunk(b"IEND", b"")
 
 
 def encoded(suffix: str, image: np.ndarray) -> bytes:
@@ -48,16 +43,7 @@ def test_headers_tell_the_size_without_decoding(tmp_path: Path, suffix: str) -> 
     assert (header.width, header.height, header.alpha) == (18, 12, False)
 
 
-def test_transparency_is_straight_and_shows_the_background(tmp_path: Path) -> None:
-    image = np.dstack([np.full((1, 3, 3), (30, 20, 10), dtype=np.uint8), np.array([[255, 0, 51]], dtype=np.uint8)])
-    (tmp_path / "a.png").write_bytes(encoded(".png", image))
-    white = load_image(tmp_path / "a.png")
-    assert white.tolist() == [[[10, 20, 30], [255, 255, 255], [206, 208, 210]]]
-    red = load_image(tmp_path / "a.png", background=(1.0, 0.0, 0.0))
-    assert red.tolist() == [[[10, 20, 30], [255, 0, 0], [206, 4, 6]]]
-
-
-def test_grey_palette_and_grey_with_alpha(tmp_path: Path) -> None:
+def test_grey_palettes_and_straight_transparency_become_rgb(tmp_path: Path) -> None:
     kinds = {
         "grey": (png((3, 1), 8, 0, [bytes([0, 100, 255])]), [[0] * 3, [100] * 3, [255] * 3]),
         "bilevel": (png((3, 1), 1, 0, [b"\xa0"]), [[255] * 3, [0] * 3, [255] * 3]),
@@ -66,11 +52,17 @@ def test_grey_palette_and_grey_with_alpha(tmp_path: Path) -> None:
             png((3, 1), 8, 3, [bytes([0, 1, 0])], chunk(b"PLTE", bytes([1, 2, 3, 4, 5, 6])) + chunk(b"tRNS", b"\xff\x00")),
             [[1, 2, 3], [255] * 3, [1, 2, 3]],
         ),
+        "alpha": (
+            png((3, 1), 8, 6, [bytes([10, 20, 30, 255, 10, 20, 30, 0, 10, 20, 30, 51])]),
+            [[10, 20, 30], [255] * 3, [206, 208, 210]],
+        ),
     }
     for name, (data, expected) in kinds.items():
         (tmp_path / name).write_bytes(data)
         assert load_image(tmp_path / name).tolist() == [expected], name
     assert read_header(tmp_path / "palette").alpha and not read_header(tmp_path / "grey").alpha
+    red = load_image(tmp_path / "alpha", background=(1.0, 0.0, 0.0))
+    assert red.tolist() == [[[10, 20, 30], [255, 0, 0], [206, 4, 6]]]
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -10,7 +10,7 @@ import torch
 from capture_files import cameras_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from record_files import example, features, record, town_records
+from record_files import bay_records, example, features, record
 
 from fprf.datamanagers.images import load_image
 from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, read_examples, read_records
@@ -93,7 +93,7 @@ def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p
 @pytest.fixture(scope="module")
 def bay(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Cameras]:
     folder = tmp_path_factory.mktemp("bay")
-    return folder / "data", town_records(folder / "data")
+    return folder / "data", bay_records(folder / "data")
 
 
 @pytest.fixture(autouse=True)
@@ -152,7 +152,7 @@ GREY, ORIGIN = np.full((24, 32, 3), 90, np.uint8), np.zeros((24, 32, 3))
 
 def test_rays_of_no_camera_are_refused_unless_told(tmp_path: Path) -> None:
     folder = tmp_path / "data"
-    town_records(folder, views=4)
+    bay_records(folder, views=4)
     rays = RAYS + np.random.default_rng(0).normal(0, 0.1, RAYS.shape)
     (folder / "odd_train.tfrecord").write_bytes(record(example(features(GREY, ORIGIN, rays))))
     with pytest.raises(DataError, match=r"the rays of cam05-0000000000000063 are .* pixels .*parser.tolerance is 1"):

@@ -28,16 +28,13 @@ def test_loose_json_is_refused(tmp_path: Path) -> None:
         assert len(str(caught.value)) < 500
 
 
-def test_paths_that_leave_the_root_are_refused() -> None:
+def test_paths_stay_inside_and_are_normalised() -> None:
     for text in (
         "/etc/passwd", "../a.png", "images/../../a.png", "..", "a\\..\\..\\b", "C:\\a.png", "C:a.png",
-        "\\\\host\\share\\a.png", "", ".", "a\0b", "\ud800", "images/../a.png",
+        "\\\\host\\share\\a.png", "", ".", "a\0b", "a\nb", "\ud800", "\u202egnp.x", "images/../a.png",
     ):  # fmt: skip
         with pytest.raises(DataError, match="here: the path"):
             path_inside(Path("root"), "here", text)
-
-
-def test_paths_inside_are_normalised() -> None:
     for text in ("images/a b.png", "./images/a b.png", "images//a b.png", ".\\images\\a b.png"):
         assert path_inside(Path("root"), "here", text) == ("images/a b.png", Path("root/images/a b.png"))
 
@@ -102,17 +99,13 @@ def test_records_fall_back_and_name_the_place() -> None:
             as_record("f", empty).records("frames")
 
 
-def pose(seed: int = 0) -> np.ndarray:
-    draw = np.random.default_rng(seed)
-    return np.concatenate([rotations(draw.normal(size=(1, 3)))[0], draw.normal(size=(3, 1))], 1)
-
-
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 999), st.floats(0, 4e-4))
 def test_rounded_rotations_are_repaired(seed: int, amount: float) -> None:
-    exact = pose(seed)
+    draw = np.random.default_rng(seed)
+    exact = np.concatenate([rotations(draw.normal(size=(1, 3)))[0], draw.normal(size=(3, 1))], 1)
     noisy = exact.copy()
-    noisy[:, :3] += amount * np.random.default_rng(seed).uniform(-0.5, 0.5, (3, 3))
+    noisy[:, :3] += amount * draw.uniform(-0.5, 0.5, (3, 3))
     repaired = rigid_pose("here", noisy)
     assert np.abs(repaired[:, :3].T @ repaired[:, :3] - np.eye(3)).max() < 1e-14
     assert np.abs(repaired - exact).max() <= 2 * amount + 1e-14

@@ -15,15 +15,7 @@ from fprf.datamanagers.images import load_image
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
-from fprf.reconstruction.images import (
-    Lens,
-    choose_frames,
-    gather_images,
-    lens_of,
-    natural_order,
-    read_lens,
-    save_frames,
-)
+from fprf.reconstruction.images import Lens, choose_frames, gather_images, lens_of, natural_order, read_lens, save_frames
 from fprf.reconstruction.scene_folder import SceneFolder, State
 
 
@@ -42,15 +34,14 @@ def test_every_frame_is_chosen_or_has_a_reason(scores: list[float], count: int, 
     assert all(choice.dropped.values())
 
 
-def tiff(order: str, model: bytes = b"Phone 9\0", focal: tuple[int, int] = (425, 100), short: int = 26) -> bytes:
+def tiff(order: str) -> bytes:
     """Header, a directory with the model and the inner directory, the inner one, and the values that don't fit."""
+    inner_at, model_at = 8 + 30, 8 + 2 * 30
+    model = b"Phone 9\0"
     head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HI", 42, 8)
-    inner_at, model_at = 8 + 2 + 2 * 12 + 4, 8 + 2 + 2 * 12 + 4 + 2 + 2 * 12 + 4
-    first = struct.pack(order + "H", 2) + struct.pack(order + "HHII", 0x0110, 2, len(model), model_at)
-    first += struct.pack(order + "HHII", 0x8769, 4, 1, inner_at) + struct.pack(order + "I", 0)
-    inner = struct.pack(order + "H", 2) + struct.pack(order + "HHII", 0x920A, 5, 1, model_at + len(model))
-    inner += struct.pack(order + "HHIHH", 0xA405, 3, 1, short, 0) + struct.pack(order + "I", 0)
-    return head + first + inner + model + struct.pack(order + "II", *focal)
+    first = struct.pack(order + "HHHIIHHIII", 2, 0x0110, 2, len(model), model_at, 0x8769, 4, 1, inner_at, 0)
+    inner = struct.pack(order + "HHHIIHHIHHI", 2, 0x920A, 5, 1, model_at + len(model), 0xA405, 3, 1, 26, 0, 0)
+    return head + first + inner + model + struct.pack(order + "II", 425, 100)
 
 
 JPEG = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
@@ -113,8 +104,7 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(photos: Path, tmp_path: 
     (photos / "notes.txt").write_text("not an image at all")
     photo(photos / ".hidden" / "x.jpg")
     state = gathered(photos, SceneFolder(tmp_path / "scene"))
-    assert len(state.images) == 3
-    assert state.dropped.keys() == {"empty.jpg", "text.png", "half.jpg"}
+    assert len(state.images) == 3 and state.dropped.keys() == {"empty.jpg", "text.png", "half.jpg"}
     assert state.dropped["half.jpg"] == "the JPEG is truncated (no end-of-image marker)"
 
 
