@@ -152,6 +152,8 @@ def test_the_store_answers_what_the_filter_says(tmp_path: Path, channels: int) -
     assert found.dtype == torch.float32
     assert (found - expected).abs().max() <= 4e-3 * expected.std()
     assert store.at(*(part[:0] for part in where)).shape == (0, channels)
+    with pytest.raises(DataError, match="no views"):
+        FeatureStore({})
     for view in (7, 10, -1):
         with pytest.raises(DataError, match=f"view {view} has no features"):
             store.at(torch.tensor([0, view]), torch.zeros(2, 2), torch.zeros(2, 3))

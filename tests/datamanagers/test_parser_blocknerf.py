@@ -1,6 +1,5 @@
 """Captures in the format of Mission Bay: TFRecord files, cameras behind rays; read, refused, and trained."""
 
-import os
 from pathlib import Path
 
 import cv2
@@ -13,6 +12,7 @@ from hypothesis import strategies as st
 from record_files import bay_records, example, features, record
 
 from fprf.datamanagers.images import load_image
+from fprf.datamanagers.parsers import blocknerf
 from fprf.datamanagers.parsers.blocknerf import crc32c, fit_camera, read_examples, read_records
 from fprf.datamanagers.parsers.config import BlockNerfConfig, parse_scene, recognise
 from fprf.errors import ConfigError, DataError
@@ -124,15 +124,12 @@ def test_the_scene_is_what_was_written(bay: tuple[Path, Cameras]) -> None:
 
 
 def test_a_complete_cache_is_not_read_again(bay: tuple[Path, Cameras], monkeypatch: pytest.MonkeyPatch) -> None:
-    from fprf.datamanagers.parsers import blocknerf
-
     first = parse_scene(bay[0], 1, None)
-    monkeypatch.setattr(blocknerf, "read_examples", lambda path: pytest.fail("read again"))
-    again = parse_scene(bay[0], 2, None)
+    with monkeypatch.context() as patch:
+        patch.setattr(blocknerf, "read_examples", lambda path: pytest.fail("read again"))
+        again = parse_scene(bay[0], 2, None)
     assert again.paths == first.paths and again.cameras.size[0].tolist() == [16, 12]
     first.paths[3].unlink()
-    monkeypatch.undo()
-    os.environ["XDG_CACHE_HOME"] = str(first.paths[0].parents[3])
     assert parse_scene(bay[0], 1, None).paths[3].is_file()
 
 

@@ -67,12 +67,8 @@ def parse(folder: Path, config: DataParserConfig | None = None) -> Scene:
 @pytest.mark.parametrize("name", FORMATS)
 def test_one_capture_in_every_format_is_one_scene(tmp_path: Path, name: str) -> None:
     config, write = FORMATS[name]
-    bent = name.startswith(("transforms", "odm"))
-    capture = Capture.make(
-        9,
-        focal=(20.0, 20.0 if "llff" in name else 21.0),  # LLFF has one
-        k=(0.05, -0.02, 0.001, -0.002) if bent else (0.0,) * 4,
-    )
+    k = (0.05, -0.02, 0.001, -0.002) if name.startswith(("transforms", "odm")) else (0.0,) * 4
+    capture = Capture.make(9, focal=(20.0, 20.0 if "llff" in name else 21.0), k=k)
     write(tmp_path, capture)
     assert recognise(tmp_path) == config
     for downscale in (1, 2, 3):
@@ -142,13 +138,16 @@ def test_lenses(tmp_path: Path, write: Writer, lens: int | None, distortion: lis
     assert cameras.focal.tolist() == [[20, 20]] * 2 and cameras.centre.tolist() == [[12, 8]] * 2
 
 
-def test_models_are_found_in_three_places(tmp_path: Path) -> None:
+def test_models_are_found_in_three_places_and_need_no_points(tmp_path: Path) -> None:
     sparse = write_colmap(tmp_path, Capture.make(2))
     for place in (sparse, tmp_path / "sparse", tmp_path):
         for file in list(sparse.iterdir()):
             file.rename(place / file.name)
         sparse = place
         assert model_folder(tmp_path) == place and len(parse(tmp_path).paths) == 2
+    (tmp_path / "points3D.bin").unlink()
+    scene = parse(tmp_path)
+    assert scene.points is None and scene.depths is None and scene.seen is None
     (tmp_path / "cameras.bin").unlink()
     assert model_folder(tmp_path) is None
 
@@ -162,14 +161,6 @@ def test_reduced_images_must_be_named(tmp_path: Path) -> None:
     (tmp_path / "images_2").rename(tmp_path / "images")
     with pytest.raises(DataError, match="12x8 pixels, but its camera has 24x16"):
         parse(tmp_path)
-
-
-@pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_points_are_optional(tmp_path: Path, suffix: str) -> None:
-    sparse = write_colmap(tmp_path, Capture.make(2), binary=suffix == "bin")
-    (sparse / f"points3D.{suffix}").unlink()
-    scene = parse(tmp_path)
-    assert scene.points is None and scene.depths is None and scene.seen is None
 
 
 def test_transforms_take_points_from_the_model_that_they_were_made_of(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -65,7 +66,6 @@ class ScanConfig(DataParserConfig):
     def recognises(self, data):
         return {answer}
 """
-SCAN = 'Recognised({confidence}, "scan.bin") if (data / "scan.bin").is_file() else None'
 
 
 def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
@@ -74,14 +74,13 @@ def test_a_strangers_parser_recognises_its_folders(tmp_path: Path) -> None:
     site.mkdir()
     with packages_in(site) as packages:
         for name, confidence in (("sure", 0.6), ("even", 0.5), ("faint", 0.2)):
-            code = {f"acme_{name}": PARSER.format(answer=SCAN.format(confidence=confidence).replace("scan", name))}
-            packages.install(f"acme-{name}", {"fprf.dataparsers": {name: f"acme_{name}:ScanConfig"}}, code=code)
+            answer = f'Recognised({confidence}, "{name}.bin") if (data / "{name}.bin").is_file() else None'
+            points = {"fprf.dataparsers": {name: f"acme_{name}:ScanConfig"}}
+            packages.install(f"acme-{name}", points, code={f"acme_{name}": PARSER.format(answer=answer)})
         (folder / "faint.bin").touch()
         assert recognise(folder) == ColmapConfig()
         (folder / "even.bin").touch()
-        with pytest.raises(
-            DataError, match=r"by 'colmap' \(a model in .*\) and by 'even' \(even\.bin\); choose one with --data"
-        ):
+        with pytest.raises(DataError, match=r"by 'colmap' \(a model in .*\) and by 'even' \(even\.bin\); choose one with"):
             recognise(folder)
         (folder / "sure.bin").touch()
         assert type(recognise(folder)).__module__ == "acme_sure"
@@ -154,21 +153,16 @@ class Parser(DataParser):
         if self.wrong == "absent" and not data.exists():
             raise FileNotFoundError(data)
         scene = TransformsConfig().build().parse(data, 1 if self.wrong == "size" else downscale)
-        pose = scene.cameras.pose
-        match self.wrong:
-            case "mirrored":
-                return replace(scene, cameras=replace(scene.cameras, pose=pose * torch.tensor([[-1.0, 1, 1, 1]])))
-            case "scaled":
-                return replace(scene, cameras=replace(scene.cameras, pose=2 * pose))
-            case "float":
-                return replace(scene, cameras=replace(scene.cameras, pose=pose.float()))
-            case "split":
-                return replace(scene, test=scene.train[:1])
-            case "paths":
-                return replace(scene, paths=scene.paths[1:])
-            case "order":
-                return replace(scene, paths=scene.paths[:: 1 if self.calls == 1 else -1])
-        return scene
+        cameras, pose = scene.cameras, scene.cameras.pose
+        changes: dict[str, dict[str, Any]] = {
+            "mirrored": {"cameras": replace(cameras, pose=pose * torch.tensor([[-1.0, 1, 1, 1]]))},
+            "scaled": {"cameras": replace(cameras, pose=2 * pose)},
+            "float": {"cameras": replace(cameras, pose=pose.float())},
+            "split": {"test": scene.train[:1]},
+            "paths": {"paths": scene.paths[1:]},
+            "order": {"paths": scene.paths[:: 1 if self.calls == 1 else -1]},
+        }
+        return replace(scene, **changes.get(self.wrong, {}))
 
 
 @dataclass(frozen=True, kw_only=True)

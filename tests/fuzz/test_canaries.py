@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ from fprf.errors import FprfError
 from fprf.plugins.weights import WeightSource, read_tensors
 
 
+@dataclass
 class Canary:
-    def __init__(self, place: Path) -> None:
-        self.place = place
+    place: Path
 
     def __reduce__(self) -> tuple[object, ...]:
         return (Path.touch, (self.place,))
