@@ -142,11 +142,9 @@ def keep_within(folder: Path, size: int, used: Collection[str]) -> None:
 def remove_stale(folder: Path, hours: float = 1.0) -> None:
     """Delete unfinished files of processes that died; younger ones may belong to a living writer."""
     for path in folder.glob(".*.safetensors"):
-        try:
+        with contextlib.suppress(OSError):  # another process was first
             if time.time() - path.stat().st_mtime > 3600 * hours:
                 path.unlink()
-        except OSError:  # another process was first
-            continue
 
 
 def _checksum(tensors: Mapping[str, Tensor]) -> int:
@@ -181,10 +179,11 @@ class FeatureStore:
         self.basis = basis
         """Basis that the encoder's features were projected on; None = kept raw."""
         self._entries = list(entries.values())
-        self._views = torch.tensor(list(entries))
-        self._numbers = torch.zeros(int(self._views.max()) + 1, dtype=torch.int64)
+        self._slots = torch.tensor(list(entries))
+        """The view of each entry."""
+        self._numbers = torch.zeros(int(self._slots.max()) + 1, dtype=torch.int64)
         """The entry of each view; 0 as well for those that have none."""
-        self._numbers[self._views] = torch.arange(len(entries))
+        self._numbers[self._slots] = torch.arange(len(entries))
         self.channels = len(self._entries[0].scale)
         self.bytes = sum(entry.coefs.numel() * 2 for entry in self._entries)
         """Size of the coefficients."""
@@ -225,22 +224,25 @@ class FeatureStore:
         image's own colour there. Raises DataError for a view that is not in the store; on the device of `to` views are not
         checked, since the host would wait.
         """
-        from ..ops.guided_kernels import gather_views
-
         if self._packed is not None and view.device == self._packed[1].device:
             packed, numbers = self._packed
             return guided.apply_packed(packed, numbers[view], pixel, rgb, grey=GREY)
         asked = view.detach().cpu()
         slot = self._numbers[asked.clamp(0, len(self._numbers) - 1)]
-        missing = asked[self._views[slot] != asked]
+        missing = asked[self._slots[slot] != asked]
         if len(missing):
             raise DataError(
                 f"feature store: view {int(missing.min())} has no features; {len(self._entries)} training views have"
             )
         positions, colours = pixel.detach().cpu().float().contiguous(), rgb.detach().cpu().float().contiguous()
         out = torch.empty(len(view), self.channels)
-        gather_views(self._table, slot.numpy(), positions.numpy(), (colours - GREY).numpy(), out.numpy())
+        self._compiled(slot, positions, colours, out)
         return out.to(view.device)
+
+    def _compiled(self, slot: Tensor, pixel: Tensor, rgb: Tensor, out: Tensor) -> None:
+        from ..ops.guided_kernels import gather_views
+
+        gather_views(self._table, slot.numpy(), pixel.numpy(), (rgb - GREY).numpy(), out.numpy())
 
 
 def extract(

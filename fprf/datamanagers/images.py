@@ -8,6 +8,7 @@ Size and transparency come from a file's first bytes (PNG, JPEG, WebP, BMP, TIFF
 a bomb costs nothing. OpenCV tells neither before it decodes; Pillow would be one more dependency and reads WebP and AVIF whole.
 """
 
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -272,6 +273,20 @@ def load_images(scene: "Scene", background: Sequence[float] | None = None, views
         return list(pool.map(load, range(len(scene.paths)) if views is None else views))
 
 
+def image_names(folder: Path) -> list[str]:
+    """Sorted names of the images directly in a folder, hidden files left out; DataError where there is none."""
+    try:
+        entries = os.listdir(folder)
+    except OSError as error:
+        raise DataError(f"{folder}: no such image folder ({error.strerror}); name it or put the images there") from error
+    names = sorted(n for n in entries if Path(n).suffix.lower() in IMAGE_SUFFIXES and not n.startswith("."))
+    if not names:
+        raise DataError(
+            f"{folder}: no image among {len(entries)} files; put PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF images there"
+        )
+    return names
+
+
 def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Path]:
     """The files among the paths and the images in the folders, each once; those of a folder in the order of their names.
 
@@ -286,9 +301,7 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
 
 def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
     """The images of a folder that can be decoded."""
-    images = sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-    if not images:
-        raise DataError(f"{folder}: holds no images ({' '.join(sorted(IMAGE_SUFFIXES))}); name a folder that does")
+    images = [folder / name for name in image_names(folder)]
 
     def fault(path: Path) -> str:
         try:

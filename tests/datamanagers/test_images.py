@@ -12,7 +12,7 @@ import pytest
 from capture_files import Capture, write_image, write_transforms
 from photo_files import HEIC, turned_jpeg
 
-from fprf.datamanagers.images import header_of, load_image, load_images, photographs, read_header
+from fprf.datamanagers.images import header_of, image_names, load_image, load_images, photographs, read_header
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.errors import DataError
 
@@ -105,8 +105,11 @@ def test_folders_of_photographs_are_listed_without_what_cannot_be_read(tmp_path:
     found = photographs([tmp_path / "b.png", tmp_path, tmp_path / "broken.jpg"], told.append)
     assert [path.name for path in found] == ["b.png", "a.jpg", "broken.jpg"], "what is named by itself is taken as it is"
     assert len(told) == 2 and "broken.jpg" in told[0] and "empty.webp: the file is empty" in told[1]
-    with pytest.raises(DataError, match="deeper: holds no images"):
+    assert image_names(tmp_path) == ["a.jpg", "b.png", "broken.jpg", "empty.webp"]
+    with pytest.raises(DataError, match="deeper: no image among 0 files"):
         photographs([tmp_path / "deeper"], told.append)
+    with pytest.raises(DataError, match="no such image folder"):
+        image_names(tmp_path / "absent")
     (tmp_path / "deeper" / "x.png").write_bytes(b"")
     with pytest.raises(DataError, match=r"none of its 1 images can be read.*x\.png"):
         photographs([tmp_path / "deeper"], told.append)

@@ -11,7 +11,7 @@ from capture_files import rotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.datamanagers.parsers.files import as_record, image_names, path_inside, read_json, read_npy, read_npz
+from fprf.datamanagers.parsers.files import as_record, path_inside, read_json, read_npy, read_npz
 from fprf.datamanagers.parsers.views import rigid_pose
 from fprf.errors import DataError
 
@@ -37,17 +37,6 @@ def test_paths_stay_inside_and_are_normalised() -> None:
             path_inside(Path("root"), "here", text)
     for text in ("images/a b.png", "./images/a b.png", "images//a b.png", ".\\images\\a b.png"):
         assert path_inside(Path("root"), "here", text) == ("images/a b.png", Path("root/images/a b.png"))
-
-
-def test_folders_are_listed_by_name(tmp_path: Path) -> None:
-    for name in ("b.PNG", "a.jpg", "notes.txt", ".hidden.png"):
-        (tmp_path / name).touch()
-    assert image_names(tmp_path) == ["a.jpg", "b.PNG"]
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="no image among 0 files"):
-        image_names(tmp_path / "empty")
-    with pytest.raises(DataError, match="no such image folder"):
-        image_names(tmp_path / "absent")
 
 
 def npy(array: np.ndarray) -> bytes:

@@ -6,7 +6,6 @@ Links inside the folder are followed: only what a file *says* must stay inside.
 
 import json
 import math
-import os
 import re
 import zipfile
 import zlib
@@ -18,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..images import IMAGE_SUFFIXES
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 
@@ -94,20 +92,6 @@ def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
 def name_of(data: Path) -> str:
     """A scene's name: its folder's."""
     return data.resolve().name or "scene"
-
-
-def image_names(folder: Path) -> list[str]:
-    """Sorted names of the images directly in a folder, hidden files left out; DataError where there is none."""
-    try:
-        entries = os.listdir(folder)
-    except OSError as error:
-        raise DataError(f"{folder}: no such image folder ({error.strerror}); name it or put the images there") from error
-    names = sorted(n for n in entries if Path(n).suffix.lower() in IMAGE_SUFFIXES and not n.startswith("."))
-    if not names:
-        raise DataError(
-            f"{folder}: no image among {len(entries)} files; put PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF images there"
-        )
-    return names
 
 
 def read_npy(where: str, data: bytes) -> NDArray[np.float64]:

@@ -11,9 +11,10 @@ import numpy as np
 
 from ...errors import DataError
 from ...interfaces import DataParser
+from ..images import image_names
 from ..scene import Scene
 from .config import LlffConfig
-from .files import image_names, path_inside, read_bytes, read_npy
+from .files import path_inside, read_bytes, read_npy
 from .views import View, assemble_scene, pixel_size, rigid_pose
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from ...errors import DataError
 from ...interfaces import DataParser
+from ..images import image_names
 from ..scene import Scene
 from .config import PolycamConfig
-from .files import Record, as_record, image_names, read_json
+from .files import Record, as_record, read_json
 from .views import View, assemble_scene, pixel_size, rigid_pose
 
 _PAIRS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
+from ..images import image_names
 from ..scene import Scene
 from .config import Record3DConfig
-from .files import Record, as_record, image_names, numbers_of, read_json, table_of
+from .files import Record, as_record, numbers_of, read_json, table_of
 from .views import View, assemble_scene, pixel_size, quaternion_rotation, rigid_pose
 
 _Rows: TypeAlias = NDArray[np.float64]
