@@ -70,10 +70,7 @@ def depth_image(
     # A plane square to the view has one disparity: shown as halfway, not as noise.
     even = (disparity - low) / (high - low) if high > low else torch.full_like(disparity, 0.5)
     # Inferno's first steps are black: stay off them, so that far places keep some hue.
-    steps = (even.clamp(0, 1) * 235 + 20).to(torch.uint8).cpu().numpy()
-    coloured = cv2.cvtColor(cv2.applyColorMap(steps, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
-    cover = torch.where(solid, opacity, torch.zeros_like(opacity)).clamp(0, 1).cpu().float()
-    return _over_empty(torch.from_numpy(coloured).float() / 255, cover)
+    return _over_empty(_mapped(even.clamp(0, 1) * 235 + 20, cv2.COLORMAP_INFERNO), torch.where(solid, opacity, 0.0))
 
 
 def match_image(
@@ -96,8 +93,7 @@ def match_image(
     picture = colours[weights.argmax(dim=-1)] * light.clamp(0, 1)[..., None]
     if kept is not None:
         picture = torch.lerp(picture, torch.tensor(_KEPT), kept.detach().cpu().float().clamp(0, 1)[..., None])
-    cover = torch.ones(weights.shape[:2]) if opacity is None else opacity.detach().cpu().float().clamp(0, 1)
-    return _over_empty(picture, cover)
+    return _over_empty(picture, opacity)
 
 
 def scale_image(
@@ -105,9 +101,7 @@ def scale_image(
 ) -> Picture:
     """Numbers as colour on a fixed scale: `low` and below dark blue, `high` and above yellow (viridis), nothing grey."""
     even = ((values.detach().cpu().float() - low) / (high - low)).nan_to_num(0.0).clamp(0, 1)
-    coloured = cv2.cvtColor(cv2.applyColorMap((even * 255).to(torch.uint8).numpy(), cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
-    cover = torch.ones(values.shape) if opacity is None else opacity.detach().cpu().float().clamp(0, 1)
-    return _over_empty(torch.from_numpy(coloured).float() / 255, cover)
+    return _over_empty(_mapped(even * 255, cv2.COLORMAP_VIRIDIS), opacity)
 
 
 def match_summary(
@@ -143,7 +137,16 @@ def _solid(depth: Tensor, opacity: Tensor, least: float = 0.5) -> Tensor:
     return torch.isfinite(depth) & (depth > 0) & (opacity > least)
 
 
-def _over_empty(picture: Annotated[Tensor, "H W 3"], cover: Annotated[Tensor, "H W"]) -> Picture:
+def _mapped(steps: Annotated[Tensor, "H W"], colours: int) -> Annotated[Tensor, "H W 3"]:
+    """Colours in [0, 1] of one of OpenCV's maps at its steps, 0 to 255."""
+    picture = cv2.applyColorMap(steps.to(torch.uint8).cpu().numpy(), colours)
+    return torch.from_numpy(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)).float() / 255
+
+
+def _over_empty(picture: Annotated[Tensor, "H W 3"], opacity: Annotated[Tensor, "H W"] | None) -> Picture:
+    if opacity is None:
+        return to_uint8(picture)
+    cover = opacity.detach().cpu().float().clamp(0, 1)
     return to_uint8(torch.lerp(torch.tensor(_EMPTY).expand_as(picture), picture, cover[..., None]))
 
 

@@ -51,7 +51,8 @@ def contact_sheet(tiles: Sequence[Tile], columns: int = _COLUMNS) -> Picture:
     drawn = [_tile(tile) for tile in tiles]
     columns = min(columns, len(drawn))
     height = max(len(each) for each in drawn)
-    page = np.full((_ceil(len(drawn), columns) * (height + _GAP) + _GAP, columns * (_SIDE + _GAP) + _GAP, 3), _PAPER, np.uint8)
+    rows = math.ceil(len(drawn) / columns)
+    page = np.full((rows * (height + _GAP) + _GAP, columns * (_SIDE + _GAP) + _GAP, 3), _PAPER, np.uint8)
     for i, each in enumerate(drawn):
         top, left = _GAP + (i // columns) * (height + _GAP), _GAP + (i % columns) * (_SIDE + _GAP)
         page[top : top + len(each), left : left + _SIDE] = each
@@ -87,10 +88,6 @@ def _cut(text: str, scale: float) -> str:
     while text and cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > _SIDE - 2:
         text = text[:-1]
     return text
-
-
-def _ceil(a: int, b: int) -> int:
-    return -(-a // b)
 
 
 _SEAM = 2

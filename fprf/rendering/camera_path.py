@@ -17,8 +17,7 @@ from torch import Tensor
 
 from ..errors import DataError
 from ..io.atomic import write_json
-from .cameras import Cameras
-from .lens import PINHOLE
+from .cameras import Cameras, ideal_cameras
 
 _FPS = 24.0
 """Nerfstudio's value where a file has none."""
@@ -54,17 +53,7 @@ def read_camera_path(path: Path) -> tuple[Cameras, float]:
         poses.append(_pose(path, f"{where}.camera_to_world", frame.get("camera_to_world")))
         fov = _number(path, f"{where}.fov", frame.get("fov"), 0.0, 180.0)
         focals.append(height / 2 / math.tan(math.radians(fov) / 2))
-    count = len(frames)
-    size = torch.tensor([width, height])
-    cameras = Cameras(
-        pose=torch.stack(poses),
-        focal=torch.tensor(focals, dtype=torch.float64)[:, None].repeat(1, 2),
-        centre=(size.double() / 2).repeat(count, 1),
-        size=size.repeat(count, 1),
-        distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.full((count,), PINHOLE),
-    )
-    return cameras, fps
+    return ideal_cameras(torch.stack(poses), torch.tensor(focals, dtype=torch.float64), (width, height)), fps
 
 
 def write_camera_path(path: Path, cameras: Cameras, fps: float) -> None:
@@ -74,9 +63,8 @@ def write_camera_path(path: Path, cameras: Cameras, fps: float) -> None:
     width, height = (int(side) for side in cameras.size[0])
     frames = []
     for view in range(len(cameras)):
-        half = float(cameras.size[view, 1]) / 2 / float(cameras.focal[view, 1])
-        matrix = [float(value) for value in cameras.pose[view].flatten()] + [0.0, 0.0, 0.0, 1.0]
-        fov = math.degrees(2 * math.atan(half))
+        matrix = [*cameras.pose[view].flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
+        fov = math.degrees(2 * math.atan(float(cameras.size[view, 1]) / 2 / float(cameras.focal[view, 1])))
         frames.append({"camera_to_world": matrix, "fov": fov, "aspect": width / height})
     content = {
         "camera_type": "perspective",

@@ -45,14 +45,7 @@ class Cameras:
 
     def select(self, index: Annotated[Tensor, "M"]) -> "Cameras":
         """Some of the views, in the order of `index` (int64, or a mask of all)."""
-        return Cameras(
-            pose=self.pose[index],
-            focal=self.focal[index],
-            centre=self.centre[index],
-            size=self.size[index],
-            distortion=self.distortion[index],
-            lens=self.lens[index],
-        )
+        return Cameras(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def to(self, device: torch.device) -> "Cameras":
         """The same views, their numbers on a device."""
@@ -66,6 +59,24 @@ class Cameras:
     def scaled(self, downscale: float) -> "Cameras":
         """The same views at 1/downscale of their size, rounded to whole pixels and at least one."""
         return self.resized((self.size.double() / downscale).round().clamp_min(1))
+
+
+def ideal_cameras(
+    pose: Annotated[Tensor, "V 3 4"], focal: Tensor | float, size: tuple[int, int], lens: int = PINHOLE
+) -> Cameras:
+    """Views of one size (width, height) without distortion, the principal point in the middle, pixels square.
+
+    `focal` in pixels is one number, or one for each view.
+    """
+    count, sides = len(pose), torch.tensor(size)
+    return Cameras(
+        pose=pose,
+        focal=torch.as_tensor(focal, dtype=torch.float64).reshape(-1, 1).expand(count, 2).clone(),
+        centre=(sides.double() / 2).repeat(count, 1),
+        size=sides.repeat(count, 1),
+        distortion=torch.zeros(count, 6, dtype=torch.float64),
+        lens=torch.full((count,), lens),
+    )
 
 
 def pixel_grid(cameras: Cameras, view: int) -> Annotated[Tensor, "N 2"]:
@@ -86,7 +97,7 @@ def rays_through(
 ) -> tuple[Annotated[Tensor, "R 3"], Annotated[Tensor, "R 3"]]:
     """Origin and unit direction in the world, float64, of the rays through pixels of views; lenses may be mixed.
 
-    A pixel that the lens maps nothing to (see `sees`) gets the outermost direction on its side.
+    A pixel that the lens maps nothing to gets the outermost direction on its side.
     """
     plane = _plane(cameras, view, pixel)
     local = unbend(cameras.distortion[view], cameras.lens[view], cameras.reach[view], plane)
@@ -95,17 +106,6 @@ def rays_through(
     turned = torch.stack([local[:, 0], -local[:, 1], -local[:, 2]], -1)
     direction = (pose[:, :, :3] @ turned[:, :, None])[:, :, 0]
     return pose[:, :, 3].clone(), torch.nn.functional.normalize(direction, dim=-1)
-
-
-def sees(cameras: Cameras, view: Annotated[Tensor, "R"], pixel: Annotated[Tensor, "R 2"]) -> Annotated[Tensor, "R"]:
-    """True where a direction maps to the pixel (to 1e-6 px); false outside of a strongly distorting lens's circle."""
-    plane = _plane(cameras, view, pixel)
-    distortion, lens, reach = cameras.distortion[view], cameras.lens[view], cameras.reach[view]
-    local = unbend(distortion, lens, reach, plane)
-    # A direction at the very reach must not fall beyond it by rounding.
-    back = bend(distortion, lens, reach * (1 + 1e-9), local)
-    miss: Tensor = torch.linalg.vector_norm((back - plane) * cameras.focal[view], dim=-1)
-    return torch.le(miss, 1e-6)
 
 
 def project(
@@ -225,8 +225,7 @@ def normals(cameras: Cameras, view: int, depth: Annotated[Tensor, "H W"]) -> Ann
     `depth` is the distance along the unit ray. Of the two neighbours in each direction the nearer one in space counts, so
     that an edge belongs to one of its sides.
     """
-    pixel = pixel_grid(cameras, view)
-    origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+    origin, direction = grid_rays(cameras, view)
     height, width = depth.shape
     solid = torch.isfinite(depth) & (depth > 0)
     far = torch.where(solid, depth, torch.zeros_like(depth)).double()

@@ -21,15 +21,10 @@ from torch import Tensor
 
 from ..errors import UsageError
 from .camera_path import read_camera_path
-from .cameras import Cameras, project, rays_through
+from .cameras import Cameras, ideal_cameras, project, rays_through
 from .lens import PANORAMA, PINHOLE
 from .space import Space
 from .splines import catmull_rom, quaternions, rotations, slerp
-
-
-def dataset(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Cameras:
-    """The captured views of `indices`, in that order, with their own lenses: renders lie over the photographs."""
-    return cameras.select(indices)
 
 
 def look_at(
@@ -40,53 +35,34 @@ def look_at(
     Where the line of sight runs along `up`, which then says nothing, another axis takes its place.
     """
     back = _unit(position - target)
-    spare = torch.eye(3, dtype=back.dtype, device=back.device)[up.abs().argmin()]
     right = torch.linalg.cross(up.expand_as(back), back)
     vague = right.norm(dim=-1, keepdim=True) < 1e-6 * up.norm()
-    right = _unit(torch.where(vague, torch.linalg.cross(spare.expand_as(back), back), right))
+    right = _unit(torch.where(vague, torch.linalg.cross(_least_axis(up).expand_as(back), back), right))
     return torch.stack([right, torch.linalg.cross(back, right), back, position], dim=-1)
 
 
 def pinhole(pose: Annotated[Tensor, "F 3 4"], *, width: int, height: int, fov: float) -> Cameras:
     """Frames at `pose` with square pixels, the principal point in the middle and a vertical angle of `fov` degrees."""
-    count, size = len(pose), torch.tensor([width, height])
-    focal = height / 2 / math.tan(math.radians(fov) / 2)
-    return Cameras(
-        pose=pose,
-        focal=torch.full((count, 2), focal, dtype=torch.float64),
-        centre=(size.double() / 2).repeat(count, 1),
-        size=size.repeat(count, 1),
-        distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.full((count,), PINHOLE),
-    )
+    return ideal_cameras(pose, height / 2 / math.tan(math.radians(fov) / 2), (width, height))
 
 
-def spiral(
-    cameras: Cameras,
-    frames: int,
-    *,
-    points: Annotated[Tensor, "P 3"] | None = None,
-    depths: Annotated[Tensor, "V 2"] | None = None,
-    turns: int = 2,
-) -> Cameras:
-    """A closed spiral about the most central captured camera, looking at what that camera sees.
+def spiral(cameras: Cameras, frames: int) -> Cameras:
+    """A closed spiral of two turns about the most central captured camera, looking at where the optical axes meet.
 
-    What it looks at lies at the median depth of the `points` in view, else at LLFF's blend of `depths` (near, far), else
-    where the optical axes meet. The radii are the spread of the cameras along the central camera's axes, shrunk until
-    no frame is farther from a captured camera than captured cameras are from each other. Raises UsageError.
+    The radii are the spread of the cameras along the central camera's axes, shrunk until no frame is farther from a
+    captured camera than captured cameras are from each other. Raises UsageError.
     """
     _at_least("frames", frames, 1)
-    _at_least("turns", turns, 1)
     centres = cameras.pose[:, :, 3]
     apart = torch.cdist(centres, centres)
     middle = int(apart.sum(-1).argmin())
     rotation, start = cameras.pose[middle, :, :3], centres[middle]
-    depth = _focus_depth(cameras, middle, points, depths)
+    depth = _focus_depth(cameras, middle)
     spread = ((centres - start) @ rotation).abs().quantile(0.9, dim=0)
     # Beyond a third of the depth the view would swing by more than 18 degrees, or pass what it looks at.
     radii = spread.clamp(max=depth / 3)
-    angle = torch.arange(frames, dtype=centres.dtype, device=centres.device) * (2 * math.pi * turns / frames)
-    loop = (torch.stack([angle.cos(), angle.sin(), (angle / turns).sin()], dim=-1) * radii) @ rotation.T
+    angle = torch.arange(frames, dtype=centres.dtype, device=centres.device) * (2 * math.pi * _TURNS / frames)
+    loop = (torch.stack([angle.cos(), angle.sin(), (angle / _TURNS).sin()], dim=-1) * radii) @ rotation.T
     reach = 1.0 if len(cameras) == 1 else _spacing(apart)
     for step in range(_SHRINKS):
         position = start + loop * (1 - step / _SHRINKS)
@@ -96,7 +72,7 @@ def spiral(
     return _pinhole(look_at(position, target, rotation[:, 1]), cameras, middle)
 
 
-def orbit(cameras: Cameras, frames: int, *, points: Annotated[Tensor, "P 3"] | None = None) -> Cameras:
+def orbit(cameras: Cameras, frames: int) -> Cameras:
     """Around the place that the cameras look at, in the distance and elevation that they have at each azimuth.
 
     A full circle where the cameras surround the place, else to and fro within the arc that they cover; closed in both
@@ -104,17 +80,15 @@ def orbit(cameras: Cameras, frames: int, *, points: Annotated[Tensor, "P 3"] | N
     """
     _at_least("frames", frames, 1)
     pose = cameras.pose
-    centres, up = pose[:, :, 3], pose[:, :, 1].mean(dim=0)
-    if float(up.norm()) < 0.3:
-        up = pose[:, :, 2].mean(dim=0)
+    centres, up = pose[:, :, 3], upwards(cameras)
     if float(up.norm()) < 1e-6:
         raise UsageError("orbit: the cameras have no common up; choose the path 'interpolate' or 'dataset'")
     up = _unit(up)
     middle = int(torch.cdist(centres, centres).sum(-1).argmin())
     target = _meeting(pose)
     if target is None:
-        target = centres[middle] - pose[middle, :, 2] * _focus_depth(cameras, middle, points, None)
-    east = _unit(_across(up))
+        target = centres[middle] - pose[middle, :, 2] * _focus_depth(cameras, middle)
+    east = _unit(torch.linalg.cross(up, _least_axis(up)))
     north = torch.linalg.cross(up, east)
     offset = centres - target
     distance = offset.norm(dim=-1)
@@ -170,6 +144,7 @@ def tour(cameras: Cameras, indices: Annotated[Tensor, "M"]) -> Annotated[Tensor,
 
 
 _SHRINKS = 64
+_TURNS = 2
 
 
 def _pinhole(pose: Annotated[Tensor, "F 3 4"], cameras: Cameras, view: int) -> Cameras:
@@ -187,12 +162,9 @@ def _unit(vector: Tensor) -> Tensor:
     return torch.nn.functional.normalize(vector, dim=-1, eps=1e-300)
 
 
-def _across(up: Tensor) -> Tensor:
-    """A vector across a unit vector: along the axis that it is least like."""
-    spare = torch.zeros_like(up)
-    spare[up.abs().argmin()] = 1.0
-    across: Tensor = torch.linalg.cross(up, spare)
-    return across
+def _least_axis(vector: Annotated[Tensor, "3"]) -> Annotated[Tensor, "3"]:
+    """The axis that a vector is least like."""
+    return torch.eye(3, dtype=vector.dtype, device=vector.device)[vector.abs().argmin()]
 
 
 def _spacing(apart: Annotated[Tensor, "V V"]) -> float:
@@ -221,19 +193,9 @@ def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:
     return target if float((past < 0.5 * ahead).double().mean()) > 0.75 else None
 
 
-def _focus_depth(cameras: Cameras, view: int, points: Tensor | None, depths: Tensor | None) -> float:
-    """Depth along the axis of a view at which what it shows lies."""
+def _focus_depth(cameras: Cameras, view: int) -> float:
+    """Depth along the axis of a view at which what it shows lies: where the optical axes meet."""
     pose = cameras.pose[view]
-    if points is not None and len(points):
-        local = (points.to(pose) - pose[:, 3]) @ pose[:, :3]
-        seen = local[local[:, 2] < 0]
-        at = (seen[:, :2] / -seen[:, 2:]).abs()
-        inside = (at <= cameras.size[view] / 2 / cameras.focal[view]).all(dim=-1)
-        if int(inside.sum()) >= 8:
-            return float(-seen[inside, 2].median())
-    if depths is not None:
-        near, far = (float(depth) for depth in depths[view])
-        return 1 / (0.25 / near + 0.75 / far)
     target = _meeting(cameras.pose)
     ahead = 0.0 if target is None else float((pose[:, 3] - target) @ pose[:, 2])
     spread = float((cameras.pose[:, :, 3] - pose[:, 3]).norm(dim=-1).max())
@@ -260,13 +222,13 @@ MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
 def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int) -> Cameras:
     """Cameras of a motion, or of a camera-path JSON file.
 
-    `interpolate` and `dataset` go through `views` of the captured `cameras`. `frames` are those of a spiral or orbit, and
+    `interpolate` and `dataset` go through `views` of the captured `cameras`, the latter with their own lenses. `frames` are those of a spiral or orbit, and
     about those of an interpolation; a file and the captured views bring their own number. Raises UsageError for what is
     neither, DataError for a file that is no camera path.
     """
     chosen = torch.tensor(list(views), dtype=torch.int64)
     if motion == "dataset":
-        return dataset(cameras, chosen)
+        return cameras.select(chosen)
     if motion == "spiral":
         return spiral(cameras, frames)
     if motion == "orbit":
@@ -298,16 +260,9 @@ def panoramas(cameras: Cameras, width: int, up: Annotated[Tensor, "3"]) -> Camer
     level = ahead - (ahead @ upright)[:, None] * upright
     # A camera that looks straight up or down: its own up is ahead, or behind.
     level = torch.where(level.norm(dim=-1, keepdim=True) < 1e-3, cameras.pose[:, :, 1], level)
-    place, count = cameras.pose[:, :, 3], len(cameras)
-    size = torch.tensor([width, max(1, width // 2)])
-    return Cameras(
-        pose=look_at(place, place + level, upright),
-        focal=torch.full((count, 2), width / (2 * math.pi), dtype=torch.float64),
-        centre=(size.double() / 2).repeat(count, 1),
-        size=size.repeat(count, 1),
-        distortion=torch.zeros(count, 6, dtype=torch.float64),
-        lens=torch.full((count,), PANORAMA),
-    )
+    place = cameras.pose[:, :, 3]
+    pose = look_at(place, place + level, upright)
+    return ideal_cameras(pose, width / (2 * math.pi), (width, max(1, width // 2)), PANORAMA)
 
 
 def eye_strips(panorama: Cameras, offset: float) -> Cameras:

@@ -57,20 +57,17 @@ class Space:
 
     def rays(self, origin: Annotated[Tensor, "R 3"], direction: Annotated[Tensor, "R 3"]) -> Rays:
         """World rays (float64, unit directions) as float32 rays of this space."""
-        turn = self._constant("rotation", origin)
-        o = (origin - self._constant("centre", origin)) @ turn.T
-        d = direction @ turn.T
-        view = direction.float()
+        o, d = self._recentred(origin, direction)
         if self.kind == "ndc":
             o, d = self._device_coordinates(o, d)
             near, far = torch.zeros_like(o[:, 0]), torch.ones_like(o[:, 0])
-            return Rays(o.float(), d.float(), view, near.float(), far.float())
-        o = o * self.scale
-        if self.kind == "box":
-            near, far = self._slab(o, d)
         else:
-            near, far = torch.full_like(o[:, 0], self.near), torch.full_like(o[:, 0], self.far)
-        return Rays(o.float(), d.float(), view, near.float(), far.float())
+            o = o * self.scale
+            if self.kind == "box":
+                near, far = self._slab(o, d)
+            else:
+                near, far = torch.full_like(o[:, 0], self.near), torch.full_like(o[:, 0], self.far)
+        return Rays(o.float(), d.float(), direction.float(), near.float(), far.float())
 
     def locate(self, x: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N 3"]:
         """Points of the space to the unit cube; of an open one they stay as they are."""
@@ -108,9 +105,7 @@ class Space:
         """World distance along unit world rays of the ray parameter t; infinite at NDC's far plane."""
         if self.kind != "ndc":
             return t / self.scale
-        turn = self._constant("rotation", origin)
-        o = (origin - self._constant("centre", origin)) @ turn.T
-        d = direction @ turn.T
+        o, d = self._recentred(origin, direction)
         to_near = -(self.near + o[:, 2]) / d[:, 2]
         start = o[:, 2] + to_near * d[:, 2]
         # NDC z = 1 + 2 near / z rises from -1; t is the share of the way to the far plane, so z = z0 / (1 - t).
@@ -123,9 +118,8 @@ class Space:
         """The ray parameter t at a world distance along unit world rays: the inverse of `metric`."""
         if self.kind != "ndc":
             return distance * self.scale
-        turn = self._constant("rotation", origin)
-        o, d = (origin - self._constant("centre", origin)) @ turn[2], direction @ turn[2]
-        z = (o + d * distance.to(o.dtype)).clamp(max=-self.near)
+        o, d = self._recentred(origin, direction)
+        z = (o[:, 2] + d[:, 2] * distance.to(o.dtype)).clamp(max=-self.near)
         return (1 + self.near / z).to(distance.dtype)
 
     def __getstate__(self) -> dict[str, object]:
@@ -143,6 +137,11 @@ class Space:
             with torch.inference_mode(False):
                 self._tensors[key] = torch.tensor(getattr(self, name), dtype=like.dtype, device=like.device)
         return self._tensors[key]
+
+    def _recentred(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """World rays about the centre, in the space's axes, still in world units."""
+        turn = self._constant("rotation", origin)
+        return (origin - self._constant("centre", origin)) @ turn.T, direction @ turn.T
 
     def _device_coordinates(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Rays from the near plane (t = 0) to infinity (t = 1); a ray that looks backwards is bent to a grazing one."""
