@@ -219,7 +219,7 @@ def pareto(config: ParetoConfig, root: Path, folder: Path, progress: Progress) -
     if config.train_minutes is not None:
         curves["trained"] = trained_points(config.train_minutes, subject, by_photographs, watch, folder, progress)
     rays = view_rays(trained.model, cameras[0], 0)
-    counters = {name: count(trained.model.parts, rays, budget).shares for name, budget in BUDGETS.items()}
+    counters = {name: count(trained.model.parts, rays, budget) for name, budget in BUDGETS.items()}
     return _outcome(config, subject, curves, missing, cameras[0], counters)
 
 

@@ -32,7 +32,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..errors import DataError, NumericsError
-from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
+from ..rendering.cameras import Cameras, grid_rays, project
 
 SHORT, LONG = 1, 7
 """Frames between the two views of a pair (Lai et al. 2018, and every peer since)."""
@@ -65,13 +65,11 @@ def warp(
     _sized(image_b.shape[:2], cameras, b, "image")
     _sized(depth_a.shape, cameras, a, "depth")
     _sized(depth_b.shape, cameras, b, "depth")
-    pixel = pixel_grid(cameras, a)
-    view = torch.full((len(pixel),), a, device=pixel.device)
-    origin, direction = rays_through(cameras, view, pixel)
-    depth = depth_a.reshape(-1).to(pixel)
+    origin, direction = grid_rays(cameras, a)
+    depth = depth_a.reshape(-1).to(origin)
     solid = torch.isfinite(depth) & (depth > 0)
     points = origin + direction * torch.where(solid, depth, torch.ones_like(depth))[:, None]
-    there, ahead = project(cameras, torch.full_like(view, b), points)
+    there, ahead = project(cameras, torch.full((len(points),), b, device=points.device), points)
     size = cameras.size[b].to(there)
     # Half a pixel from the border there is no neighbour to interpolate with. The slack is rounding.
     inside = ((there >= 0.5 - 1e-6) & (there <= size - 0.5 + 1e-6)).all(dim=-1) & (ahead > 0)

@@ -117,6 +117,15 @@ def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:
     return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
 
 
+def mean_scores(
+    pictures: Sequence[Annotated[Tensor, "H W 3"]], truth: Sequence[Annotated[Tensor, "H W 3"]]
+) -> tuple[dict[str, float], Annotated[Tensor, "N"]]:
+    """`image_metrics`, means over the views, and `delta_e`, the mean over all pixels; and that of each pixel of all views."""
+    row = mean_metrics([image_metrics(a, b) for a, b in zip(pictures, truth, strict=True)])
+    apart = torch.cat([delta_e(a, b).flatten() for a, b in zip(pictures, truth, strict=True)])
+    return {**row, "delta_e": float(apart.mean())}, apart
+
+
 _SIGMA = 1.5
 _REACH = 5
 """Pixels from the middle of a window to its side: Wang's 11 x 11."""

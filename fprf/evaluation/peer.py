@@ -1,9 +1,9 @@
 """`fprf bench peer`: frames of any system, read from files and scored by the code that scores ours."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
@@ -13,23 +13,16 @@ from ..datamanagers.parsers.files import Record, as_record, read_bytes, read_jso
 from ..datamanagers.parsers.views import rigid_pose
 from ..errors import DataError
 from ..plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
-from ..rendering.cameras import Cameras, pixel_grid, rays_through
+from ..rendering.cameras import Cameras, grid_rays
 from ..training.loading import load_run
 from ..training.views import render_view
 from .config import PeerConfig
 from .consistency import published, steadiness
-from .metrics import delta_e, image_metrics, matched_regions, mean_metrics, structure, style_distances
+from .metrics import matched_regions, mean_scores, structure, style_distances
 from .report import words
 
-Along = Literal["ray", "axis"]
-
-
-class Frames(NamedTuple):
-    """Pictures in the order of their names."""
-
-    names: tuple[str, ...]
-    """Stems of the files."""
-    images: list[Annotated[Tensor, "H W 3"]]
+Frames = Mapping[str, Annotated[Tensor, "H W 3"]]
+"""Pictures by the stems of their files, in the order of these."""
 
 
 def read_pictures(folder: Path, names: Sequence[str] | None = None) -> Frames:
@@ -41,7 +34,7 @@ def read_pictures(folder: Path, names: Sequence[str] | None = None) -> Frames:
     missing = [name for name in wanted if name not in files]
     if missing:
         raise DataError(f"{folder}: no picture named {missing[0]} ({len(missing)} are missing); name them as the frames")
-    return Frames(tuple(wanted), [torch.from_numpy(load_image(files[name])).float() / 255 for name in wanted])
+    return {name: torch.from_numpy(load_image(files[name])).float() / 255 for name in wanted}
 
 
 def read_cameras(path: Path, frames: Frames) -> Cameras:
@@ -53,25 +46,26 @@ def read_cameras(path: Path, frames: Frames) -> Cameras:
     entries = {
         Path(record.text("file_path") or "").stem: record for record in as_record(path, read_json(path)).records("frames")
     }
-    chosen = [entries[name] for name in frames.names if name in entries]
-    if not chosen and len(entries) == len(frames.names):
+    chosen = [entries[name] for name in frames if name in entries]
+    if not chosen and len(entries) == len(frames):
         chosen = [entries[name] for name in sorted(entries)]
-    if len(chosen) != len(frames.names):
-        raise DataError(
-            f"{path}: cameras for {len(chosen)} of {len(frames.names)} frames; name the frames as the entries' file_path"
-        )
-    views = [_camera(record, image.shape[1], image.shape[0]) for record, image in zip(chosen, frames.images, strict=True)]
+    if len(chosen) != len(frames):
+        raise DataError(f"{path}: cameras for {len(chosen)} of {len(frames)} frames; name the frames as the entries' file_path")
+    sizes = [(image.shape[1], image.shape[0]) for image in frames.values()]
+    views = [_camera(record, *size) for record, size in zip(chosen, sizes, strict=True)]
     return Cameras(
         pose=torch.stack([torch.from_numpy(rigid_pose(r.where, r.matrix("transform_matrix"))) for r in chosen]),
         focal=torch.tensor([focal for focal, _ in views], dtype=torch.float64),
         centre=torch.tensor([centre for _, centre in views], dtype=torch.float64),
-        size=torch.tensor([[image.shape[1], image.shape[0]] for image in frames.images]),
+        size=torch.tensor(sizes),
         distortion=torch.zeros(len(views), 6, dtype=torch.float64),
         lens=torch.zeros(len(views), dtype=torch.int64),
     )
 
 
-def read_depths(folder: Path, names: Sequence[str], cameras: Cameras, along: Along) -> list[Annotated[Tensor, "H W"]]:
+def read_depths(
+    folder: Path, names: Iterable[str], cameras: Cameras, along: Literal["ray", "axis"]
+) -> list[Annotated[Tensor, "H W"]]:
     """Distances along the unit ray of NAME.npz (array `depth`) or NAME.npy, [H W] in the unit of the poses.
 
     `along` says what the files hold: distances along the ray, or along the camera's axis. Raises DataError.
@@ -90,8 +84,7 @@ def read_depths(folder: Path, names: Sequence[str], cameras: Cameras, along: Alo
         if depth.shape != (height, width):
             raise DataError(f"{folder}/{name}: depth of shape {tuple(depth.shape)}, the frame has {height} rows of {width}")
         if along == "axis":
-            pixel = pixel_grid(cameras, view)
-            _, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+            _, direction = grid_rays(cameras, view)
             depth = depth / (-direction @ cameras.pose[view, :, 2]).view(height, width)
         depths.append(depth)
     return depths
@@ -121,53 +114,49 @@ _LARGEST = 512
 Progress = Callable[[int, int, str], None]
 
 
-class _Known(NamedTuple):
-    """Data that frames are judged by, as far as it is there."""
-
-    plain: list[Tensor] | None
-    depths: list[Tensor] | None
-
-
 def peer(config: PeerConfig, progress: Progress) -> dict[str, Any]:
     """The document. What cannot be said for lack of input is None, and `missing` names the flag that would tell.
 
     Raises DataError for frames, cameras and depths that do not fit each other.
     """
     frames = read_pictures(config.frames)
-    cameras = read_cameras(config.cameras, frames)
-    known = _known(config, frames, cameras, progress)
+    images, cameras = list(frames.values()), read_cameras(config.cameras, frames)
+    plain, depths = _plain_and_depths(config, frames, cameras, progress)
     missing: dict[str, str] = {}
     document: dict[str, Any] = {
         "benchmark": "peer",
-        "frames": len(frames.images),
+        "frames": len(images),
         "size": [int(side) for side in cameras.size[0]],
         "steadiness": None,
         "published": None,
         "truth": None,
         "style": None,
     }
-    if known.depths is None:
+    if depths is None:
         missing |= dict.fromkeys(("steadiness", "published"), "--depth or --run")
     else:
-        document["published"] = published(frames.images, known.depths, cameras)
-        if known.plain is None:
+        document["published"] = published(images, depths, cameras)
+        if plain is None:
             missing["steadiness"] = "--plain or --run"
         else:
-            document["steadiness"] = steadiness(known.plain, frames.images, known.depths, cameras)._asdict()
+            document["steadiness"] = steadiness(plain, images, depths, cameras)._asdict()
     if config.truth is None:
         missing["truth"] = "--truth"
     else:
-        document["truth"] = _nearness(frames, read_pictures(config.truth, frames.names).images)
-    if known.plain is None or not config.references:
+        document["truth"] = mean_scores(images, list(read_pictures(config.truth, list(frames)).values()))[0]
+    if plain is None or not config.references:
         missing["style"] = "--references, and --plain or --run"
     else:
-        document["style"] = _style(config, frames.images, known.plain)
+        document["style"] = _style(config, images, plain)
     return {**document, "missing": missing}
 
 
-def _known(config: PeerConfig, frames: Frames, cameras: Cameras, progress: Progress) -> _Known:
-    plain = None if config.plain is None else read_pictures(config.plain, frames.names).images
-    depths = None if config.depth is None else read_depths(config.depth, frames.names, cameras, config.depth_along)
+def _plain_and_depths(
+    config: PeerConfig, frames: Frames, cameras: Cameras, progress: Progress
+) -> tuple[list[Tensor] | None, list[Tensor] | None]:
+    """Unstylised frames and depths: from their folders or else from the run, as far as there are any."""
+    plain = None if config.plain is None else list(read_pictures(config.plain, list(frames)).values())
+    depths = None if config.depth is None else read_depths(config.depth, frames, cameras, config.depth_along)
     if config.run is not None and (plain is None or depths is None):
         trained = load_run(config.run, config.device)
         rendered = []
@@ -176,22 +165,15 @@ def _known(config: PeerConfig, frames: Frames, cameras: Cameras, progress: Progr
             rendered.append(render_view(trained.model, trained.known.facts, cameras, view, trained.config.render))
         plain = [each.rgb for each in rendered] if plain is None else plain
         depths = [each.depth for each in rendered] if depths is None else depths
-    for name, own, image in zip(frames.names, frames.images, plain or frames.images, strict=True):
+    for (name, own), image in zip(frames.items(), plain or frames.values(), strict=True):
         if image.shape != own.shape:
             raise DataError(f"--plain: {name} is {_size(image)}, the stylised frame {_size(own)}; both must agree")
-    return _Known(plain, depths)
-
-
-def _nearness(frames: Frames, truth: Sequence[Tensor]) -> dict[str, float]:
-    row = mean_metrics([image_metrics(a, b) for a, b in zip(frames.images, truth, strict=True)])
-    apart = torch.cat([delta_e(a, b).flatten() for a, b in zip(frames.images, truth, strict=True)])
-    return {**row, "delta_e": float(apart.mean())}
+    return plain, depths
 
 
 def _style(config: PeerConfig, styled: Sequence[Tensor], plain: Sequence[Tensor]) -> dict[str, float | None]:
     """Distance to the references (1 = no change) and what is left of the frames' structure (1 = all of it)."""
-    references = [torch.from_numpy(load_image(path, upright=True)).float() / 255 for path in config.references]
-    references = [_reduced(image) for image in references]
+    references = [_reduced(torch.from_numpy(load_image(path, upright=True)).float() / 255) for path in config.references]
     here, there = matched_regions(BundledSemanticConfig().build(), plain, references, regions=REGIONS, seed=0)
     judge = {"bundled-content": BundledContentConfig().build()}
     before, target = list(zip(plain, here, strict=True)), list(zip(references, there, strict=True))

@@ -158,7 +158,8 @@ class Row:
         if self.goal is not None:
             known["goal_is"] = "at least" if self.more_is_better else "at most"
         if self.ratio is not None:
-            known |= {key: _rounded(value) for key, value in _ratio_fields(self.ratio).items()}
+            median, low, high, _ = self.ratio
+            known |= {"ratio": _rounded(median), "ratio_low": _rounded(low), "ratio_high": _rounded(high)}
         return known | {key: text for key in ("error_kind", "note") if (text := getattr(self, key))}
 
 
@@ -230,10 +231,6 @@ def _cells(row: Row, compared: bool) -> list[str]:
     goals = [] if row.goal is None else [f"{'≥' if row.more_is_better else '≤'} {number(row.goal)}"]
     goals += [] if row.ratio_goal is None else [f"≥ {number(row.ratio_goal)} ×"]
     return [*cells, ", ".join(goals)]
-
-
-def _ratio_fields(ratio: Spread) -> dict[str, float]:
-    return {"ratio": ratio.median, "ratio_low": ratio.low, "ratio_high": ratio.high}
 
 
 def _rounded(value: float) -> float:

@@ -167,15 +167,14 @@ def _each(views: Sequence[T], function: Callable[[T], Image]) -> tuple[list[Imag
 
 MATCHED, BOUND = "true classes", "best class maps"
 """No methods: they know classes, or even the truth (see `scores`)."""
-GOALS: Mapping[str, float] = {
-    "over_no_change_db": 3.0,
-    "over_best_global_db": 1.5,
-    "over_2d_db": 1.5,
-    "match_inside": 0.90,
-    "consistency": 0.05,
+GOALS: Mapping[str, tuple[str, float, str, str]] = {
+    "over_no_change_db": ("≥", 3.0, "dB", "PSNR over no change"),
+    "over_best_global_db": ("≥", 1.5, "dB", f"PSNR over the best of {GLOBAL[0]}, {GLOBAL[1]} and {GLOBAL[2]}"),
+    "over_2d_db": ("≥", 1.5, "dB", "PSNR over itself on single pictures (2d)"),
+    "match_inside": ("≥", 0.90, "", "match inside"),
+    "consistency": ("≤", 0.05, "", "consistency"),
 }
-"""PSNR of the recommended stylizer with three references against no change, the best of GLOBAL, and itself on single pictures,
-at least; its match rate inside of things, at least; its score of consistency, at most."""
+"""Goals of the recommended stylizer with three references: figures with their units, and what they are of."""
 JUDGED = "three"
 LPIPS_MISSING = "its weights do not ship with the package, and no dependency brings them"
 """Why that figure is null."""
@@ -205,7 +204,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
     stage = set_stage(scene, opened.known, settings, views=config.views, frames=config.frames, longest=config.longest)
     encoders = scene.encoders()
     results = cases(config, stage, encoders, folder, progress)
-    sets = sorted({case.set for case in results}, key=[case.set for case in results].index)
+    sets = dict.fromkeys(case.set for case in results)
     means = {name: mean_rows([case.rows for case in results if case.set == name]) for name in sets}
     best = list(lineup(config.stylizer))[-1]
     document = {
@@ -285,10 +284,15 @@ def verdict(rows: Mapping[str, Row], best: str) -> dict[str, Any]:
         "consistency": ours["consistency"],
     }
     met = {
-        name: None if value is None else value <= goal if name == "consistency" else value >= goal
-        for (name, goal), value in zip(GOALS.items(), reached.values(), strict=True)
+        name: None if (value := reached[name]) is None else value <= goal if sign == "≤" else value >= goal
+        for name, (sign, goal, _, _) in GOALS.items()
     }
-    return {"goals": dict(GOALS), "reached": reached, "met": met, "best_global": baseline}
+    return {
+        "goals": {name: goal for name, (_, goal, _, _) in GOALS.items()},
+        "reached": reached,
+        "met": met,
+        "best_global": baseline,
+    }
 
 
 def _case(
@@ -369,13 +373,6 @@ COLUMNS: tuple[Column, ...] = (
     ("style_seconds", "style s", ".2f"),
     ("view_seconds", "view s", ".3f"),
 )
-_GOALS = {
-    "over_no_change_db": ("PSNR over no change", "dB", "≥"),
-    "over_best_global_db": ("PSNR over the best of reinhard, histogram and adain", "dB", "≥"),
-    "over_2d_db": ("PSNR over itself on single pictures (2d)", "dB", "≥"),
-    "match_inside": ("match inside", "", "≥"),
-    "consistency": ("consistency", "", "≤"),
-}
 _ABOUT = """# Restyling with a true answer
 
 Nobody knows what a photographed scene would look like at night. Of the embedded town we know: a palette changes colours and
@@ -445,7 +442,7 @@ def _verdict(document: Mapping[str, Any]) -> str:
     judged = document["verdict"]
     lines = [f"Recommended: `{document['recommended']}`; the best global baseline is `{judged['best_global']}`.\n"]
     lines += ["| with three references | reached | goal | |", "|---|---:|---:|---|"]
-    for name, (label, unit, sign) in _GOALS.items():
+    for name, (sign, _, unit, label) in GOALS.items():
         reached, met = judged["reached"][name], judged["met"][name]
         value = "–" if reached is None else f"{reached:.3g} {unit}".strip()
         verdict = {None: "not known", True: "met", False: "**not met**"}[met]

@@ -126,7 +126,7 @@ def triplane_rows(config: SpeedConfig, trained: Trained) -> list[Row]:
         return []
     points = draw_points(config.points, config.seed, device)
     table = planes.table.detach().clone()
-    calls = {name: _caller(form, points, table, planes.resolutions) for name, form in FORMS.items()}
+    calls = {name: partial(forward_backward, form, points, table, planes.resolutions) for name, form in FORMS.items()}
     seconds = watch_of(config, trained).in_turn(calls)
     truth = forward_backward(triplane.lookup_reference, points.double(), table.double(), planes.resolutions)
     rows = []
@@ -171,10 +171,6 @@ def draw_points(count: int, seed: int, device: torch.device) -> Annotated[Tensor
     """Points of the unit cube, evenly spread."""
     generator = torch.Generator().manual_seed(seed)
     return (torch.rand(count, 3, generator=generator) * 2 - 1).to(device)
-
-
-def _caller(form: Lookup, points: Tensor, table: Tensor, resolutions: Sequence[int]) -> Callable[[], tuple[Tensor, Tensor]]:
-    return lambda: forward_backward(form, points, table, resolutions)
 
 
 def _error(computed: tuple[Tensor, Tensor], truth: tuple[Tensor, Tensor]) -> float:
@@ -337,7 +333,7 @@ def _rendering(config: SpeedConfig, subject: Subject) -> tuple[list[Row], dict[s
                 peer_error=difference(calls[f"naive {name}"](), truth).largest,
             )
         )
-    return rows, count(model.parts, rays, render.budget).shares
+    return rows, count(model.parts, rays, render.budget)
 
 
 def _drawn(model: Model, facts: Facts, camera: Cameras, render: RenderConfig, look: Restyle | None) -> Tensor:

@@ -16,7 +16,7 @@ from ..config import RenderConfig, TrainConfig
 from ..errors import FprfError, UsageError, WeightsError
 from ..io.images import write_image
 from ..ops import backend
-from ..rendering.cameras import Cameras, PixelRays, pixel_grid, rays_through
+from ..rendering.cameras import Cameras, PixelRays
 from ..rendering.renderer import Parts, march, render_rays
 from ..style.look import Restyle
 from ..town.layout import build_town
@@ -27,6 +27,7 @@ from ..training.model import Facts, Model, background_of, build_model
 from ..training.prepare import Prepared, prepare
 from ..training.run import view_names
 from ..training.trainer import Loop, optimizer_of
+from ..training.views import view_rays as world_rays
 from ..types import Batch, Rays, Want
 from .config import BenchConfig
 from .report import Watch
@@ -135,8 +136,7 @@ SHARE = 0.5
 
 def loop_of(config: TrainConfig, prepared: Prepared, model: Model) -> Loop:
     """The trainer's own loop around a model."""
-    device = model.device
-    return Loop(config, prepared, model, optimizer_of(config, model), device)
+    return Loop(config, prepared, model, optimizer_of(config, model), model.device)
 
 
 def stepper(loop: Loop, first: int) -> Callable[[], None]:
@@ -181,26 +181,6 @@ M = TypeVar("M", bound=nn.Module)
 CHUNK = 4096
 
 
-class Counts(NamedTuple):
-    """Rays and samples of a view: all, kept, and empty rays."""
-
-    rays: int
-    samples: int
-    kept: int
-    """Samples that met the content network."""
-    empty: int
-    """Rays that kept none."""
-
-    @property
-    def shares(self) -> dict[str, float]:
-        """As shares, by name."""
-        return {
-            "kept_samples_share": self.kept / max(1, self.samples),
-            "empty_rays_share": self.empty / max(1, self.rays),
-            "kept_samples_per_ray": self.kept / max(1, self.rays),
-        }
-
-
 class Difference(NamedTuple):
     """Of two images in [0, 1]."""
 
@@ -210,48 +190,47 @@ class Difference(NamedTuple):
 
 def view_rays(model: Model, cameras: Cameras, view: int) -> Rays:
     """Rays of all pixels, on the model's device."""
-    pixel = pixel_grid(cameras, view)
-    rays = model.space.rays(*rays_through(cameras, torch.full((len(pixel),), view), pixel))
-    return _to(rays, model.device)
+    return world_rays(model, cameras, view)[0]
 
 
-@torch.inference_mode()
 def exact(model: Model, facts: Facts, rays: Rays, restyle: Restyle | None = None) -> Annotated[Tensor, "R 3"]:
     """Colours in [0, 1] in float64, nothing skipped."""
-    wide = _double(model)
     restyle = None if restyle is None else replace(restyle, stylizer=_double(restyle.stylizer))
-    background = background_of(facts, rays.near.device)
-    rgb = []
-    for part in _chunks(Rays(*(x.double() for x in rays))):
-        out = render_rays(part, wide.parts, want=Want.COLOUR, budget=0.0, background=background, restyle=restyle)
-        assert out.rgb is not None
-        rgb.append(out.rgb)
-    return torch.cat(rgb).clamp(0, 1)
+    return _colours(_double(model), facts, Rays(*(x.double() for x in rays)), 0.0, CHUNK, restyle)
 
 
 def plainly(
     model: Model, facts: Facts, rays: Rays, render: RenderConfig, look: Restyle | None = None
 ) -> Annotated[Tensor, "R 3"]:
     """Colours in [0, 1] without compiled kernels."""
+    with backend.plain():
+        return _colours(model, facts, rays, render.budget, render.chunk, look)
+
+
+@torch.inference_mode()
+def _colours(model: Model, facts: Facts, rays: Rays, budget: float, chunk: int, look: Restyle | None) -> Tensor:
     background = background_of(facts, rays.near.device)
     rgb = []
-    with torch.inference_mode(), backend.plain():
-        for part in _chunks(rays, render.chunk):
-            out = render_rays(part, model.parts, want=Want.COLOUR, budget=render.budget, background=background, restyle=look)
-            assert out.rgb is not None
-            rgb.append(out.rgb)
+    for part in _chunks(rays, chunk):
+        out = render_rays(part, model.parts, want=Want.COLOUR, budget=budget, background=background, restyle=look)
+        assert out.rgb is not None
+        rgb.append(out.rgb)
     return torch.cat(rgb).clamp(0, 1)
 
 
 @torch.inference_mode()
-def count(parts: Parts, rays: Rays, budget: float) -> Counts:
-    """Count samples that a budget keeps."""
+def count(parts: Parts, rays: Rays, budget: float) -> dict[str, float]:
+    """Shares of the samples that a budget keeps (for the content network), of the rays that keep none; kept ones a ray."""
     samples = kept = empty = 0
-    for part in _chunks(rays):
+    for part in _chunks(rays, CHUNK):
         marched = march(part, parts, budget=budget)
         samples, kept = samples + marched.weights.numel(), kept + len(marched.kept.ray)
         empty += len(part.near) - len(torch.unique(marched.kept.ray))
-    return Counts(len(rays.near), samples, kept, empty)
+    return {
+        "kept_samples_share": kept / max(1, samples),
+        "empty_rays_share": empty / max(1, len(rays.near)),
+        "kept_samples_per_ray": kept / max(1, len(rays.near)),
+    }
 
 
 def difference(image: Tensor, truth: Tensor) -> Difference:
@@ -264,9 +243,5 @@ def _double(module: M) -> M:
     return copy.deepcopy(module).double()
 
 
-def _to(rays: Rays, device: torch.device) -> Rays:
-    return Rays(*(x.to(device) for x in rays))
-
-
-def _chunks(rays: Rays, size: int = CHUNK) -> list[Rays]:
+def _chunks(rays: Rays, size: int) -> list[Rays]:
     return [Rays(*(x[at : at + size] for x in rays)) for at in range(0, len(rays.near), size)]

@@ -13,6 +13,7 @@ right if the code that it takes most of has its own true class. Classes that no 
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -36,7 +37,7 @@ from ..town.render import View, geometry, render, walk
 from ..town.surface import CAR, CLASSES, DOOR, FACADE, FOLIAGE, LAMP, LAWN, ROAD, ROOF, SIDEWALK, SKY, TRUNK, WINDOW
 from ..town.write import TownSettings, is_town
 from ..training.run import Known
-from .metrics import delta_e, image_metrics, mean_metrics
+from .metrics import mean_scores
 from .single_image import encoded
 
 _STEP = 0.12
@@ -141,7 +142,7 @@ def short_path(start: Cameras, frames: int, stride: float = 1.0) -> Cameras:
         )
         pose[step, :, :3] = turn @ pose[step, :, :3]
         pose[step, :2, 3] += k * _STEP * ahead
-    return Cameras(pose, path.focal, path.centre, path.size, path.distortion, path.lens)
+    return replace(path, pose=pose)
 
 
 def _read_settings(folder: Path) -> TownSettings:
@@ -305,11 +306,9 @@ def score(
     pictures: Sequence[Picture], truth: Sequence[Picture], labels: Sequence[Annotated[Tensor, "H W"]]
 ) -> tuple[Row, dict[str, float]]:
     """`psnr`, `ssim` (means over the views) and `delta_e` (over all pixels); and the latter by class."""
-    row: Row = dict(mean_metrics([image_metrics(a, b) for a, b in zip(pictures, truth, strict=True)]))
-    apart = torch.cat([delta_e(a, b).flatten() for a, b in zip(pictures, truth, strict=True)])
+    row, apart = mean_scores(pictures, truth)
     kinds = torch.cat([each.flatten() for each in labels])
-    row["delta_e"] = float(apart.mean())
-    return row, {CLASSES[k]: float(apart[kinds == k].mean()) for k in sorted(set(kinds.tolist()))}
+    return {**row}, {CLASSES[k]: float(apart[kinds == k].mean()) for k in sorted(set(kinds.tolist()))}
 
 
 def best_class_maps(plain: Labelled, truth: Sequence[Picture]) -> list[Picture]:

@@ -15,13 +15,13 @@ from ..config import RenderConfig
 from ..memory import chunk_size
 from ..plugins.samplers.config import UniformConfig
 from ..plugins.samplers.samplers import UniformSampler
-from ..rendering.cameras import Cameras, project
+from ..rendering.cameras import Cameras
 from ..rendering.renderer import March, Parts, composite, march_features, shade
 from ..style.look import Restyle
 from ..training.model import Facts, Model, background_of
 from ..training.views import on_host
 from ..types import Rays, Want
-from .depth_maps import DepthMaps, depth_gaps
+from .depth_maps import DepthMaps, at_nearest, depth_gaps
 
 _DECAY = math.log(9)
 """Extinctions of a uniform medium over the distance in which a ray meets the middle 80 % of its light."""
@@ -87,11 +87,8 @@ def expected_presence(
         return torch.ones(len(point))
     for view, thickness in enumerate(maps.thickness):
         row, rank = ((seen.view == view) & (seen.weight > 0)).nonzero().unbind(1)
-        pixel, _ = project(maps.cameras, torch.full((len(row),), view, dtype=torch.int64), point[row])
-        height, width = thickness.shape
-        pixel = torch.nan_to_num(pixel)
-        x, y = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
-        light = -torch.expm1(-_DECAY * 2 * tolerance / thickness[y, x].clamp_min(1e-6))
+        thick = at_nearest(maps, view, thickness, point[row])
+        light = -torch.expm1(-_DECAY * 2 * tolerance / thick.clamp_min(1e-6))
         share = seen.weight[row, rank].float()
         total.index_add_(0, row, light * share)
         weight.index_add_(0, row, share)
@@ -111,7 +108,7 @@ class Coloured(NamedTuple):
     """sRGB in [0, 1], one set a look."""
     presence: Annotated[Tensor, "N"]
     """Share of light from close to a point, in [0, 1]: low where it floats before or behind the field's own surface,
-    and where that is thick (see `witness.expected_presence`)."""
+    and where that is thick (see `expected_presence`)."""
 
 
 def colours_in_styles(

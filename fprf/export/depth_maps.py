@@ -77,8 +77,7 @@ def _directed(maps: DepthMaps, view: int) -> tuple[Tensor, Tensor, Tensor]:
     """
     cameras, depth = maps.cameras, maps.depth[view].double()
     height, width = depth.shape
-    pixel = pixel_grid(cameras, view)
-    origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+    origin, direction = _rays(cameras, view)
     here = depth.isfinite()
     point = (origin + direction * torch.where(here, depth, 1.0).view(-1, 1)).view(height, width, 3)
     size = torch.where(here, depth, 0.0) / cameras.focal[view].mean()
@@ -88,6 +87,12 @@ def _directed(maps: DepthMaps, view: int) -> tuple[Tensor, Tensor, Tensor]:
     # Image rows run downwards: down x across points back to the camera.
     normal = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1)
     return point, normal, -(normal * direction.view(height, width, 3)).sum(-1)
+
+
+def _rays(cameras: Cameras, view: int) -> tuple[Annotated[Tensor, "N 3"], Annotated[Tensor, "N 3"]]:
+    """Through all pixels. Not `grid_rays`: its rounding would change the files of earlier exports."""
+    pixel = pixel_grid(cameras, view)
+    return rays_through(cameras, torch.full((len(pixel),), view), pixel)
 
 
 def _step(
@@ -121,6 +126,16 @@ def depth_gaps(
     return gap, distance
 
 
+def at_nearest(
+    maps: DepthMaps, view: int, values: Annotated[Tensor, "H W"], points: Annotated[Tensor, "N 3"]
+) -> Annotated[Tensor, "N"]:
+    """Values at the pixels of a view that world points fall on; beside the image, those at its border."""
+    pixel, _ = project(maps.cameras, torch.full((len(points),), view, dtype=torch.int64), points)
+    height, width = values.shape
+    x, y = torch.nan_to_num(pixel).long().unbind(-1)
+    return values[y.clamp(0, height - 1), x.clamp(0, width - 1)]
+
+
 def _lookup(depth: Annotated[Tensor, "H W"], pixel: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N"]:
     """Depths between pixel centres: linear in 1/depth, as a plane is, or the nearest pixel's where a surface is torn."""
     height, width = depth.shape
@@ -143,11 +158,8 @@ def _lookup(depth: Annotated[Tensor, "H W"], pixel: Annotated[Tensor, "N 2"]) ->
 
 _SOLID = 0.5
 """Rays of a smaller opacity meet nothing."""
-
-
 _THICKEST = 2.0
 """Surfaces are taken for no thicker than so many times their distance."""
-
 _REACH = 20.0
 """Distance of the sky in inner radii of a contraction, unless the user says otherwise."""
 _REACH_AHEAD = 50.0
@@ -209,8 +221,7 @@ def ray_quantile(
 def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reach: float) -> tuple[Tensor, Tensor]:
     """Depth and thickness [H W] of a view's surfaces."""
     device = model.device
-    pixel = pixel_grid(cameras, view)
-    origin, direction = rays_through(cameras, torch.full((len(pixel),), view), pixel)
+    origin, direction = _rays(cameras, view)
     rays = model.space.rays(origin, direction)
 
     def met(here: slice) -> tuple[Tensor, Tensor]:
@@ -218,7 +229,7 @@ def _depth(model: Model, cameras: Cameras, view: int, config: RenderConfig, reac
         parts = [ray_quantile(marched.weights, marched.sampled.t, share * marched.opacity) for share in (0.1, 0.5, 0.9)]
         return torch.stack(parts, 1), marched.opacity
 
-    parts = zip(*in_parts(len(pixel), chunk_size(config.chunk, device), met), strict=True)
+    parts = zip(*in_parts(len(origin), chunk_size(config.chunk, device), met), strict=True)
     t, opacity = on_host(*(torch.cat(part) for part in parts))
     first, depth, last = (model.space.metric(origin, direction, part).float() for part in t.unbind(1))
     seen = (opacity > _SOLID) & (depth < reach) & (depth > 0)

@@ -20,9 +20,8 @@ from torch import Tensor
 from ..errors import DataError
 from ..io.atomic import write_bytes
 from ..io.images import srgb_to_linear
-from ..rendering.cameras import project
 from ..splats.files.ply import ply_file
-from .depth_maps import DepthMaps, cosine_map, depth_gaps
+from .depth_maps import DepthMaps, at_nearest, cosine_map, depth_gaps
 from .point_cloud import SPAN, Cloud, cells, keys, origin_comment, vertex_table
 
 _TRUNCATION = 3.0
@@ -82,7 +81,7 @@ def integrate(
             gap, distance = depth_gaps(maps, view, point)
             close = gap.abs() < far / _STEEP
             slope = torch.full_like(gap, _CLEAR)
-            slope[close] = _slopes(maps, view, cosine, point[close])
+            slope[close] = at_nearest(maps, view, cosine, point[close]).clamp_min(_STEEP)
             value = (gap * slope / far).clamp(max=1)
             # Far in front nobody asks how the surface behind lies.
             value = torch.where(close, value, torch.where(gap > 0, 1.0, torch.nan))
@@ -94,14 +93,6 @@ def integrate(
     report(len(maps.depth), len(maps.depth))
     known = count >= 2
     return SignedDistance(cell[known], total[known] / weight[known], origin, edge)
-
-
-def _slopes(maps: DepthMaps, view: int, cosine: Annotated[Tensor, "H W"], point: Annotated[Tensor, "N 3"]) -> Tensor:
-    """The cosine at the pixel of each point, at least `_STEEP`."""
-    pixel, _ = project(maps.cameras, torch.full((len(point),), view), point)
-    height, width = cosine.shape
-    x, y = pixel[:, 0].long().clamp(0, width - 1), pixel[:, 1].long().clamp(0, height - 1)
-    return cosine[y, x].clamp_min(_STEEP)
 
 
 _CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]

@@ -88,17 +88,7 @@ def _choose(colours: tuple[tuple[float, float, float], ...], index: NDArray[np.i
 
 
 def _some(parts: Parts, at: NDArray[np.int64]) -> Parts:
-    return Parts(
-        window=parts.window[at],
-        door=parts.door[at],
-        shutter=parts.shutter[at],
-        across=parts.across[at],
-        up=parts.up[at],
-        half=parts.half[at],
-        tall=parts.tall[at],
-        column=parts.column[at],
-        storey=parts.storey[at],
-    )
+    return Parts(*(each[at] for each in parts))
 
 
 def _bare(style: int, tint: NDArray[np.int64], u: Array, v: Array, look: Palette) -> Colours:

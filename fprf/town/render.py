@@ -138,14 +138,19 @@ def cast(town: Town, view: View, d: tuple[Array, Array, Array], samples: int) ->
     return Hits(distance, face)
 
 
+def _across(sun: Array) -> tuple[Array, Array]:
+    """Two unit vectors square to the sun's rays and to each other, the first one level."""
+    level = np.cross(sun, [0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    return level, np.cross(sun, level)
+
+
 def shadowed(town: Town, points: Array, sun: Array, foliage: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], ...]:
     """Masks: something solid, and foliage, stands between points [N 3] and the sun (a unit vector towards it).
 
     `foliage` says of each solid whether it lets some light through.
     """
-    across = np.cross(sun, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across)
-    frame = np.stack([across, np.cross(sun, across), sun])
+    frame = np.stack([*_across(sun), sun])
     place = points @ frame.T
     order = np.argsort(place[:, 0], kind="stable")
     place, points = place[order], points[order]
@@ -300,9 +305,7 @@ def shade(town: Town, look: Palette, face: NDArray[np.integer], points: Array) -
     facing = np.flatnonzero(lit > 0)
     solid, leaves = shadowed(town, points[facing], sun, through)
     # Light falls through crowns in patches, whose pattern runs along the sun's rays.
-    across = np.cross(sun, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across)
-    a, b = points[facing] @ across, points[facing] @ np.cross(sun, across)
+    a, b = (points[facing] @ axis for axis in _across(sun))
     dapple = step(noise2(2.2 * a, 2.2 * b, 121), 0.55, 0.8) * 0.7
     lit[facing] *= np.where(solid, 0, np.where(leaves, dapple, 1))
     up = (0.5 + 0.5 * normals[:, 2])[:, None]

@@ -126,9 +126,13 @@ def extrude(
         normal[axis] = 2.0 * end - 1.0
         normals.append(normal)
         faces.append(_face(finishes[len(corner) + end], normal, rings[end]))
-    offsets = np.array([face.origin @ normal for face, normal in zip(faces, normals, strict=True)])
     every = rings.reshape(-1, 3)
-    return Polyhedron(np.stack(normals), offsets, tuple(faces), every.min(0), every.max(0))
+    return _polyhedron(normals, faces, every.min(0), every.max(0))
+
+
+def _polyhedron(normals: list[Array], faces: list[Face], low: Array, high: Array) -> Polyhedron:
+    offsets = np.array([face.origin @ normal for face, normal in zip(faces, normals, strict=True)])
+    return Polyhedron(np.stack(normals), offsets, tuple(faces), low, high)
 
 
 def box(low: Sequence[float], high: Sequence[float], finishes: Sequence[Finish]) -> Polyhedron:
@@ -151,8 +155,7 @@ def pyramid(low: Sequence[float], high: Sequence[float], finish: Finish) -> Poly
         faces.append(_face(finish, normal, corners))
     normals.append(np.array([0.0, 0.0, -1.0]))
     faces.append(_face(finish, normals[-1], ring))
-    offsets = np.array([face.origin @ normal for face, normal in zip(faces, normals, strict=True)])
-    return Polyhedron(np.stack(normals), offsets, tuple(faces), np.asarray(low, float), np.asarray(high, float))
+    return _polyhedron(normals, faces, np.asarray(low, float), np.asarray(high, float))
 
 
 def _round(finish: Finish, low: Array, high: Array, curve: Array) -> tuple[Face, ...]:
@@ -298,8 +301,10 @@ def tree(x: float, y: float, size: float, rng: np.random.Generator) -> list[Shap
             ellipsoid((x, y, 1.0 + tall), (0.55 * size, 0.55 * size, tall), leaf),
         ]
     stem = 2.1 + 0.4 * size
-    shapes: list[Shape] = [cylinder(x, y, 0.0, stem + 0.8, 0.11 + 0.05 * size, bark)]
-    shapes.append(ellipsoid((x, y, stem + 0.95 * size), (0.85 * size, 0.85 * size, 0.95 * size), leaf))
+    shapes: list[Shape] = [
+        cylinder(x, y, 0.0, stem + 0.8, 0.11 + 0.05 * size, bark),
+        ellipsoid((x, y, stem + 0.95 * size), (0.85 * size, 0.85 * size, 0.95 * size), leaf),
+    ]
     turn = float(rng.uniform(0, 2 * math.pi))
     count = 7
     for k in range(count):

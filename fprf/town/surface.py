@@ -13,20 +13,7 @@ from .shapes import PLINTH, Material
 
 SKY, LAWN, ROAD, SIDEWALK, FACADE, ROOF, FOLIAGE, TRUNK, WINDOW, LAMP, DOOR, CAR = range(12)
 
-CLASSES = (
-    "sky",
-    "lawn",
-    "road",
-    "sidewalk",
-    "facade",
-    "roof",
-    "foliage",
-    "trunk",
-    "window",
-    "lamp",
-    "door",
-    "car",
-)
+CLASSES = ("sky", "lawn", "road", "sidewalk", "facade", "roof", "foliage", "trunk", "window", "lamp", "door", "car")
 """Names by id."""
 
 
