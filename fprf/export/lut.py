@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..config import RenderConfig
 from ..io.atomic import write_text
-from ..memory import chunk_size
+from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import composite
 from ..style.look import Restyle
@@ -163,19 +163,19 @@ def colour_pairs(
     weight = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
     view, pixel = lattice(cameras, torch.tensor(list(views)), rays)
     every = model.space.rays(*rays_through(cameras, view, pixel))
-    chunks = []
-    size = chunk_size(config.chunk, device)
-    for start in range(0, len(view), size):
-        part = Rays(*(x[start : start + size].to(device) for x in every))
-        looks = [None, *styles]
+
+    def looked(here: slice) -> Tensor:
+        part, looks = Rays(*(x[here].to(device) for x in every)), [None, *styles]
         marched, colours, semantic = colours_in_styles(part, model.parts, config.budget, looks, semantic=weight.divided)
         kept = marched.kept
         shares = weight(kept.point[:, :0] if semantic is None or not weight.divided else semantic)
-        chunks.append(torch.cat([*colours, composite(kept, shares, len(part.near))], 1))
-    whole = torch.cat(chunks).cpu()
-    solid = whole[:, 3 * len(styles) + 3 :].sum(1).clamp_min(1e-6)
-    colour = (whole[:, : 3 * len(styles) + 3] / solid[:, None]).clamp(0, 1).view(len(whole), -1, 3)
-    return ColourPairs(colour[:, 0], colour[:, 1:].transpose(0, 1), whole[:, 3 * len(styles) + 3 :])
+        return torch.cat([*colours, composite(kept, shares, len(part.near))], 1)
+
+    whole = torch.cat(list(in_parts(len(view), chunk_size(config.chunk, device), looked))).cpu()
+    count = 3 * (1 + len(styles))
+    colours, share = whole[:, :count], whole[:, count:]
+    colour = (colours / share.sum(1).clamp_min(1e-6)[:, None]).clamp(0, 1).view(len(whole), -1, 3)
+    return ColourPairs(colour[:, 0], colour[:, 1:].transpose(0, 1), share)
 
 
 def fit_quality(

@@ -2,7 +2,7 @@
 
 import base64
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from itertools import groupby
@@ -40,7 +40,7 @@ class Style(NamedTuple):
     """Share of the scene that each of them styled (`maps.match_summary`); none where that was not measured."""
     matches: Sequence[Picture] = ()
     """Match maps (`maps.match_image`), one per view or fewer."""
-    metrics: "Metrics" = MappingProxyType({})
+    metrics: Metrics = MappingProxyType({})
     """Figures of this style alone."""
 
 
@@ -70,6 +70,13 @@ def _cards(pictures: Sequence[Picture], view_names: Sequence[str], what: str, st
         for view, (name, picture) in enumerate(zip(view_names, pictures, strict=False))
     )
     return f'<div class="grid small">\n{cards}\n</div>'
+
+
+def _section(title: str, body: str, lead: str = "", *, of: str = "") -> str:
+    """A part of the page that its navigation names; `of` is its class."""
+    kind = f' class="{of}"' if of else ""
+    told = f'<p class="lead">{lead}</p>\n' if lead else ""
+    return f'<section{kind} id="{title.lower()}">\n<h2>{title}</h2>\n{told}{body}\n</section>'
 
 
 _LEAST, _MOST = 760, 2.6
@@ -156,17 +163,14 @@ def _overview(view_names: Sequence[str], originals: Sequence[Picture], styles: S
         ]
         rows.append(f'<tr><th scope="row">{escape(name)}</th>{"".join(cells)}</tr>')
     body = "\n".join(rows)
-    return f"""<section id="overview">
-<h2>Overview</h2>
-<p class="lead">Every view in every style. Choose one to compare it above.</p>
-<div class="scroller" tabindex="0" role="region" aria-label="Every view in every style">
+    table = f"""<div class="scroller" tabindex="0" role="region" aria-label="Every view in every style">
 <table class="matrix" style="--pictures:{len(styles) + 1}">
 <thead><tr><th scope="col">View</th>{heads}</tr></thead>
 <tbody>
 {body}
 </tbody>
-</table></div>
-</section>"""
+</table></div>"""
+    return _section("Overview", table, "Every view in every style. Choose one to compare it above.")
 
 
 def _cell(picture: Picture, what: str, goes: str) -> str:
@@ -174,19 +178,8 @@ def _cell(picture: Picture, what: str, goes: str) -> str:
     return f'<td><button type="button" data-go="{goes}" style="--ratio:{_ratio(picture)}">{shown}</button></td>'
 
 
-def _styles_section(view_names: Sequence[str], styles: Sequence[Style], known: Mapping[str, Reference]) -> str:
-    """Each style with its references and figures beside its views, its match maps below."""
-    if not styles:
-        return ""
-    blocks = "\n".join(_style(index, style, view_names, known) for index, style in enumerate(styles))
-    return f"""<section class="styles" id="styles">
-<h2>Styles</h2>
-<p class="lead">The same trained scene, restyled by photographs. Choose a view to compare it above.</p>
-{blocks}
-</section>"""
-
-
 def _style(index: int, style: Style, view_names: Sequence[str], known: Mapping[str, Reference]) -> str:
+    """A style with its references and figures beside its views, its match maps below."""
     cards = "\n".join(
         f'<button class="card" type="button" data-shot="{index}-{view}" style="--ratio:{_ratio(picture)}">'
         f"{_img(picture, _VIEW_SIDE, f'View {name}, {style.name}')}<span>{escape(name)}</span></button>"
@@ -256,13 +249,16 @@ def write_gallery(
     film = "" if video is None else _film(video, path)
     upright = originals[0].shape[0] > originals[0].shape[1]
     beside = film if upright and styles else ""
+    blocks = "\n".join(_style(index, style, view_names, known) for index, style in enumerate(styles))
+    told = "The same trained scene, restyled by photographs. Choose a view to compare it above."
+    near = "Rendered depth: near is bright, far is dark, nothing is grey. All styles share it."
     parts = [
         ("", _opening(title, lead, scene)),
         ("Compare", _compare(view_names, originals, styles, known, beside)),
-        ("Flight", _flight(film) if film and not beside else ""),
+        ("Flight", _section("Flight", f'<div class="film-box">{film}</div>') if film and not beside else ""),
         ("Overview", _overview(view_names, originals, styles)),
-        ("Styles", _styles_section(view_names, styles, known)),
-        ("Geometry", _geometry(view_names, depth)),
+        ("Styles", _section("Styles", blocks, told, of="styles") if styles else ""),
+        ("Geometry", _section("Geometry", _cards(depth, view_names, "depth"), near) if depth else ""),
         ("Figures", _figures(metrics or {})),
     ]
     present = [(name, part) for name, part in parts if part]
@@ -302,16 +298,6 @@ def _opening(title: str, lead: str, scene: Mapping[str, str | int | float]) -> s
     return f'<section class="opening">\n<h1>{escape(title)}</h1>{told}{listed}\n</section>'
 
 
-def _geometry(view_names: Sequence[str], depth: Sequence[Picture]) -> str:
-    if not depth:
-        return ""
-    return f"""<section id="geometry">
-<h2>Geometry</h2>
-<p class="lead">Rendered depth: near is bright, far is dark, nothing is grey. All styles share it.</p>
-{_cards(depth, view_names, "depth")}
-</section>"""
-
-
 def _film(video: Path, page: Path) -> str:
     with video.open("rb") as film:
         data = film.read(_EMBEDDED_VIDEO + 1)
@@ -330,32 +316,21 @@ def _film(video: Path, page: Path) -> str:
     return f'<video class="flight" src="{source}" {kind}></video>'
 
 
-def _flight(film: str) -> str:
-    return f'<section id="flight">\n<h2>Flight</h2>\n<div class="film-box">{film}</div>\n</section>'
-
-
-def _figures(metrics: "Metrics") -> str:
+def _figures(metrics: Metrics) -> str:
     tables = []
+    heads = '<th scope="col">Figure</th><th scope="col" class="value">Value</th><th scope="col" class="unit">Unit</th>'
     for group, rows in groupby(figures(metrics), key=lambda figure: figure.group):
-        body = _cells((row.label, row.value, row.unit) for row in rows)
-        tables.append(
-            f"<table>\n<caption>{escape(group or 'Quality and cost')}</caption>\n{_HEAD}\n<tbody>\n{body}\n</tbody>\n</table>"
+        body = "\n".join(
+            f'<tr><th scope="row">{escape(row.label)}</th><td class="value">{escape(row.value)}</td>'
+            f'<td class="unit">{escape(row.unit)}</td></tr>'
+            for row in rows
         )
-    if not tables:
-        return ""
+        tables.append(f"""<table>
+<caption>{escape(group or "Quality and cost")}</caption>
+<thead><tr>{heads}</tr></thead>
+<tbody>
+{body}
+</tbody>
+</table>""")
     listed = "\n".join(tables)
-    return f'<section id="figures">\n<h2>Figures</h2>\n<div class="figures">\n{listed}\n</div>\n</section>'
-
-
-_HEAD = (
-    '<thead><tr><th scope="col">Figure</th><th scope="col" class="value">Value</th>'
-    '<th scope="col" class="unit">Unit</th></tr></thead>'
-)
-
-
-def _cells(rows: Iterable[tuple[str, str, str]]) -> str:
-    return "\n".join(
-        f'<tr><th scope="row">{escape(label)}</th><td class="value">{escape(value)}</td>'
-        f'<td class="unit">{escape(unit)}</td></tr>'
-        for label, value, unit in rows
-    )
+    return _section("Figures", f'<div class="figures">\n{listed}\n</div>') if tables else ""

@@ -87,7 +87,7 @@ def number(value: float | int | str | bool | None) -> str:
     return f"{value:.{1 if abs(value) >= 50 else 2 if abs(value) >= 1 else 3}f}"
 
 
-def figures(metrics: "Metrics", group: str = "") -> Iterator[Figure]:
+def figures(metrics: Metrics, group: str = "") -> Iterator[Figure]:
     """Every figure of a metrics object, in its order, the objects within it after its own."""
     inner: list[tuple[str, Metrics]] = []
     for key, value in metrics.items():

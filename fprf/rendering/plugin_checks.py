@@ -100,7 +100,8 @@ def _asked(config: PluginConfig, what: str, function: Callable[[Tensor], T], giv
     except FprfError:
         raise
     except Exception as error:
-        raise _breach(config, what, "an answer", f"{type(error).__name__}: {_line(error)}") from error
+        line = (str(error).splitlines() or [""])[0][:200]
+        raise _breach(config, what, "an answer", f"{type(error).__name__}: {line}") from error
     if not torch.equal(before, given):
         raise _breach(config, what, "an input that is left alone", "an input that was written to")
     return answer
@@ -142,7 +143,3 @@ def _breach(config: PluginConfig, what: str, expected: str, actual: str) -> Plug
 
 def _kind(tensor: Tensor) -> str:
     return str(tensor.dtype).removeprefix("torch.")
-
-
-def _line(error: Exception) -> str:
-    return (str(error).splitlines() or [""])[0][:200]

@@ -93,7 +93,7 @@ def _march(rays: Rays, parts: Parts, budget: float, step: int | None, generator:
     located = space.locate(points.view(-1, 3))
     sample = parts.field.density(located)
     density = sample.density.view(middle.shape)
-    scale = _near_camera_gradient_scale(rays, middle) if scaled else None
+    scale = (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1) if scaled else None
     if scale is not None:
         density = scale_gradient(density, scale)
     weights = transmittance_weights(density, sampled.t)
@@ -135,10 +135,6 @@ def _march_compiled(rays: Rays, parts: Parts, sampled: Sampled, budget: float) -
 def _fixed(rays: Rays) -> Rays:
     """The rays without gradients: neither where samples lie nor what things are moves a pose."""
     return Rays(*(x.detach() for x in rays))
-
-
-def _near_camera_gradient_scale(rays: Rays, middle: Annotated[Tensor, "R S"]) -> Annotated[Tensor, "R S"]:
-    return (middle / (_NEAR_CAMERA * rays.near[:, None])).square().clamp(max=1)
 
 
 def march_features(
