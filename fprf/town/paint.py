@@ -88,7 +88,7 @@ def _choose(colours: tuple[tuple[float, float, float], ...], index: NDArray[np.i
 
 
 def _some(parts: Parts, at: NDArray[np.int64]) -> Parts:
-    return Parts(*(each[at] for each in parts))
+    return Parts._make(each[at] for each in parts)
 
 
 def _bare(style: int, tint: NDArray[np.int64], u: Array, v: Array, look: Palette) -> Colours:

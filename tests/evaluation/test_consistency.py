@@ -76,9 +76,9 @@ def test_what_is_hidden_or_outside_is_not_compared() -> None:
     ignored = warp(image_b, depth_a, torch.full_like(depth_b, 0.0), cameras, 0, 1)
     assert not bool(ignored.valid.any())
     # Without the occlusion test white would show: a depth of b that lies about it lets it through.
-    plane = seen(cameras, 1)[1]
-    fooled = warp(image_b, seen(cameras, 0)[1], plane, cameras, 0, 1)
-    assert float((fooled.image - seen(cameras, 0)[0])[fooled.valid].abs().max()) > 0.2
+    (plane_a, way_a), (_, way_b) = seen(cameras, 0), seen(cameras, 1)
+    fooled = warp(image_b, way_a, way_b, cameras, 0, 1)
+    assert float((fooled.image - plane_a)[fooled.valid].abs().max()) > 0.2
 
 
 def test_a_consistent_path_scores_zero_and_flicker_its_own_size() -> None:
@@ -118,40 +118,31 @@ def test_the_relative_error_does_not_reward_dullness() -> None:
 def test_what_does_not_fit_is_named() -> None:
     cameras = row_of_cameras(2)
     image, depth = seen(cameras, 0)
-    with pytest.raises(DataError, match="1 images, 2 depths, 2 cameras"):
+    with pytest.raises(DataError):
         consistency([image], [depth] * 2, cameras, [])
     with pytest.raises(DataError, match="view 1: the image is 48x35, its camera 48x36"):
         warp(image[:-1], depth, depth, cameras, 0, 1)
     with pytest.raises(DataError, match="view 0: the depth is 36x48"):
         warp(image, depth.T, depth, cameras, 0, 1)
-    with pytest.raises(NumericsError, match="not finite"):
+    with pytest.raises(NumericsError):
         consistency([image * math.nan] * 2, [depth] * 2, cameras, [(0, 0)])
-
-
-STILL_FRAMES = 9
-
-
-def still() -> Cameras:
-    pose = torch.eye(4, dtype=torch.float64)[None, :3].repeat(STILL_FRAMES, 1, 1)
-    return pinhole(pose, width=12, height=12, fov=53.0)
+    with pytest.raises(NumericsError):
+        steadiness([image] * 2, [image * math.nan] * 2, [depth] * 2, cameras)
 
 
 def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
     """Brighter by 0.01 with every frame: neighbours differ by that, frames 7 apart by seven times as much."""
-    images = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(STILL_FRAMES)]
-    found = published(images, [torch.full((12, 12), 2.0)] * STILL_FRAMES, still())
+    images, depths = [torch.full((12, 12, 3), 0.2 + 0.01 * t) for t in range(9)], [torch.full((12, 12), 2.0)] * 9
+    still = pinhole(torch.eye(4, dtype=torch.float64)[None, :3].repeat(9, 1, 1), width=12, height=12, fov=53.0)
+    found = published(images, depths, still)
     assert found["short"]["rmse"] == pytest.approx(0.01, rel=1e-4) and found["short"]["pairs"] == 8
     assert found["short"]["e_warp"] == pytest.approx(1e-4, rel=1e-4)
     assert found["long"]["rmse"] == pytest.approx(0.07, rel=1e-4) and found["long"]["pairs"] == 2
-    assert found["short"]["lpips"] is None
-
-
-def test_nothing_to_compare() -> None:
-    images = [torch.zeros(12, 12, 3)] * STILL_FRAMES
-    found = published(images, [torch.zeros(12, 12)] * STILL_FRAMES, still())
-    assert found["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}
-    with pytest.raises(DataError, match="2 images, 9 depths"):
-        published(images[:2], [torch.zeros(12, 12)] * STILL_FRAMES, still())
+    nothing = published(images, [torch.zeros(12, 12)] * 9, still)
+    assert nothing["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}
+    for mistaken in (published, lambda *given: steadiness(images, *given)):
+        with pytest.raises(DataError):
+            mistaken(images[:2], depths, still)
 
 
 FILM_WIDTH, FILM_HEIGHT, FILM_FRAMES = 96, 72, 8
@@ -213,15 +204,11 @@ def test_the_render_itself_scores_zero(day: list[Tensor], depths: list[Tensor], 
     assert found.valid_share > 0.4
 
 
-def test_dull_and_inverted_colours_score_zero(day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
+def test_a_consistent_recolouring_scores_zero(day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
+    """Another palette is a new colour for every point of the town, the same from every view."""
+    assert score(day, film(path, "night"), depths, path) < 0.02
     for recoloured in ([0.4 * x + 0.3 for x in day], [1 - x for x in day]):
         assert score(day, recoloured, depths, path) < 1e-3
-
-
-@pytest.mark.parametrize("light", ["night"])
-def test_a_consistent_recolouring_scores_zero(light: str, day: list[Tensor], depths: list[Tensor], path: Cameras) -> None:
-    """Another palette is a new colour for every point of the town, the same from every view."""
-    assert score(day, film(path, light), depths, path) < 0.02
 
 
 @pytest.mark.parametrize(

@@ -1,24 +1,39 @@
 """Scores of pictures against their definitions."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.color import rgb_to_lab
+from torch import Tensor
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.metrics import PSNR_CAP, delta_e_2000, image_metrics, psnr, srgb_to_lab, ssim, structure
+from fprf.evaluation.metrics import (
+    PSNR_CAP,
+    RegionStatistics,
+    delta_e_2000,
+    gaussian_distance,
+    image_metrics,
+    psnr,
+    relative_distance,
+    srgb_to_lab,
+    ssim,
+    structure,
+    style_distances,
+)
+from fprf.interfaces import Encoder
 
 
 def noise(height: int, width: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def ssim_oracle(a: np.ndarray, b: np.ndarray) -> float:
-    """Wang et al. 2004 in float64, window by window."""
-    x = np.arange(11) - 5
-    g = np.exp(-(x**2) / (2 * 1.5**2))
+def ssim_oracle(a: np.ndarray, b: np.ndarray, *, means: bool = True) -> float:
+    """Wang et al. 2004 in float64, window by window; or its second factor alone."""
+    g = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
     window = np.outer(g, g)[..., None] / g.sum() ** 2
     found = []
     for i in range(a.shape[0] - 10):
@@ -26,9 +41,8 @@ def ssim_oracle(a: np.ndarray, b: np.ndarray) -> float:
             p, q = a[i : i + 11, j : j + 11], b[i : i + 11, j : j + 11]
             mp, mq = (window * p).sum((0, 1)), (window * q).sum((0, 1))
             vp, vq = (window * (p - mp) ** 2).sum((0, 1)), (window * (q - mq) ** 2).sum((0, 1))
-            cov = (window * (p - mp) * (q - mq)).sum((0, 1))
-            top = (2 * mp * mq + 1e-4) * (2 * cov + 9e-4)
-            found.append(top / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
+            first = (2 * mp * mq + 1e-4) / (mp**2 + mq**2 + 1e-4) if means else 1.0
+            found.append(first * (2 * (window * (p - mp) * (q - mq)).sum((0, 1)) + 9e-4) / (vp + vq + 9e-4))
     return float(np.mean(found))
 
 
@@ -54,10 +68,13 @@ def test_what_is_not_finite_is_no_score(value: float) -> None:
             metric(broken, noise(12, 12))
 
 
-@pytest.mark.parametrize("shape", [(4, 5, 3), (5, 4, 4), (4, 5), (0, 5, 3)])
+@pytest.mark.parametrize("shape", [(14, 15, 3), (15, 14, 4), (14, 15), (0, 14, 3)])
 def test_unlike_shapes_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(DataError, match="cannot be compared"):
-        psnr(torch.zeros(shape), torch.zeros(5, 4, 3))
+    for metric in (psnr, structure):
+        with pytest.raises(DataError):
+            metric(torch.zeros(shape), torch.zeros(15, 14, 3))
+    with pytest.raises(DataError):
+        structure(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3))
 
 
 def test_what_a_mask_leaves_out_does_not_count() -> None:
@@ -113,16 +130,10 @@ PUBLISHED = """
 """
 
 
-ROWS = torch.tensor([[float(x) for x in line.split()] for line in PUBLISHED.strip().splitlines()], dtype=torch.float64)
-
-
-colours = st.tuples(*[st.floats(0, 1) for _ in range(3)])
-
-
 def test_the_published_pairs() -> None:
-    assert len(ROWS) == 34
-    found = delta_e_2000(ROWS[:, :3], ROWS[:, 3:6])
-    assert (found - ROWS[:, 6]).abs().max() < 5e-5, "as many digits as were published"
+    rows = torch.tensor([[float(x) for x in line.split()] for line in PUBLISHED.strip().splitlines()], dtype=torch.float64)
+    found = delta_e_2000(rows[:, :3], rows[:, 3:6])
+    assert (found - rows[:, 6]).abs().max() < 5e-5, "as many digits as were published"
 
 
 def test_lab_is_that_of_another_library() -> None:
@@ -132,38 +143,19 @@ def test_lab_is_that_of_another_library() -> None:
 
 
 def picture(height: int = 24, width: int = 30, seed: int = 0) -> torch.Tensor:
-    """Noise with edges, colours apart."""
-    draw = torch.Generator().manual_seed(seed)
-    noise = torch.rand(height, width, 3, generator=draw)
-    noise[:, width // 2 :] *= 0.3
-    return noise
-
-
-def structure_oracle(a: np.ndarray, b: np.ndarray) -> float:
-    """Window by window, in float64."""
-    weights = np.array([0.2126, 0.7152, 0.0722])
-    greys = []
-    for image in (a, b):
-        grey = image @ weights
-        greys.append((grey - grey.mean()) / grey.std() * 0.25)
-    at = np.arange(11) - 5
-    window = np.outer(np.exp(-(at**2) / 4.5), np.exp(-(at**2) / 4.5))
-    window /= window.sum()
-    found = []
-    for i in range(a.shape[0] - 10):
-        for j in range(a.shape[1] - 10):
-            p, q = greys[0][i : i + 11, j : j + 11], greys[1][i : i + 11, j : j + 11]
-            dp, dq = p - (window * p).sum(), q - (window * q).sum()
-            found.append((2 * (window * dp * dq).sum() + 9e-4) / ((window * (dp**2 + dq**2)).sum() + 9e-4))
-    return float(np.mean(found))
+    """Noise with an edge."""
+    return noise(height, width, seed) * torch.where(torch.arange(width) < width // 2, 1.0, 0.3)[:, None]
 
 
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000), st.integers(11, 20), st.integers(11, 20))
 def test_structure_is_the_written_out_one(seed: int, height: int, width: int) -> None:
+    """SSIM's second factor of luminances with one mean and deviation."""
     a, b = picture(height, width, seed), picture(height, width, seed + 1)
     b = 0.5 * a + 0.5 * b
-    assert structure(a, b) == pytest.approx(structure_oracle(a.double().numpy(), b.double().numpy()), abs=1e-6)
+    greys = [image.double().numpy() @ np.array([[0.2126], [0.7152], [0.0722]]) for image in (a, b)]
+    alike = [0.25 * (grey - grey.mean()) / grey.std() for grey in greys]
+    assert structure(a, b) == pytest.approx(ssim_oracle(*alike, means=False), abs=1e-6)
 
 
 @settings(max_examples=20, deadline=None)
@@ -174,7 +166,80 @@ def test_brightness_contrast_and_tint_cost_nothing(contrast: float, brightness: 
     assert structure(grey, tinted) == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(("a", "b"), [((16, 16, 3), (16, 17, 3)), ((10, 30, 3), (10, 30, 3)), ((16, 16), (16, 16))])
-def test_sizes_that_cannot_be_compared_are_refused(a: tuple[int, ...], b: tuple[int, ...]) -> None:
-    with pytest.raises(DataError):
-        structure(torch.rand(a), torch.rand(b))
+class Pixels(Encoder):
+    """Colours, plain or doubled."""
+
+    def __init__(self, gain: float = 1.0) -> None:
+        super().__init__()
+        self.gain = gain
+
+    @property
+    def identity(self) -> str:
+        return "pixels"
+
+    @property
+    def channels(self) -> int:
+        return 3
+
+    def forward(self, image: Tensor) -> Tensor:
+        return self.gain * image
+
+
+def statistics(seed: int, channels: int = 4) -> RegionStatistics:
+    draw = np.random.default_rng(seed)
+    root = draw.normal(size=(channels, channels))
+    return RegionStatistics(100, torch.from_numpy(draw.normal(size=channels)), torch.from_numpy(root @ root.T))
+
+
+def draws(seed: int, mean: float = 0.5, spread: float = 0.1) -> Tensor:
+    return mean + spread * torch.randn(12, 16, 3, generator=torch.Generator().manual_seed(seed))
+
+
+HALVES = (torch.arange(16) >= 8).long().expand(12, 16)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000), st.integers(1, 6))
+def test_the_full_distance_is_frechets(seed: int, channels: int) -> None:
+    a, b = statistics(seed, channels), statistics(seed + 1, channels)
+    product = np.linalg.eigvals(a.covariance.numpy() @ b.covariance.numpy())
+    cross = np.sqrt(np.maximum(product.real, 0)).sum()
+    square = np.square((a.mean - b.mean).numpy()).sum() + np.trace(a.covariance) + np.trace(b.covariance) - 2 * cross
+    assert gaussian_distance(a, b, full=True) == pytest.approx(math.sqrt(max(0, float(square))), abs=1e-5)
+    assert gaussian_distance(a, b, full=True) == pytest.approx(gaussian_distance(b, a, full=True), abs=1e-6)
+    assert gaussian_distance(a, a, full=True) < 1e-5
+
+
+def test_no_change_is_one_and_the_reference_itself_is_zero() -> None:
+    plain, style = draws(0), draws(1, mean=0.2, spread=0.2)
+    halfway = (plain + style.mean(dim=(0, 1))) / 2
+    rows = style_distances(
+        {"plain": Pixels(), "doubled": Pixels(2.0)},
+        [(plain, HALVES)],
+        {"none": [(plain, HALVES)], "style": [(style, HALVES)], "half": [(halfway, HALVES)]},
+        [(style, HALVES)],
+    )
+    assert rows["none"] == {"plain": 1.0, "doubled": 1.0, "mean": 1.0}
+    assert rows["style"] == {"plain": 0.0, "doubled": 0.0, "mean": 0.0}
+    assert 0.1 < (rows["half"]["mean"] or 0.0) < 0.9
+
+
+def test_a_style_that_is_right_in_the_wrong_places_is_no_style() -> None:
+    plain, style = draws(0), draws(1) + torch.where(HALVES == 0, 0.3, -0.3)[..., None]
+    local, everywhere = (
+        style_distances({"it": Pixels()}, [(plain, parts)], {"swapped": [(style.flip(1), parts)]}, [(style, parts)])
+        for parts in (HALVES, torch.zeros_like(HALVES))
+    )
+    assert (local["swapped"]["mean"] or 0.0) > 1.5 and (everywhere["swapped"]["mean"] or 1.0) < 0.1
+
+
+def test_regions_weigh_by_their_share_and_small_ones_not_at_all() -> None:
+    def at(mean: float, cells: int) -> RegionStatistics:
+        return RegionStatistics(cells, torch.tensor([mean]).double(), torch.zeros(1, 1).double())
+
+    plain = {0: at(1.0, 30), 1: at(1.0, 10), 2: at(9.0, 4)}
+    styled = {0: at(0.5, 30), 1: at(1.0, 10), 2: at(9.0, 4)}
+    style = {0: at(0.0, 9), 1: at(0.0, 9), 2: at(0.0, 9), 3: at(5.0, 9)}
+    assert relative_distance(plain, styled, style) == pytest.approx((30 * 0.5 + 10) / 40)
+    assert relative_distance(style, style, style) is None
+    assert relative_distance({7: at(1.0, 30)}, styled, style) is None

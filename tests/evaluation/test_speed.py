@@ -57,23 +57,20 @@ def test_counts_are_those_of_the_march(world: World) -> None:
     rays = view_rays(trained.model, trained.known.cameras, 0)
     with torch.inference_mode():
         kept = march(rays, trained.model.parts, budget=0.3).kept
-    found = count(trained.model.parts, rays, 0.3)
-    assert (found.rays, found.samples, found.kept) == (768, 768 * 8, len(kept.ray))
-    assert found.empty == 768 - len(set(kept.ray.tolist()))
-    assert found.shares["kept_samples_per_ray"] == pytest.approx(len(kept.ray) / 768)
-
-
-def made(resolutions: tuple[int, ...], channels: int, seed: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    points = torch.rand(50, 3, generator=generator, dtype=dtype) * 2.4 - 1.2
-    return points, torch.randn(triplane.rows(resolutions), channels, generator=generator, dtype=dtype)
+    assert count(trained.model.parts, rays, 0.3) == {
+        "kept_samples_share": len(kept.ray) / (768 * 8),
+        "empty_rays_share": 1 - len(set(kept.ray.tolist())) / 768,
+        "kept_samples_per_ray": len(kept.ray) / 768,
+    }
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(2, 9), min_size=1, max_size=3), st.integers(1, 9), st.integers(0, 99))
 def test_grid_sample_is_the_same_lookup(resolutions: list[int], channels: int, seed: int) -> None:
     """In float64 both round by 1e-16; what is left is a step over a node's edge, which both take continuously."""
-    points, table = made(tuple(resolutions), channels, seed, torch.float64)
+    draw = torch.Generator().manual_seed(seed)
+    points = torch.rand(50, 3, generator=draw, dtype=torch.float64) * 2.4 - 1.2
+    table = torch.randn(triplane.rows(tuple(resolutions)), channels, generator=draw, dtype=torch.float64)
     leaves = [table.clone().requires_grad_() for _ in range(2)]
     forms = (grid_sample_lookup, triplane.lookup_reference)
     values = [form(points, leaf, tuple(resolutions)) for form, leaf in zip(forms, leaves, strict=True)]
@@ -109,11 +106,7 @@ def test_skipping_moves_the_gradient_and_exactness_does_not(world: World) -> Non
     assert errors[0] < 1e-4 < errors[1] < errors[2]
 
 
-CPU = torch.device("cpu")
-SECONDS = st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=9)
-
-
-@given(SECONDS, st.floats(0.1, 50))
+@given(st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=9), st.floats(0.1, 50))
 def test_load_that_both_meet_in_a_round_cancels(loads: list[float], faster: float) -> None:
     found = ratio([faster * load for load in loads], loads)
     for value in found[:3]:
@@ -124,7 +117,7 @@ def test_rounds_run_everything_in_turn_after_one_that_does_not_count() -> None:
     heard: list[str] = []
     told: list[tuple[int, int]] = []
     calls = {name: lambda name=name: heard.append(name) for name in "abc"}
-    taken = Watch(4, CPU).in_turn(calls, lambda done, total: told.append((done, total)))
+    taken = Watch(4, torch.device("cpu")).in_turn(calls, lambda done, total: told.append((done, total)))
     assert "".join(heard) == "abc" + "abc" + "bca" + "cab" + "abc"
     assert {name: len(seconds) for name, seconds in taken.items()} == {"a": 4, "b": 4, "c": 4}
     assert told == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 4)]

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from town_views import project
 
 from fprf.datamanagers.parsers.config import TownConfig
 from fprf.errors import DataError
@@ -42,8 +43,7 @@ def test_files_are_the_pictures(folder):
         shot = render(town, views[k], palette("autumn"))
         assert np.array_equal(cv2.imread(str(folder / f"images/{k:04d}.png"))[..., ::-1], shot.rgb)
         depth, kinds = read_truth(folder, k)
-        assert np.array_equal(depth, shot.depth)
-        assert np.array_equal(kinds, shot.labels)
+        assert np.array_equal(depth, shot.depth) and np.array_equal(kinds, shot.labels)
         assert np.array_equal(np.isinf(depth), kinds == SKY)
 
 
@@ -63,17 +63,10 @@ def test_transforms_follow_the_format(folder):
 def test_points_lie_on_surfaces(folder):
     with np.load(folder / "points.npz") as stored:
         xyz, rgb = stored["xyz"], stored["rgb"]
-    assert xyz.shape == rgb.shape
-    assert len(xyz) > 7 * 100
+    assert xyz.shape == rgb.shape and len(xyz) > 7 * 100 and xyz[:, 2].min() > -0.01
     assert (xyz.dtype, rgb.dtype) == (np.float32, np.uint8)
-    assert xyz[:, 2].min() > -0.01
-    view = walk(seed=2, views=9, width=24, height=18)[1]
-    depth, _ = read_truth(folder, 1)
-    off = xyz[: write._POINTS] - view.pose[:, 3]
-    local = off @ view.pose[:, :3]
-    x = np.floor(view.focal * local[:, 0] / -local[:, 2] + 12).astype(int)
-    y = np.floor(-view.focal * local[:, 1] / -local[:, 2] + 9).astype(int)
-    np.testing.assert_allclose(np.linalg.norm(off, axis=1), depth[y, x], rtol=1e-4)
+    row, column, distance = project(walk(seed=2, views=9, width=24, height=18)[1], xyz[: write._POINTS])
+    np.testing.assert_allclose(distance, read_truth(folder, 1)[0][row, column], rtol=1e-4)
 
 
 def test_a_damaged_folder_is_rendered_again(tmp_path):
@@ -113,8 +106,7 @@ def test_somebody_elses_folder_is_left_alone(tmp_path):
 def test_parser_renders_once_into_the_cache(cache, monkeypatch):
     config = TownConfig(**TINY)
     scene = config.build().parse(Path("town"), 1)
-    assert scene.name == "town"
-    assert len(scene.cameras) == 2
+    assert scene.name == "town" and len(scene.cameras) == 2
     assert (scene.train.tolist(), scene.test.tolist()) == ([1], [0])
     assert scene.points is not None
     assert scene.cameras.size.tolist() == [[24, 18]] * 2
@@ -129,8 +121,7 @@ def test_parser_renders_once_into_the_cache(cache, monkeypatch):
 
 def test_parser_reads_town_folders_and_refuses_others(cache, folder, tmp_path):
     scene = TownConfig().build().parse(folder, 1)
-    assert len(scene.cameras) == 9
-    assert not cache.exists()
+    assert len(scene.cameras) == 9 and not cache.exists()
     (tmp_path / "photos").mkdir()
     with pytest.raises(DataError, match=r"no town\.json"):
         TownConfig().build().parse(tmp_path / "photos", 1)

@@ -2,29 +2,11 @@
 
 import numpy as np
 import pytest
+from town_views import project, world
 
 from fprf.town.layout import ROAD_HALF, build_town
-from fprf.town.render import directions, geometry, is_test, walk
+from fprf.town.render import geometry, is_test, walk
 from fprf.town.surface import CLASSES
-
-SEEDS = range(2)
-
-
-def world(view, depth):
-    rays = np.stack(directions(view, 1), -1)
-    return view.pose[:, 3] + rays * np.where(np.isfinite(depth), depth, 0.0)[..., None]
-
-
-def project(view, points):
-    """Row, column and distance of points [N 3]; row -1 where they lie outside the image."""
-    off = points - view.pose[:, 3]
-    local = off @ view.pose[:, :3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = view.focal * local[:, 0] / -local[:, 2] + view.width / 2
-        y = -view.focal * local[:, 1] / -local[:, 2] + view.height / 2
-        inside = (local[:, 2] < -0.05) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
-        row, column = np.where(inside, np.floor(y), -1).astype(int), np.where(inside, np.floor(x), -1).astype(int)
-    return row, column, np.linalg.norm(off, axis=1)
 
 
 def test_towns_are_functions_of_their_seed():
@@ -37,7 +19,7 @@ def test_towns_are_functions_of_their_seed():
     assert not any(np.array_equal(a.pose, b.pose) for a, b in zip(first, other, strict=True))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", [0, 1])
 def test_every_town_shows_every_class(seed):
     town = build_town(seed)
     views = walk(seed=seed, views=40, width=40, height=30)
@@ -62,18 +44,15 @@ def test_cameras_are_rigid_upright_and_at_eye_level():
     assert [k for k in range(40) if is_test(k)] == [0, 8, 16, 24, 32]
 
 
-@pytest.mark.parametrize("seed", [0])
-def test_held_out_views_are_seen_by_three_training_views(seed):
-    town = build_town(seed)
-    views = walk(seed=seed, views=40, width=64, height=48)
-    pictures = [geometry(town, view) for view in views]
+def test_held_out_views_are_seen_by_three_training_views():
+    town, views = build_town(0), walk(seed=0, views=40, width=64, height=48)
+    depths = [geometry(town, view)[0] for view in views]
     counts = []
     for k in filter(is_test, range(40)):
-        depth = pictures[k][0]
-        points = world(views[k], depth)[np.isfinite(depth)]
+        points, _ = world(views[k], depths[k])
         count = np.zeros(len(points), int)
         for j in (j for j in range(40) if not is_test(j)):
             row, column, distance = project(views[j], points)
-            count += (row >= 0) & (np.abs(pictures[j][0][row, column] - distance) < 0.1 + 0.05 * distance)
+            count += (row >= 0) & (np.abs(depths[j][row, column] - distance) < 0.1 + 0.05 * distance)
         counts.append(count)
     assert (np.concatenate(counts) >= 3).mean() >= 0.95

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from town_views import project, world
 
 from fprf.town.layout import build_town
 from fprf.town.palettes import PALETTES, palette
@@ -37,13 +38,10 @@ def test_colour_is_a_function_of_the_point():
     """Points seen from one camera, shaded one by one and in another order, keep their colour."""
     view = VIEWS[3]
     hits = cast(TOWN, view, directions(view, 1), 1)
-    rays = np.stack(directions(view, 1), -1)[hits.face >= 0]
-    points = view.pose[:, 3] + rays * hits.distance[hits.face >= 0][:, None]
-    face = hits.face[hits.face >= 0]
+    points, seen = world(view, hits.distance)
+    face = hits.face[seen]
     together = shade(TOWN, palette("sunset"), face, points)
-    assert np.isfinite(together).all()
-    assert together.min() >= 0
-    assert together.max() <= 1
+    assert np.isfinite(together).all() and together.min() >= 0 and together.max() <= 1
     order = np.random.default_rng(0).permutation(len(face))[:200]
     apart = shade(TOWN, palette("sunset"), face[order], points[order])
     np.testing.assert_allclose(apart, together[order], atol=2e-4)
@@ -54,19 +52,13 @@ def test_views_agree_on_colours():
     big = walk(seed=0, views=40, width=120, height=90)
     a, b = big[2], big[3]
     one, two = (colours(TOWN, view, palette("day"), 1) for view in (a, b))
-    (depth_a, _), (depth_b, _) = geometry(TOWN, a), geometry(TOWN, b)
-    seen = np.isfinite(depth_a)
-    points = (a.pose[:, 3] + np.stack(directions(a, 1), -1) * np.where(seen, depth_a, 0)[..., None])[seen]
-    off = points - b.pose[:, 3]
-    local = off @ b.pose[:, :3]
-    x = np.floor(b.focal * local[:, 0] / -local[:, 2] + b.width / 2).astype(int)
-    y = np.floor(-b.focal * local[:, 1] / -local[:, 2] + b.height / 2).astype(int)
-    both = (local[:, 2] < -0.1) & (x >= 0) & (x < b.width) & (y >= 0) & (y < b.height)
-    both[both] &= np.abs(depth_b[y[both], x[both]] - np.linalg.norm(off[both], axis=1)) < 0.02 * depth_b[y[both], x[both]]
+    points, seen = world(a, geometry(TOWN, a)[0])
+    row, column, distance = project(b, points)
+    there = geometry(TOWN, b)[0][row, column]
+    both = (row >= 0) & (np.abs(there - distance) < 0.02 * there)
     assert both.sum() > 1000
-    difference = np.abs(one[seen][both] - two[y[both], x[both]]).mean(1)
-    assert np.median(difference) < 0.02
-    assert difference.mean() < 0.05
+    difference = np.abs(one[seen] - two[row, column])[both].mean(1)
+    assert np.median(difference) < 0.02 and difference.mean() < 0.05
 
 
 @settings(max_examples=25, deadline=None)
@@ -81,7 +73,5 @@ def test_noise_is_continuous_and_in_range(state, seed):
         assert value.dtype == np.float32
         assert ((value >= 0) & (value <= 1)).all()
         assert np.abs(value - near).max() < 2e-3
-    lattice = np.round(x)
-    np.testing.assert_array_equal(
-        noise2(lattice, np.round(y), seed), hashed(seed, lattice.astype(np.int64), np.round(y).astype(np.int64))
-    )
+    i, j = np.round(p[:, :2]).astype(np.int64).T
+    np.testing.assert_array_equal(noise2(i.astype(float), j.astype(float), seed), hashed(seed, i, j))

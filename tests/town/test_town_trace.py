@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf.town.layout import Town, build_town
+from fprf.town.layout import build_town
 from fprf.town.render import _enter, cast, directions, shadowed, walk
 from fprf.town.shapes import Cylinder, Ellipsoid, Finish, Material, Polyhedron, box, cylinder, ellipsoid, extrude, pyramid
 
@@ -55,20 +55,15 @@ def slow_enter(shape, o, d):
     return t if t > 1e-4 else math.inf
 
 
-def slow_distance(town: Town, o, d) -> float:
-    ground = -o[2] / d[2] if d[2] < 0 else math.inf
-    return min(ground, *(slow_enter(shape, o, d) for shape in town.shapes))
-
-
-@pytest.mark.parametrize("seed", [3])
-def test_depth_is_that_of_a_plain_loop(seed):
-    town = build_town(seed)
-    rng = np.random.default_rng(seed)
-    for view in walk(seed=seed, views=5, width=40, height=30):
+def test_depth_is_that_of_a_plain_loop():
+    town, rng = build_town(3), np.random.default_rng(3)
+    for view in walk(seed=3, views=5, width=40, height=30):
         d = np.stack(directions(view, 1), -1)
         distance = cast(town, view, directions(view, 1), 1).distance
         for row, column in zip(rng.integers(0, 30, 24), rng.integers(0, 40, 24), strict=True):
-            slow = slow_distance(town, view.pose[:, 3].tolist(), d[row, column].tolist())
+            place, way = view.pose[:, 3].tolist(), d[row, column].tolist()
+            ground = -place[2] / way[2] if way[2] < 0 else math.inf
+            slow = min(ground, *(slow_enter(shape, place, way) for shape in town.shapes))
             assert distance[row, column] == pytest.approx(slow, rel=1e-10)
 
 
