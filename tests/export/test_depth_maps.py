@@ -10,15 +10,11 @@ from hypothesis import strategies as st
 from tiny_world import World
 
 from fprf.export.colours import Coloured, point_colours, single_view
-from fprf.export.depth_maps import (
-    DepthMaps,
-    depth_gaps,
-    ray_quantile,
-    render_depth_maps,
-    surface_points,
-)
-from fprf.rendering.cameras import pixel_grid, rays_through
+from fprf.export.depth_maps import DepthMaps, depth_gaps, ray_quantile, render_depth_maps, surface_points
+from fprf.plugins.stylizers.config import RegionOtConfig
+from fprf.rendering.cameras import grid_rays, pixel_grid, rays_through
 from fprf.style.look import Restyle
+from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
 angle = st.floats(-1.0, 1.0)
@@ -97,25 +93,22 @@ def test_points_on_rays_of_pixels_have_the_colours_of_the_picture(world: World) 
     """At any distance along the ray, and one set for each style."""
     trained = world.load()
     known, render = trained.known, trained.config.render
-    pixel = pixel_grid(known.cameras, 1)
-    origin, direction = rays_through(known.cameras, torch.full((len(pixel),), 1), pixel)
-    points = origin + direction * (1 + torch.rand(len(pixel), 1))
-    styled = trained_restyle(world)
+    origin, direction = grid_rays(known.cameras, 1)
+    points = origin + direction * (1 + torch.rand(len(origin), 1))
+    styled = restyle(trained, world.references, RegionOtConfig()).restyle
     told: list[tuple[int, int]] = []
-    seen = single_view(torch.full((len(pixel),), 1))
+    seen = single_view(torch.full((len(points),), 1))
     [plain, full, none], presence = point_colours(
         trained.model, known.facts, known.cameras, points, seen, render, [None, styled, Restyle(styled.stylizer, 0.0)],
         tolerance=None, report=lambda done, total: told.append((done, total)),
     )  # fmt: skip
-    picture = render_view(trained.model, known.facts, known.cameras, 1, render).rgb.view(-1, 3)
-    styled_picture = render_view(trained.model, known.facts, known.cameras, 1, render, styled).rgb.view(-1, 3)
+    picture, styled_picture = (render_view(trained.model, known.facts, known.cameras, 1, render, s) for s in (None, styled))
     # The ray's direction is found again from a point on it, and a sample may then cross the error budget.
-    assert float((plain - picture).abs().amax()) < 5e-3
-    assert float((full - styled_picture).abs().amax()) < 5e-3
+    assert float((plain - picture.rgb.view(-1, 3)).abs().amax()) < 5e-3
+    assert float((full - styled_picture.rgb.view(-1, 3)).abs().amax()) < 5e-3
+    assert float((presence - picture.opacity.view(-1)).abs().amax()) < 5e-3
     assert torch.equal(plain, none) and float((plain - full).abs().mean()) > 0.01
     assert told[-1] == (len(points), len(points))
-    opacity = render_view(trained.model, known.facts, known.cameras, 1, render).opacity.view(-1)
-    assert float((presence - opacity).abs().amax()) < 5e-3
 
 
 def test_near_a_point_nothing_else_of_its_rays_is_seen(world: World) -> None:
@@ -123,8 +116,7 @@ def test_near_a_point_nothing_else_of_its_rays_is_seen(world: World) -> None:
     trained = world.load()
     known, render = trained.known, trained.config.render
     maps = render_depth_maps(trained.model, known.cameras, known.train[:1], render, side=400, reach=math.inf)
-    pixel = pixel_grid(maps.cameras, 0)
-    origin, direction = rays_through(maps.cameras, torch.zeros(len(pixel), dtype=torch.int64), pixel)
+    origin, direction = grid_rays(maps.cameras, 0)
     depth = maps.depth[0].view(-1, 1).double()
     there = depth[:, 0].isfinite()
 
@@ -144,10 +136,3 @@ def test_near_a_point_nothing_else_of_its_rays_is_seen(world: World) -> None:
     lost = look(1e-3, 1e-6)
     assert bool((lost.presence < 1e-3).all())
     assert float((lost.colours[0] - whole).abs().amax()) < 0.02, "where nothing is the whole ray's colour stands in"
-
-
-def trained_restyle(world: World) -> Restyle:
-    from fprf.plugins.stylizers.config import RegionOtConfig
-    from fprf.style.restyle import restyle
-
-    return restyle(world.load(), world.references, RegionOtConfig()).restyle

@@ -9,36 +9,31 @@ import trimesh
 from analytic import RADIUS, globe
 
 from fprf.errors import DataError
-from fprf.export.mesh import (
-    Mesh,
-    build_mesh,
-    surface_nets,
-    write_mesh_glb,
-    write_mesh_ply,
-)
-from fprf.export.point_cloud import fuse
+from fprf.export.depth_maps import DepthMaps
+from fprf.export.mesh import Mesh, build_mesh, surface_nets, write_mesh_glb, write_mesh_ply
+from fprf.export.point_cloud import Cloud, fuse
 from fprf.io.images import srgb_to_linear
 
 ZERO = torch.zeros(3, dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
-def mesh() -> Mesh:
+def seen() -> tuple[DepthMaps, Cloud]:
     maps = globe(10)
-    return build_mesh(maps, fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2), edge=0.1)
+    return maps, fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
 
 
-def ball(radius: float, side: int = 24) -> trimesh.Trimesh:
-    """Surface nets of an exact signed distance."""
-    axis = torch.arange(-side // 2, side // 2 + 1)
-    cell = torch.cartesian_prod(axis, axis, axis)
-    at, face = surface_nets(cell, cell.double().norm(dim=1) - radius)
-    return trimesh.Trimesh(at.numpy(), face.numpy(), process=False)
+@pytest.fixture(scope="module")
+def mesh(seen: tuple[DepthMaps, Cloud]) -> Mesh:
+    return build_mesh(*seen, edge=0.1)
 
 
 @pytest.mark.parametrize("radius", [3.3, 5.0, 9.7])
 def test_surface_nets_of_a_ball_are_closed_and_turned_outwards(radius: float) -> None:
-    found = ball(radius)
+    """Of its exact signed distance."""
+    cell = torch.cartesian_prod(*(torch.arange(-12, 13),) * 3)
+    at, face = surface_nets(cell, cell.double().norm(dim=1) - radius)
+    found = trimesh.Trimesh(at.numpy(), face.numpy(), process=False)
     assert found.is_watertight and found.is_winding_consistent and found.euler_number == 2
     assert np.abs(np.linalg.norm(found.vertices, axis=1) - radius).max() < 0.2
     assert found.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.12), "negative if it were inside out"
@@ -71,8 +66,6 @@ def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     assert document[:4] == b"glTF" and int.from_bytes(document[8:12], "little") == len(document)
 
 
-def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake() -> None:
-    maps = globe(10)
-    cloud = fuse(maps, edge=0.1, most=10**6, tolerance=0.02, agree=2)
+def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake(seen: tuple[DepthMaps, Cloud]) -> None:
     with pytest.raises(DataError, match="no surface for a mesh; raise --mesh-edge"):
-        build_mesh(maps, cloud, edge=50.0)
+        build_mesh(*seen, edge=50.0)

@@ -25,12 +25,11 @@ from fprf.export.point_cloud import (
     spacing,
     write_points,
 )
-from fprf.rendering.cameras import pixel_grid, rays_through
+from fprf.rendering.cameras import grid_rays
 
 
-def fused(maps: DepthMaps, **changes: object) -> Cloud:
-    options: dict[str, object] = {"edge": None, "most": 10**6, "tolerance": 0.02, "agree": 2, **changes}
-    return fuse(maps, **options)  # type: ignore[arg-type]
+def fused(maps: DepthMaps, edge: float = 0.2) -> Cloud:
+    return fuse(maps, edge=edge, most=10**6, tolerance=0.02, agree=2)
 
 
 def test_points_of_a_sphere_lie_on_it_and_look_outwards() -> None:
@@ -61,7 +60,7 @@ def test_it_is_the_same_far_from_the_origin() -> None:
     shift = torch.tensor([4.5e6, 5e5, 200.0], dtype=torch.float64)
     pose = maps.cameras.pose
     moved = replace(maps.cameras, pose=torch.cat([pose[:, :, :3], (pose[:, :, 3] + shift)[:, :, None]], 2))
-    here, there = fused(maps, edge=0.2), fused(maps._replace(cameras=moved), edge=0.2)
+    here, there = fused(maps), fused(maps._replace(cameras=moved))
     assert abs(len(here.point) - len(there.point)) <= 0.02 * len(here.point)
     assert float((there.point - shift).norm(dim=-1).amax()) < RADIUS + 0.01
 
@@ -99,7 +98,7 @@ def test_spacing_is_the_mean_distance_to_the_nearest(seed: int, edge: float) -> 
 
 def test_the_dome_lies_where_views_see_nothing() -> None:
     maps = globe(6)
-    cloud = fuse(maps, edge=0.2, most=10**6, tolerance=0.02, agree=2)
+    cloud = fused(maps)
     sky = sky_dome(maps, cloud)
     assert sky is not None
     centre = maps.cameras.pose[:, :, 3].mean(0)
@@ -110,8 +109,7 @@ def test_the_dome_lies_where_views_see_nothing() -> None:
     assert torch.allclose(sky.normal.double(), -out, atol=1e-6)
     assert float((sky.space / sky.edge).amin()) > 1
     for view, depth in enumerate(maps.depth):
-        pixel = pixel_grid(maps.cameras, view)[depth.isinf().view(-1)]
-        _, direction = rays_through(maps.cameras, torch.full((len(pixel),), view), pixel)
+        direction = grid_rays(maps.cameras, view)[1][depth.isinf().view(-1)]
         # Every direction of open sky has a point of the dome within a cell's diagonal, 2 pixels of 1/50 wide.
         assert float((direction @ out.T).amax(1).amin()) > 1 - (2 / 50 * 3**0.5) ** 2 / 2
     # ... and the view that is to colour it looks there.
@@ -121,7 +119,7 @@ def test_the_dome_lies_where_views_see_nothing() -> None:
 
 
 def test_far_from_its_origin_a_capture_is_moved_and_the_file_says_so(tmp_path: Path) -> None:
-    near = fuse(globe(6), edge=0.2, most=10**6, tolerance=0.02, agree=2)
+    near = fused(globe(6))
     shift = torch.tensor([4_500_000.0, 500_000.0, 200.0], dtype=torch.float64)
     far = near._replace(point=near.point + shift)
     origin = origin_of(far)

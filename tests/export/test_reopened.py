@@ -16,20 +16,16 @@ LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--no-sky"]
 LOOKS = {"": "plain", ".dusk": "dusk", ".snow": "snow"}
 
 
-@pytest.fixture(scope="module")
-def _made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("export") / "all"
-
-
 @pytest.fixture
-def folder(world: World, _made: Path) -> Path:
+def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Written once."""
-    if _made.exists():
-        return _made
+    made = tmp_path_factory.getbasetemp() / "exported"
+    if made.exists():
+        return made
     styles = [f"{name}={path}" for name, path in zip(("dusk", "snow"), world.references, strict=True)]
-    words = ["export", str(world.run), *LOOSE, "--styles", *styles, "--lut-size", "9", "--output", str(_made)]
+    words = ["export", str(world.run), *LOOSE, "--styles", *styles, "--lut-size", "9", "--output", str(made)]
     assert cli.main(words) == 0
-    return _made
+    return made
 
 
 def test_all_files_of_one_geometry_agree(folder: Path) -> None:
@@ -68,12 +64,8 @@ def test_both_meshes_agree_in_every_look(folder: Path) -> None:
 
 
 def test_cameras_are_those_of_the_capture(folder: Path, world: World) -> None:
-    document, capture = (
-        json.loads((folder / "transforms.json").read_text()),
-        json.loads((world.town / "transforms.json").read_text()),
-    )
-    found = {Path(frame["file_path"]).stem: frame for frame in document["frames"]}
-    wanted = {Path(frame["file_path"]).stem: frame for frame in capture["frames"]}
+    document, capture = (json.loads((place / "transforms.json").read_text()) for place in (folder, world.town))
+    found, wanted = ({Path(frame["file_path"]).stem: frame for frame in of["frames"]} for of in (document, capture))
     assert found.keys() == wanted.keys()
     for name, frame in wanted.items():
         assert np.allclose(found[name]["transform_matrix"], frame["transform_matrix"], atol=1e-9)
@@ -83,21 +75,14 @@ def test_cameras_are_those_of_the_capture(folder: Path, world: World) -> None:
     assert (folder / document["ply_file_path"]).is_file()
 
 
-def read_cube(path: Path) -> np.ndarray:
-    """[blue, green, red, 3], as Adobe's specification orders it."""
-    lines = path.read_text("ascii").splitlines()
-    [size] = [int(line.split()[1]) for line in lines if line.startswith("LUT_3D_SIZE")]
-    rows = [line.split() for line in lines if line[:1] in "0123456789"]
-    return np.array(rows, dtype=float).reshape(size, size, size, 3)
-
-
 def test_lookup_tables_bring_colours_nearer_to_the_style(folder: Path) -> None:
     """Points' colours through the table, by nearest nodes, against the points' colours in the style."""
     plain = trimesh.load(folder / "points.ply").colors[:, :3] / 255
     for name in ("dusk", "snow"):
         styled = trimesh.load(folder / f"points.{name}.ply").colors[:, :3] / 255
-        cube = read_cube(folder / "luts" / name / "all.cube")
-        assert cube.shape == (9, 9, 9, 3) and cube.min() >= 0 and cube.max() <= 1
+        # [blue, green, red, 3], as Adobe's specification orders it
+        cube = np.loadtxt(folder / "luts" / name / "all.cube", skiprows=4).reshape(9, 9, 9, 3)
+        assert cube.min() >= 0 and cube.max() <= 1
         node = np.rint(plain * 8).astype(int)
         through = cube[node[:, 2], node[:, 1], node[:, 0]]
         assert np.square(through - styled).mean() < 0.5 * np.square(plain - styled).mean()

@@ -20,12 +20,10 @@ json_values = st.recursive(
 def test_the_file_appears_when_the_block_ends(tmp_path: Path) -> None:
     final = tmp_path / "a" / "b" / "film.mp4"
     with atomic_path(final) as temporary:
-        assert temporary.parent == final.parent
-        assert temporary.suffix == ".mp4"
+        assert temporary.parent == final.parent and temporary.suffix == ".mp4"
         temporary.write_bytes(b"new")
         assert not final.exists()
-    assert final.read_bytes() == b"new"
-    assert list(final.parent.iterdir()) == [final]
+    assert final.read_bytes() == b"new" and list(final.parent.iterdir()) == [final]
 
 
 @pytest.mark.parametrize("failure", [ValueError("x"), KeyboardInterrupt(), SystemExit(3)])

@@ -24,6 +24,7 @@ class Page(HTMLParser):
         self.open: list[str] = []
         self.tags: list[tuple[str, dict[str, str]]] = []
         self.text: list[str] = []
+        self.whole = text
         self.feed(text)
         self.close()
         assert not self.open
@@ -78,9 +79,8 @@ def gallery(tmp_path_factory: pytest.TempPathFactory) -> Page:
     return page_of(tmp_path_factory.mktemp("gallery") / "gallery.html")
 
 
-def test_nothing_is_loaded_from_anywhere(gallery: Page, tmp_path: Path) -> None:
-    write_gallery(tmp_path / "g.html", **content())
-    assert not re.search(r"(?i)https?:|//[a-z0-9-]+\.|@import|url\(", (tmp_path / "g.html").read_text("utf-8"))
+def test_nothing_is_loaded_from_anywhere(gallery: Page) -> None:
+    assert not re.search(r"(?i)https?:|//[a-z0-9-]+\.|@import|url\(", gallery.whole)
     for tag, attrs in gallery.tags:
         assert attrs.get("src", "data:").startswith("data:"), tag
         assert attrs.get("href", "#").startswith(("#", "data:,")), tag
@@ -89,14 +89,16 @@ def test_nothing_is_loaded_from_anywhere(gallery: Page, tmp_path: Path) -> None:
     assert policy["content"].startswith("default-src 'none'; img-src data:;")
 
 
+def decoded(image: dict[str, str]) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(image["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+
+
 def test_embedded_pictures_decode_and_are_of_the_size_they_claim(gallery: Page) -> None:
     for image in gallery.all("img"):
-        data = base64.b64decode(image["src"].split(",")[1])
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert decoded.shape == (int(image["height"]), int(image["width"]), 3)
-        assert max(decoded.shape) <= 1024
+        assert decoded(image).shape == (int(image["height"]), int(image["width"]), 3)
+        assert max(decoded(image).shape) <= 1024
     (first,) = gallery.all("img", **{"class": "before"})
-    shown = cv2.imdecode(np.frombuffer(base64.b64decode(first["src"].split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+    shown = decoded(first)
     assert np.abs(cv2.cvtColor(shown, cv2.COLOR_BGR2RGB).astype(int) - picture(0)).mean() < 6
 
 
@@ -132,48 +134,40 @@ def test_names_are_text_whatever_they_hold(tmp_path: Path) -> None:
     assert page.all("img")[0]["alt"] == f"View {EVIL}, {EVIL}"
 
 
-def film(path: Path, size: int = 32, h264: bool = True) -> Path:
-    frames = (np.full((size, size, 3), index * 20, np.uint8) for index in range(6))
-    write_video(path, frames, 12, h264=h264)
+def film(path: Path) -> Path:
+    write_video(path, (np.full((32, 24, 3), index * 20, np.uint8) for index in range(6)), 12)
     return path
 
 
-def test_a_small_film_is_part_of_the_page(tmp_path: Path) -> None:
+def test_a_film_is_part_of_the_page_or_linked_where_it_is_large(tmp_path: Path) -> None:
     pytest.importorskip("av")
-    path = film(tmp_path / "flight.mp4")
+    path = film(tmp_path / "films" / "my flight #1.mp4")
     (video,) = page_of(tmp_path / "g.html", video=path).all("video")
     assert base64.b64decode(video["src"].removeprefix("data:video/mp4;base64,")) == path.read_bytes()
     assert "controls" in video and "autoplay" not in video
-
-
-def test_a_large_film_is_linked_beside_the_page(tmp_path: Path) -> None:
-    pytest.importorskip("av")
-    path = film(tmp_path / "films" / "my flight #1.mp4")
     path.write_bytes(path.read_bytes() + bytes(9 * 2**20))
-    (tmp_path / "page").mkdir()
     (video,) = page_of(tmp_path / "page" / "g.html", video=path).all("video")
     assert video["src"] == "../films/my%20flight%20%231.mp4"
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"view_names": ["a"]}, "3 originals and 1 view names"),
-        ({"view_names": [], "originals": [], "styles": []}, "0 originals"),
-        ({"styles": [Style("s", [picture(0)])]}, "style s has 1 views, there are 3"),
-        ({"styles": [Style("s", [picture(0)] * 3, ["sea"])]}, "names reference sea; known are city, field"),
-        ({"styles": [Style("s", [picture(0)] * 3, ["city"], [0.5, 0.5])]}, "2 shares of 1 references"),
+        {"view_names": ["a"]},
+        {"view_names": [], "originals": [], "styles": []},
+        {"styles": [Style("s", [picture(0)])]},
+        {"styles": [Style("s", [picture(0)] * 3, ["sea"])]},
+        {"styles": [Style("s", [picture(0)] * 3, ["city"], [0.5, 0.5])]},
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(DataError, match=message):
+def test_what_does_not_fit_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(DataError):
         write_gallery(tmp_path / "g.html", **content(**changes))
     assert not list(tmp_path.iterdir())
 
 
 def test_an_animated_picture_plays_without_h264_and_stands_beside_upright_views(tmp_path: Path) -> None:
-    flight = tmp_path / "flight.webp"
-    write_video(flight, (np.full((32, 24, 3), index * 20, np.uint8) for index in range(6)), 12)
+    flight = film(tmp_path / "flight.webp")
     page = page_of(tmp_path / "wide.html", video=flight, credits=["By A <a@b>", EVIL])
     (shown,) = page.all("img", **{"class": "flight"})
     assert base64.b64decode(shown["src"].removeprefix("data:image/webp;base64,")) == flight.read_bytes()

@@ -74,10 +74,6 @@ def test_what_does_not_fit_is_named() -> None:
         match_summary(torch.rand(2, 2, 2), torch.tensor([0, 1]), ["a"])
 
 
-def picture(height: int = 20, width: int = 30) -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
-
-
 def flat(value: int, width: int = 40, height: int = 6) -> np.ndarray:
     return np.full((height, width, 3), value, np.uint8)
 
