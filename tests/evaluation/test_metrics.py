@@ -17,6 +17,7 @@ from fprf.evaluation.metrics import (
     delta_e_2000,
     gaussian_distance,
     image_metrics,
+    matched_regions,
     psnr,
     relative_distance,
     srgb_to_lab,
@@ -167,11 +168,11 @@ def test_brightness_contrast_and_tint_cost_nothing(contrast: float, brightness: 
 
 
 class Pixels(Encoder):
-    """Colours, plain or doubled."""
+    """Colours, plain or doubled, at the full size or a smaller one."""
 
-    def __init__(self, gain: float = 1.0) -> None:
+    def __init__(self, gain: float = 1.0, stride: int = 1) -> None:
         super().__init__()
-        self.gain = gain
+        self.gain, self.stride = gain, stride
 
     @property
     def identity(self) -> str:
@@ -182,7 +183,7 @@ class Pixels(Encoder):
         return 3
 
     def forward(self, image: Tensor) -> Tensor:
-        return self.gain * image
+        return self.gain * torch.nn.functional.avg_pool2d(image, self.stride)
 
 
 def statistics(seed: int, channels: int = 4) -> RegionStatistics:
@@ -243,3 +244,22 @@ def test_regions_weigh_by_their_share_and_small_ones_not_at_all() -> None:
     assert relative_distance(plain, styled, style) == pytest.approx((30 * 0.5 + 10) / 40)
     assert relative_distance(style, style, style) is None
     assert relative_distance({7: at(1.0, 30)}, styled, style) is None
+
+
+def bands(heights: tuple[int, ...], colours: list[tuple[float, float, float]]) -> Tensor:
+    return torch.cat([torch.tensor(c).expand(h, 12, 3) for h, c in zip(heights, colours, strict=True)])
+
+
+DAY = [(0.2, 0.4, 0.9), (0.9, 0.2, 0.2), (0.2, 0.8, 0.2)]
+NIGHT = [(0.1, 0.15, 0.3), (0.3, 0.1, 0.08), (0.1, 0.28, 0.08)]
+
+
+def test_bands_of_another_light_find_their_like() -> None:
+    content, other, style = bands((8, 4, 12), DAY), bands((4, 12, 8), DAY), bands((8, 8, 8), NIGHT)
+    here, there = matched_regions(Pixels(stride=2), [content, other], [style], regions=3, seed=0)
+    assert [tuple(each.shape) for each in here] == [(12, 6), (12, 6)]
+    sky, wall, grass = (int(there[0][row, 0]) for row in (1, 5, 9))
+    assert len({sky, wall, grass}) == 3
+    assert there[0].equal(torch.tensor([sky, wall, grass]).repeat_interleave(4)[:, None].expand(12, 6))
+    assert here[0][:, 0].tolist() == [sky] * 4 + [wall] * 2 + [grass] * 6
+    assert here[1][:, 0].tolist() == [sky] * 2 + [wall] * 6 + [grass] * 4

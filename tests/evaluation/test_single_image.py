@@ -1,4 +1,4 @@
-"""Pictures restyled one by one: flat scenes, global transfers, matched regions."""
+"""Pictures restyled one by one: flat scenes, global transfers."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks.styles import cells_basis, flat_reference, painted
 from fprf.datamanagers.config import GuidedConfig
-from fprf.evaluation.metrics import matched_regions, psnr
+from fprf.evaluation.metrics import psnr
 from fprf.evaluation.single_image import Flat, encoded, flat_scene, histogram_matching, reinhard, render_flat
 from fprf.interfaces import Decoder, Encoder
 from fprf.plugins.decoders.config import MlpDecoderConfig
@@ -103,37 +103,3 @@ def test_ranks_are_those_of_numpys_quantiles(seed: int, n: int, m: int) -> None:
         rank = (np.argsort(np.argsort(content[:, channel].numpy())) + 0.5) / n
         wanted = np.quantile(style[:, channel].numpy(), rank, method="hazen")
         assert np.allclose(found[:, channel].numpy(), wanted, atol=1e-12)
-
-
-class Halved(Encoder):
-    """Colours at half the size."""
-
-    @property
-    def identity(self) -> str:
-        return "halved"
-
-    @property
-    def channels(self) -> int:
-        return 3
-
-    def forward(self, image: Tensor) -> Tensor:
-        return torch.nn.functional.avg_pool2d(image, 2)
-
-
-def bands(heights: tuple[int, ...], colours: list[tuple[float, float, float]]) -> Tensor:
-    return torch.cat([torch.tensor(c).expand(h, 12, 3) for h, c in zip(heights, colours, strict=True)])
-
-
-DAY = [(0.2, 0.4, 0.9), (0.9, 0.2, 0.2), (0.2, 0.8, 0.2)]
-NIGHT = [(0.1, 0.15, 0.3), (0.3, 0.1, 0.08), (0.1, 0.28, 0.08)]
-
-
-def test_bands_of_another_light_find_their_like() -> None:
-    content, other, style = bands((8, 4, 12), DAY), bands((4, 12, 8), DAY), bands((8, 8, 8), NIGHT)
-    here, there = matched_regions(Halved(), [content, other], [style], regions=3, seed=0)
-    assert [tuple(each.shape) for each in here] == [(12, 6), (12, 6)]
-    sky, wall, grass = (int(there[0][row, 0]) for row in (1, 5, 9))
-    assert len({sky, wall, grass}) == 3
-    assert there[0].equal(torch.tensor([sky, wall, grass]).repeat_interleave(4)[:, None].expand(12, 6))
-    assert here[0][:, 0].tolist() == [sky] * 4 + [wall] * 2 + [grass] * 6
-    assert here[1][:, 0].tolist() == [sky] * 2 + [wall] * 6 + [grass] * 4

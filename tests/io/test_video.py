@@ -59,6 +59,7 @@ def test_a_film_plays_while_it_loads_and_says_its_colours(tmp_path: Path) -> Non
     assert data.find(b"moov") < data.find(b"mdat") and b"avc1" in data
     with av.open(str(path)) as film:
         context = film.streams.video[0].codec_context
+        assert context.name == "h264"
         assert (context.pix_fmt, context.colorspace, context.color_range) == ("yuv420p", 1, 1)
         assert float(film.streams.video[0].average_rate) == pytest.approx(29.97, abs=1e-3)
 

@@ -12,13 +12,12 @@ from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor, nn
 from toy_parts import Never, Ones, Shift, Squash, Uniform, parts_of, rays_of, space_of
 
-from fprf.interfaces import ContentField
 from fprf.plugins.samplers.config import UniformConfig
 from fprf.rendering.renderer import Parts, march, render_rays
-from fprf.rendering.space import Kind, Space
+from fprf.rendering.space import Kind
 from fprf.rendering.stepfun import midpoints
 from fprf.style.look import Restyle
-from fprf.types import FieldSample, Rays, Rendered, Want
+from fprf.types import Rays, Rendered, Want
 
 pytestmark = pytest.mark.usefixtures("form")
 QUICK = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -156,11 +155,8 @@ def test_content_moves_density_only_where_it_may(moves: bool) -> None:
 def test_a_background_is_seen_through_and_density_learns_from_it(density: float) -> None:
     """Colour c (1 - e^-x) + b e^-x over a length L, x = density L; its derivative is L (c - b) e^-x."""
     parts = Parts(space_of("box"), UniformConfig(samples=8).build(seed=0), Uniform(density, 0.3), None, Squash())
-    origin, direction = (
-        torch.tensor([[0.0, 0.0, -2.0]], dtype=torch.float64),
-        torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64),
-    )
-    rays, background = parts.space.rays(origin, direction), torch.tensor([1.0, 0.5, 0.0])
+    ahead = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    rays, background = parts.space.rays(-2 * ahead, ahead), torch.tensor([1.0, 0.5, 0.0])
     colour, through = 1 / (1 + math.exp(-0.3)), math.exp(-2 * density)
     found = render_rays(rays, parts, want=Want.COLOUR, budget=0.0, background=background)
     assert found.rgb is not None
@@ -202,49 +198,14 @@ def test_nothing_is_computed_that_nobody_wants() -> None:
     assert found.rgb is not None
 
 
-EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-NEAR = 0.1
-
-
-class Told(ContentField):
-    """The densities that it was given, sample by sample."""
-
-    def __init__(self, values: Tensor) -> None:
-        super().__init__()
-        self.values = nn.Parameter(values)
-
-    def density(self, points: Tensor) -> FieldSample:
-        return FieldSample(self.values[: len(points)], points)
-
-    def content(self, latent: Tensor, view: Tensor) -> Tensor:
-        return latent
-
-    def penalties(self) -> dict[str, Tensor]:
-        return {}
-
-
-def told_parts(kind: Kind, samples: int) -> Parts:
-    values = torch.rand(4 * samples, generator=torch.Generator().manual_seed(0))
-    space = Space(kind, (0.0, 0.0, 0.0), EYE, 1.0, NEAR, 1e3)
-    return Parts(space, UniformConfig(samples=samples).build(seed=0), Told(values), None, Squash())
-
-
-def told_rays(parts: Parts, count: int) -> Rays:
-    origin = torch.zeros(count, 3, dtype=torch.float64)
-    direction = torch.tensor([[0.0, 0.6, 0.8]], dtype=torch.float64).expand(count, 3)
-    return parts.space.rays(origin, direction)
-
-
 @pytest.mark.parametrize("kind", ["contraction", "box"])
 def test_near_densities_learn_by_the_square_of_their_distance(kind: Kind) -> None:
-    parts = told_parts(kind, 64)
-    rays = told_rays(parts, 4)
-    assert isinstance(parts.field, Told)
+    field = Uniform(torch.rand(4 * 64, generator=torch.Generator().manual_seed(0)))
+    parts = Parts(space_of(kind), UniformConfig(samples=64).build(seed=0), field, None, Squash())
+    rays = parts.space.rays(torch.zeros(4, 3).double(), torch.tensor([[0.0, 0.6, 0.8]]).double().expand(4, 3))
 
     def gradient(step: int | None) -> Tensor:
-        marched = march(rays, parts, budget=0.0, step=step)
-        assert isinstance(parts.field, Told)
-        (grad,) = torch.autograd.grad(marched.weights.square().sum(), parts.field.values)
+        (grad,) = torch.autograd.grad(march(rays, parts, budget=0.0, step=step).weights.square().sum(), field.value)
         return grad.view(4, -1)
 
     plain, training = gradient(None), gradient(0)

@@ -9,15 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.rendering.stepfun import (
-    distortion,
-    interlevel,
-    keep_heaviest,
-    midpoints,
-    resample,
-    scale_gradient,
-    transmittance_weights,
-)
+from fprf.rendering import stepfun
+from fprf.rendering.stepfun import interlevel, keep_heaviest, midpoints, resample, scale_gradient, transmittance_weights
 
 QUICK = settings(max_examples=40, deadline=None)
 U = 2.0**-24
@@ -47,28 +40,24 @@ def edges_of(width: Tensor) -> Tensor:
     return torch.nn.functional.pad(width.cumsum(-1), (1, 0))
 
 
-def check_weights(density: Tensor, t: Tensor) -> Tensor:
-    """Within 4u (1 + tau) of fp64 relative to itself, tau the optical depth so far; returns the weights."""
-    w = transmittance_weights(density, t)
-    assert w.isfinite().all() and (w >= 0).all()
-    tau = (density * (t[:, 1:] - t[:, :-1])).double()
-    for ray, found in zip(tau.tolist(), w.double().tolist(), strict=True):
-        depth = 0.0
-        for x, a, b in zip(ray, found, weights_oracle(ray), strict=True):
-            assert abs(a - b) <= 4 * U * (1 + depth) * b + SMALLEST
-            depth = min(depth + x, 1e3)
-    return w
-
-
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_weights_on_the_grid_of_extremes(count: int) -> None:
-    """Every pair of density and length of zip-NeRF's test, in rays of several: relative bounds, gradients near fp64's."""
+    """Every pair of density and length of zip-NeRF's test, in rays of several.
+
+    Within 4u (1 + tau) of fp64 relative to itself, tau the optical depth so far; gradients near fp64's.
+    """
     pairs = list(itertools.product(GRID, GRID))
     for shift in range(0, len(pairs), 7):
         rays = [[pairs[(i + shift * k) % len(pairs)] for k in range(count)] for i in range(len(pairs))]
         # Optical depths go in as densities of unit steps, since edges at 1e30 swallow steps of 1.
         depth = torch.tensor([[min(d * x, 3e38) for d, x in ray] for ray in rays], requires_grad=True)
-        w = check_weights(depth, torch.arange(count + 1.0).repeat(len(pairs), 1))
+        w = transmittance_weights(depth, torch.arange(count + 1.0).repeat(len(pairs), 1))
+        assert w.isfinite().all() and (w >= 0).all()
+        for ray, weights in zip(depth.double().tolist(), w.double().tolist(), strict=True):
+            tau = 0.0
+            for x, a, b in zip(ray, weights, weights_oracle(ray), strict=True):
+                assert abs(a - b) <= 4 * U * (1 + tau) * b + SMALLEST
+                tau = min(tau + x, 1e3)
         g = torch.randn(w.shape, generator=torch.Generator().manual_seed(shift))
         (found,) = torch.autograd.grad((w * g).sum(), depth)
         assert found.isfinite().all()
@@ -193,7 +182,7 @@ def test_distortion_is_the_double_sum(samples: int, seed: int) -> None:
     m = midpoints(exact_s)
     pairs = exact_w[:, :, None] * exact_w[:, None] * (m[:, :, None] - m[:, None]).abs()
     wanted = (pairs.sum((1, 2)) + (exact_w.square() * exact_s.diff(dim=-1)).sum(-1) / 3).mean()
-    found = distortion(s, w)
+    found = stepfun.distortion(s, w)
     # Weights sum to 1 and places lie in [0, 1]: prefix sums are off by a few u, whatever the result.
     assert abs(found.item() - wanted.item()) <= 16 * U
     (a,), (b,) = torch.autograd.grad(found, w), torch.autograd.grad(wanted, exact_w)

@@ -30,11 +30,11 @@ class Squash(Decoder):
 
 
 class Uniform(ContentField):
-    """One density and one content everywhere."""
+    """One density everywhere, or one for each of the samples; one content everywhere."""
 
-    def __init__(self, density: float, content: float = 0.0) -> None:
+    def __init__(self, density: float | Tensor, content: float = 0.0) -> None:
         super().__init__()
-        self.value = nn.Parameter(torch.tensor(density))
+        self.value = nn.Parameter(torch.as_tensor(density))
         self.feature = content
 
     def density(self, points: Tensor) -> FieldSample:
