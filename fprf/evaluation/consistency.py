@@ -229,7 +229,8 @@ def _errors(plain: Frames, styled: Frames, depths: Sequence[Tensor], cameras: Ca
     for a, b in path_pairs(len(plain), gap):
         there, valid = warp(plain[b], depths[a], depths[b], cameras, a, b)
         valid = valid & ((plain[a] - there).norm(dim=-1) <= _ALIKE)
-        within = _share(valid)
+        # Share of the window around each pixel that counts; beyond the frame nothing does.
+        within = F.avg_pool2d(valid[None, None].double(), _WINDOW, 1, _WINDOW // 2)[0, 0]
         full = valid & (within >= 0.5)
         counted, pixels = counted + int(full.sum()), pixels + full.numel()
         moved = warp(styled[b], depths[a], depths[b], cameras, a, b).image
@@ -239,11 +240,6 @@ def _errors(plain: Frames, styled: Frames, depths: Sequence[Tensor], cameras: Ca
             spread[i] += float((first - first.mean(0)).square().sum()) if len(first) else 0.0
     errors = [math.sqrt(s / v) if v > 0 else None for s, v in zip(squared, spread, strict=True)]
     return _Errors(errors[0], errors[1], counted / pixels if pixels else 0.0)
-
-
-def _share(valid: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]:
-    """Share of the window around each pixel that counts; beyond the frame nothing does."""
-    return F.avg_pool2d(valid[None, None].double(), _WINDOW, 1, _WINDOW // 2)[0, 0]
 
 
 def _window_mean(

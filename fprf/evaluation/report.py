@@ -239,11 +239,12 @@ def _rounded(value: float) -> float:
 
 def provenance(device: str) -> dict[str, object]:
     """Origin of a report: versions, commit, machine; nothing in it depends on the time. `device` as configs name it."""
+    here, processor = device_of(device), platform.machine().replace("_", "-")
     return {
         "commit": commit(Path(__file__).parent),
         "fprf": __version__,
         "torch": torch.__version__,
-        "machine": _machine(device_of(device)),
+        "machine": torch.cuda.get_device_name(here) if here.type == "cuda" else f"{os.cpu_count()} {processor} cores",
     }
 
 
@@ -266,12 +267,6 @@ def words(origin: dict[str, object]) -> str:
     """A line for a page."""
     where = f"commit {origin['commit']}, " if origin["commit"] else ""
     return f"{where}fprf {origin['fprf']}, torch {origin['torch']}, {origin['machine']}"
-
-
-def _machine(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"{os.cpu_count()} {platform.machine().replace('_', '-')} cores"
 
 
 Column = tuple[str, str, str]

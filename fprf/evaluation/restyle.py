@@ -206,7 +206,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
     results = cases(config, stage, encoders, folder, progress)
     sets = dict.fromkeys(case.set for case in results)
     means = {name: mean_rows([case.rows for case in results if case.set == name]) for name in sets}
-    best = list(lineup(config.stylizer))[-1]
+    best, plain = list(lineup(config.stylizer))[-1], [view.restyled().rgb for view in stage.shown]
     document = {
         "benchmark": "restyle",
         "settings": {
@@ -229,7 +229,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
         "lpips": None,
         "lpips_missing": LPIPS_MISSING,
         "recommended": best,
-        "reconstruction": _own_look(stage),
+        "reconstruction": score(plain, true_views(stage, settings.palette), [each.labels for each in stage.truth])[0],
         "means": means,
         "verdict": verdict(means[JUDGED], best),
         "palettes": {
@@ -351,11 +351,6 @@ def _rest(
     row |= {"consistency": steady.score, "warp_short": steady.short, "warp_long": steady.long}
     row["view_seconds"] = method.view_seconds
     return row
-
-
-def _own_look(stage: Stage) -> Row:
-    truth = true_views(stage, stage.settings.palette)
-    return score([view.restyled().rgb for view in stage.shown], truth, [each.labels for each in stage.truth])[0]
 
 
 def _less(a: float | None, b: float | None) -> float | None:

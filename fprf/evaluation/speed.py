@@ -131,16 +131,9 @@ def triplane_rows(config: SpeedConfig, trained: Trained) -> list[Row]:
     truth = forward_backward(triplane.lookup_reference, points.double(), table.double(), planes.resolutions)
     rows = []
     for peer in ("grid_sample", "reference"):
-        ours = spread(seconds["ours"]).map(lambda s: 1e3 * s)
         rows.append(
-            Row(
-                name=f"tri-plane forward + backward, against {peer}",
-                figure=ours.median,
-                low=ours.low,
-                high=ours.high,
-                unit="ms",
-                peer=1e3 * spread(seconds[peer]).median,
-                ratio=ratio(seconds[peer], seconds["ours"]),
+            replace(
+                _compared(f"tri-plane forward + backward, against {peer}", "ms", _milliseconds, seconds["ours"], seconds[peer]),
                 ratio_goal=GOAL if peer == "grid_sample" and device.type == "cpu" else None,
                 error=_error(calls["ours"](), truth),
                 error_kind="largest error of value or gradient against float64, relative to the largest of each",
@@ -196,21 +189,14 @@ def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, Stylize
     calls: dict[str, Callable[[], Tensor]] = {}
     for name, look in looks.items():
         calls[name] = lambda look=look: view.restyled(look).rgb  # type: ignore[misc]
-        calls[f"anew {name}"] = partial(_drawn_anew, subject, camera, look)
+        calls[f"anew {name}"] = partial(_drawn, trained.model, known.facts, camera, render, look)
     seconds = watch_of(config, trained).in_turn(calls)
     rows = []
     for name in looks:
-        taken = spread(seconds[name]).map(lambda s: 1e3 * s)
         rows.append(
-            Row(
-                name=f"cached view restyled, {name}",
-                figure=taken.median,
-                low=taken.low,
-                high=taken.high,
-                unit="ms",
+            replace(
+                _compared(f"cached view restyled, {name}", "ms", _milliseconds, seconds[name], seconds[f"anew {name}"]),
                 goal=_FAST if whole else None,
-                peer=1e3 * spread(seconds[f"anew {name}"]).median,
-                ratio=ratio(seconds[f"anew {name}"], seconds[name]),
                 error=difference(calls[name](), calls[f"anew {name}"]()).largest,
                 error_kind="largest colour difference from the view rendered anew",
                 note=f"{size_of(camera)}, {view.bytes / 2**20:.0f} MiB cached",
@@ -219,9 +205,14 @@ def cached_rows(config: SpeedConfig, subject: Subject, styles: dict[str, Stylize
     return rows
 
 
-def _drawn_anew(subject: Subject, camera: Cameras, look: Restyle) -> Tensor:
-    trained = subject.trained
-    return render_view(trained.model, trained.known.facts, camera, 0, trained.config.render, look).rgb
+def _milliseconds(seconds: float) -> float:
+    return 1e3 * seconds
+
+
+def _compared(name: str, unit: str, figure: Callable[[float], float], own: Sequence[float], peer: Sequence[float]) -> Row:
+    """A monotonic figure of the seconds of each round, beside that of a peer."""
+    ours, theirs = spread(own).map(figure), figure(spread(peer).median)
+    return Row(name=name, figure=ours.median, low=ours.low, high=ours.high, unit=unit, peer=theirs, ratio=ratio(peer, own))
 
 
 Progress = Callable[[int, int, str], None]
@@ -271,18 +262,11 @@ def _training(config: SpeedConfig, subject: Subject, prepared: Prepared) -> Row:
             walk()
 
     seconds = watch_of(config, trained).in_turn({"ours": take, "naive": naively})
-    batch = ours.manager.batch(trained.step)
-    rays = len(batch.rgb)
-    fast = spread(seconds["ours"]).map(lambda s: rays / s)
-    slow = spread(seconds["naive"]).map(lambda s: len(naive.manager.batch(0).rgb) / s)
-    return Row(
-        name="train",
-        figure=fast.median,
-        low=fast.low,
-        high=fast.high,
-        unit="rays/s",
-        peer=slow.median,
-        ratio=ratio(seconds["naive"], seconds["ours"]),
+    rays, naive_rays = len(ours.manager.batch(trained.step).rgb), len(naive.manager.batch(0).rgb)
+    row = _compared("train", "rays/s", lambda s: rays / s, seconds["ours"], seconds["naive"])
+    return replace(
+        row,
+        peer=naive_rays / spread(seconds["naive"]).median,
         error=_gradient_error(subject, prepared),
         error_kind="relative L2 error of the colour loss's gradient against float64 without skipping",
     )
@@ -317,16 +301,9 @@ def _rendering(config: SpeedConfig, subject: Subject) -> tuple[list[Row], dict[s
     rows = []
     for name, look in looks.items():
         truth = exact(model, facts, rays, look).cpu()
-        fast = spread(seconds[name]).map(lambda s: pixels / s)
         rows.append(
-            Row(
-                name=name,
-                figure=fast.median,
-                low=fast.low,
-                high=fast.high,
-                unit="rays/s",
-                peer=pixels / spread(seconds[f"naive {name}"]).median,
-                ratio=ratio(seconds[f"naive {name}"], seconds[name]),
+            replace(
+                _compared(name, "rays/s", lambda s: pixels / s, seconds[name], seconds[f"naive {name}"]),
                 ratio_goal=3.0 if render.budget == BUDGET else None,
                 error=difference(calls[name](), truth).largest,
                 error_kind="largest colour error against float64 without skipping",

@@ -64,18 +64,17 @@ def finest_only(points: Annotated[Tensor, "N 3"], level: Annotated[Tensor, "N"],
 def spacing(points: Annotated[Tensor, "N 3"], edge: Annotated[Tensor, "N"], neighbours: int = 4) -> Annotated[Tensor, "N"]:
     """Mean distance of each point to its nearest neighbours; infinite where it has fewer within two edges of its own."""
     result = torch.full((len(points),), torch.inf, dtype=points.dtype)
-    shifts = torch.stack(torch.meshgrid(*(torch.arange(-1, 2),) * 3, indexing="ij"), -1).view(-1, 3)
+    shifts = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
     for width in sorted(set(edge.tolist())):
         cell = cells(points, 2 * width)
         sorted_keys, order = keys(cell).sort()
         for mine in (edge == width).nonzero()[:, 0].split(_CHUNK):
-            start = torch.searchsorted(sorted_keys, keys(cell[mine, None] + shifts))
-            index = (start[:, :, None] + torch.arange(_CROWD)).clamp(max=len(points) - 1)
+            around = keys(cell[mine, None] + shifts)
+            index = torch.searchsorted(sorted_keys, around)[:, :, None] + torch.arange(_CROWD)
+            known = index < len(points)
+            index = index.clamp(max=len(points) - 1)
             there = order[index]
-            wanted = keys(cell[mine, None] + shifts)[:, :, None] == sorted_keys[index]
-            wanted &= there != mine[:, None, None]
-            # The last index may come several times where it was clamped.
-            wanted &= (start[:, :, None] + torch.arange(_CROWD)) < len(points)
+            wanted = known & (around[:, :, None] == sorted_keys[index]) & (there != mine[:, None, None])
             away = torch.linalg.vector_norm(points[there] - points[mine, None, None], dim=-1)
             away = torch.where(wanted & (away <= 2 * width), away, torch.inf).view(len(mine), -1)
             result[mine] = away.topk(neighbours, largest=False).values.mean(-1)
@@ -240,13 +239,8 @@ def sky_dome(maps: DepthMaps, cloud: Cloud) -> Cloud | None:
     first = torch.full((len(key),), len(direction)).scatter_reduce(0, group, torch.arange(len(direction)), "amin")
     width = torch.full((len(key),), edge, dtype=torch.float64)
     centre = cameras.pose[:, :, 3].mean(0)
-    radius = _FAR * _extent(cloud.point, centre)
+    radius = _FAR * float(torch.linalg.vector_norm(cloud.point - centre, dim=-1).amax())
     return Cloud(centre + radius * mean, -mean.float(), radius * width, _LOOSE * radius * width, view[first])
-
-
-def _extent(points: Annotated[Tensor, "N 3"], centre: Annotated[Tensor, "3"]) -> float:
-    """Distance of the outermost point."""
-    return float(torch.linalg.vector_norm(points - centre, dim=-1).amax())
 
 
 _FINE = 1 / 16

@@ -63,7 +63,9 @@ def spiral(cameras: Cameras, frames: int) -> Cameras:
     radii = spread.clamp(max=depth / 3)
     angle = torch.arange(frames, dtype=centres.dtype, device=centres.device) * (2 * math.pi * _TURNS / frames)
     loop = (torch.stack([angle.cos(), angle.sin(), (angle / _TURNS).sin()], dim=-1) * radii) @ rotation.T
-    reach = 1.0 if len(cameras) == 1 else _spacing(apart)
+    # The distance from a camera to the nearest other one, such that nine in ten are closer.
+    others = apart + torch.diag(torch.full_like(apart[0], torch.inf))
+    reach = 1.0 if len(cameras) == 1 else float(others.amin(dim=-1).quantile(0.9))
     for step in range(_SHRINKS):
         position = start + loop * (1 - step / _SHRINKS)
         if float(torch.cdist(position, centres).amin(dim=-1).amax()) <= reach:
@@ -165,12 +167,6 @@ def _unit(vector: Tensor) -> Tensor:
 def _least_axis(vector: Annotated[Tensor, "3"]) -> Annotated[Tensor, "3"]:
     """The axis that a vector is least like."""
     return torch.eye(3, dtype=vector.dtype, device=vector.device)[vector.abs().argmin()]
-
-
-def _spacing(apart: Annotated[Tensor, "V V"]) -> float:
-    """The distance from a camera to the nearest other one, such that nine in ten are closer."""
-    others = apart + torch.diag(torch.full_like(apart[0], torch.inf))
-    return float(others.amin(dim=-1).quantile(0.9))
 
 
 def _meeting(pose: Annotated[Tensor, "V 3 4"]) -> Annotated[Tensor, "3"] | None:

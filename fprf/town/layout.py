@@ -121,12 +121,6 @@ def _wood(start: float, rng: np.random.Generator) -> list[Shape]:
     return shapes
 
 
-def _table(faces: list[Face]) -> FaceTable:
-    numbers = np.array([face.finish for face in faces], dtype=np.int64)
-    frames = [np.stack(rows) for rows in zip(*(face[1:] for face in faces), strict=True)]
-    return FaceTable(*numbers.T, *frames)
-
-
 def build_town(seed: int, extra: float = 0.0) -> Town:
     """The town of a seed, its street longer by `extra` metres: same seed and length, same town."""
     begin = START - extra
@@ -153,4 +147,7 @@ def build_town(seed: int, extra: float = 0.0) -> Town:
         and np.ptp([s.low[0], s.high[0]]) > 0.7
     ]
     prints = np.array([[*s.low[:2], *s.high[:2], s.high[2]] for s in solid])
-    return Town(seed, tuple(shapes), tuple(first), _table(faces), prints, np.array(lights), begin)
+    numbers = np.array([face.finish for face in faces], dtype=np.int64)
+    frames = [np.stack(rows) for rows in zip(*(face[1:] for face in faces), strict=True)]
+    table = FaceTable(*numbers.T, *frames)
+    return Town(seed, tuple(shapes), tuple(first), table, prints, np.array(lights), begin)
