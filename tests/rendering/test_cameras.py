@@ -82,32 +82,21 @@ def test_any_lens_round_trips_up_to_its_reach(lens: int, k: tuple[float, ...]) -
     assert ((again - pixel)[inside].abs() < 1e-5).all()
 
 
-def test_the_opencv_lens_is_opencv_s() -> None:
-    # OpenCV has k1 k2 p1 p2 k3; the fourth radial term is ours alone.
-    k1, k2, k3, _, p1, p2 = K[OPENCV]
-    scene = cameras([OPENCV], (k1, k2, k3, 0.0, p1, p2))
+@pytest.mark.parametrize("lens", [OPENCV, FISHEYE])
+def test_lenses_are_those_of_opencv(lens: int) -> None:
+    k1, k2, k3, k4, p1, p2 = K[lens]
+    # OpenCV's lens has k1 k2 p1 p2 k3; the fourth radial term is ours alone.
+    scene = cameras([lens], (k1, k2, k3, k4 if lens == FISHEYE else 0.0, p1, p2))
     view, pixel = pixels(scene, 50)
     origin, direction = rays_through(scene, view, pixel)
-    expected, _ = cv2.projectPoints((origin + 2 * direction).numpy(), *_opencv_pose(scene), np.array([k1, k2, p1, p2, k3]))
-    assert np.abs(expected[:, 0] - pixel.numpy()).max() < 1e-8
-
-
-def test_the_fisheye_is_opencv_s() -> None:
-    scene = cameras([FISHEYE])
-    view, pixel = pixels(scene, 50)
-    origin, direction = rays_through(scene, view, pixel)
-    rotation, translation, matrix = _opencv_pose(scene)
-    points = (origin + 2 * direction).numpy()[:, None]
-    expected, _ = cv2.fisheye.projectPoints(points, rotation, translation, matrix, np.array(K[FISHEYE][:4]))
-    assert np.abs(expected[:, 0] - pixel.numpy()).max() < 1e-8
-
-
-def _opencv_pose(scene: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    pose = scene.pose[0].numpy()
+    points, pose = (origin + 2 * direction).numpy()[:, None], scene.pose[0].numpy()
     rotation = (pose[:, :3] * [1, -1, -1]).T
     (fx, fy), (cx, cy) = scene.focal[0].tolist(), scene.centre[0].tolist()
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    return cv2.Rodrigues(rotation)[0], -rotation @ pose[:, 3], matrix
+    own = cv2.fisheye.projectPoints if lens == FISHEYE else cv2.projectPoints
+    bent = np.array([k1, k2, k3, k4] if lens == FISHEYE else [k1, k2, p1, p2, k3])
+    expected, _ = own(points, cv2.Rodrigues(rotation)[0], -rotation @ pose[:, 3], matrix, bent)
+    assert np.abs(expected[:, 0] - pixel.numpy()).max() < 1e-8
 
 
 @pytest.mark.parametrize(
