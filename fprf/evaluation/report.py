@@ -22,7 +22,7 @@ from rich.table import Table
 from torch import Tensor
 
 from .. import __version__
-from ..io.images import Picture, to_uint8
+from ..io.images import Picture, resized, to_uint8
 from ..io.report import number
 from ..training.prepare import device_of
 
@@ -322,11 +322,7 @@ def contact_sheet(rows: Mapping[str, Sequence[Tensor]], columns: Sequence[str], 
 
 
 def _scaled(picture: Picture, height: int) -> Picture:
-    width = max(1, round(picture.shape[1] * height / picture.shape[0]))
-    smaller = height < picture.shape[0]
-    return np.asarray(
-        cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC), dtype=np.uint8
-    )
+    return resized(picture, max(1, round(picture.shape[1] * height / picture.shape[0])), height)
 
 
 def _write(page: Picture, text: str, at: tuple[int, int]) -> None:

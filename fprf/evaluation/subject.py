@@ -119,12 +119,12 @@ def small_view(cameras: Cameras, view: int, rays: int) -> Cameras:
     return one if area <= rays else one.resized((one.size * (rays / area) ** 0.5).floor().clamp_min(1))
 
 
-def town_references(folder: Path, *, width: int = 160, height: int = 120) -> tuple[Path, ...]:
+def town_references(folder: Path) -> tuple[Path, ...]:
     """One picture of another town for each look."""
     paths = []
     for look, (seed, view) in LOOKS.items():
         path = folder / f"{look}.png"
-        camera = walk(seed=seed, views=20, width=width, height=height)[view]
+        camera = walk(seed=seed, views=20, width=160, height=120)[view]
         write_image(path, render(build_town(seed), camera, palette(look)).rgb)
         paths.append(path)
     return tuple(paths)

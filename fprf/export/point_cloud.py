@@ -61,8 +61,8 @@ def finest_only(points: Annotated[Tensor, "N 3"], level: Annotated[Tensor, "N"],
     return alone
 
 
-def spacing(points: Annotated[Tensor, "N 3"], edge: Annotated[Tensor, "N"], neighbours: int = 4) -> Annotated[Tensor, "N"]:
-    """Mean distance of each point to its nearest neighbours; infinite where it has fewer within two edges of its own."""
+def spacing(points: Annotated[Tensor, "N 3"], edge: Annotated[Tensor, "N"]) -> Annotated[Tensor, "N"]:
+    """Mean distance of each point to its 4 nearest neighbours; infinite where it has fewer within two edges of its own."""
     result = torch.full((len(points),), torch.inf, dtype=points.dtype)
     shifts = torch.cartesian_prod(*(torch.arange(-1, 2),) * 3)
     for width in sorted(set(edge.tolist())):
@@ -77,7 +77,7 @@ def spacing(points: Annotated[Tensor, "N 3"], edge: Annotated[Tensor, "N"], neig
             wanted = known & (around[:, :, None] == sorted_keys[index]) & (there != mine[:, None, None])
             away = torch.linalg.vector_norm(points[there] - points[mine, None, None], dim=-1)
             away = torch.where(wanted & (away <= 2 * width), away, torch.inf).view(len(mine), -1)
-            result[mine] = away.topk(neighbours, largest=False).values.mean(-1)
+            result[mine] = away.topk(4, largest=False).values.mean(-1)
     return result
 
 

@@ -29,7 +29,6 @@ _OPTIONS: dict[Format, list[int]] = {
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 92],
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 84],
 }
-_MEDIA: dict[Format, str] = {"png": "image/png", "jpg": "image/jpeg", "webp": "image/webp"}
 _ENDINGS: dict[str, Format] = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg", ".webp": "webp"}
 
 
@@ -59,9 +58,15 @@ def encode(picture: Picture, form: Format) -> bytes:
     return bytes(data.tobytes())
 
 
-def data_uri(picture: Picture, form: Format = "webp") -> str:
-    """A picture as text that a page can hold."""
-    return f"data:{_MEDIA[form]};base64,{base64.b64encode(encode(picture, form)).decode('ascii')}"
+def data_uri(picture: Picture) -> str:
+    """A picture as text that a page can hold: WebP."""
+    return f"data:image/webp;base64,{base64.b64encode(encode(picture, 'webp')).decode('ascii')}"
+
+
+def resized(picture: Picture, width: int, height: int) -> Picture:
+    """The picture in another size: area-averaged where it gets smaller, bicubic where it gets larger."""
+    how = cv2.INTER_AREA if height < picture.shape[0] or width < picture.shape[1] else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=how), dtype=np.uint8)
 
 
 def shrink(picture: Picture, side: int) -> Picture:
@@ -70,8 +75,7 @@ def shrink(picture: Picture, side: int) -> Picture:
     scale = side / max(height, width)
     if scale >= 1:
         return picture
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return resized(picture, max(1, round(width * scale)), max(1, round(height * scale)))
 
 
 def write_image(path: Path, picture: Picture) -> None:

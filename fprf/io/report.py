@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from ..errors import UsageError
@@ -174,16 +175,13 @@ def bar_chart(rows: Sequence[tuple[str, float, str]]) -> str:
     return f'<dl class="bars">{drawn}</dl>' if rows else ""
 
 
-def sparkline(values: Sequence[float | None], width: int = 24) -> str:
-    """A line of blocks, low to high, for a terminal; what is not known is left out."""
+def sparkline(values: Sequence[float | None]) -> str:
+    """A line of at most 24 blocks, low to high, for a terminal; what is not known is left out."""
     known = [value for value in values if value is not None]
     if not known:
         return ""
-    count = min(width, len(known))
-    means = []
-    for k in range(count):
-        part = known[k * len(known) // count : (k + 1) * len(known) // count]
-        means.append(sum(part) / len(part))
+    count = min(24, len(known))
+    means = [fmean(known[k * len(known) // count : (k + 1) * len(known) // count]) for k in range(count)]
     low, high = min(means), max(means)
     scale = (len(_LEVELS) - 1) / (high - low) if high > low else 0.0
     return "".join(_LEVELS[round((value - low) * scale)] for value in means)

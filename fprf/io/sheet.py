@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import DataError
-from .images import Picture, checked
+from .images import Picture, checked, resized
 from .maps import palette
 
 _SIDE = 240
@@ -61,9 +61,7 @@ def contact_sheet(tiles: Sequence[Tile], columns: int = _COLUMNS) -> Picture:
 
 def _tile(tile: Tile) -> Picture:
     height, width = checked(tile.picture).shape[:2]
-    tall = max(1, round(height * _SIDE / width))
-    smaller = width > _SIDE
-    picture = cv2.resize(tile.picture, (_SIDE, tall), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+    picture = resized(tile.picture, _SIDE, max(1, round(height * _SIDE / width)))
     below = np.full((_BAR + _LINE * len(tile.lines) + _GAP, _SIDE, 3), _PAPER, dtype=np.uint8)
     if tile.shares:
         _draw_bar(below[:_BAR], tile.shares)
