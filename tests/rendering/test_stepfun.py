@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.rendering import stepfun
-from fprf.rendering.stepfun import interlevel, keep_heaviest, midpoints, resample, scale_gradient, transmittance_weights
+from fprf.rendering.stepfun import interlevel, keep_heaviest, midpoints, resample, transmittance_weights
 
 QUICK = settings(max_examples=40, deadline=None)
 U = 2.0**-24
@@ -209,13 +209,6 @@ def test_the_heaviest_are_kept_and_no_more_than_needed(samples: int, seed: int, 
         if len(inside):  # dropping the lightest of the kept as well would exceed the budget
             assert float(dropped[ray]) + float(inside.min()) > budget - slack
     assert not kept[0].any()
-
-
-def test_gradients_are_scaled_and_values_are_not() -> None:
-    x, by = torch.tensor([1.0, -2.0, 3.0], requires_grad=True), torch.tensor([0.5, 0.0, 4.0])
-    found = scale_gradient(x, by)
-    (found * torch.tensor([1.0, 1.0, -1.0])).sum().backward()
-    assert found.tolist() == x.tolist() and x.grad is not None and x.grad.tolist() == [0.5, 0.0, -4.0]
 
 
 @pytest.mark.parametrize("weight", [0.0, 1e-9, 5e-8, 1e-7, 2e-7, 1e-3])
