@@ -120,8 +120,9 @@ def every_pixel(cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def mixed(offset: float = 0.0) -> Cameras:
-    """Five poses of four lenses."""
+    """Five poses of four lenses, of one focal length and centre."""
     rig = cameras([PINHOLE, OPENCV, FISHEYE, OPENCV, PINHOLE], tiny=True, offset=offset)
+    rig = replace(rig, focal=rig.focal[:1].repeat(5, 1), centre=rig.centre[:1].repeat(5, 1))
     return replace(rig.select(torch.tensor([0, 1, 2, 1, 4])), pose=rig.pose)
 
 
