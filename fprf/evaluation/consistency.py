@@ -139,11 +139,6 @@ class WarpError:
         }
 
 
-def path_pairs(frames: int, gap: int) -> list[tuple[int, int]]:
-    """All (t, t + gap) of a path; none where it is too short."""
-    return [(t, t + gap) for t in range(frames - gap)]
-
-
 def _at(image: Annotated[Tensor, "H W C"], place: Annotated[Tensor, "N 2"]) -> Annotated[Tensor, "N C"]:
     """Bilinear values; `place` runs from -1 to 1 between the outer edges of the image."""
     sampled = grid_sample(
@@ -226,7 +221,7 @@ class _Errors(NamedTuple):
 def _errors(plain: Frames, styled: Frames, depths: Sequence[Tensor], cameras: Cameras, gap: int) -> _Errors:
     squared, spread = [0.0, 0.0], [0.0, 0.0]
     counted = pixels = 0
-    for a, b in path_pairs(len(plain), gap):
+    for a, b in zip(range(len(plain)), range(gap, len(plain)), strict=False):
         there, valid = warp(plain[b], depths[a], depths[b], cameras, a, b)
         valid = valid & ((plain[a] - there).norm(dim=-1) <= _ALIKE)
         # Share of the window around each pixel that counts; beyond the frame nothing does.

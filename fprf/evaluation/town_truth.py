@@ -102,14 +102,18 @@ def town_folder(config: RunConfig) -> Path | None:
 
 
 def town_settings(config: RunConfig) -> TownSettings:
-    """Return the town that a run was trained on. Raises UsageError where there is none, DataError for a bad record."""
+    """The town that a run was trained on. Raises UsageError where there is none, DataError for a bad record."""
     folder = town_folder(config)
     if folder is None:
         raise UsageError(
             f"the run was trained on {config.data}, whose looks in other light nobody knows; "
             "train the embedded town, for example with `fprf train fprf-lite --data town`"
         )
-    return _read_settings(folder)
+    record = folder / "town.json"
+    try:
+        return TownSettings(**json.loads(record.read_text(encoding="utf-8"))["settings"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{record}: {error}; remove the folder {folder} and let it be rendered again") from error
 
 
 def town_view(cameras: Cameras, view: int) -> View:
@@ -145,14 +149,6 @@ def short_path(start: Cameras, frames: int, stride: float = 1.0) -> Cameras:
     return replace(path, pose=pose)
 
 
-def _read_settings(folder: Path) -> TownSettings:
-    record = folder / "town.json"
-    try:
-        return TownSettings(**json.loads(record.read_text(encoding="utf-8"))["settings"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{record}: {error}; remove the folder {folder} and let it be rendered again") from error
-
-
 PARTS = {"facades": (FACADE, WINDOW, DOOR), "plants": (FOLIAGE, LAWN, TRUNK), "street": (ROAD, SIDEWALK, SKY)}
 """What each of three references shows most of."""
 _WALK = 20
@@ -165,7 +161,7 @@ _SEARCHED = 40
 
 
 class Place(NamedTuple):
-    """Return the viewpoint of a reference."""
+    """Viewpoint of a reference."""
 
     name: str
     seed: int

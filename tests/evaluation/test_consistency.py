@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from fprf.errors import DataError, NumericsError
-from fprf.evaluation.consistency import consistency, path_pairs, published, steadiness, warp
+from fprf.evaluation.consistency import consistency, published, steadiness, warp
 from fprf.evaluation.town_truth import short_path, town_view
 from fprf.rendering.cameras import Cameras, pixel_grid, rays_through
 from fprf.rendering.paths import look_at, pinhole
@@ -84,7 +84,8 @@ def test_a_consistent_path_scores_zero_and_flicker_its_own_size() -> None:
     cameras = row_of_cameras(10, step=0.05)
     views = [seen(cameras, view) for view in range(10)]
     images, depths = [image for image, _ in views], [depth for _, depth in views]
-    rows = [consistency(images, depths, cameras, path_pairs(10, gap)) for gap in (1, 7)]
+    pairs = [[(t, t + gap) for t in range(10 - gap)] for gap in (1, 7)]
+    rows = [consistency(images, depths, cameras, each) for each in pairs]
     assert [row["pairs"] for row in rows] == [9, 3]
     for row in rows:
         assert row["rmse"] is not None and row["rmse"] < 1e-3
@@ -92,9 +93,8 @@ def test_a_consistent_path_scores_zero_and_flicker_its_own_size() -> None:
         assert row["valid_share"] is not None and row["valid_share"] > 0.8
     # Every other frame brighter by 0.1: short pairs differ by exactly that, as do pairs 7 apart.
     flicker = [image + 0.1 * (index % 2) for index, image in enumerate(images)]
-    for gap in (1, 7):
-        row = consistency(flicker, depths, cameras, path_pairs(10, gap))
-        assert row["rmse"] == pytest.approx(0.1, abs=1e-3)
+    for each in pairs:
+        assert consistency(flicker, depths, cameras, each)["rmse"] == pytest.approx(0.1, abs=1e-3)
 
 
 def test_the_relative_error_does_not_reward_dullness() -> None:
