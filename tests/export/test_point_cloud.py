@@ -5,12 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 from analytic import RADIUS, globe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fprf.errors import DataError
 from fprf.export.depth_maps import DepthMaps, surface_points
 from fprf.export.point_cloud import (
     LEVELS,
@@ -52,6 +54,14 @@ def test_what_one_view_alone_claims_is_dropped() -> None:
     cloud = fused(spoilt, edge=0.1)
     assert float(cloud.point.norm(dim=-1).amax()) < RADIUS + 0.05
     assert not bool((cloud.view == 3).any())
+
+
+def test_points_are_bounded_in_number_and_none_is_an_error() -> None:
+    maps = globe(6)
+    assert 100 < len(fuse(maps, edge=None, most=300, tolerance=0.02, agree=2).point) <= 300
+    nothing = tuple(torch.full_like(depth, torch.inf) for depth in maps.depth)
+    with pytest.raises(DataError, match="no surface that two views agree on"):
+        fused(maps._replace(depth=nothing))
 
 
 def test_it_is_the_same_far_from_the_origin() -> None:
