@@ -25,8 +25,7 @@ from ..memory import chunk_size, in_parts
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.renderer import composite
 from ..style.look import Restyle
-from ..style.regional import RegionWeight
-from ..style.scene import SceneStyle
+from ..style.scene import Membership, SceneStyle
 from ..training.model import Model
 from ..training.style_pass import lattice
 from ..types import Rays
@@ -160,7 +159,7 @@ def colour_pairs(
 ) -> ColourPairs:
     """Pixels spread evenly over the views, without any background."""
     device = model.device
-    weight = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
+    weight = Membership(scene).to(device)
     view, pixel = lattice(cameras, torch.tensor(list(views)), rays)
     every = model.space.rays(*rays_through(cameras, view, pixel))
 

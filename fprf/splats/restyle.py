@@ -22,7 +22,7 @@ from ..style.colours import ColourMaps, carried_colours
 from ..style.controls import luma, place_weight
 from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
-from ..style.scene import SceneStyle, membership, own_style
+from ..style.scene import SceneStyle, own_style
 
 _DIRECTIONS = 48
 """In which harmonics are evaluated to find where renderers cut their colours."""
@@ -104,7 +104,7 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
     """A and b of one part at full strength."""
     if part.colours is not None:
         maps = part.colours
-        belongs = membership(semantic, maps.semantic_mean, maps.units, maps.softness)
+        belongs = maps.membership(semantic)
         return (belongs @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
     # An affine stylizer is known by what it makes of black and of each channel alone.
     black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)

@@ -22,7 +22,7 @@ from ..ops.precision import double
 from ..types import Want
 from .controls import blend_strength
 from .dictionary import StyleDictionary, blend_codes
-from .scene import SceneStyle, membership, region_units
+from .scene import Membership, SceneStyle
 from .statistics import mix, monge, symmetric_root
 
 _DRAWS = 512
@@ -36,8 +36,6 @@ _QUIET = 2e-4
 class ColourMaps(nn.Module):
     """An affine map of colours for each region, mixed by membership."""
 
-    semantic_mean: Annotated[Tensor, "D"]
-    units: Annotated[Tensor, "K D"]
     matrix: Annotated[Tensor, "K 3 3"]
     bias: Annotated[Tensor, "K 3"]
     origin: Annotated[Tensor, "3"]
@@ -46,9 +44,7 @@ class ColourMaps(nn.Module):
         self, scene: SceneStyle, matrix: Annotated[Tensor, "K 3 3"], bias: Annotated[Tensor, "K 3"], share: float
     ) -> None:
         super().__init__()
-        units, self.softness = region_units(scene.keys, scene.semantic_mean)
-        self.register_buffer("semantic_mean", scene.semantic_mean.float())
-        self.register_buffer("units", units.float())
+        self.membership = Membership(scene)
         # The identity is taken out: what is small stays exact, and a map that changes nothing is nothing.
         self.register_buffer("matrix", (share * (matrix - torch.eye(3).to(matrix))).float())
         self.register_buffer("bias", (share * bias).float())
@@ -57,7 +53,7 @@ class ColourMaps(nn.Module):
     @property
     def needs(self) -> Want:
         """Semantics only where there is more than one region."""
-        return Want.CONTENT | Want.SEMANTIC if len(self.units) > 1 else Want.CONTENT
+        return Want.CONTENT | Want.SEMANTIC if self.membership.divided else Want.CONTENT
 
     def forward(
         self,
@@ -70,12 +66,9 @@ class ColourMaps(nn.Module):
         `belongs` is the points' membership, where somebody has it.
         """
         if belongs is None:
-            seen = colour[:, :0] if semantic is None else semantic
-            belongs = membership(seen.to(self.units), self.semantic_mean, self.units, self.softness)
-        change = mixture.affine(colour.to(self.units), belongs.to(self.units), self.matrix, self.bias, centre=self.origin).to(
-            colour
-        )
-        return (colour + change).clamp(0, 1) - colour
+            belongs = self.membership(colour[:, :0] if semantic is None else semantic)
+        change = mixture.affine(colour.to(self.bias), belongs.to(self.bias), self.matrix, self.bias, centre=self.origin)
+        return (colour + change.to(colour)).clamp(0, 1) - colour
 
 
 @torch.no_grad()

@@ -72,7 +72,7 @@ class Restyle:
                 needs |= part.stylizer.needs
                 if part.colours is not None:
                     needs |= part.colours.needs
-                if part.regions is not None and part.regions.divided:
+                if part.regions is not None and part.regions.membership.divided:
                     needs |= Want.SEMANTIC
         return needs
 

@@ -21,9 +21,9 @@ from ..io.maps import match_image, match_summary, scale_image, weighted_sum
 from ..io.sheet import Tile, highlight
 from ..rendering.cameras import Cameras, pixel_grid
 from .matching import unit
-from .regional import RegionWeight
 from .regions import Regions, membership_view, shrunk
 from .restyle import Codes, Styled
+from .scene import Membership
 
 _LISTED = 0.005
 """Codes that less than this share of a view takes are not listed."""
@@ -62,7 +62,7 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
     """Matches of one of the scene's own views, or of `cameras`: geometry and semantics alone are computed."""
     cameras, scene, look = here.cameras if cameras is None else cameras, styled.scene, styled.restyle
     device = here.device
-    belongs = RegionWeight(scene, torch.eye(len(scene.share))).to(device)
+    belongs = Membership(scene).to(device)
     centre, units, codes = scene.semantic_mean.to(device), styled.codes.units.to(device), len(styled.codes.reference)
 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ..interfaces import Stylizer
 from ..types import Want
 from .dictionary import StyleDictionary, choose
-from .scene import SceneStyle, membership, region_units
+from .scene import Membership, SceneStyle
 
 if TYPE_CHECKING:
     from ..plugins.stylizers.config import StylizerConfig
@@ -37,29 +37,19 @@ def regional(
 class RegionWeight(nn.Module):
     """One number a region, at points: by how much they belong to each."""
 
-    centre: Annotated[Tensor, "D"]
-    units: Annotated[Tensor, "K D"]
     values: Annotated[Tensor, "K X"]
 
     def __init__(self, scene: SceneStyle, values: Annotated[Tensor, "K X"]) -> None:
         super().__init__()
-        units, self.softness = region_units(scene.keys, scene.semantic_mean)
-        self.register_buffer("centre", scene.semantic_mean.float())
-        self.register_buffer("units", units.float())
+        self.membership = Membership(scene)
         self.register_buffer("values", values.float())
-
-    @property
-    def divided(self) -> bool:
-        """More than one region: points need semantics to tell which."""
-        return len(self.units) > 1
 
     def forward(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
     ) -> Annotated[Tensor, "N X"]:
         """The values, mixed by membership (`belongs`, where it is known): exactly 0 where all of a point's regions have 0."""
-        if belongs is None:
-            belongs = membership(semantic.to(self.units), self.centre, self.units, self.softness)
-        return belongs.to(self.values) @ self.values
+        share: Tensor = self.membership(semantic) if belongs is None else belongs
+        return share.to(self.values) @ self.values
 
 
 class RegionStylizer(Stylizer):

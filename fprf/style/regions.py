@@ -15,8 +15,7 @@ from ..rendering.cameras import Cameras, pixel_grid
 from .config import Pixel, pixel_of
 from .files import Key
 from .matching import scores, unit
-from .regional import RegionWeight
-from .scene import SceneStyle
+from .scene import Membership, SceneStyle
 
 ALIKE = 0.5
 """Least cosine of a region with a key from elsewhere: below, the scene has no such region.
@@ -90,8 +89,8 @@ def memberships(
     scene: Scene, style: SceneStyle, cameras: Cameras, view: int, pixel: Annotated[Tensor, "N 2"]
 ) -> tuple[Annotated[Tensor, "N K"], Annotated[Tensor, "N"]]:
     """Share of what pixels (centres) see that belongs to each region of a scene's style, and their opacity."""
-    weight = RegionWeight(style, torch.eye(len(style.share))).to(scene.device)
-    return scene.paint(cameras, view, pixel, lambda features, points: weight(features), semantic=weight.divided)
+    belongs = Membership(style).to(scene.device)
+    return scene.paint(cameras, view, pixel, lambda features, points: belongs(features), semantic=belongs.divided)
 
 
 def membership_view(regions: Regions, view: int, size: int) -> tuple[Annotated[Tensor, "H W K"], Annotated[Tensor, "H W"]]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
 from ..ops.precision import double
@@ -94,6 +94,28 @@ def membership(
     if len(units) == 1:
         return semantic.new_ones(len(semantic), 1)
     return point_shares(semantic, units, temperature, centre=centre, faint=_FAINT)
+
+
+class Membership(nn.Module):
+    """`membership` in the regions of one scene, on the device of the module."""
+
+    centre: Annotated[Tensor, "D"]
+    units: Annotated[Tensor, "K D"]
+
+    def __init__(self, scene: SceneStyle) -> None:
+        super().__init__()
+        units, self._temperature = region_units(scene.keys, scene.semantic_mean)
+        self.register_buffer("centre", scene.semantic_mean.float())
+        self.register_buffer("units", units.float())
+
+    @property
+    def divided(self) -> bool:
+        """More than one region: points need semantics to tell which."""
+        return len(self.units) > 1
+
+    def forward(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N K"]:
+        """Rows sum to 1."""
+        return membership(semantic.to(self.units), self.centre, self.units, self._temperature)
 
 
 def region_contacts(

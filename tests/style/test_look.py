@@ -12,7 +12,7 @@ from fprf.style.controls import keep_luminance
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.look import Restyle
 from fprf.style.regional import RegionWeight
-from fprf.style.scene import SceneStyle, scene_style
+from fprf.style.scene import Membership, SceneStyle, scene_style
 from fprf.types import Want
 
 
@@ -68,7 +68,7 @@ def test_kept_regions_stay_bit_for_bit_and_the_others_are_styled() -> None:
     stylizer = AdainConfig().build(dictionary=d, scene=scene)
     look = Restyle(stylizer, 1.0, RegionWeight(scene, torch.tensor([[0.0], [1.0], [0.5]])), luminance=0.7)
     assert stylizer.needs == Want.CONTENT and look.needs == Want.CONTENT | Want.SEMANTIC
-    share = RegionWeight(scene, torch.eye(3))(semantic)
+    share = Membership(scene)(semantic)
     decoder = Sigmoid()
     colour, plain = look.colour(decoder, content, semantic), decoder(content)
     kept, full = share[:, 0] == 1, share[:, 1] == 1

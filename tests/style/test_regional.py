@@ -14,7 +14,7 @@ from fprf.plugins.stylizers.config import (
 from fprf.plugins.stylizers.region import TwoSidedStylizer
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary, choose, whole_style
 from fprf.style.regional import regional
-from fprf.style.scene import SceneStyle, membership, region_units, scene_style
+from fprf.style.scene import Membership, SceneStyle, scene_style
 from fprf.types import Want
 
 ALL = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
@@ -32,10 +32,6 @@ def setting() -> tuple[torch.Tensor, torch.Tensor, SceneStyle, StyleDictionary]:
     scene = scene_style(content, semantic, torch.ones(300), None, 3, 0)
     d = build_dictionary([Reference(f"r{i}", *points(seed=5 + i), i + 1.0) for i in range(3)], clusters=2)
     return content, semantic, scene, d
-
-
-def belonging(semantic: torch.Tensor, scene: SceneStyle) -> torch.Tensor:
-    return membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean))
 
 
 def test_a_dictionary_of_some_references_is_the_one_built_of_them() -> None:
@@ -56,7 +52,7 @@ def test_each_region_is_styled_by_what_it_may_take_from(config: StylizerConfig) 
     allowed = torch.tensor([[True, False, False], [True, True, True], [False, True, True]])
     made = regional(d, scene, allowed, config)
     assert made.needs == Want.CONTENT | Want.SEMANTIC
-    share = belonging(semantic, scene)
+    share = Membership(scene)(semantic)
     out, match = torch.zeros_like(content), torch.zeros(300, len(d.keys))
     for k in range(3):
         part, codes = choose(d, allowed[k])
@@ -79,7 +75,7 @@ def test_stylizers_made_of_regions_heed_the_choice_themselves(config: StylizerCo
     allowed = torch.tensor([[True, False, False], [True, True, True], [False, True, True]])
     made = regional(d, scene, allowed, config)
     assert isinstance(made, TwoSidedStylizer)
-    share = belonging(semantic, scene)
+    share = Membership(scene)(semantic)
     out, match = torch.zeros_like(content), torch.zeros(300, len(d.keys))
     for k in range(3):
         part, codes = choose(d, allowed[k])

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from fprf.errors import CheckpointError, DataError
 from fprf.style.dictionary import Reference, build_dictionary
-from fprf.style.scene import check_fit, from_tensors, membership, region_smoothing, region_units, scene_style, to_tensors
+from fprf.style.scene import Membership, check_fit, from_tensors, region_smoothing, scene_style, to_tensors
 
 
 def points(n: int = 1200, c: int = 5, d: int = 4) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -18,7 +18,7 @@ def test_regions_are_the_clusters_and_their_statistics_those_of_the_soft_members
     content, semantic, weights = points()
     scene = scene_style(content, semantic, weights, None, 3, 0)
     assert scene.keys.shape == (3, 4)
-    share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean)).double()
+    share = Membership(scene)(semantic).double()
     for k in range(3):
         w = share[:, k] * weights
         mean = (w[:, None] * content).sum(0) / w.sum()
@@ -47,7 +47,7 @@ def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: floa
     assert all(bool(t.isfinite().all()) for t in scene)
     assert 1 <= len(scene.keys) <= min(n, regions)
     assert bool((scene.share > 0).all())
-    share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean))
+    share = Membership(scene)(semantic)
     torch.testing.assert_close(share.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
 
 

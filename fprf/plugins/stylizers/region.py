@@ -19,7 +19,7 @@ from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, choose, code_odds, whole_style
 from ...style.matching import Keys, Matching, match_keys, unit
-from ...style.scene import SceneStyle, check_fit, membership, own_style, region_units
+from ...style.scene import Membership, SceneStyle, check_fit, own_style
 from ...style.statistics import deviation, monge
 from ...types import Want
 
@@ -107,10 +107,7 @@ class ChannelMaps(RegionMaps):
 
 
 class MatrixMaps(RegionMaps):
-    """Optimal transport: one matrix a region, no direction amplified more than `gain`.
-
-    Both are buffers, so that a renderer can multiply them into a decoder's first layer.
-    """
+    """Optimal transport: one matrix a region, no direction amplified more than `gain`."""
 
     matrix: Annotated[Tensor, "K C C"]
     bias: Annotated[Tensor, "K C"]
@@ -133,22 +130,17 @@ class TwoSidedStylizer(Stylizer):
     """Membership of points, and the map of each region."""
 
     centre: Annotated[Tensor, "C"]
-    semantic_mean: Annotated[Tensor, "D"]
-    units: Annotated[Tensor, "K D"]
     table: Annotated[Tensor, "K T"]
 
     def __init__(self, plan: RegionPlan, scene: SceneStyle, maps: RegionMaps) -> None:
         super().__init__()
-        self.maps = maps
-        units, self.softness = region_units(scene.keys, scene.semantic_mean)
+        self.maps, self.membership = maps, Membership(scene)
         self.register_buffer("centre", scene.mean.float())
-        self.register_buffer("semantic_mean", scene.semantic_mean.float())
-        self.register_buffer("units", units.float())
         self.register_buffer("table", plan.table.to(scene.mean))
 
     @property
     def needs(self) -> Want:
-        return Want.CONTENT if len(self.units) == 1 else Want.CONTENT | Want.SEMANTIC
+        return Want.CONTENT | Want.SEMANTIC if self.membership.divided else Want.CONTENT
 
     def forward(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Annotated[Tensor, "N C"]:
         """Each point by the maps of the regions that it belongs to."""
@@ -159,20 +151,18 @@ class TwoSidedStylizer(Stylizer):
     ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N K"]]:
         """`forward`, and the regions that points belong to."""
         with full_precision(content):
-            share = self._membership(content[:, :0] if semantic is None else semantic)
+            share = self.membership(content[:, :0] if semantic is None else semantic)
             moved: Tensor = self.maps(content.to(self.centre), share, self.centre)
             return moved.to(content), share
 
     def match(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N T"]:
         with full_precision(semantic):
-            return self._membership(semantic) @ self.table
+            share: Tensor = self.membership(semantic)
+            return share @ self.table
 
     def region_match(self, keys: Annotated[Tensor, "K D"]) -> Annotated[Tensor, "K T"]:
         """The table of the plan."""
         return self.table
-
-    def _membership(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N K"]:
-        return membership(semantic.to(self.units), self.semantic_mean, self.units, self.softness)
 
 
 def _matched(scene: SceneStyle, dictionary: StyleDictionary, matching: Matching) -> Annotated[Tensor, "K T"]:

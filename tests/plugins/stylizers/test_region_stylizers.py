@@ -9,7 +9,7 @@ from fprf.plugins.stylizers.config import RegionAdainConfig, RegionOtConfig
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import Matching, Similarity, score_spread, share_mean, unit
-from fprf.style.scene import SceneStyle, membership, own_style, region_units, scene_style
+from fprf.style.scene import Membership, SceneStyle, own_style, scene_style
 from fprf.style.statistics import deviation, monge
 from fprf.types import Want
 
@@ -45,7 +45,7 @@ def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
     content, semantic, scene, d = setting()
     stylizer = config(temperature=temperature, whitening=0.0, recentred=0).build(dictionary=d, scene=scene)
     assert stylizer.needs == Want.CONTENT | Want.SEMANTIC
-    share = membership(semantic, scene.semantic_mean, *region_units(scene.keys, scene.semantic_mean)).double()
+    share = Membership(scene)(semantic).double()
     own = own_style(scene, d.blend)
     here, there = plain_table(scene, own, temperature), plain_table(scene, d, temperature)
     f, expected = content.double(), torch.zeros(600, 6, dtype=torch.float64)
