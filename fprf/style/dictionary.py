@@ -91,22 +91,11 @@ def build_dictionary(
     _check(references)
     ordered = sorted(references, key=lambda r: (_content_hash(r), r.name, r.weight))
     parts = [_codes(r, clusters, blend, seed, min_members) for r in ordered]
-    keys, mean, covariances, share = (torch.cat(part).cpu() for part in zip(*(p.fields for p in parts), strict=True))
-    colours = [p.colours for p in parts if p.colours is not None]
-    coloured = len(colours) == len(parts)
-    count = torch.tensor([len(p.fields[0]) for p in parts])
-    return StyleDictionary(
-        keys=keys,
-        mean=mean,
-        covariance=covariances,
-        share=share,
-        reference=torch.arange(len(parts)).repeat_interleave(count),
-        weight=torch.tensor([float(r.weight) for r in ordered]).repeat_interleave(count),
-        names=tuple(r.name for r in ordered),
-        blend=float(blend),
-        colour_mean=torch.cat([mean for mean, _ in colours]).cpu() if coloured else None,
-        colour_covariance=torch.cat([spread for _, spread in colours]).cpu() if coloured else None,
-    )
+    names = _TENSORS if any(r.colour is None for r in ordered) else _TENSORS + _COLOURS
+    tables = {name: torch.cat([part[name] for part in parts]).cpu() for name in names if name != "reference"}
+    count = torch.tensor([len(part["keys"]) for part in parts])
+    reference = torch.arange(len(parts)).repeat_interleave(count)
+    return StyleDictionary(**tables, reference=reference, names=tuple(r.name for r in ordered), blend=float(blend))
 
 
 def blend_codes(
@@ -193,33 +182,28 @@ def load_dictionary(path: Path) -> StyleDictionary:
     return d
 
 
-class _Codes(NamedTuple):
-    """Of one reference."""
-
-    fields: tuple[Tensor, Tensor, Tensor, Tensor]
-    """Keys, means, covariances and shares."""
-    colours: tuple[Tensor, Tensor] | None
-    """Means and covariances."""
-
-
 def _stored(d: StyleDictionary) -> tuple[str, ...]:
     return _TENSORS if d.colour_mean is None else _TENSORS + _COLOURS
 
 
-def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> _Codes:
+def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> dict[str, Tensor]:
+    """The tables of one reference, float32, those of colours where it has some."""
     label, centres = _cluster(r.semantic, clusters, seed)
-    alike = r.content.new_ones(len(r.content), dtype=torch.float32)
-    whole = moments(r.content, alike)
     member = double(torch.nn.functional.one_hot(label, len(centres)))
-    mean, covariances, share = group_moments(r.content, member)
+    share = member.sum(0) / len(label)
     at = 1 - (1 - blend) * (share * len(label) / min_members).clamp_max(1.0)
-    mean, covariances = blend_codes(mean, covariances, whole.mean, covariance(whole), at)
-    fields = (centres.float(), mean.float(), covariances.float(), share.float())
-    if r.colour is None:
-        return _Codes(fields, None)
-    overall, (tint, spread, _) = moments(r.colour, alike.to(r.colour)), group_moments(r.colour, member)
-    tint, spread = blend_codes(tint, spread, overall.mean, covariance(overall), at)
-    return _Codes(fields, (tint.float(), spread.float()))
+
+    def statistics(features: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "T C"], Annotated[Tensor, "T C C"]]:
+        whole = moments(features, features.new_ones(len(features)))
+        mean, covariances, _ = group_moments(features, member)
+        return blend_codes(mean, covariances, whole.mean, covariance(whole), at)
+
+    mean, covariances = statistics(r.content)
+    tables = {"keys": centres, "mean": mean, "covariance": covariances, "share": share}
+    tables["weight"] = torch.full_like(share, r.weight)
+    if r.colour is not None:
+        tables["colour_mean"], tables["colour_covariance"] = statistics(r.colour)
+    return {name: table.float() for name, table in tables.items()}
 
 
 def _cluster(semantic: Tensor, clusters: int, seed: int) -> tuple[Tensor, Tensor]:

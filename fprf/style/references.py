@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import at_least
 from ..datamanagers.config import GuidedConfig
 from ..datamanagers.images import Image, load_image
 from ..errors import DataError
@@ -63,56 +62,23 @@ class Encoders(NamedTuple):
 
 @torch.inference_mode()
 def encode_photograph(path: Path, encoders: Encoders, *, name: str, weight: float = 1.0, mask: Path | None = None) -> Reference:
-    """One photograph as samples in the scene's terms. Raises what `read_reference` raises."""
-    return read_reference(
-        path,
-        content=encoders.content,
-        semantic=encoders.semantic,
-        basis=encoders.basis,
-        longest=max(encoders.longest, SHORTEST_REFERENCE),
-        weight=weight,
-        guided=encoders.guided,
-        mask=mask,
-        name=name,
-        device=encoders.device,
-    )
+    """One photograph as samples in the scene's terms: D is 0 without a semantic encoder or basis.
 
-
-@torch.no_grad()
-def read_reference(
-    path: Path,
-    *,
-    content: Encoder,
-    semantic: Encoder | None,
-    basis: "Basis | None",
-    longest: int = 512,
-    weight: float = 1.0,
-    guided: GuidedConfig | None = None,
-    mask: Path | None = None,
-    name: str | None = None,
-    device: torch.device | None = None,
-) -> Reference:
-    """Encode a photograph, reduced to `longest` pixels a side (the scene's images' own is best), and sample it.
-
-    `basis` projects the semantics as the scene's were; without encoder or basis D is 0. `guided` is the scene's. Of a
-    photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of it.
-    `name` is the file's by default. Encoders must be on `device`, and the samples will be; None = the CPU. Raises DataError
-    where a file is no readable image, or a mask does not fit.
+    Of a photograph with a `mask`, a picture of the same shape, only what is white there is sampled; the encoders see all of
+    it. Raises DataError where a file is no readable image, or a mask does not fit.
     """
-    at_least("longest", longest, _SHORTEST)
     photo = load_image(path, upright=True)
-    image = torch.from_numpy(_reduced(photo, longest)).to(device).float() / 255
+    image = torch.from_numpy(_reduced(photo, max(encoders.longest, SHORTEST_REFERENCE))).to(encoders.device).float() / 255
     height, width = image.shape[:2]
     pixel = _grid(height, width) if mask is None else _inside(_mask(mask, path, photo, (width, height)))
     pixel = pixel.to(image.device)
-    guided, name = GuidedConfig() if guided is None else guided, path.name if name is None else name
-    samples, colour = _sampled(_encode(content, image), image, pixel, guided), image[pixel[:, 1], pixel[:, 0]]
-    if semantic is None or basis is None:
+    samples, colour = _sampled(_encode(encoders.content, image), image, pixel, encoders.guided), image[pixel[:, 1], pixel[:, 0]]
+    if encoders.semantic is None or encoders.basis is None:
         return Reference(name, samples, samples.new_zeros(len(samples), 0), weight, colour)
-    maps = _encode(semantic, image)
+    maps = _encode(encoders.semantic, image)
     # Projecting is linear and so is the filter: fewer channels first.
-    maps = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
-    return Reference(name, samples, _sampled(maps, image, pixel, guided), weight, colour)
+    maps = encoders.basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
+    return Reference(name, samples, _sampled(maps, image, pixel, encoders.guided), weight, colour)
 
 
 def _reduced(photo: Image, longest: int) -> Image:

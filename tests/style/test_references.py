@@ -7,19 +7,17 @@ import torch
 from photo_files import turned_jpeg
 
 from fprf.datamanagers.basis import Basis
-from fprf.errors import ConfigError, DataError
+from fprf.errors import DataError
 from fprf.ops.guided import upsample
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.style.dictionary import build_dictionary
-from fprf.style.references import read_reference
+from fprf.style.references import Encoders, encode_photograph
+from fprf.testing.cases import scene
 
 CONTENT = RandomConfig(channels=6, stride=2).build()
-
-
 SEMANTIC = RandomConfig(channels=9, stride=8, seed=1).build()
-
-
 BASIS = Basis(torch.randn(9, generator=torch.Generator().manual_seed(0)), torch.linalg.qr(torch.randn(9, 4))[0])
+ENCODERS = Encoders(CONTENT, SEMANTIC, BASIS, scene(1, 6, 4))
 
 
 def photo(folder: Path, height: int, width: int, *, flat: bool = False) -> Path:
@@ -33,8 +31,8 @@ def photo(folder: Path, height: int, width: int, *, flat: bool = False) -> Path:
 
 def test_samples_have_the_statistics_of_the_whole_filtered_image(tmp_path: Path) -> None:
     path = photo(tmp_path, 300, 420)
-    r = read_reference(path, content=CONTENT, semantic=SEMANTIC, basis=BASIS, weight=2.0)
-    assert r.name == "300x420.png" and r.weight == 2.0
+    r = encode_photograph(path, ENCODERS, name="it", weight=2.0)
+    assert r.name == "it" and r.weight == 2.0
     image = torch.from_numpy(np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])).float() / 255
     for encoder, samples in ((CONTENT, r.content), (SEMANTIC, r.semantic)):
         maps = encoder(image.permute(2, 0, 1)[None])[0]
@@ -55,12 +53,8 @@ def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path)
         cv2.imwrite(str(tmp_path / f"{name}.png"), upright[:, :, ::-1])
     for masked in (False, True):
         turned, plain = (
-            read_reference(
-                tmp_path / f"photo.{kind}",
-                content=CONTENT,
-                semantic=SEMANTIC,
-                basis=BASIS,
-                mask=tmp_path / f"mask.{kind}" if masked else None,
+            encode_photograph(
+                tmp_path / f"photo.{kind}", ENCODERS, name="it", mask=tmp_path / f"mask.{kind}" if masked else None
             )
             for kind in ("jpg", "png")
         )
@@ -71,7 +65,7 @@ def test_a_photograph_on_its_side_is_the_upright_one_bit_for_bit(tmp_path: Path)
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 700), (700, 3), (64, 64), (65, 1000)])
 def test_any_shape_gives_a_dictionary(tmp_path: Path, height: int, width: int) -> None:
-    r = read_reference(photo(tmp_path, height, width), content=CONTENT, semantic=SEMANTIC, basis=BASIS)
+    r = encode_photograph(photo(tmp_path, height, width), ENCODERS, name="it")
     assert len(r.content) == len(r.semantic) > 0
     assert all(bool(t.isfinite().all()) for t in build_dictionary([r])[:6])
 
@@ -89,28 +83,21 @@ def two_halves(folder: Path, *, mask_size: tuple[int, int] = (80, 120), white: i
 
 def test_a_mask_leaves_only_what_is_white(tmp_path: Path) -> None:
     path, mask = two_halves(tmp_path)
-    whole, some = (
-        read_reference(path, content=CONTENT, semantic=SEMANTIC, basis=BASIS, longest=120, mask=m) for m in (None, mask)
-    )
+    whole, some = (encode_photograph(path, ENCODERS._replace(longest=120), name="it", mask=m) for m in (None, mask))
     assert len(some.content) == len(some.semantic) == len(whole.content) // 2
     grid = whole.content.view(80, 120, -1)
     assert torch.equal(some.content, grid[:, 60:].reshape(-1, grid.shape[-1])), "the same features, of fewer pixels"
 
 
-def test_unreadable_files_and_sizes_are_named(tmp_path: Path) -> None:
+def test_unreadable_files_and_masks_that_cannot_be_are_named(tmp_path: Path) -> None:
     (tmp_path / "x.jpg").write_bytes(b"no image")
-    with pytest.raises(DataError):
-        read_reference(tmp_path / "x.jpg", content=CONTENT, semantic=None, basis=None)
-    with pytest.raises(ConfigError):
-        read_reference(photo(tmp_path, 9, 9), content=CONTENT, semantic=None, basis=None, longest=8)
-
-
-def test_masks_that_cannot_be_are_named(tmp_path: Path) -> None:
-    path, mask = two_halves(tmp_path, white=0)
-    with pytest.raises(DataError):
-        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
-    path, mask = two_halves(tmp_path, mask_size=(120, 80))
-    with pytest.raises(DataError):
-        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=mask)
-    with pytest.raises(DataError):
-        read_reference(path, content=CONTENT, semantic=None, basis=None, longest=120, mask=tmp_path / "absent.png")
+    (tmp_path / "turned").mkdir()
+    cases = [
+        (tmp_path / "x.jpg", None),
+        two_halves(tmp_path / "turned", mask_size=(120, 80)),
+        two_halves(tmp_path, white=0),
+        (tmp_path / "photo.png", tmp_path / "absent.png"),
+    ]
+    for path, mask in cases:
+        with pytest.raises(DataError, match=(mask or path).name):
+            encode_photograph(path, ENCODERS, name="it", mask=mask)
