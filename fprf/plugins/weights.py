@@ -53,6 +53,7 @@ def _widened(tensor: Tensor) -> Tensor:
     return tensor.float() if tensor.dtype in (torch.float16, torch.bfloat16) else tensor
 
 
+Triple = tuple[float, float, float]
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CHUNK = 1 << 20
 TIMEOUT_SECONDS = 30
@@ -134,10 +135,14 @@ def read_tensors(path: Path, source: WeightSource) -> tuple[dict[str, Tensor], d
     return {name: value.float() for name, value in tensors.items() if isinstance(value, Tensor)}, {}
 
 
-def stated_triple(
-    metadata: dict[str, str], key: str, default: tuple[float, float, float], path: Path
-) -> Annotated[Tensor, "3"]:
-    """Three numbers of a file's metadata, such as the mean of its input's channels; the default where it says nothing."""
+def input_statistics(
+    metadata: Mapping[str, str], path: Path, mean: Triple = IMAGENET_MEAN, std: Triple = IMAGENET_STD
+) -> tuple[Annotated[Tensor, "3"], Annotated[Tensor, "3"]]:
+    """Mean and deviation of a network's input, as the file's metadata says; those given where it says nothing."""
+    return _stated_triple(metadata, "mean", mean, path), _stated_triple(metadata, "std", std, path)
+
+
+def _stated_triple(metadata: Mapping[str, str], key: str, default: Triple, path: Path) -> Annotated[Tensor, "3"]:
     if key not in metadata:
         return torch.tensor(default)
     try:

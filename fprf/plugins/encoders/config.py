@@ -61,130 +61,123 @@ class BundledSemanticConfig(EncoderConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Vgg16Config(EncoderConfig):
-    """VGG-16 of ImageNet. torchvision's weights are downloaded once, unless named."""
+class _VggConfig(EncoderConfig):
+    network: ClassVar[str]
+    depth: ClassVar[int]
+    """Convolutions of each of the last three blocks."""
 
     layer: str = "relu2_1"
     """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
     weights: Path | None = None
-    """torchvision's vgg16-397923af.pth, Caffe's vgg16-00b39a1b.pth, or a safetensors file with their keys. By default the
-    download cache."""
     normalise: bool = True
     """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-3])", self.layer):
-            raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-16; allowed are conv1_1, relu1_1 ... relu5_3")
+        if not re.fullmatch(rf"(conv|relu)([12]_[12]|[345]_[1-{self.depth}])", self.layer):
+            name = self.network.upper().replace("VGG", "VGG-")
+            raise ConfigError(
+                f"layer: {self.layer!r} is no layer of {name}; allowed are conv1_1, relu1_1 ... relu5_{self.depth}"
+            )
 
     def needs(self) -> tuple[Need, ...]:
         from ..weights import weights_needed
-        from .vgg import SOURCES
+        from .vgg import SOURCES, shipped
 
-        return weights_needed(SOURCES["vgg16"], self.weights)
+        return weights_needed(SOURCES[self.network], self.weights or shipped(self.network, self.layer))
 
     def build(self) -> Encoder:
-        from .vgg import build_vgg16
+        from .vgg import build_vgg
 
-        return build_vgg16(self.layer, weights=self.weights, normalise=self.normalise)
+        return build_vgg(self.network, self.layer, weights=self.weights, normalise=self.normalise)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Vgg19Config(EncoderConfig):
+class Vgg16Config(_VggConfig):
+    """VGG-16 of ImageNet. torchvision's weights are downloaded once, unless named."""
+
+    network: ClassVar[str] = "vgg16"
+    depth: ClassVar[int] = 3
+
+    weights: Path | None = None
+    """torchvision's vgg16-397923af.pth, Caffe's vgg16-00b39a1b.pth, or a safetensors file with their keys. By default the
+    download cache."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vgg19Config(_VggConfig):
     """VGG-19 of ImageNet, the paper's content encoder. Ships up to relu2_1; torchvision's weights are downloaded for more."""
 
-    layer: str = "relu2_1"
-    """convX_Y or reluX_Y, X in 1..5: up to where the weights reach."""
+    network: ClassVar[str] = "vgg19"
+    depth: ClassVar[int] = 4
+
     weights: Path | None = None
     """torchvision's vgg19-dcbb9e9d.pth, Caffe's vgg19-d01eb7cb.pth, AdaIN's vgg_normalised.pth, or a safetensors file with
     torchvision's keys. By default the file that ships up to relu2_1 (the original weights, for which decoders ship), beyond it
     the download cache."""
-    normalise: bool = True
-    """Divide every filter by its mean activation on photographs, reflect at borders (AdaIN, FPRF); else plain VGG."""
-
-    def __post_init__(self) -> None:
-        if not re.fullmatch(r"(conv|relu)([12]_[12]|[345]_[1-4])", self.layer):
-            raise ConfigError(f"layer: {self.layer!r} is no layer of VGG-19; allowed are conv1_1, relu1_1 ... relu5_4")
-
-    def needs(self) -> tuple[Need, ...]:
-        from ..weights import weights_needed
-        from .vgg import BUNDLED_LAYERS, SOURCES
-
-        ships = self.weights is None and self.layer[4:] in BUNDLED_LAYERS
-        return () if ships else weights_needed(SOURCES["vgg19"], self.weights)
-
-    def build(self) -> Encoder:
-        from .vgg import build_vgg19
-
-        return build_vgg19(self.layer, weights=self.weights, normalise=self.normalise)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DinoConfig(EncoderConfig):
+class _TransformerConfig(EncoderConfig):
+    family: ClassVar[str]
+
+    model: str
+    """A model of the Hugging Face hub, or a folder that holds one."""
+    layer: int = -1
+    """Block whose tokens are taken, from 1; negative counts from the last."""
+    stride: int = 8
+    """Pixels of the image per feature: the image is resized until one patch covers that many."""
+
+    def __post_init__(self) -> None:
+        if self.layer == 0:
+            raise ConfigError("layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last")
+        at_least("stride", self.stride, 1)
+
+    def needs(self) -> tuple[Need, ...]:
+        needs = []
+        if importlib.util.find_spec("transformers") is None:
+            ships = "or choose an encoder that ships: --semantic.encoder bundled-semantic"
+            needs.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
+        home = os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface"
+        hub = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub")
+        cached = any(hub.glob(f"models--{self.model.replace('/', '--')}/snapshots/*/config.json"))
+        if not cached and not (Path(self.model) / "config.json").is_file():
+            needs.append(Need(f"the model {self.model}", f"hf download {self.model}", downloaded=True))
+        return tuple(needs)
+
+    def build(self) -> Encoder:
+        from .vit import build_vit
+
+        return build_vit(self.family, self.model, layer=self.layer, stride=self.stride)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DinoConfig(_TransformerConfig):
     """DINO, the paper's semantic encoder: a self-supervised vision transformer. Needs the extra `encoders`."""
+
+    family: ClassVar[str] = "dino"
 
     model: str = "facebook/dino-vits8"
     """A model of the Hugging Face hub, or a folder that holds one."""
-    layer: int = -1
-    """Block whose tokens are taken, from 1; negative counts from the last."""
-    stride: int = 8
-    """Pixels of the image per feature: the image is resized until one patch covers that many."""
-
-    def __post_init__(self) -> None:
-        _check_transformer(self.layer, self.stride)
-
-    def needs(self) -> tuple[Need, ...]:
-        return _transformer_needs(self.model)
-
-    def build(self) -> Encoder:
-        from .vit import build_vit
-
-        return build_vit("dino", self.model, layer=self.layer, stride=self.stride)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dinov2Config(EncoderConfig):
+class Dinov2Config(_TransformerConfig):
     """DINOv2: the successor, with steadier semantics. Needs the extra `encoders`."""
+
+    family: ClassVar[str] = "dinov2"
 
     model: str = "facebook/dinov2-small"
     """A model of the Hugging Face hub, or a folder that holds one."""
-    layer: int = -1
-    """Block whose tokens are taken, from 1; negative counts from the last."""
-    stride: int = 8
-    """Pixels of the image per feature: the image is resized until one patch covers that many."""
-
-    def __post_init__(self) -> None:
-        _check_transformer(self.layer, self.stride)
-
-    def needs(self) -> tuple[Need, ...]:
-        return _transformer_needs(self.model)
-
-    def build(self) -> Encoder:
-        from .vit import build_vit
-
-        return build_vit("dinov2", self.model, layer=self.layer, stride=self.stride)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dinov3Config(EncoderConfig):
+class Dinov3Config(_TransformerConfig):
     """DINOv3: the third of them, for dense features. Needs the extra `encoders`; its licence is accepted on the hub."""
+
+    family: ClassVar[str] = "dinov3"
 
     model: str = "facebook/dinov3-vits16-pretrain-lvd1689m"
     """A vision transformer of the Hugging Face hub, or a folder that holds one."""
-    layer: int = -1
-    """Block whose tokens are taken, from 1; negative counts from the last."""
-    stride: int = 8
-    """Pixels of the image per feature: the image is resized until one patch covers that many."""
-
-    def __post_init__(self) -> None:
-        _check_transformer(self.layer, self.stride)
-
-    def needs(self) -> tuple[Need, ...]:
-        return _transformer_needs(self.model)
-
-    def build(self) -> Encoder:
-        from .vit import build_vit
-
-        return build_vit("dinov3", self.model, layer=self.layer, stride=self.stride)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,24 +200,6 @@ class RandomConfig(EncoderConfig):
         from .bundled import RandomEncoder
 
         return RandomEncoder(channels=self.channels, stride=self.stride, seed=self.seed)
-
-
-def _check_transformer(layer: int, stride: int) -> None:
-    if layer == 0:
-        raise ConfigError("layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last")
-    at_least("stride", stride, 1)
-
-
-def _transformer_needs(model: str) -> tuple[Need, ...]:
-    needs = []
-    if importlib.util.find_spec("transformers") is None:
-        ships = "or choose an encoder that ships: --semantic.encoder bundled-semantic"
-        needs.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
-    hub = os.environ.get("HF_HUB_CACHE") or Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface") / "hub"
-    cached = any(Path(hub).glob(f"models--{model.replace('/', '--')}/snapshots/*/config.json"))
-    if not cached and not (Path(model) / "config.json").is_file():
-        needs.append(Need(f"the model {model}", f"hf download {model}", downloaded=True))
-    return tuple(needs)
 
 
 @dataclass(frozen=True, kw_only=True)

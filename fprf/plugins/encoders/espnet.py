@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..weights import IMAGENET_MEAN, IMAGENET_STD, WeightSource, find_weights, read_tensors, stated_triple
+from ..weights import WeightSource, find_weights, input_statistics, read_tensors
 from .frozen import FrozenTensors, NetworkEncoder, fitting
 
 
@@ -180,9 +180,7 @@ def build_espnet(layer: str, *, weights: Path | None) -> NetworkEncoder:
     """`level1` to `level4`, or `logits`. Raises WeightsError where the file is absent or does not hold the layer."""
     path = find_weights(SOURCE, weights)
     tensors, metadata = read_tensors(path, SOURCE)
-    mean, std = (
-        stated_triple(metadata, key, default, path) for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD))
-    )
+    mean, std = input_statistics(metadata, path)
     with fitting(str(path), f"ESPNetv2 {layer}", FLAG):
         network = EspNet(tensors, layer, mean=mean, std=std)
         multiple = COARSEST if layer == "logits" else STRIDES[layer]

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...errors import WeightsError
-from ..weights import IMAGENET_MEAN, IMAGENET_STD, WeightSource, find_weights, read_tensors, stated_triple, torchvision_file
+from ..weights import WeightSource, find_weights, input_statistics, read_tensors, torchvision_file
 from .frozen import FrozenTensors, NetworkEncoder, fitting
 
 TENSORFLOW_EPS, TORCHVISION_EPS = 1e-3, 1e-5
@@ -102,9 +102,7 @@ def build_mobilenet(layer: str, *, weights: Path | None) -> NetworkEncoder:
     path = find_weights(SOURCE, weights)
     tensors, metadata = read_tensors(path, SOURCE)
     same = metadata.get("padding", "").startswith("TensorFlow SAME")
-    mean, std = (
-        stated_triple(metadata, key, default, path) for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD))
-    )
+    mean, std = input_statistics(metadata, path)
     last = int(layer.rpartition(".")[2])
     with fitting(str(path), f"MobileNetV2 {layer}", FLAG):
         folded = fold(tensors, "features.", _eps(metadata, path))
@@ -160,7 +158,6 @@ DEEPLAB_SOURCE = WeightSource(
     FLAG,
 )
 _DEEPLAB_LAST = 17
-_DEEPLAB_MEAN = (0.5, 0.5, 0.5)
 
 
 class _Scores(nn.Module):
@@ -186,9 +183,7 @@ def build_deeplab(layer: str, *, weights: Path | None) -> NetworkEncoder:
     """`backbone.N` or `logits`. Raises WeightsError where the file is absent or does not hold the layer."""
     path = find_weights(DEEPLAB_SOURCE, weights)
     tensors, metadata = read_tensors(path, DEEPLAB_SOURCE)
-    mean, std = (
-        stated_triple(metadata, key, default, path) for key, default in (("mean", _DEEPLAB_MEAN), ("std", _DEEPLAB_MEAN))
-    )
+    mean, std = input_statistics(metadata, path, (0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
     last = _DEEPLAB_LAST if layer == "logits" else int(layer.rpartition(".")[2])
     with fitting(str(path), f"DeepLabv3 {layer}", FLAG):
         folded = fold(tensors, "backbone.", TENSORFLOW_EPS)

@@ -18,9 +18,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ...errors import WeightsError
-from ...interfaces import Encoder
-from ..weights import IMAGENET_MEAN, IMAGENET_STD, find_weights, read_tensors, stated_triple, tensors_hash, torchvision_file
-from .frozen import freeze, reflect_pad, street
+from ..weights import find_weights, input_statistics, read_tensors, tensors_hash, torchvision_file
+from .frozen import FrozenEncoder, freeze, reflect_pad, street
 
 
 def _places(depths: Sequence[int]) -> Mapping[str, int]:
@@ -33,7 +32,7 @@ CONVOLUTIONS: Mapping[str, Mapping[str, int]] = {"vgg16": _places((2, 2, 3, 3, 3
 """Place of each convolution in torchvision's `features`, by network."""
 
 
-class VggEncoder(Encoder):
+class VggEncoder(FrozenEncoder):
     """One layer of a VGG. `scale` [C] divides the features where they are normalised, None leaves them plain."""
 
     def __init__(
@@ -47,28 +46,20 @@ class VggEncoder(Encoder):
         scale: Annotated[Tensor, "C"] | None,
         source: str,
     ) -> None:
-        super().__init__()
-        self._network, self._layer, self._normalised = network, layer, scale is not None
-        names = list(CONVOLUTIONS[network])
-        self._names = names[: names.index(layer[4:]) + 1]
-        for index, name in enumerate(self._names):
-            self.register_buffer(f"weight{index}", _tensor(tensors, network, name, "weight", source))
-            self.register_buffer(f"bias{index}", _tensor(tensors, network, name, "bias", source))
-        self.register_buffer("mean", mean.float())
-        self.register_buffer("std", std.float())
-        self.register_buffer("scale", torch.ones(self.channels) if scale is None else scale.float())
-        self._hash = tensors_hash(dict(self.named_buffers()))
+        every = list(CONVOLUTIONS[network])
+        names = every[: every.index(layer[4:]) + 1]
+        used = {"mean": mean.float(), "std": std.float()}
+        for index, name in enumerate(names):
+            for part in ("weight", "bias"):
+                used[f"{part}{index}"] = _tensor(tensors, network, name, part, source)
+        channels = len(used[f"bias{len(names) - 1}"])
+        used["scale"] = torch.ones(channels) if scale is None else scale.float()
+        kind = "plain" if scale is None else "normalised"
+        super().__init__(f"{network}:{layer}:{kind}:{tensors_hash(used)}", channels)
+        self._names, self._layer, self._normalised = names, layer, scale is not None
+        for key, value in used.items():
+            self.register_buffer(key, value)
         freeze(self)
-
-    @property
-    def identity(self) -> str:
-        """Network, layer, normalisation and a hash of every tensor that is used."""
-        return f"{self._network}:{self._layer}:{'normalised' if self._normalised else 'plain'}:{self._hash}"
-
-    @property
-    def channels(self) -> int:
-        """64, 128, 256 or 512."""
-        return int(self.get_buffer(f"weight{len(self._names) - 1}").shape[0])
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
@@ -142,19 +133,14 @@ class _Held(NamedTuple):
     """Each filter is divided by its mean activation already."""
 
 
-def build_vgg16(layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
-    """The encoder from a file, the cache or the download. Raises WeightsError where none of them serves."""
-    return _build("vgg16", layer, weights=weights, normalise=normalise)
+def shipped(network: str, layer: str) -> Path | None:
+    """The file of the package that holds the layer; None where none does."""
+    return BUNDLED if network == "vgg19" and layer[4:] in BUNDLED_LAYERS else None
 
 
-def build_vgg19(layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
+def build_vgg(network: str, layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
     """The encoder from a file, the package, the cache or the download. Raises WeightsError where none of them serves."""
-    if weights is None and layer[4:] in BUNDLED_LAYERS:
-        weights = BUNDLED
-    return _build("vgg19", layer, weights=weights, normalise=normalise)
-
-
-def _build(network: str, layer: str, *, weights: Path | None, normalise: bool) -> VggEncoder:
+    weights = weights or shipped(network, layer)
     path = find_weights(SOURCES[network], weights)
     held = _read(network, path)
 
@@ -186,10 +172,7 @@ def _read(network: str, path: Path) -> _Held:
     if re.search(CAFFE_FILES, path.name) and "features.0.weight" in tensors:
         turned = {**tensors, "features.0.weight": tensors["features.0.weight"].flip(1)}
         return _Held(turned, torch.tensor(CAFFE_MEAN), torch.full((3,), 1 / 255), normalised=False)
-    mean, std = (
-        stated_triple(metadata, key, default, path) for key, default in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD))
-    )
-    return _Held(tensors, mean, std, normalised=False)
+    return _Held(tensors, *input_statistics(metadata, path), normalised=False)
 
 
 def _from_adain(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

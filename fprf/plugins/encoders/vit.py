@@ -12,10 +12,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ...errors import WeightsError
-from ..weights import tensors_hash
+from ..weights import IMAGENET_MEAN, IMAGENET_STD, tensors_hash
 from .frozen import FrozenEncoder, freeze
 
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 # ViT interpolates its position table on demand, DINOv2 always does, DINOv3 turns its tokens by where they lie.
 CALLS: Mapping[str, Mapping[str, bool]] = {"dino": {"interpolate_pos_encoding": True}, "dinov2": {}, "dinov3": {}}
 TYPES: Mapping[str, tuple[str, ...]] = {
@@ -43,7 +42,7 @@ class VitEncoder(FrozenEncoder):
         size = (height * self._patch, width * self._patch)
         if size != tuple(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
-        mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (MEAN, STD))
+        mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
         tokens: Tensor = self.model(pixel_values=(image - mean) / std, **self._call).last_hidden_state
         # Class and register tokens come first.
         return tokens[:, -height * width :].transpose(1, 2).reshape(len(image), self._channels, height, width)
