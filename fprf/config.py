@@ -87,17 +87,8 @@ class LossConfig:
     """A loss term of an installed package, by name."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "rgb",
-            "content",
-            "semantic",
-            "variation",
-            "proposal_variation",
-            "interlevel",
-            "distortion",
-            "depth",
-            "sky",
-        ):
+        weights = ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion", "depth", "sky")
+        for name in weights:
             at_least(f"loss.{name}", getattr(self, name), 0.0)
         names = [name for name, _ in self.penalties]
         for name, weight in self.penalties:

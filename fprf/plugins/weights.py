@@ -16,6 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ..errors import WeightsError
+from ..io.atomic import write_bytes
 from .config import Need, absent_file
 
 
@@ -33,10 +34,7 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 def write_weights(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write all or nothing: a reader never meets half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    partial.write_bytes(save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, dict(metadata)))
-    partial.replace(path)
+    write_bytes(path, save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, dict(metadata)))
 
 
 def tensors_hash(tensors: Mapping[str, Tensor]) -> str:

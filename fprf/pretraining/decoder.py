@@ -16,7 +16,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..datamanagers.config import GuidedConfig
 from ..errors import WeightsError
 from ..interfaces import Decoder, Encoder
 from ..ops.precision import double
@@ -30,9 +29,9 @@ from .config import PretrainDecoderConfig
 from .loop import generator_of, sheet, train
 from .photos import filtered_at, filtered_crop, filtered_whole, find_photos, load_photo, random_pixels, split
 
+Report = dict[str, float | int | str]
+Decode = Callable[[Annotated[Tensor, "N C"]], Annotated[Tensor, "N 3"]]
 NAMES = ("1_1", "1_2", "2_1", "2_2", "3_1", "3_2", "3_3", "3_4", "4_1")
-LAST = ("relu4_1", "relu3_4")
-"""The deepest layer of the style, the first of these that the weights reach."""
 CONTENT = 1
 """Index of the activations that the content loss compares: relu2_1, the paper's layer."""
 EPS = 1e-4
@@ -83,15 +82,11 @@ class StyleNetwork(nn.Module):
 
 def load_style_network(weights: Path | None) -> StyleNetwork:
     """The network from a file of VGG-19's weights (None = the download that `vgg19` uses). Raises WeightsError."""
-    for layer in LAST:
-        try:
-            encoder = Vgg19Config(layer=layer, weights=weights, normalise=False).build()
-        except WeightsError:
-            if layer == LAST[-1]:
-                raise
-            continue
-        break
-    count = NAMES.index(layer.removeprefix("relu")) + 1
+    count = len(NAMES)
+    try:
+        encoder = Vgg19Config(layer="relu4_1", weights=weights, normalise=False).build()
+    except WeightsError:  # they may end before it
+        encoder, count = Vgg19Config(layer="relu3_4", weights=weights, normalise=False).build(), count - 1
     tensors = [(encoder.get_buffer(f"weight{i}"), encoder.get_buffer(f"bias{i}")) for i in range(count)]
     return StyleNetwork(tensors, encoder.get_buffer("mean"), encoder.get_buffer("std"))
 
@@ -150,7 +145,7 @@ def prepare_crops(
     """
     loaded = [load_photo(path, longest).to(device) for path in photos]
     side = min(side, *(min(photo.shape[:2]) for photo in loaded))
-    made = [filtered_crop(encoder, photo, side, GuidedConfig(), generator_of(seed, i)) for i, photo in enumerate(loaded)]
+    made = [filtered_crop(encoder, photo, side, generator_of(seed, i)) for i, photo in enumerate(loaded)]
     images = [rgb.view(side, side, 3).permute(2, 0, 1) for _, rgb in made]
     if measure:
         network.measure(images)
@@ -171,7 +166,7 @@ def prepare_crops(
 def restyling_losses(
     crops: Crops,
     network: StyleNetwork,
-    decode: Callable[[Annotated[Tensor, "N C"]], Annotated[Tensor, "N 3"]],
+    decode: Decode,
     content: Annotated[Tensor, "B"],
     style: Annotated[Tensor, "B"],
 ) -> tuple[Annotated[Tensor, ""], Annotated[Tensor, ""]]:
@@ -195,22 +190,29 @@ def _whitened(activation: Annotated[Tensor, "1 K h w"]) -> Annotated[Tensor, "1 
 REPORT_PHOTOS = 20
 LONGEST = 384
 SAMPLE_PHOTOS, SAMPLE_LONGEST = 3, 192
-Report = dict[str, float | int | str]
-Decode = Callable[[Annotated[Tensor, "N C"]], Annotated[Tensor, "N 3"]]
 
 
 def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[[str], None]) -> Report:
     """Train, write `output`, and measure it on held-out photographs."""
     device = device_of(config.device)
     encoder = config.encoder.build().to(device)
-    network = _style_network(config)
+    measured = config.style_weights is not None or config.content > 0 or config.style > 0
+    network = load_style_network(config.style_weights).to(device) if measured else None
+
+    def prepared(chosen: Sequence[Path], seed: int, *, measure: bool) -> Crops | None:
+        if network is None:
+            return None
+        return prepare_crops(
+            encoder, network, chosen, side=config.size, longest=LONGEST, seed=seed, measure=measure, device=device
+        )
+
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
-    features, colours = _samples(encoder, photos, config)
+    features, colours = _samples(encoder, photos, config, device)
     mean = features.mean(0).to(device)
     std = features.std(0, correction=0).clamp_min(1e-3 * float(features.std())).to(device)  # dead channels are not blown up
     say(f"{len(features)} pixels prepared")
-    crops = _crops(encoder, network, photos[: config.crops], config, measure=True)
+    crops = prepared(photos[: config.crops], config.seed + 2, measure=True)
 
     torch.manual_seed(config.seed)
     decoder = MlpDecoder(encoder.channels, config.hidden).to(device)
@@ -245,7 +247,7 @@ def pretrain_decoder(config: PretrainDecoderConfig, output: Path, say: Callable[
     trained = load_decoder(output, encoder=encoder.identity, channels=encoder.channels).to(device)
     report: Report = {"encoder": encoder.identity, "steps": steps, "learned_photos": len(photos)}
     report |= decoder_report(encoder, trained, held[:REPORT_PHOTOS], device)
-    others = _crops(encoder, network, held[:REPORT_PHOTOS], config, measure=False)
+    others = prepared(held[:REPORT_PHOTOS], config.seed + 3, measure=False)
     return report | (restyling_report(others, network, trained) if others is not None and network is not None else {})
 
 
@@ -255,7 +257,7 @@ def decoder_report(encoder: Encoder, decoder: Decoder, photos: Sequence[Path], d
     psnr = []
     for path in photos:
         photo = load_photo(path, LONGEST).to(device)
-        content = filtered_whole(encoder, photo, GuidedConfig())
+        content = filtered_whole(encoder, photo)
         error = float(double(decoder(content) - photo.flatten(0, 1)).square().mean())
         psnr.append(-10 * math.log10(max(error, 1e-10)))
     return {
@@ -275,24 +277,6 @@ def restyling_report(crops: Crops, network: StyleNetwork, decode: Decode) -> Rep
     return {"content_loss": round(content, 4), "style_loss": round(style, 4)}
 
 
-def _style_network(config: PretrainDecoderConfig) -> StyleNetwork | None:
-    """None where neither loss counts and nobody named the weights to measure them with."""
-    if config.style_weights is None and config.content == config.style == 0:
-        return None
-    return load_style_network(config.style_weights).to(device_of(config.device))
-
-
-def _crops(
-    encoder: Encoder, network: StyleNetwork | None, photos: Sequence[Path], config: PretrainDecoderConfig, *, measure: bool
-) -> Crops | None:
-    if network is None:
-        return None
-    seed = config.seed + (2 if measure else 3)
-    return prepare_crops(
-        encoder, network, photos, side=config.size, longest=LONGEST, seed=seed, measure=measure, device=device_of(config.device)
-    )
-
-
 def _pairs(count: int, size: int, generator: torch.Generator) -> tuple[Annotated[Tensor, "B"], Annotated[Tensor, "B"]]:
     """Content and style of each pair: two different crops, where there are two."""
     content = torch.randint(0, count, (size,), generator=generator)
@@ -305,7 +289,7 @@ def _picture(
 ) -> Callable[[], Annotated[Tensor, "H W 3"]]:
     """Rows of photo | decoded | decoded in the style of the next photo."""
     photos = [load_photo(path, SAMPLE_LONGEST).to(device) for path in held[:SAMPLE_PHOTOS]]
-    features = [filtered_whole(encoder, photo, GuidedConfig())[None] for photo in photos]
+    features = [filtered_whole(encoder, photo)[None] for photo in photos]
     styles = []
     for each in features:
         mean = each.mean(1)
@@ -322,14 +306,14 @@ def _picture(
 
 
 def _samples(
-    encoder: Encoder, photos: Sequence[Path], config: PretrainDecoderConfig
+    encoder: Encoder, photos: Sequence[Path], config: PretrainDecoderConfig, device: torch.device
 ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
     """On the CPU: they may be more than an accelerator holds."""
-    device, features, colours = device_of(config.device), [], []
+    features, colours = [], []
     for index, path in enumerate(photos):
         photo = load_photo(path, LONGEST).to(device)
         pixels = random_pixels(photo, config.pixels, generator_of(config.seed + 1, index))
-        content, rgb = filtered_at(encoder, photo, pixels, GuidedConfig())
+        content, rgb = filtered_at(encoder, photo, pixels)
         features.append(content.cpu())
         colours.append(rgb.cpu())
     return torch.cat(features), torch.cat(colours)

@@ -21,6 +21,8 @@ from ..ops.guided import apply, coefficients, upsample
 SUFFIXES = (".jpg", ".jpeg", ".png")
 HELD_OUT = 12
 """One photograph in so many is held out."""
+GUIDED = GuidedConfig()
+"""The filter that features of a scene pass."""
 
 
 def find_photos(folders: Sequence[Path]) -> list[Path]:
@@ -61,34 +63,33 @@ def random_pixels(photo: Annotated[Tensor, "H W 3"], count: int, generator: torc
 
 @torch.no_grad()
 def filtered_at(
-    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], pixels: Annotated[Tensor, "N 2"], guided: GuidedConfig
+    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], pixels: Annotated[Tensor, "N 2"]
 ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
     """Features and colours at pixels (row, column)."""
     height, width = photo.shape[:2]
     pixels = pixels.to(photo.device)
     features = encoder(photo.permute(2, 0, 1)[None])[0]
-    coefs = coefficients(features, photo, radius=_radius(photo, guided), eps=guided.eps, stride=guided.stride)
+    coefs = coefficients(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride)
     rgb = photo[pixels[:, 0], pixels[:, 1]]
     return apply(coefs, pixels.flip(1) + 0.5, rgb, (height, width)), rgb
 
 
 @torch.no_grad()
 def filtered_crop(
-    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], side: int, guided: GuidedConfig, generator: torch.Generator
+    encoder: Encoder, photo: Annotated[Tensor, "H W 3"], side: int, generator: torch.Generator
 ) -> tuple[Annotated[Tensor, "N C"], Annotated[Tensor, "N 3"]]:
     """Features and colours of a random square of the photograph, row by row; the whole of it was encoded."""
     top, left = (int(torch.randint(0, size - side + 1, (), generator=generator)) for size in photo.shape[:2])
     rows, columns = torch.meshgrid(top + torch.arange(side), left + torch.arange(side), indexing="ij")
-    return filtered_at(encoder, photo, torch.stack([rows.flatten(), columns.flatten()], 1), guided)
+    return filtered_at(encoder, photo, torch.stack([rows.flatten(), columns.flatten()], 1))
 
 
 @torch.no_grad()
-def filtered_whole(encoder: Encoder, photo: Annotated[Tensor, "H W 3"], guided: GuidedConfig) -> Annotated[Tensor, "N C"]:
+def filtered_whole(encoder: Encoder, photo: Annotated[Tensor, "H W 3"]) -> Annotated[Tensor, "N C"]:
     """Features at every pixel, row by row."""
     features = encoder(photo.permute(2, 0, 1)[None])[0]
-    radius = _radius(photo, guided)
-    return upsample(features, photo, radius=radius, eps=guided.eps, stride=guided.stride).flatten(0, 1)
+    return upsample(features, photo, radius=_radius(photo), eps=GUIDED.eps, stride=GUIDED.stride).flatten(0, 1)
 
 
-def _radius(photo: Annotated[Tensor, "H W 3"], guided: GuidedConfig) -> int:
-    return round(guided.radius * min(photo.shape[:2]))
+def _radius(photo: Annotated[Tensor, "H W 3"]) -> int:
+    return round(GUIDED.radius * min(photo.shape[:2]))

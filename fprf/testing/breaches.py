@@ -1,11 +1,13 @@
 """Requirements that say in one sentence what was found where."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
+
+from ..interfaces import ContentField, Sampler, SemanticField
 
 
 def require(condition: bool, breach: str) -> None:
@@ -70,14 +72,7 @@ def follows(call: Callable[[], Tensor], like: Tensor, name: str) -> None:
     require(whole, f"{name}: makes a tensor that is not on the device of its inputs")
 
 
-class Regularised(Protocol):
-    """A part with penalties."""
-
-    def penalties(self) -> dict[str, Tensor]:
-        """Scalars by name."""
-
-
-def penalties(part: Regularised, name: str) -> None:
+def penalties(part: ContentField | SemanticField | Sampler, name: str) -> None:
     """Finite scalars by name, the same names at each call, of a part in float64."""
     penalties = part.penalties()
     require(part.penalties().keys() == penalties.keys(), f"{name}: must have the same penalties at each call")

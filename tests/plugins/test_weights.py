@@ -39,7 +39,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(Path, "replace", fail)
+    monkeypatch.setattr("os.replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_weights(path, {"a": torch.ones(2)}, {})
     assert torch.equal(read_weights(path)[0]["a"], torch.zeros(2))

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from photo_folder import photo_folder
 
-from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import DataError
 from fprf.plugins.encoders.config import RandomConfig
 from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
@@ -81,9 +80,9 @@ def test_a_basis_is_orthonormal_and_keeps_what_it_says(features: int, seed: int)
 def test_filtered_pixels_are_those_of_the_whole_image(folder: Path) -> None:
     photo, encoder = load_photo(find_photos([folder])[0]), RandomConfig(channels=3, stride=2).build()
     pixels = random_pixels(photo, 40, generator())
-    features, rgb = filtered_at(encoder, photo, pixels, GuidedConfig())
+    features, rgb = filtered_at(encoder, photo, pixels)
     assert torch.equal(rgb, photo[pixels[:, 0], pixels[:, 1]])
-    all_of_them = filtered_whole(encoder, photo, GuidedConfig()).view(*photo.shape[:2], 3)
+    all_of_them = filtered_whole(encoder, photo).view(*photo.shape[:2], 3)
     torch.testing.assert_close(features, all_of_them[pixels[:, 0], pixels[:, 1]], rtol=1e-4, atol=1e-5)
 
 

@@ -13,12 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fprf.datamanagers.config import GuidedConfig
 from fprf.errors import UsageError
 from fprf.interfaces import Encoder
 from fprf.ops.precision import double
 from fprf.plugins.encoders.bundled import CONTENT_KIND, ContentStudent, load_content_encoder
-from fprf.plugins.encoders.vgg import build_vgg19
+from fprf.plugins.encoders.config import Vgg19Config
 from fprf.plugins.weights import write_weights
 from fprf.pretraining.loop import generator_of, train
 from fprf.pretraining.photos import filtered_at, filtered_whole, find_photos, load_photo, random_pixels, split
@@ -80,7 +79,7 @@ def pretrain_content(config: DistilConfig, output: Path, say: Callable[[str], No
     if len(config.teachers) != 1:
         raise UsageError(f"--teachers: {len(config.teachers)} files; `content` takes one, the weights of VGG-19")
     device = device_of(config.device)
-    teacher = build_vgg19("relu2_1", weights=config.teachers[0], normalise=True).to(device)
+    teacher = Vgg19Config(weights=config.teachers[0]).build().to(device)
     photos, held = split(find_photos(config.images)[: config.photos])
     say(f"{len(photos)} photographs to learn from, {len(held)} held out")
     basis = content_basis(teacher, photos[:BASIS_PHOTOS], config.seed, device)
@@ -114,7 +113,7 @@ def content_basis(teacher: Encoder, photos: Sequence[Path], seed: int, device: t
     for index, path in enumerate(photos):
         photo = load_photo(path).to(device)
         pixels = random_pixels(photo, BASIS_PIXELS, generator_of(seed, index))
-        samples.append(filtered_at(teacher, photo, pixels, GuidedConfig())[0])
+        samples.append(filtered_at(teacher, photo, pixels)[0])
     return fit_basis(torch.cat(samples), CHOICES, ENERGY)
 
 
@@ -129,7 +128,7 @@ def content_report(
         image = photo.permute(2, 0, 1)[None]
         pairs = [
             (student(image), projected(image)),
-            (filtered_whole(student, photo, GuidedConfig()), filtered_whole(projected, photo, GuidedConfig())),
+            (filtered_whole(student, photo), filtered_whole(projected, photo)),
         ]
         for row, (found, wanted) in enumerate(pairs):
             error[row] += double(found - wanted).square().mean().cpu()
