@@ -157,19 +157,20 @@ def match_keys(
     With cosines, moving one side or rotating both changes nothing. Dot products are the paper's, and know no frame.
     """
     here, there = (Keys(double(side.keys), double(side.share) / double(side.share).sum()) for side in (here, there))
+
+    def matched(queries: Annotated[Tensor, "K D"], keys: Annotated[Tensor, "T D"]) -> Annotated[Tensor, "K T"]:
+        return attention(queries, keys, matching.temperature * score_spread(queries, keys), double(prior))
+
     if matching.similarity == "dot":
         centres = share_mean(*here), share_mean(*there)
-        queries, keys = compared(here.keys, there.keys, "dot", queries_centre=centres[0], keys_centre=centres[1])
-        return attention(queries, keys, matching.temperature * score_spread(queries, keys), double(prior))
+        return matched(*compared(here.keys, there.keys, "dot", queries_centre=centres[0], keys_centre=centres[1]))
     if not matching.centred:
         zero = torch.zeros_like(here.keys[0]) if origin is None else double(origin)
-        queries, keys = unit(here.keys, zero), unit(there.keys, zero)
-        return attention(queries, keys, matching.temperature * score_spread(queries, keys), double(prior))
+        return matched(unit(here.keys, zero), unit(there.keys, zero))
     queries = _directions(here.keys, share_mean(*here), whitener(here, matching.whitening))
     white, weight = whitener(there, matching.whitening), there.share
     for _ in range(matching.recentred + 1):
-        keys = _directions(there.keys, share_mean(there.keys, weight), white)
-        table = attention(queries, keys, matching.temperature * score_spread(queries, keys), double(prior))
+        table = matched(queries, _directions(there.keys, share_mean(there.keys, weight), white))
         weight = here.share @ table
     return table
 
