@@ -4,15 +4,15 @@ from typing import Annotated
 
 import pytest
 import torch
+from style_cases import setting
 from torch import Tensor
 
 from fprf.interfaces import Decoder, Stylizer
 from fprf.plugins.stylizers.config import AdainConfig, RegionOtConfig
 from fprf.style.controls import keep_luminance
-from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.look import Restyle
 from fprf.style.regional import RegionWeight
-from fprf.style.scene import Membership, SceneStyle, scene_style
+from fprf.style.scene import Membership
 from fprf.types import Want
 
 
@@ -42,19 +42,6 @@ class Never(Stylizer):
 
     def match(self, semantic: Tensor) -> Tensor:
         raise AssertionError
-
-
-def points(*, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    kind = torch.randint(0, 3, (300,), generator=g)
-    content = torch.randn(3, 6, generator=g)[kind] * 2 + torch.randn(300, 6, generator=g)
-    return content, torch.eye(3, 4)[kind] * 3 + torch.randn(300, 4, generator=g) * 0.3
-
-
-def setting() -> tuple[torch.Tensor, torch.Tensor, SceneStyle, StyleDictionary]:
-    content, semantic = points()
-    scene = scene_style(content, semantic, torch.ones(300), None, 3, 0)
-    return content, semantic, scene, build_dictionary([Reference(f"r{i}", *points(seed=5 + i)) for i in range(2)], clusters=2)
 
 
 def test_at_strength_0_nothing_is_asked_for() -> None:

@@ -4,8 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import CheckpointError, DataError
-from fprf.style.dictionary import Reference, build_dictionary
-from fprf.style.scene import Membership, check_fit, from_tensors, region_smoothing, scene_style, to_tensors
+from fprf.style.scene import Membership, from_tensors, region_smoothing, scene_style, to_tensors
 
 
 def points(n: int = 1200, c: int = 5, d: int = 4) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -51,33 +50,21 @@ def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: floa
     torch.testing.assert_close(share.sum(1), torch.ones(n), rtol=0.0, atol=1e-6)
 
 
-def test_tensors_round_trip() -> None:
-    content, semantic, weights = points()
-    scene = scene_style(content, semantic, weights, None, 3, 0)
-    back = from_tensors(to_tensors(scene))
-    assert all(torch.equal(a, b) for a, b in zip(scene, back, strict=True))
+def test_tensors_round_trip_and_runs_without_contacts_are_read() -> None:
+    tensors = to_tensors(scene_style(*points(), None, 3, 0))
+    assert all(torch.equal(value, tensors[name]) for name, value in from_tensors(tensors)._asdict().items())
+    del tensors["contacts"]
+    assert torch.equal(from_tensors(tensors).contacts, torch.zeros(3, 3))
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
-    [
-        ("share", None, "share missing"),
-        ("mean", torch.zeros(9), "expected"),
-        ("keys", torch.full((3, 4), float("inf")), "keys is not finite"),
-    ],
+    ("name", "value"), [("share", None), ("region_mean", torch.zeros(3, 9)), ("keys", torch.full((3, 4), float("inf")))]
 )
-def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None, said: str) -> None:
-    content, semantic, weights = points()
-    tensors = to_tensors(scene_style(content, semantic, weights, None, 3, 0))
-    del tensors[name]
-    with pytest.raises(CheckpointError, match=said):
-        from_tensors(tensors if value is None else tensors | {name: value})
-
-
-def test_a_run_without_contacts_is_read() -> None:
+def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None) -> None:
     tensors = to_tensors(scene_style(*points(), None, 3, 0))
-    del tensors["contacts"]
-    assert torch.equal(from_tensors(tensors).contacts, torch.zeros(3, 3))
+    del tensors[name]
+    with pytest.raises(CheckpointError, match=name):
+        from_tensors(tensors if value is None else tensors | {name: value})
 
 
 @settings(max_examples=30, deadline=None)
@@ -99,11 +86,3 @@ def test_smoothing_mixes_and_keeps_the_mean_over_the_scene(regions: int, smoothn
 def test_an_empty_scene_is_an_error() -> None:
     with pytest.raises(DataError):
         scene_style(torch.ones(3, 2), None, torch.zeros(3), None, 1, 0)
-
-
-def test_a_dictionary_of_other_encoders_does_not_fit() -> None:
-    content, semantic, weights = points()
-    scene = scene_style(content, semantic, weights, None, 3, 0)
-    other = build_dictionary([Reference("a", torch.randn(50, 6), torch.randn(50, 4))])
-    with pytest.raises(DataError):
-        check_fit(other, scene)

@@ -4,31 +4,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from style_cases import points, scene_of, setting
 
 from fprf.plugins.stylizers.config import RegionAdainConfig, RegionOtConfig
 from fprf.plugins.stylizers.region import region_table
 from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.matching import Matching, Similarity, score_spread, share_mean, unit
-from fprf.style.scene import Membership, SceneStyle, own_style, scene_style
+from fprf.style.scene import Membership, SceneStyle, own_style
 from fprf.style.statistics import deviation, monge
 from fprf.types import Want
 
 BOTH = (RegionAdainConfig, RegionOtConfig)
 Config = type[RegionAdainConfig] | type[RegionOtConfig]
-
-
-def points(n: int = 600, c: int = 6, d: int = 4, *, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    kind = torch.randint(0, 3, (n,), generator=g)
-    content = torch.randn(3, c, generator=g)[kind] * 2 + torch.randn(n, c, generator=g) * (kind[:, None] + 1) + 5
-    return content, torch.eye(3, d)[kind] * 3 + torch.randn(n, d, generator=g) * 0.5 + 1
-
-
-def setting(regions: int = 3, clusters: int = 3) -> tuple[torch.Tensor, torch.Tensor, SceneStyle, StyleDictionary]:
-    content, semantic = points()
-    scene = scene_style(content, semantic, torch.ones(len(content)), None, regions, 0)
-    d = build_dictionary([Reference(f"r{i}", *points(seed=5 + i)) for i in range(2)], clusters=clusters)
-    return content, semantic, scene, d
 
 
 def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float, similarity: Similarity = "cosine") -> torch.Tensor:
@@ -42,7 +29,7 @@ def plain_table(scene: SceneStyle, d: StyleDictionary, temperature: float, simil
 @pytest.mark.parametrize("config", BOTH)
 @pytest.mark.parametrize("temperature", [0.1, 0.4, 5.0])
 def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
-    content, semantic, scene, d = setting()
+    content, semantic, scene, d = setting(n=600)
     stylizer = config(temperature=temperature, whitening=0.0, recentred=0).build(dictionary=d, scene=scene)
     assert stylizer.needs == Want.CONTENT | Want.SEMANTIC
     share = Membership(scene)(semantic).double()
@@ -69,10 +56,10 @@ def test_the_map_is_its_definition(config: Config, temperature: float) -> None:
 @pytest.mark.parametrize("temperature", [0.05, 0.4, 20.0])
 @pytest.mark.parametrize("blend", [0.0, 0.3, 1.0])
 def test_the_scenes_own_style_is_the_identity(config: Config, regions: int, temperature: float, blend: float) -> None:
-    content, semantic = points()
+    content, semantic = points(600)
     content[:, 1] *= 1e-3
     content[:, 2] = 4.0
-    scene = scene_style(content, semantic, torch.ones(600), None, regions, 0)
+    scene = scene_of(content, semantic, regions)
     scene = scene._replace(contacts=torch.full_like(scene.contacts, 0.1))
     for smoothness in (0.0, 5.0):
         made = config(temperature=temperature, smoothness=smoothness).build(dictionary=own_style(scene, blend), scene=scene)
@@ -82,7 +69,7 @@ def test_the_scenes_own_style_is_the_identity(config: Config, regions: int, temp
 
 @pytest.mark.parametrize("config", BOTH)
 def test_smoothness_makes_regions_alike_that_meet(config: Config) -> None:
-    _, _, scene, d = setting()
+    _, _, scene, d = setting(n=600)
     contacts = torch.zeros(3, 3)
     contacts[0, 1] = contacts[1, 0] = 0.1
     scene = scene._replace(contacts=contacts)
@@ -97,7 +84,7 @@ def test_smoothness_makes_regions_alike_that_meet(config: Config) -> None:
 
 @pytest.mark.parametrize("like", [0, 1])
 def test_a_region_that_no_reference_shows_takes_the_codes_of_one_that_looks_like_it(like: int) -> None:
-    _, _, scene, d = setting()
+    _, _, scene, d = setting(n=600)
     other = 1 - like
     near = d._replace(keys=scene.keys[torch.arange(len(d.keys)) % 2])
     mean = scene.region_mean.clone()
@@ -125,7 +112,7 @@ def test_never_nan_for_degenerate_scenes_and_styles(
 ) -> None:
     content, semantic = torch.randn(n, 4) * here + 3, torch.randn(n, 3) * here
     d = build_dictionary([Reference("a", torch.randn(n, 4) * there, torch.randn(n, 3) * there)], clusters=clusters)
-    scene = scene_style(content, semantic, torch.ones(n), None, regions, 0)
+    scene = scene_of(content, semantic, regions)
     made = config().build(dictionary=d, scene=scene)
     for rows in (n, 1, 0):
         out = made(content[:rows], semantic[:rows])
@@ -134,7 +121,7 @@ def test_never_nan_for_degenerate_scenes_and_styles(
 
 @pytest.mark.parametrize("similarity", ["cosine", "dot"])
 def test_the_table_is_the_softmax_of_the_scores(similarity: Similarity) -> None:
-    _, _, scene, d = setting()
+    _, _, scene, d = setting(n=600)
     table = region_table(scene, d, Matching(0.4, similarity))
     torch.testing.assert_close(table, plain_table(scene, d, 0.4, similarity), rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(table.sum(1), torch.ones(3, dtype=torch.float64))
