@@ -1,6 +1,7 @@
 """Every config refuses what lies outside of its ranges, and names the field."""
 
 from math import inf, nan
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,6 +26,7 @@ from fprf.plugins.executors.config import RayConfig
 from fprf.plugins.samplers.config import ProposalConfig, UniformConfig
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionAdainConfig, RegionOtConfig, RegionToneConfig
 from fprf.pretraining.config import PretrainDecoderConfig
+from fprf.style.config import NO_MASK, StyleConfig
 from fprf.training.quality import QualityConfig
 from tools.distil.config import DistilConfig
 
@@ -76,6 +78,15 @@ OUTSIDE: dict[type, dict[str, list[Any]]] = {
     DistilConfig: {name: [0] for name in ("minutes", "steps", "batch", "rate", "crops")}
     | {"seed": [-1], "photos": [1], "size": [8]},
     PretrainDecoderConfig: {name: [-1] for name in ("noise", "style", "content", "samples")} | {"crops": [1], "pairs": [0]},
+    StyleConfig: {
+        "strength": [1.1],
+        "at": [nan],
+        "clusters": [0],
+        "weights": [(0.0,)],
+        "keep_below": [1.5],
+        "region_strength": [("3=2",)],
+        "pin": [("3",), ("box:1,2=0",)],
+    },
     RestyleConfig: {"frames": [7], "seeds": [(1, 2)], "blend": [1.1], "palettes": [()], "longest": [8]},
 }
 ROWS = [(kind, name, value) for kind, fields in OUTSIDE.items() for name, values in fields.items() for value in values]
@@ -88,6 +99,8 @@ def test_a_value_outside_of_its_range_is_refused_by_name(kind: type, name: str, 
     assert name in str(refused.value)
 
 
-def test_a_loss_that_weighs_nothing_is_refused() -> None:
+def test_fields_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(ConfigError):
         LossConfig(rgb=0.0, content=0.0, semantic=0.0)
+    with pytest.raises(ConfigError):
+        StyleConfig(references=(Path("a"), Path("b")), masks=(NO_MASK,))

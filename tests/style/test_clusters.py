@@ -27,14 +27,14 @@ def test_the_result_is_a_fixed_point_of_lloyd_in_plain_float64(norm: float) -> N
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 40), st.integers(1, 12), st.integers(1, 4), st.integers(1, 6), st.integers(0, 99))
+@given(st.integers(0, 40), st.integers(0, 12), st.integers(1, 4), st.integers(1, 6), st.integers(0, 99))
 def test_any_size_gives_non_empty_clusters_and_finite_centres(n: int, k: int, d: int, distinct: int, seed: int) -> None:
     g = torch.Generator().manual_seed(seed)
     x = torch.randn(distinct, d, generator=g)[torch.randint(0, distinct, (n,), generator=g)]
     found = kmeans(x, k, seed=seed)
     assert len(found.centres) <= min(k, len(x.unique(dim=0)) if n else 0)
     assert bool(found.centres.isfinite().all())
-    assert torch.equal(found.label.unique(), torch.arange(len(found.centres)))
+    assert torch.equal(found.label.unique(), torch.arange(len(found.centres))) or k == 0
     again = kmeans(x, k, seed=seed)
     assert torch.equal(found.label, again.label) and torch.equal(found.centres, again.centres)
 
@@ -58,11 +58,10 @@ def test_the_next_centre_is_drawn_by_squared_distance() -> None:
     assert abs(sum(far) / 300 - 0.8) < 0.1
 
 
-def test_bad_values_are_refused() -> None:
-    with pytest.raises(NumericsError, match="k-means"):
-        kmeans(torch.tensor([[float("nan")]]), 1, seed=0)
-    with pytest.raises(NumericsError, match="negative"):
-        kmeans(torch.ones(2, 1), 1, seed=0, weights=torch.tensor([1.0, -1.0]))
+@pytest.mark.parametrize(("value", "weight"), [(float("nan"), 1.0), (0.0, -1.0), (0.0, float("inf"))])
+def test_bad_values_are_refused(value: float, weight: float) -> None:
+    with pytest.raises(NumericsError):
+        kmeans(torch.tensor([[1.0], [value]]), 1, seed=0, weights=torch.tensor([1.0, weight]))
 
 
 def test_of_many_rows_a_sample_is_clustered_and_all_are_labelled() -> None:
@@ -74,9 +73,3 @@ def test_of_many_rows_a_sample_is_clustered_and_all_are_labelled() -> None:
     only = torch.zeros(60_000)
     only[[5, 59_999]] = 1.0
     torch.testing.assert_close(kmeans(x, 3, seed=0, weights=only).centres.sum(0), x[5] + x[59_999])
-
-
-@pytest.mark.parametrize(("rows", "k"), [(0, 3), (4, 0), (0, 0)])
-def test_no_rows_or_no_clusters(rows: int, k: int) -> None:
-    found = kmeans(torch.ones(rows, 2), k, seed=0)
-    assert found.centres.shape == (0, 2) and found.label.tolist() == [0] * rows

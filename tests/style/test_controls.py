@@ -1,5 +1,8 @@
 """What users ask of a style: strengths, luminance, regions and references by their names."""
 
+import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -69,7 +72,7 @@ PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/ni
     ],
 )
 def test_a_wish_is_split_at_its_last_equals_sign(text: str, wish: RegionValue) -> None:
-    assert parse_region_value("pin", text) == wish
+    assert parse_region_value("pin", text) == wish and parse_strength("region_strength", "sky=0.5") == ("sky", 0.5)
 
 
 @pytest.mark.parametrize(
@@ -93,32 +96,17 @@ def test_labels_are_short_and_different(paths: list[str], names: tuple[str, ...]
     assert labels([Path(p) for p in paths]) == names and len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize("strength", [-0.1, 1.1, float("nan"), float("inf")])
-def test_strength_has_a_range(strength: float) -> None:
-    with pytest.raises(UsageError):
-        blend_strength(torch.zeros(1, 1), torch.zeros(1, 1), strength)
-
-
-@pytest.mark.parametrize("wish", [{"pin": {2: {0}}}, {"pin": {0: {2}}}, {"forbid": [(0, -1)]}])
-def test_unknown_numbers_are_named(wish: dict[str, object]) -> None:
-    with pytest.raises(UsageError):
-        allowed_references(2, 2, **wish)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("wish", [{"forbid": [(1, 0), (1, 1)]}, {"pin": {1: {0}}, "forbid": [(1, 0)]}])
-def test_a_region_left_with_nothing_is_named(wish: dict[str, object]) -> None:
-    with pytest.raises(UsageError):
-        allowed_references(2, 2, **wish)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("text", ["3=1.5", "3=nan", "3=much"])
-def test_strengths_are_numbers_in_a_range(text: str) -> None:
-    assert parse_strength("region_strength", "sky=0.5") == ("sky", 0.5)
-    with pytest.raises(ConfigError):
-        parse_strength("region_strength", text)
-
-
-@pytest.mark.parametrize("text", ["x", "night"])
-def test_references_that_are_unknown_or_not_clear_are_refused(text: str) -> None:
-    with pytest.raises(UsageError):
-        find_reference(text, PHOTOS)
+@pytest.mark.parametrize(
+    ("kind", "mistake"),
+    [
+        *((UsageError, partial(blend_strength, torch.zeros(1, 1), torch.zeros(1, 1), s)) for s in (-0.1, 1.1, math.nan)),
+        *((UsageError, partial(allowed_references, 2, 2, pin=pin)) for pin in ({2: {0}}, {0: {2}})),
+        *((UsageError, partial(allowed_references, 2, 2, forbid=ban)) for ban in ([(0, -1)], [(1, 0), (1, 1)])),
+        (UsageError, partial(allowed_references, 2, 2, pin={1: {0}}, forbid=[(1, 0)])),
+        *((ConfigError, partial(parse_strength, "region_strength", text)) for text in ("3=1.5", "3=nan", "3=much")),
+        *((UsageError, partial(find_reference, text, PHOTOS)) for text in ("x", "night")),
+    ],
+)
+def test_what_cannot_be_is_refused(kind: type[Exception], mistake: Callable[[], object]) -> None:
+    with pytest.raises(kind):
+        mistake()

@@ -4,7 +4,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import NumericsError
-from fprf.style.statistics import covariance, dead_channels, deviation, empty, group_moments, merge, mix, moments
+from fprf.style.statistics import (
+    covariance,
+    dead_channels,
+    deviation,
+    empty,
+    group_moments,
+    limit_gain,
+    merge,
+    mix,
+    moments,
+    monge,
+    symmetric_root,
+)
 
 
 def rows(n: int, c: int, *, scale: float = 1.0, offset: float = 0.0, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -66,49 +78,40 @@ def test_rows_of_weight_zero_count_for_nothing_whatever_they_hold() -> None:
 def test_group_moments_equal_moments_per_group() -> None:
     x, _ = rows(301, 4)
     belongs = torch.rand(301, 5) * (torch.rand(301, 5) > 0.5)
+    belongs[:, 2] = 0
     mean, covariances, share = group_moments(x, belongs)
     for k in range(5):
         one = moments(x, belongs[:, k])
         torch.testing.assert_close(mean[k], one.mean, rtol=1e-12, atol=1e-14)
         torch.testing.assert_close(covariances[k], covariance(one), rtol=1e-12, atol=1e-14)
     torch.testing.assert_close(share, belongs.double().sum(0) / belongs.double().sum(), rtol=1e-12, atol=0.0)
+    assert not bool(mean[2].any()) and group_moments(x, 0 * belongs)[2].tolist() == [0.0] * 5
 
 
-def test_deviation_biases_no_live_channel_and_floors_dead_ones() -> None:
-    sigma = torch.tensor([5e-3, 1e-2, 2e-2, 1e-6, 0.0], dtype=torch.float64)
-    floored = deviation(torch.zeros(5).double(), sigma.square())
-    assert torch.equal(floored[:3], sigma.square().sqrt()[:3])
-    torch.testing.assert_close(floored[3:], torch.full((2,), 5e-5, dtype=torch.float64), rtol=1e-12, atol=0.0)
+@pytest.mark.parametrize(
+    ("mean", "variance", "floored"),
+    [
+        ([0.0] * 5, [25e-6, 1e-4, 4e-4, 1e-12, 0.0], [5e-3, 1e-2, 2e-2, 5e-5, 5e-5]),  # a hundredth of the median
+        ([1e4, 0.0, 1.0], [0.0] * 3, [1e-2] * 3),  # rounding of the largest mean
+        ([0.0] * 3, [-1e-9, 1.0, 1.0], [1e-2, 1.0, 1.0]),  # a variance that rounding made negative
+        ([1e6] * 3, [0.25] * 3, [1.0] * 3),
+    ],
+)
+def test_deviation_biases_no_live_channel_and_floors_dead_ones(
+    mean: list[float], variance: list[float], floored: list[float]
+) -> None:
+    given = torch.tensor(mean, dtype=torch.float64), torch.tensor(variance, dtype=torch.float64)
+    found = deviation(*given)
+    assert found.tolist() == pytest.approx(floored)
+    assert torch.equal(dead_channels(*given), found.square() > given[1] * (1 + 1e-9)), "those that are floored"
 
 
-def test_dead_channels_are_those_that_are_floored() -> None:
-    sigma = torch.tensor([1.0, 0.5, 2.0, 1e-3, 0.0, 0.9, 0.006])
-    assert dead_channels(torch.zeros(6), sigma.square()).tolist() == [False, False, False, True, True, False, False]
-    assert dead_channels(torch.full((3,), 1e6), torch.full((3,), 0.25)).all(), "rounding of the mean"
-    assert not dead_channels(torch.zeros(4), torch.ones(4)).any()
-
-
-def test_groups_of_nothing_have_no_share() -> None:
-    mean, spread, share = group_moments(torch.randn(5, 3), torch.zeros(5, 2))
-    assert share.tolist() == [0.0, 0.0] and not bool(mean.any()) and not bool(spread.any())
-
-
-@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
-def test_one_bad_number_among_good_ones_is_refused(bad: float) -> None:
+@pytest.mark.parametrize(("feature", "weight"), [(0.0, -1.0), (0.0, float("nan")), (float("inf"), 1.0)])
+def test_one_bad_number_among_good_ones_is_refused(feature: float, weight: float) -> None:
     x, w = rows(20, 3)
-    w[7] = bad
-    with pytest.raises(NumericsError, match="a weight"):
+    x[7, 1], w[7] = feature, weight
+    with pytest.raises(NumericsError):
         moments(x, w)
-    x, w = rows(20, 3)
-    x[7, 1] = bad
-    if bad != -1.0:
-        with pytest.raises(NumericsError, match="a content feature"):
-            moments(x, w)
-
-
-def test_the_largest_mean_says_what_rounding_is() -> None:
-    found = deviation(torch.tensor([1e4, 0.0, 1.0]), torch.zeros(3))
-    assert found.tolist() == pytest.approx([1e-2] * 3)
 
 
 def test_weights_are_shares_of_whatever_they_sum_to() -> None:
@@ -122,7 +125,54 @@ def test_weights_are_shares_of_whatever_they_sum_to() -> None:
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-14)
 
 
-def test_a_variance_that_rounding_made_negative_is_none() -> None:
-    mean, variance = torch.zeros(3), torch.tensor([-1e-9, 1.0, 1.0])
-    assert deviation(mean, variance).tolist() == pytest.approx([0.01, 1.0, 1.0])
-    assert dead_channels(mean, variance).tolist() == [True, False, False]
+def spectrum(c: int, *, rank: int | None = None, decay: float = 2.0, scale: float = 1.0, seed: int = 0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    q, _ = torch.linalg.qr(torch.randn(c, c, generator=g, dtype=torch.float64))
+    value = torch.logspace(0, -decay, c, dtype=torch.float64)
+    value[c if rank is None else rank :] = 0
+    return scale * (q * value) @ q.T
+
+
+def with_ridge(c: torch.Tensor) -> torch.Tensor:
+    return c + 1e-4 * c.diagonal().mean() * torch.eye(len(c), dtype=c.dtype)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(1, 24), st.integers(0, 24), st.integers(0, 24), st.sampled_from([1e-4, 1.0, 1e4]), st.integers(0, 99))
+def test_the_map_carries_one_covariance_to_the_other_at_any_rank(c: int, ra: int, rb: int, scale: float, seed: int) -> None:
+    content = spectrum(c, rank=min(ra, c), decay=4.0, seed=seed)
+    style = spectrum(c, rank=min(rb, c), decay=3.0, scale=scale, seed=seed + 1)
+    t = monge(content, style, gain=1e300)
+    assert bool(t.isfinite().all())
+    assert torch.equal(t, t.mT)
+    assert float(torch.linalg.eigvalsh(t)[0]) >= -1e-9 * float(t.abs().max())
+    if ra and rb:
+        reached, aim = t @ with_ridge(content) @ t, with_ridge(style)
+        assert float((reached - aim).abs().max() / aim.abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize(("c", "rank"), [(1, 1), (7, 0), (7, 1), (64, 3), (128, 128)])
+def test_equal_covariances_give_the_identity(c: int, rank: int) -> None:
+    a = spectrum(c, rank=rank, decay=8.0)
+    torch.testing.assert_close(monge(a, a, gain=1.0 + 1e-6), torch.eye(c).double(), rtol=0.0, atol=1e-9)
+
+
+def test_gain_is_capped_where_the_scene_is_flat() -> None:
+    flat, lively = torch.zeros(5, 5), torch.eye(5)
+    torch.testing.assert_close(monge(flat, lively, gain=8.0), 8.0 * torch.eye(5).double(), rtol=1e-9, atol=1e-9)
+    assert float(monge(lively, flat, gain=8.0).abs().max()) < 1e-6
+
+
+def test_batches_equal_single_maps() -> None:
+    a, b = (torch.stack([spectrum(6, seed=s + i) for i in range(3)]) for s in (0, 10))
+    both = monge(a, b, gain=8.0)
+    for k in range(3):
+        torch.testing.assert_close(both[k], monge(a[k], b[k], gain=8.0), rtol=1e-9, atol=1e-11)
+
+
+def test_the_cap_is_for_what_is_above_it_and_rounding_below_0_is_none() -> None:
+    t = torch.diag(torch.tensor([10.0, 3.0, 0.5, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(limit_gain(t, 3.0), t.clamp_max(3.0))
+    below = torch.diag(torch.tensor([3.0, 1.0, -1e-9], dtype=torch.float64))
+    assert torch.equal(limit_gain(below, 3.0), below), "bit for bit where nothing is above"
+    torch.testing.assert_close(symmetric_root(below), below.clamp_min(0).sqrt())

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -107,20 +106,3 @@ def test_what_is_wrong_is_named_with_the_file(tmp_path: Path, text: str, said: s
     with pytest.raises(ConfigError) as caught:
         read_style(photo(tmp_path / "style.json", text))
     assert str(caught.value).startswith(f"{tmp_path / 'style.json'}: ") and said in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"strength": 1.1}, "strength: 1.1"),
-        ({"at": float("nan")}, "at: nan"),
-        ({"clusters": 0}, "clusters: 0 must be at least 1"),
-        ({"weights": (0.0,)}, "weights: 0.0"),
-        ({"keep_below": 1.5}, "keep_below"),
-        ({"region_strength": ("3=2",)}, "region_strength: 2.0"),
-        ({"references": (Path("a"), Path("b")), "masks": (NO_MASK,)}, "masks: 1 masks for 2 references"),
-    ],
-)
-def test_fields_have_ranges(change: dict[str, object], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        replace(StyleConfig(), **change)  # type: ignore[arg-type]
