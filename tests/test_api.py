@@ -18,16 +18,9 @@ from fprf.style.config import StyleConfig
 
 
 @pytest.fixture(scope="module")
-def _scene() -> dict[str, TrainedScene]:
-    return {}
-
-
-@pytest.fixture
-def scene(world: World, _scene: dict[str, TrainedScene]) -> TrainedScene:
+def scene(_world: World) -> TrainedScene:
     """Loaded once: its encoders, too."""
-    if not _scene:
-        _scene["scene"] = fprf.load(world.run, device="cpu")
-    return _scene["scene"]
+    return fprf.load(_world.run, device="cpu")
 
 
 def test_five_lines_do_what_the_verbs_do(world: World, tmp_path: Path) -> None:
@@ -121,6 +114,7 @@ def test_mistakes_are_told(scene: TrainedScene, world: World, tmp_path: Path) ->
         (UsageError, lambda: scene.save_style(tmp_path / "style.json")),
         (UsageError, lambda: scene.towards(scene.stylize([world.references[0]]), 0.5)),
         (UsageError, lambda: scene.stylize([])),
+        (ConfigError, lambda: scene.stylize(world.references, weights=[1, 2, 3])),
         (DataError, lambda: scene.stylize([tmp_path / "absent.png"])),
         (UsageError, lambda: scene.camera_at([0, 0, 0], [0, 0, 0])),
         (ConfigError, lambda: scene.camera_at([0, 0, 0], [1, 0, 0], fov=180)),

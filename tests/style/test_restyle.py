@@ -9,33 +9,15 @@ import pytest
 import torch
 from tiny_world import World
 
-from fprf.errors import ConfigError, DataError, UsageError
+from fprf.errors import ConfigError
 from fprf.io.images import write_image
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.files import StyleFile, write_style
 from fprf.style.references import Encoders
-from fprf.style.restyle import apply_style, restyle
+from fprf.style.restyle import apply_style
 from fprf.training.loading import Trained
 from fprf.training.views import render_view
-
-
-def test_mistakes(world: World, tmp_path: Path) -> None:
-    trained = world.load()
-    with pytest.raises(UsageError, match="--references: at least one photograph"):
-        restyle(trained, [], RegionOtConfig())
-    with pytest.raises(ConfigError, match="weights: 3 weights for 2 references"):
-        restyle(trained, world.references, RegionOtConfig(), weights=(1.0, 2.0, 3.0))
-    with pytest.raises(DataError, match=r"absent\.jpg"):
-        restyle(trained, [tmp_path / "absent.jpg"], RegionOtConfig())
-    (tmp_path / "text.jpg").write_text("no picture")
-    with pytest.raises(DataError, match=r"text\.jpg"):
-        restyle(trained, [tmp_path / "text.jpg"], RegionOtConfig())
-
-
-def write_picture(path: Path, pixels: np.ndarray) -> Path:
-    write_image(path, pixels.astype(np.uint8))
-    return path
 
 
 @pytest.mark.parametrize(("height", "width", "colour"), [(1, 1, (3, 200, 90)), (90, 120, (0, 0, 0)), (2, 300, None)])
@@ -44,7 +26,8 @@ def test_degenerate_photographs_give_finite_pictures(
 ) -> None:
     """One pixel, one colour, a strip of noise: from the file to colours, with every stylizer and any number of clusters."""
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3))
-    path = write_picture(tmp_path / "x.png", noise if colour is None else np.broadcast_to(colour, (height, width, 3)))
+    path = tmp_path / "x.png"
+    write_image(path, (noise if colour is None else np.broadcast_to(colour, (height, width, 3))).astype(np.uint8))
     trained = world.load()
     encoders, known = trained.encoders(), trained.known
     for clusters in (1, 13):
@@ -70,7 +53,6 @@ SECOND: dict[str, object] = {
     "stylizer": RegionAdainConfig(),
 }
 """Those of `references`, `masks`, `between` and `at` need files: see below."""
-STYLIZERS = [LocalAdainConfig(), RegionOtConfig()]
 
 
 class Bench:
@@ -80,28 +62,18 @@ class Bench:
         self.trained: Trained = world.load()
         self.encoders: Encoders = self.trained.encoders()
         self.base = StyleConfig(references=world.references, clusters=3)
-        self.plain = self.render(None)
+        self.plain = self.show(None)
         self.first = self.show(self.base)
 
-    def render(self, style: StyleConfig | None) -> torch.Tensor:
+    def show(self, style: StyleConfig | None) -> torch.Tensor:
         known, config = self.trained.known, self.trained.config.render
         look = None if style is None else apply_style(self.trained, StyleFile(style), self.encoders).restyle
         return render_view(self.trained.model, known.facts, known.cameras, 0, config, look).rgb
 
-    def show(self, style: StyleConfig) -> torch.Tensor:
-        return self.render(style)
-
 
 @pytest.fixture(scope="module")
-def _bench() -> dict[str, Bench]:
-    return {}
-
-
-@pytest.fixture
-def bench(world: World, _bench: dict[str, Bench]) -> Bench:
-    if not _bench:
-        _bench["it"] = Bench(world)
-    return _bench["it"]
+def bench(_world: World) -> Bench:
+    return Bench(_world)
 
 
 def test_every_field_has_a_second_value() -> None:
@@ -144,7 +116,7 @@ def test_styles_that_lead_back_to_themselves_are_refused(bench: Bench, tmp_path:
         bench.show(replace(bench.base, between=a))
 
 
-@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("stylizer", [LocalAdainConfig(), RegionOtConfig()], ids=lambda s: type(s).__name__)
 def test_region_controls_work_with_every_stylizer(bench: Bench, stylizer: StylizerConfig) -> None:
     base = replace(bench.base, stylizer=stylizer)
     first, count = bench.show(base), 4

@@ -12,11 +12,8 @@ from fprf.config import TrainConfig
 from fprf.errors import WeightsError
 from fprf.methods import fprf_lite
 from fprf.plugins.decoders.config import DecoderConfig, MlpDecoderConfig, ResidualDecoderConfig, pretrain_line
-from fprf.plugins.decoders.decoders import DECODER_KIND, MlpDecoder
 from fprf.plugins.encoders.config import BundledContentConfig, Dinov2Config, EncoderConfig, RandomConfig, Vgg19Config
-from fprf.plugins.weights import write_weights
 from fprf.pretraining.config import PretrainDecoderConfig
-from fprf.training.model import build_decoder
 from fprf.training.prepare import prepare
 
 ENCODERS = [
@@ -54,12 +51,3 @@ def test_an_encoder_without_a_decoder_is_refused_before_its_features_are_made(de
     assert "no decoder ships for the encoder random:5:" in text
     assert f"`{pretrain_line(RandomConfig(channels=5))}` makes its decoder" in text
     assert "\n" not in text
-
-
-def test_a_decoder_of_another_encoder_is_refused_with_the_line(tmp_path: Path) -> None:
-    file = tmp_path / "d.safetensors"
-    write_weights(file, MlpDecoder(5, 4).state_dict(), {"kind": DECODER_KIND, "encoder": "random:5:stride4:seed9"})
-    encoder = RandomConfig(channels=5)
-    config = with_encoder(encoder, MlpDecoderConfig(weights=file))
-    with pytest.raises(WeightsError, match=r"random:5:stride4:seed9.*--encoder random --encoder\.channels 5"):
-        build_decoder(config, encoder=encoder.build().identity, channels=5)

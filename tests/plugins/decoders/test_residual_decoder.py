@@ -1,7 +1,6 @@
 """The colour head of a scene: nothing at first, trained with the scene, and gone where a style changes the colour."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,9 +39,8 @@ def decoder_of(fade: float = 0.5, trained: bool = True) -> ResidualDecoder:
     return made
 
 
-def residual_config(world: World, **knobs: float) -> TrainConfig:
-    decoder = ResidualDecoderConfig(**knobs)  # type: ignore[arg-type]
-    return replace(world.config, content=replace(world.config.content, decoder=decoder))
+def residual_config(world: World) -> TrainConfig:
+    return replace(world.config, content=replace(world.config.content, decoder=ResidualDecoderConfig()))
 
 
 def exaggerated(trained: Trained) -> Trained:
@@ -55,19 +53,17 @@ def exaggerated(trained: Trained) -> Trained:
 
 
 @pytest.fixture(scope="module")
-def _runs() -> dict[str, Path]:
-    return {}
+def run(_world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config, folder = residual_config(_world), tmp_path_factory.mktemp("residual") / "run"
+    made = trained_for(_world, folder, config)
+    made.save_config(replace(config, output=None), "fprf-lite")
+    made.save_known(_world.prepared.scene, _world.town, _world.prepared.facts)
+    return folder
 
 
 @pytest.fixture
-def trained(world: World, tmp_path_factory: pytest.TempPathFactory, _runs: dict[str, Path]) -> Trained:
-    if "run" not in _runs:
-        config, folder = residual_config(world), tmp_path_factory.mktemp("residual") / "run"
-        run = trained_for(world, folder, config)
-        run.save_config(replace(config, output=None), "fprf-lite")
-        run.save_known(world.prepared.scene, world.town, world.prepared.facts)
-        _runs["run"] = folder
-    return load_run(_runs["run"], "cpu")
+def trained(world: World, run: Path) -> Trained:
+    return load_run(run, "cpu")
 
 
 def test_it_keeps_the_contract() -> None:
@@ -191,16 +187,9 @@ def test_training_sees_both_colours_and_rendering_one(background: torch.Tensor |
 
 def rendered_of(rgb: float, unaided: float | None) -> Rendered:
     """One ray, whose colours are given."""
-    edges = torch.tensor([[0.0, 1.0]])
-    colour: Callable[[float], torch.Tensor] = lambda value: torch.full((1, 3), value)  # noqa: E731
-    return Rendered(
-        torch.ones(1),
-        torch.ones(1),
-        rgb=colour(rgb),
-        weights=torch.ones(1, 1),
-        sampled=Sampled(edges, edges),
-        frozen_rgb=None if unaided is None else colour(unaided),
-    )
+    edges, one = torch.tensor([[0.0, 1.0]]), torch.ones(1)
+    frozen = None if unaided is None else torch.full((1, 3), unaided)
+    return Rendered(one, one, rgb=torch.full((1, 3), rgb), weights=one[None], sampled=Sampled(edges, edges), frozen_rgb=frozen)
 
 
 @pytest.mark.parametrize("unaided", [None, 0.9])
