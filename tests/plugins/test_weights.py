@@ -1,7 +1,6 @@
 """Weights files: what goes in comes out, whole or not at all."""
 
 import shutil
-import urllib.error
 from pathlib import Path
 
 import pytest
@@ -11,8 +10,14 @@ from hypothesis import strategies as st
 from network_files import deeplab_file, mobilenet_tensors
 
 from fprf.errors import WeightsError
-from fprf.plugins import weights
-from fprf.plugins.encoders.config import DeepLabConfig, EncoderConfig, EspNetConfig, MobileNetV2Config
+from fprf.plugins.encoders.config import (
+    DeepLabConfig,
+    EncoderConfig,
+    EspNetConfig,
+    MobileNetV2Config,
+    Vgg16Config,
+    Vgg19Config,
+)
 from fprf.plugins.encoders.mobilenet import DEEPLAB_SOURCE as DEEPLAB
 from fprf.plugins.weights import find_weights, read_weights, tensors_hash, write_weights
 
@@ -56,21 +61,11 @@ def test_the_hash_sees_names_shapes_and_values_alone(seed: int) -> None:
     assert base not in [tensors_hash(other) for other in others]
 
 
-@pytest.fixture(autouse=True)
-def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A home of its own, and no network."""
-
-    def refuse(*_: object, **__: object) -> None:
-        raise urllib.error.URLError("no network in tests")
-
-    monkeypatch.setattr(weights.urllib.request, "urlopen", refuse)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    return tmp_path / "home"
-
-
 @pytest.mark.parametrize(
     ("config", "file"),
     [
+        (Vgg16Config(layer="relu3_1"), "vgg16-397923af.pth"),
+        (Vgg19Config(layer="relu3_1"), "vgg19-dcbb9e9d.pth"),
         (MobileNetV2Config(), "mobilenet_v2-b0353104.pth"),
         (DeepLabConfig(), "deeplabv3_mobilenetv2_pascal.safetensors"),
         (EspNetConfig(), "espnetv2_s_2.0_pascal_384x384.pth"),
@@ -79,9 +74,10 @@ def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def test_missing_weights_name_file_folder_and_flag(config: EncoderConfig, file: str, home: Path) -> None:
     with pytest.raises(WeightsError) as raised:
         config.build()
-    for part in (file, str(home / ".cache/fprf/weights"), "--semantic.encoder.weights FILE"):
+    for part in (file, str(home / ".cache/fprf/weights"), ".encoder.weights FILE"):
         assert part in str(raised.value)
     assert "\n" not in str(raised.value)
+    assert not list(home.rglob("*.p*th*")), "nothing is left of a download that failed"
 
 
 @pytest.mark.parametrize("folder", [".cache/fprf/weights", ".cache/torch/hub/checkpoints"])

@@ -34,19 +34,8 @@ def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
 
 def test_content(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "content.safetensors"
-    args = [
-        "--images",
-        photos,
-        "--teachers",
-        str(vgg_file(tmp_path, 64)),
-        "--output",
-        str(output),
-        "--size",
-        "32",
-        "--crops",
-        "2",
-    ]
-    assert main(["content", *args, *QUICK]) == 0
+    teacher = ["--teachers", str(vgg_file(tmp_path, 64))]
+    assert main(["content", "--images", photos, *teacher, "--output", str(output), "--size", "32", "--crops", "2", *QUICK]) == 0
     report = report_of(capsys)
     assert report["steps"] == 2
     assert 0 < report["relative_l2"] < 10
@@ -60,9 +49,10 @@ def test_content(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 def test_semantic(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / "semantic.safetensors"
-    teachers = [str(path) for path in teacher_files(tmp_path)]
-    args = ["--images", photos, "--teachers", *teachers, "--output", str(output), "--size", "64", "--towns", "0"]
-    assert main(["semantic", *args, *QUICK]) == 0
+    teachers = ["--teachers", *map(str, teacher_files(tmp_path))]
+    assert (
+        main(["semantic", "--images", photos, *teachers, "--output", str(output), "--size", "64", "--towns", "0", *QUICK]) == 0
+    )
     report = report_of(capsys)
     assert -1 <= report["teacher_cosine"] <= 1
     assert -1 <= report["night_cosine"] <= 1
@@ -70,38 +60,25 @@ def test_semantic(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert encoder(torch.rand(1, 3, 40, 70)).shape == (1, 26 + 25, 5, 9)
 
 
-def test_decoder(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "decoder.safetensors"
-    args = ["--images", photos, "--output", str(output), "--encoder", "random", "--encoder.channels", "5", "--pixels", "50"]
-    assert run(["decoder", *args, *QUICK]) == 0
-    encoder = RandomConfig(channels=5).build()
-    assert report_of(capsys)["encoder"] == encoder.identity
-    decoder = MlpDecoderConfig(weights=output).build(encoder=encoder.identity, channels=5)
-    assert decoder(torch.rand(4, 5)).shape == (4, 3)
-
-
 def test_a_decoder_learns_and_its_report_is_honest(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = []
+    output, encoder, found = tmp_path / "d.safetensors", RandomConfig(channels=12).build(), []
+    chosen = ["--encoder", "random", "--encoder.channels", "12", "--rate", "0.02", "--batch", "512"]
     for steps in ("1", "300"):
-        args = ["--images", photos, "--output", str(tmp_path / "d.safetensors"), "--encoder", "random", "--rate", "0.02"]
-        assert run(["decoder", *args, "--steps", steps, "--batch", "512"]) == 0
-        found.append(report_of(capsys)["psnr_db"])
+        assert run(["decoder", "--images", photos, "--output", str(output), *chosen, "--steps", steps]) == 0
+        report = report_of(capsys)
+        assert report["encoder"] == encoder.identity
+        found.append(report["psnr_db"])
     assert found[1] > found[0] + 5
+    decoder = MlpDecoderConfig(weights=output).build(encoder=encoder.identity, channels=12)
+    assert decoder(torch.rand(4, 12)).shape == (4, 3)
 
 
 @pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        ([], "allowed is decoder"),
-        (["field"], "'field' to train"),
-        (["content"], "tools.distil content"),
-        (["decoder"], "--images DIR"),
-        (["decoder", "--images", "."], "--output FILE"),
-        (["decoder", "--images", ".", "--teachers", "x"], "--teachers"),
-    ],
+    "args",
+    [[], ["field"], ["content"], ["decoder"], ["decoder", "--images", "."], ["decoder", "--images", ".", "--teachers", "x"]],
 )
-def test_mistakes(args: list[str], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
+def test_mistakes(args: list[str]) -> None:
+    with pytest.raises(UsageError):
         run(args)
 
 

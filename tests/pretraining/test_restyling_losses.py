@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
+from network_files import vgg_convolutions
 from photo_folder import photo_folder
 from safetensors.torch import save_file
 
@@ -20,25 +21,19 @@ from fprf.pretraining.decoder import (
 )
 from fprf.pretraining.photos import find_photos, load_photo
 
-WIDTHS = (3, 4, 4, 6, 6, 8, 8, 8, 8, 10)
+PLACES = dict(zip((0, 2, 5, 7, 10, 12, 14, 16, 19), (4, 4, 6, 6, 8, 8, 8, 8, 10), strict=True))
+"""Filters of each convolution."""
 
 
-def network(layers: int = 8) -> StyleNetwork:
-    draw = torch.Generator().manual_seed(1)
-    tensors = [
-        (torch.randn(WIDTHS[i + 1], WIDTHS[i], 3, 3, generator=draw) / (3 * WIDTHS[i] ** 0.5), torch.zeros(WIDTHS[i + 1]))
-        for i in range(layers)
-    ]
+def network() -> StyleNetwork:
+    made = iter(vgg_convolutions(dict(list(PLACES.items())[:8]), seed=1, biased=False).values())
+    tensors = list(zip(made, made, strict=True))
     return StyleNetwork(tensors, torch.full((3,), 0.45), torch.full((3,), 0.25))
 
 
 def test_layers_end_where_the_weights_do(tmp_path: Path) -> None:
-    places = (0, 2, 5, 7, 10, 12, 14, 16, 19)
     for count, last in ((8, "relu3_4"), (9, "relu4_1")):
-        tensors = {}
-        for i, place in enumerate(places[:count]):
-            tensors[f"features.{place}.weight"] = torch.randn(WIDTHS[i + 1], WIDTHS[i], 3, 3)
-            tensors[f"features.{place}.bias"] = torch.zeros(WIDTHS[i + 1])
+        tensors = vgg_convolutions(dict(list(PLACES.items())[:count]))
         save_file(tensors, tmp_path / "vgg.safetensors")
         found = load_style_network(tmp_path / "vgg.safetensors")
         assert found.layers == ["relu1_1", "relu2_1", "relu3_1", last]

@@ -7,11 +7,13 @@ import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from photo_folder import STRIDES, mobilenet_tensors, photo_folder, teacher_files
+from network_files import mobilenet_tensors
+from photo_folder import photo_folder, teacher_files
 from safetensors.torch import save_file
 from torch import Tensor
 
 from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.plugins.encoders.mobilenet import CLASSIFIER
 from fprf.town.palettes import PALETTES
 from fprf.town.surface import CLASSES
 from tools.distil.config import SemanticDistilConfig
@@ -91,20 +93,20 @@ def streets() -> Streets:
 
 
 @pytest.fixture(scope="module")
-def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Ensemble:
-    teachers = [load_teacher(path) for path in teacher_files(tmp_path_factory.mktemp("teachers"))]
+def teachers(tmp_path_factory: pytest.TempPathFactory) -> list[MobileNetTeacher]:
+    return [load_teacher(path) for path in teacher_files(tmp_path_factory.mktemp("teachers"))]
+
+
+@pytest.fixture(scope="module")
+def ensemble(teachers: list[MobileNetTeacher]) -> Ensemble:
     return semantic_ensemble(teachers, list(torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(0))), CELL)
 
 
-def test_every_view_in_every_palette(streets: Streets) -> None:
+def test_every_view_in_every_palette_and_shares_of_its_classes(streets: Streets) -> None:
     assert streets.images.shape == (VIEWS, len(PALETTES), 3, CROP, CROP)
-    assert streets.images.dtype == torch.uint8
     day, night = list(PALETTES).index("day"), list(PALETTES).index("night")
     brightness = streets.images.float().mean((2, 3, 4))
     assert (brightness[:, night] < brightness[:, day]).all()
-
-
-def test_shares_of_classes_sum_to_one(streets: Streets) -> None:
     assert streets.classes.shape == (VIEWS, len(CLASSES), CROP // CELL, CROP // CELL)
     assert torch.allclose(streets.classes.sum(1), torch.ones(VIEWS, 4, 4), atol=1e-6)
 
@@ -127,11 +129,6 @@ def test_targets_are_half_way_to_the_mean_of_their_class(ensemble: Ensemble, str
         mean = sum(share[v, k, i, j] * means[k] for k in means)
         wanted = 0.5 * said[v, :, i, j] + 0.5 * mean
         assert torch.allclose(found[v, :, i, j].double(), wanted, atol=1e-4)
-
-
-@pytest.fixture(scope="module")
-def teachers(tmp_path_factory: pytest.TempPathFactory) -> list[MobileNetTeacher]:
-    return [load_teacher(path) for path in teacher_files(tmp_path_factory.mktemp("teachers"))]
 
 
 def test_mirrored_images_give_mirrored_features(teachers: list[MobileNetTeacher]) -> None:
@@ -171,7 +168,7 @@ def unfolded(tensors: dict[str, Tensor], image: Tensor) -> Tensor:
 
     x = layer(2 * image.double() - 1, "0.0", "0.1", 2).clamp(0, 6)
     for block in range(1, 14):
-        stride, y, at = STRIDES[block - 1], x, 0
+        stride, y, at = CLASSIFIER.strides[block - 1], x, 0
         if block > 1:
             y, at = layer(x, f"{block}.conv.0.0", f"{block}.conv.0.1").clamp(0, 6), 1
         y = layer(y, f"{block}.conv.{at}.0", f"{block}.conv.{at}.1", stride, y.shape[1]).clamp(0, 6)
@@ -190,8 +187,8 @@ def test_folding_changes_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(16, 16), (17, 33), (40, 90), (5, 100)])
-def test_one_feature_per_sixteen_pixels(tmp_path: Path, height: int, width: int) -> None:
-    for path in teacher_files(tmp_path):
-        features = load_teacher(path)(torch.rand(1, 3, height, width))
+def test_one_feature_per_sixteen_pixels(teachers: list[MobileNetTeacher], height: int, width: int) -> None:
+    for teacher in teachers:
+        features = teacher(torch.rand(1, 3, height, width))
         assert features.shape[2:] == (-(-height // 16), -(-width // 16))
         assert torch.isfinite(features).all()

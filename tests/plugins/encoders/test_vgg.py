@@ -1,7 +1,6 @@
 """VGG against torch in float64, and where its weights come from."""
 
 import io
-import urllib.error
 from pathlib import Path
 
 import pytest
@@ -17,14 +16,7 @@ from fprf.plugins.encoders.config import Vgg16Config, Vgg19Config
 from fprf.plugins.encoders.frozen import street
 from fprf.plugins.encoders.vgg import SOURCES, vgg_activations
 
-
-@pytest.fixture(autouse=True)
-def _no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise urllib.error.URLError("no network in tests")
-
-    monkeypatch.setattr(weights.urllib.request, "urlopen", refuse)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+pytestmark = pytest.mark.usefixtures("home")
 
 
 def oracle(image: Tensor, layer: str, *, normalise: bool) -> Tensor:
@@ -120,15 +112,6 @@ def test_adains_files_are_never_plain(tmp_path: Path) -> None:
         Vgg19Config(weights=tmp_path / "vgg_normalised.pth", normalise=False).build()
     with pytest.raises(WeightsError, match=r"holds no conv5_1"):
         Vgg19Config(weights=tmp_path / "vgg_normalised.pth", layer="relu5_1").build()
-
-
-@pytest.mark.parametrize(("kind", "file"), [(Vgg16Config, "vgg16-397923af.pth"), (Vgg19Config, "vgg19-dcbb9e9d.pth")])
-def test_absent_weights_say_what_to_put_where(tmp_path: Path, kind: type[Vgg19Config], file: str) -> None:
-    with pytest.raises(WeightsError) as raised:
-        kind(layer="relu3_1").build()
-    for part in (f"https://download.pytorch.org/models/{file}", file[6:14], ".cache/fprf/weights", "--content.en"):
-        assert part in str(raised.value)
-    assert not list((tmp_path / "home/.cache/fprf/weights").iterdir())
 
 
 def test_a_download_is_kept_and_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
