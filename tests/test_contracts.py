@@ -1,24 +1,39 @@
-"""The contracts themselves: built-ins keep to them, and each breach is told."""
+"""The contracts themselves: built-ins and plain plug-ins keep to them, and each breach is told. Parsers: tests/datamanagers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from fprf import testing
-from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.datamanagers.config import RayBatchesConfig
+from fprf.fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
 from fprf.fields.layouts import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig, StreetConfig
-from fprf.interfaces import BlockLayout, Decoder, Encoder, Executor, Sampler, Stylizer
+from fprf.interfaces import (
+    BlockLayout,
+    ContentField,
+    DataManager,
+    Decoder,
+    Encoder,
+    Executor,
+    LossTerm,
+    Sampler,
+    SemanticField,
+    Stylizer,
+)
 from fprf.plugins import registry
 from fprf.plugins.decoders.config import DecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
 from fprf.plugins.executors.config import ExecutorConfig, SerialConfig
+from fprf.plugins.losses.config import LossTermConfig
 from fprf.plugins.samplers.config import ProposalConfig, SamplerConfig, UniformConfig
 from fprf.plugins.stylizers.config import StylizerConfig
-from fprf.types import Boxes, Sampled, Site, Want
+from fprf.rendering.renderer import Parts
+from fprf.types import Batch, Boxes, FieldSample, Rendered, Sampled, Site, Want
 
 BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_encoder, RandomConfig(channels=5, stride=3)),
@@ -31,6 +46,7 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
     (testing.check_layout, AdaptiveConfig()),
     (testing.check_layout, StreetConfig()),
     (testing.check_executor, SerialConfig()),
+    (testing.check_data_manager, RayBatchesConfig(rays=64, semantic_share=0.5)),
     *(
         (testing.check_stylizer, registry.load("fprf.stylizers", n, StylizerConfig)())
         for n in registry.installed("fprf.stylizers")
@@ -41,6 +57,142 @@ BUILT_IN: list[tuple[Callable[[Any], None], Any]] = [
 @pytest.mark.parametrize(("check", "config"), BUILT_IN, ids=lambda value: getattr(value, "__name__", type(value).__name__))
 def test_built_ins_keep_to_the_contract(check: Callable[[Any], None], config: Any) -> None:
     check(config)
+
+
+class Linear(ContentField):
+    """Density and content of one matrix, with one thing wrong."""
+
+    def __init__(self, wrong: str, channels: int, seed: int) -> None:
+        super().__init__()
+        generator = None if wrong == "seed" else torch.Generator().manual_seed(seed)
+        self.weight, self.wrong, self.calls = nn.Parameter(torch.rand(3, channels, generator=generator)), wrong, 0
+        if wrong == "idle":
+            self.spare = nn.Parameter(torch.ones(()))
+
+    def density(self, points: Tensor) -> FieldSample:
+        base = points - points.mean(0) if self.wrong == "batch" else points
+        density = (base @ self.weight[:, 0]).exp()
+        if self.wrong == "device":
+            density = density + torch.zeros(len(points), dtype=points.dtype)
+        changed = {"negative": -density, "dtype": density.float(), "infinite": density / 0}
+        return FieldSample(changed.get(self.wrong, density), points)
+
+    def content(self, latent: Tensor, view: Tensor) -> Tensor:
+        content = (latent + view) @ self.weight
+        return {"channels": content[:, 1:], "rows": content - content.mean(0)}.get(self.wrong, content)
+
+    def penalties(self) -> dict[str, Tensor]:
+        self.calls += 1
+        value = self.weight.square().mean()
+        if self.wrong == "penalty device":
+            value = value + torch.zeros(1, dtype=value.dtype).sum()
+        found = {"penalty shape": value[None], "penalty": value * torch.nan}.get(self.wrong, value)
+        return {f"own{self.calls if self.wrong == 'penalty names' else ''}": found}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearConfig(ContentFieldConfig):
+    wrong: str = ""
+
+    def build(self, *, channels: int, seed: int) -> ContentField:
+        return Linear(self.wrong, channels, seed)
+
+
+class Semantic(SemanticField):
+    def __init__(self, wrong: str, channels: int) -> None:
+        super().__init__()
+        self.weight, self.wrong = nn.Parameter(torch.ones(3, channels)), wrong
+
+    def forward(self, points: Tensor) -> Tensor:
+        found = points @ self.weight
+        changed = {"channels": found[:, 1:], "batch": found - found.mean(0), "frozen": found.detach(), "dtype": found.float()}
+        return changed.get(self.wrong, found)
+
+    def penalties(self) -> dict[str, Tensor]:
+        return {"own": self.weight.sum(0)} if self.wrong == "penalty" else {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SemanticConfig(SemanticFieldConfig):
+    wrong: str = ""
+
+    def build(self, *, channels: int, seed: int) -> SemanticField:
+        return Semantic(self.wrong, channels)
+
+
+class Term(LossTerm):
+    """Mean square of the weights, with one thing wrong."""
+
+    def __init__(self, wrong: str) -> None:
+        self.wrong = wrong
+
+    @property
+    def needs(self) -> Want:
+        return Want.COLOUR
+
+    def __call__(
+        self, rendered: Rendered, batch: Batch, parts: Parts, *, step: int, generator: torch.Generator | None
+    ) -> Tensor:
+        assert rendered.weights is not None
+        weights, opacity = rendered.weights, rendered.weights.sum(1)
+        value = opacity.square().mean()
+        wrongs: dict[str, Callable[[], Tensor]] = {
+            "item": lambda: value * (1 if value.item() > 0 else 2),
+            "bool": lambda: value if value > 0 else -value,
+            "mask": lambda: weights[weights > -1].mean(),
+            "log": lambda: torch.log(opacity).mean(),
+            "root": lambda: opacity.sqrt().mean(),
+            "detached": lambda: value.detach(),
+            "rays": lambda: opacity,
+            "random": lambda: value * torch.rand(()),
+            "device": lambda: value * torch.linspace(0, 1, 3).mean(),
+        }
+        return wrongs[self.wrong]() if self.wrong else value
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermConfig(LossTermConfig):
+    wrong: str = ""
+
+    def build(self) -> LossTerm:
+        return Term(self.wrong)
+
+
+class Pixels(DataManager):
+    """The built-in one, with one thing wrong."""
+
+    def __init__(self, inner: DataManager, wrong: str) -> None:
+        self.inner, self.wrong, self.calls = inner, wrong, 0
+        self.content_store, self.semantic_store = inner.content_store, inner.semantic_store
+
+    def batch(self, step: int) -> Batch:
+        self.calls += 1
+        batch = self.inner.batch(self.calls if self.wrong == "calls" else 0 if self.wrong == "step" else step)
+        changed = {
+            "held": {"view": torch.ones_like(batch.view)},
+            "corner": {"pixel": batch.pixel - 0.5},
+            "outside": {"pixel": batch.pixel + 30},
+            "colour": {"rgb": 1 - batch.rgb},
+            "none": {"content": None},
+            "channels": {"semantic": None if batch.semantic is None else batch.semantic[:, 1:]},
+        }
+        return batch._replace(**changed.get(self.wrong, {}))
+
+    def image(self, view: int) -> Tensor:
+        image = self.inner.image(view)
+        return {"range": 255 * image, "turned": image.mT}.get(self.wrong, image)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelsConfig(RayBatchesConfig):
+    rays: int = 64
+    wrong: str = ""
+
+    def build(self, *, seed: int, **named: Any) -> DataManager:
+        return Pixels(super().build(seed=0 if self.wrong == "seed" else seed, **named), self.wrong)
+
+    def batch_rays(self) -> int:
+        return 3 if self.wrong == "count" else self.rays
 
 
 class Strange(Encoder):
@@ -79,29 +231,6 @@ class StrangeConfig(EncoderConfig):
         return Strange(self.wrong) if self.wrong != "dict" else {}  # type: ignore[return-value]
 
 
-def test_a_plain_encoder_passes() -> None:
-    testing.check_encoder(StrangeConfig())
-
-
-@pytest.mark.parametrize(
-    ("wrong", "breach"),
-    [
-        ("unstable", "must be deterministic"),
-        ("batch", "must not depend on its batch"),
-        ("square", "do not keep the aspect"),
-        ("miscounted", "expected shape"),
-        ("divides", "not finite"),
-        ("named", "identity must be the same"),
-        ("training", "evaluation mode"),
-        ("learning", "must not want gradients"),
-        ("dict", "not an fprf.interfaces.Encoder"),
-    ],
-)
-def test_a_breach_of_an_encoder_is_told(wrong: str, breach: str) -> None:
-    with pytest.raises(AssertionError, match=breach):
-        testing.check_encoder(StrangeConfig(wrong=wrong))
-
-
 @dataclass(frozen=True)
 class Positional(EncoderConfig):
     layer: int = 1
@@ -110,13 +239,6 @@ class Positional(EncoderConfig):
 @dataclass(frozen=True, kw_only=True)
 class Typed(EncoderConfig):
     type: int = 1
-
-
-def test_breaches_of_a_config_are_told() -> None:
-    with pytest.raises(AssertionError, match="keyword-only"):
-        testing.check_config(Positional())
-    with pytest.raises(AssertionError, match="must not be called 'type'"):
-        testing.check_config(Typed())
 
 
 class Backwards(Sampler):
@@ -192,17 +314,114 @@ class SilentConfig(ExecutorConfig):
         return Silent()
 
 
+BREACHES: list[tuple[Callable[..., None], Any, dict[str, str]]] = [
+    (
+        testing.check_content_field,
+        LinearConfig,
+        {
+            "seed": "drawn from the seed alone",
+            "batch": "must not depend on the others",
+            "rows": "points must not depend on others",
+            "negative": "at least 0",
+            "infinite": "not finite",
+            "channels": "expected shape",
+            "idle": "no gradient reaches spare",
+            "dtype": r"density: expected torch\.float64 on cpu .* found torch\.float32",
+            "device": "density: makes a tensor that is not on the device",
+            "penalty": "'own' is not finite",
+            "penalty shape": "'own' must be a scalar",
+            "penalty names": "the same penalties at each call",
+            "penalty device": "'own': makes a tensor that is not on the device",
+        },
+    ),
+    (
+        testing.check_semantic_field,
+        SemanticConfig,
+        {
+            "channels": "expected shape",
+            "batch": "must not depend on the others",
+            "frozen": "no gradient goes through its answer",
+            "dtype": r"expected torch\.float64",
+            "penalty": "must be a scalar",
+        },
+    ),
+    (
+        testing.check_loss_term,
+        TermConfig,
+        {
+            "item": "reads numbers of the device",
+            "bool": "reads numbers of the device",
+            "mask": "reads numbers of the device",
+            "log": "of rays that meet nothing: holds values that are not finite",
+            "root": "gradient for rays that meet nothing is not finite",
+            "detached": "no gradient goes through",
+            "rays": "expected shape",
+            "random": "a function of its inputs",
+            "device": "not on the device of its inputs",
+        },
+    ),
+    (
+        testing.check_data_manager,
+        PixelsConfig,
+        {
+            "calls": "a function of the seed and the step",
+            "step": "another step",
+            "seed": "another seed",
+            "held": "training views alone",
+            "corner": "must be centres",
+            "outside": "must be centres",
+            "colour": "the colour of the pixel",
+            "none": "must bring what stores hold",
+            "channels": "semantic: expected shape",
+            "range": r"must lie in \[0, 1\]",
+            "turned": "image: expected shape",
+            "count": "the rays of a batch, 64",
+        },
+    ),
+    (
+        testing.check_encoder,
+        StrangeConfig,
+        {
+            "unstable": "must be deterministic",
+            "batch": "must not depend on its batch",
+            "square": "do not keep the aspect",
+            "miscounted": "expected shape",
+            "divides": "not finite",
+            "named": "identity must be the same",
+            "training": "evaluation mode",
+            "learning": "must not want gradients",
+            "dict": r"not an fprf\.interfaces\.Encoder",
+        },
+    ),
+]
+OTHERS: list[tuple[Callable[[Any], None], Any, str]] = [
+    (testing.check_config, Positional(), "keyword-only"),
+    (testing.check_config, Typed(), "must not be called 'type'"),
+    (testing.check_sampler, BackwardsConfig(), "must be sorted"),
+    (testing.check_stylizer, AveragingConfig(), "must not depend on the others"),
+    (testing.check_layout, HalvesConfig(), "orthonormal"),
+    (partial(testing.check_decoder, encoder="any", channels=6), BrightConfig(), r"in \[0, 1\]"),
+    (testing.check_executor, SilentConfig(), "must reach the caller"),
+]
+
+
+def test_plain_plug_ins_keep_to_the_contract() -> None:
+    for check, kind, _ in BREACHES:
+        check(kind())
+
+
 @pytest.mark.parametrize(
     ("check", "config", "breach"),
     [
-        (testing.check_sampler, BackwardsConfig(), "must be sorted"),
-        (testing.check_stylizer, AveragingConfig(), "must not depend on the others"),
-        (testing.check_layout, HalvesConfig(), "orthonormal"),
-        (lambda config: testing.check_decoder(config, encoder="any", channels=6), BrightConfig(), r"in \[0, 1\]"),
-        (testing.check_executor, SilentConfig(), "must reach the caller"),
+        *(
+            pytest.param(check, kind(wrong=wrong), breach, id=f"{kind.__name__}-{wrong}")
+            for check, kind, wrongs in BREACHES
+            for wrong, breach in wrongs.items()
+        ),
+        *(pytest.param(*row, id=type(row[1]).__name__) for row in OTHERS),
     ],
 )
-def test_breaches_of_other_kinds_are_told(check: Callable[[Any], None], config: Any, breach: str) -> None:
+def test_a_breach_is_told(check: Callable[[Any], None], config: Any, breach: str) -> None:
     with pytest.raises(AssertionError, match=breach):
         check(config)
 

@@ -4,8 +4,8 @@ What it changes is named beside it; a field without an entry fails the test, so 
 """
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from fprf.datamanagers.parsers.config import parse_scene
 from fprf.io.images import write_image
 from fprf.methods import fprf_lite
 from fprf.plugins.codec import from_json, to_json
+from fprf.plugins.slots import replace as replaced
+from fprf.plugins.slots import slots
+from fprf.plugins.typed_json import leaves
 from fprf.training import checkpoint
 from fprf.training.loop import progress
 from fprf.training.model import build_model
@@ -104,20 +107,6 @@ SECOND: dict[str, tuple[Any, str]] = {
 """A second value of every field of `fprf-lite`, valid for the tiny config too, and where it shows."""
 
 
-def leaves(config: Any, path: str = "") -> Iterator[str]:
-    for field in fields(config):
-        value = getattr(config, field.name)
-        if is_dataclass(value):
-            yield from leaves(value, f"{path}{field.name}.")
-        else:
-            yield f"{path}{field.name}"
-
-
-def changed(config: Any, path: str, value: Any) -> Any:
-    name, _, rest = path.partition(".")
-    return replace(config, **{name: changed(getattr(config, name), rest, value) if rest else value})
-
-
 def differ(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() != b.keys() or any(a[name].shape != b[name].shape or not torch.equal(a[name], b[name]) for name in a)
 
@@ -131,15 +120,15 @@ def shown(where: str) -> list[str]:
 
 
 def test_every_leaf_has_a_second_value() -> None:
-    slots = {"datamanager.parser", "executor", "blocks", "loss.extra"}
-    assert set(leaves(fprf_lite())) - slots == set(SECOND)
+    places = {slot.path for slot in slots(fprf_lite())}
+    assert set(leaves(fprf_lite())) - places == set(SECOND)
 
 
 def test_all_second_values_survive_the_command_line_and_json() -> None:
     wanted, args = fprf_lite(), []
     for path, (value, _) in SECOND.items():
-        assert changed(wanted, path, value) != wanted, path
-        wanted = changed(wanted, path, value)
+        assert replaced(wanted, path, value) != wanted, path
+        wanted = replaced(wanted, path, value)
         args += [f"--{path.replace('_', '-')}", *spelled(value)]
     assert parse(fprf_lite(), args, prog="x", description="") == wanted
     assert from_json(json.loads(json.dumps(to_json(wanted))), TrainConfig) == wanted
@@ -150,7 +139,7 @@ def test_it_changes_the_model(path: str, world: World) -> None:
     def start(config: TrainConfig) -> dict[str, torch.Tensor]:
         return build_model(config, world.prepared.facts).state_dict()
 
-    assert differ(start(world.config), start(changed(world.config, path, SECOND[path][0])))
+    assert differ(start(world.config), start(replaced(world.config, path, SECOND[path][0])))
 
 
 @pytest.fixture(scope="module")
@@ -168,10 +157,10 @@ def test_it_changes_the_training(path: str, world: World, tmp_path: Path, _train
 
     base = replace(world.config, steps=5)
     soon = 1 if path == "sampler.update_every" else 5000
-    base = changed(base, "sampler.warm_up", soon)  # until then the proposals learn at every step
+    base = replaced(base, "sampler.warm_up", soon)  # until then the proposals learn at every step
     if soon not in _trained:
         _trained[soon] = after(base, tmp_path / "base")
-    config = changed(base, path, SECOND[path][0])
+    config = replaced(base, path, SECOND[path][0])
     if path.startswith("datamanager."):
         made = config.datamanager
         assert isinstance(made, type(world.config.datamanager)) and isinstance(world.prepared.manager, RayBatches)
@@ -187,8 +176,8 @@ def test_it_changes_the_targets(path: str, world: World) -> None:
         return {"content": batch.content, "semantic": batch.semantic}
 
     # On so small a picture the window would otherwise be narrower than a stride.
-    base = changed(world.config, "datamanager.guided.radius", 0.9 if path.endswith("stride") else 0.08)
-    assert differ(of(base), of(changed(base, path, SECOND[path][0])))
+    base = replaced(world.config, "datamanager.guided.radius", 0.9 if path.endswith("stride") else 0.08)
+    assert differ(of(base), of(replaced(base, path, SECOND[path][0])))
 
 
 @pytest.mark.parametrize("path", shown("style"))
@@ -196,7 +185,7 @@ def test_it_changes_the_style(path: str, world: World) -> None:
     trained, scene = world.load(), world.prepared.scene
     first, second = (
         measure_style(config, trained.model, scene.cameras, scene.train)._asdict()
-        for config in (world.config, changed(world.config, path, SECOND[path][0]))
+        for config in (world.config, replaced(world.config, path, SECOND[path][0]))
     )
     assert differ(first, second)
 
@@ -204,7 +193,7 @@ def test_it_changes_the_style(path: str, world: World) -> None:
 @pytest.mark.parametrize("path", shown("file"))
 def test_it_names_a_file(path: str, world: World) -> None:
     """What does not exist is missed, so it is looked for."""
-    config = changed(world.config, path, SECOND[path][0])
+    config = replaced(world.config, path, SECOND[path][0])
     builds: dict[str, Callable[[], object]] = {
         "content.encoder.weights": lambda: config.content.encoder.build(),
         "content.decoder.weights": lambda: build_model(config, world.prepared.facts),
@@ -221,7 +210,7 @@ def test_it_changes_what_an_accelerator_does(world: World) -> None:
     assert isinstance(manager, RayBatches)
     size = manager.held_bytes
     with pretend_cuda(memory=3 * size):
-        for config, there in ((world.config, True), (changed(world.config, "device_memory", 0.25), False)):
+        for config, there in ((world.config, True), (replaced(world.config, "device_memory", 0.25), False)):
             prepared = prepare(config)
             loop = Loop(
                 config, prepared, model := build_model(config, prepared.facts).to(CUDA), optimizer_of(config, model), CUDA
@@ -230,7 +219,7 @@ def test_it_changes_what_an_accelerator_does(world: World) -> None:
         products = []
         loop.model.learned()[0].register_hook(lambda gradient: products.append(torch.get_float32_matmul_precision()))
         loop.step(0, 0.0)
-        lower = Loop(changed(config, "precision", "tf32"), prepared, model, optimizer_of(config, model), CUDA)
+        lower = Loop(replaced(config, "precision", "tf32"), prepared, model, optimizer_of(config, model), CUDA)
         lower.step(0, 0.0)
         assert products == ["highest", "high"] and torch.get_float32_matmul_precision() == "highest"
 
@@ -239,17 +228,25 @@ def test_tones_and_poses_are_facts_of_the_scene(world: World) -> None:
     assert shown("facts") == ["tones", "poses"]
     first, second, third = (
         prepare(config).facts
-        for config in (world.config, *(changed(world.config, path, SECOND[path][0]) for path in shown("facts")))
+        for config in (world.config, *(replaced(world.config, path, SECOND[path][0]) for path in shown("facts")))
     )
     assert first.exposure == () and len(second.exposure) == 10 and len(second.held) == 2
     assert first.centres == second.centres == () and len(third.centres) == 10 and len(third.held) == 2 and third.reach > 0
 
 
-def test_points_count_where_several_views_see_them(world: World, tmp_path: Path) -> None:
-    """Rays that are drawn through them, and the loss on those."""
+@pytest.mark.parametrize("where", ["points", "masks"])
+def test_it_counts_where_the_capture_has_them(where: str, world: World, tmp_path: Path) -> None:
+    """Rays through points and the loss on those; masks of what is used and of the sky."""
     scene, base, found = replace(world.prepared.scene, seen=None), replace(world.config, steps=5), []
-    for name in ("", *shown("points")):
-        config = changed(base, name, SECOND[name][0]) if name else base
+    if where == "masks":
+        width, height = scene.cameras.size[0].tolist()
+        half = np.zeros((height, width, 3), np.uint8)
+        half[: height // 2] = 255
+        write_image(tmp_path / "half.png", half)
+        paths = (tmp_path / "half.png",) * len(scene.paths)
+        scene = replace(scene, masks=paths, sky_masks=paths)
+    for name in ("", *shown(where)):
+        config = replaced(base, name, SECOND[name][0]) if name else base
         manager = config.datamanager.build(
             scene=scene, content=None, semantic=None, dim=8, cache=tmp_path / "cache", seed=config.seed
         )
@@ -258,33 +255,12 @@ def test_points_count_where_several_views_see_them(world: World, tmp_path: Path)
     assert len(found) == 3 and all(differ(found[0], other) for other in found[1:])
 
 
-def test_masks_count_where_there_are_some(world: World, tmp_path: Path) -> None:
-    """A scene with masks of what is used and of its sky: both fields change what is learnt."""
-    scene = world.prepared.scene
-    width, height = scene.cameras.size[0].tolist()
-    half = np.zeros((height, width, 3), np.uint8)
-    half[: height // 2] = 255
-    write_image(tmp_path / "half.png", half)
-    paths = (tmp_path / "half.png",) * len(scene.paths)
-    there = replace(scene, masks=paths, sky_masks=paths)
-    base, found = replace(world.config, steps=5), []
-    for name in ("", *shown("masks")):
-        config = changed(base, name, SECOND[name][0]) if name else base
-        manager = config.datamanager.build(
-            scene=there, content=None, semantic=None, dim=8, cache=tmp_path / "cache", seed=config.seed
-        )
-        prepared = world.prepared._replace(scene=there, manager=manager)
-        run = trained_for(replace(world, prepared=prepared), tmp_path / f"run{name}", config)
-        found.append(checkpoint.load(run.checkpoints, 5).model)
-    assert len(found) == 3 and all(differ(found[0], other) for other in found[1:])
-
-
 def test_the_rest(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
     def second(path: str) -> TrainConfig:
         seen.append(path)
-        return changed(world.config, path, SECOND[path][0])
+        return replaced(world.config, path, SECOND[path][0])
 
     with pytest.raises(Exception, match="other: no such folder"):
         parse_scene(second("data").data, 1, None)
