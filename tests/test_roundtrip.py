@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from fprf import __version__
 from fprf.cli.parsing import flags_of, load_method, parse
 from fprf.cli.plugins import KINDS
 from fprf.fields.config import PlanesConfig
@@ -46,6 +47,11 @@ def test_a_method_survives_json_and_the_command_line(name: str, tmp_path: Path) 
     assert from_json(json.loads(json.dumps(to_json(config))), type(config)) == config
     save_config(tmp_path / "config.json", config, name)
     assert load_config(tmp_path / "config.json") == (config, name)
+    whole = json.loads((tmp_path / "config.json").read_text())
+    assert whole["format"] == 1 and whole["fprf"] == __version__
+    if "sampler" in whole["config"]:
+        assert whole["plugins"]["sampler"] == f"proposal fprf {__version__}"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["config.json"]
     for start in METHODS:
         default, _ = load_method(start)
         if type(default) is not type(config):  # their flags differ

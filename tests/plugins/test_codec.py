@@ -12,11 +12,10 @@ from fake_packages import ENCODER, METHOD, Packages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fprf import __version__
 from fprf.cli.parsing import load_method, parse
 from fprf.config import IncompleteConfig
 from fprf.errors import ConfigError, PluginError
-from fprf.methods import fprf, fprf_lite
+from fprf.methods import fprf
 from fprf.plugins import registry
 from fprf.plugins.codec import Missing, from_json, load_config, save_config, to_json
 from fprf.plugins.encoders.config import EncoderConfig, RandomConfig
@@ -103,17 +102,6 @@ def test_what_json_cannot_hold_is_not_saved() -> None:
     for bad in (Leaf(real=math.nan), Leaf(many=(1.0, math.inf)), Leaf(text=b"x")):  # type: ignore[arg-type]
         with pytest.raises(ConfigError, match="cannot be saved"):
             to_json(bad)
-
-
-@pytest.mark.parametrize("method", [fprf, fprf_lite])
-def test_a_file_gives_back_config_and_method(tmp_path: Path, method: Callable[[], Any]) -> None:
-    path = tmp_path / "config.json"
-    save_config(path, method(), "some-method")
-    assert load_config(path) == (method(), "some-method")
-    whole = json.loads(path.read_text())
-    assert whole["format"] == 1 and whole["fprf"] == __version__
-    assert whole["plugins"]["sampler"] == f"proposal fprf {__version__}"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["config.json"]
 
 
 def test_nothing_is_imported_because_a_file_says_so(tmp_path: Path) -> None:

@@ -117,13 +117,6 @@ def table(here: Keys, there: Keys, matching: Matching) -> torch.Tensor:
     return match_keys(here, there, matching, torch.ones(len(there.keys)))
 
 
-def test_without_frame_it_is_attention_of_centred_cosines() -> None:
-    here, there = side(5, 4, 0), side(7, 4, 1)
-    queries, keys = (unit(s.keys, s.share @ s.keys / s.share.sum()) for s in (here, there))
-    expected = attention(queries, keys, 0.3 * score_spread(queries, keys))
-    torch.testing.assert_close(table(here, there, Matching(0.3)), expected)
-
-
 @pytest.mark.parametrize("matching", FRAMES)
 def test_where_a_side_lies_and_how_both_are_turned_decides_nothing(matching: Matching) -> None:
     here, there, rotation = side(6, 5, 2), side(9, 5, 3), turned(5, 4)
@@ -166,12 +159,6 @@ def test_rows_are_shares_whatever_comes(k: int, t: int, dims: int, scale: float,
     found = table(Keys(here.keys * scale, here.share), Keys((there.keys * scale).float(), there.share.float()), matching)
     assert found.shape == (k, t) and found.dtype == torch.float64 and bool((found >= 0).all())
     torch.testing.assert_close(found.sum(1), torch.ones(k, dtype=torch.float64))
-
-
-def test_zero_queries_and_keys_match_everything_alike() -> None:
-    k = unit(torch.randn(4, 3), torch.zeros(3))
-    torch.testing.assert_close(attention(torch.zeros(2, 3), k, 0.1), torch.full((2, 4), 0.25))
-    torch.testing.assert_close(attention(torch.randn(2, 3), torch.zeros(4, 3), 0.1), torch.full((2, 4), 0.25))
 
 
 def test_spread_within_rounding_of_the_largest_score_is_none() -> None:

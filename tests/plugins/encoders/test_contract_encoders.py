@@ -1,7 +1,6 @@
 """What every encoder owes: any size, no randomness, no gradient, a telling identity, batches like single images."""
 
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -91,7 +90,8 @@ def test_identities_differ_with_settings(tmp_path: Path) -> None:
     file, other = vgg_file(tmp_path), vgg_file(tmp_path, normalisation=False)
     keras, one, two = mobilenet_file(tmp_path, tensorflow=True), RandomConfig(), RandomConfig(seed=1)
     configs = [
-        one, two, RandomConfig(stride=2), RandomConfig(channels=3), BundledContentConfig(), BundledSemanticConfig(),
+        one, two, AveragedConfig(), ConcatConfig(),
+        RandomConfig(stride=2), RandomConfig(channels=3), BundledContentConfig(), BundledSemanticConfig(),
         Vgg16Config(weights=file), Vgg19Config(weights=file), Vgg19Config(weights=file, normalise=False),
         Vgg19Config(weights=file, layer="conv2_1"), Vgg19Config(weights=other),
         MobileNetV2Config(weights=mobilenet_file(tmp_path, tensorflow=False)), MobileNetV2Config(weights=keras),
@@ -105,11 +105,3 @@ def test_identities_differ_with_settings(tmp_path: Path) -> None:
     identities = [config.build().identity for config in configs]
     assert len(set(identities)) == len(configs)
     assert identities == [config.build().identity for config in configs]
-
-
-def test_parts_default_to_what_ships() -> None:
-    """Composed encoders build without a file or a network."""
-    for kind in (AveragedConfig, ConcatConfig):
-        parts = [getattr(kind(), field.name) for field in fields(kind)]
-        shipped = [part for part in parts if isinstance(part, EncoderConfig)]
-        assert shipped and all(part.build().channels > 0 for part in shipped)
