@@ -2,6 +2,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,19 +59,13 @@ def test_a_style_file_goes_out_and_comes_back(scene: TrainedScene, world: World,
 
 
 def test_every_control_reaches_the_style(scene: TrainedScene, world: World) -> None:
-    plain = scene.stylize(world.references).render(1).rgb
-    changed = {
-        "weights": scene.stylize(world.references, weights=[1, 9]),
-        "strength": scene.stylize(world.references, strength=0.5),
-        "luminance": scene.stylize(world.references, luminance=0.5),
-        "clusters": scene.stylize(world.references, clusters=2),
-        "blend": scene.stylize(world.references, blend=0.9),
-        "pin": scene.stylize(world.references, pin=["0=dusk", "1=dusk", "2=dusk", "3=dusk"]),
-        "forbid": scene.stylize(world.references, forbid=["0=snow", "1=snow", "2=snow", "3=snow"]),
-        "keep": scene.stylize(world.references, keep=["0", "1"]),
-        "towards": scene.stylize(world.references).towards(scene.stylize(world.references[:1]), 0.5),
-    }
-    assert [name for name, styled in changed.items() if torch.equal(styled.render(1).rgb, plain)] == []
+    styled, every = scene.stylize(world.references), range(4)
+    controls: dict[str, Any] = {"weights": [1, 9], "strength": 0.5, "luminance": 0.5, "clusters": 2, "blend": 0.9}
+    controls |= {"pin": [f"{k}=dusk" for k in every], "forbid": [f"{k}=snow" for k in every], "keep": ["0", "1"]}
+    changed = [scene.stylize(world.references, **{name: value}) for name, value in controls.items()]
+    changed.append(styled.towards(scene.stylize(world.references[:1]), 0.5))
+    plain = styled.render(1).rgb
+    assert not [name for name, other in zip([*controls, "towards"], changed, strict=True) if other.render(1).rgb.equal(plain)]
 
 
 def test_matches_of_any_camera(scene: TrainedScene, world: World) -> None:

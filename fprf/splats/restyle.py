@@ -104,7 +104,7 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
     """A and b of one part at full strength."""
     if part.colours is not None:
         maps = part.colours
-        belongs = maps.membership(semantic)
+        belongs: Tensor = maps.membership(semantic)
         return (belongs @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
     # An affine stylizer is known by what it makes of black and of each channel alone.
     black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)

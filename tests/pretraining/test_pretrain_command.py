@@ -51,9 +51,11 @@ def test_semantic(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str
     output = tmp_path / "semantic.safetensors"
     teachers = ["--teachers", *map(str, teacher_files(tmp_path))]
     assert (
-        main(["semantic", "--images", photos, *teachers, "--output", str(output), "--size", "64", "--towns", "0", *QUICK]) == 0
+        main(["semantic", "--images", photos, *teachers, "--output", str(output), "--size", "64", "--towns", "1", *QUICK]) == 0
     )
-    report = report_of(capsys)
+    said, report = capsys.readouterr(), {}
+    report = json.loads(said.out)
+    assert "crops prepared" in said.err
     assert -1 <= report["teacher_cosine"] <= 1
     assert -1 <= report["night_cosine"] <= 1
     encoder = BundledSemanticConfig(weights=output).build()

@@ -1,22 +1,13 @@
 """Teachers, their ensemble, the views and streets that semantics are distilled from."""
 
-from pathlib import Path
-
 import pytest
 import torch
-import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from network_files import mobilenet_tensors
-from photo_folder import photo_folder, teacher_files
-from safetensors.torch import save_file
-from torch import Tensor
+from photo_folder import teacher_files
 
-from fprf.plugins.encoders.config import BundledSemanticConfig
-from fprf.plugins.encoders.mobilenet import CLASSIFIER
 from fprf.town.palettes import PALETTES
 from fprf.town.surface import CLASSES
-from tools.distil.config import SemanticDistilConfig
 from tools.distil.semantic import (
     LOOKS,
     STRIDE,
@@ -26,7 +17,6 @@ from tools.distil.semantic import (
     Streets,
     load_teacher,
     look,
-    pretrain_semantic,
     relations,
     render_streets,
     semantic_ensemble,
@@ -72,18 +62,6 @@ def test_relations_compare_cosines_about_the_mean() -> None:
     assert float(found) == pytest.approx(total, rel=1e-12)
 
 
-def test_a_short_run_from_photographs_and_streets(tmp_path: Path) -> None:
-    """Written, of the ensemble's width, measured."""
-    photos = photo_folder(tmp_path / "photos", 5)
-    config = SemanticDistilConfig(images=(photos,), teachers=teacher_files(tmp_path), size=32, towns=1, steps=2, batch=2)
-    said: list[str] = []
-    report = pretrain_semantic(config, tmp_path / "s.safetensors", said.append)
-    assert "29 crops prepared" in said  # four photographs and five views in five palettes
-    assert BundledSemanticConfig(weights=tmp_path / "s.safetensors").build().channels == 26 + 25
-    assert report["steps"] == 2
-    assert 0 < float(report["relative_l2"]) < 20
-
-
 CROP, CELL = 32, 8
 
 
@@ -112,22 +90,13 @@ def test_every_view_in_every_palette_and_shares_of_its_classes(streets: Streets)
 
 
 def test_targets_are_half_way_to_the_mean_of_their_class(ensemble: Ensemble, streets: Streets) -> None:
-    """Plain loops over cells as the oracle."""
     found = street_targets(ensemble, streets, CELL)
     said = torch.cat([taught(ensemble, view[:1].float() / 255, CELL) for view in streets.images]).double()
     share = streets.classes.double()
-    means = {}
-    for k in range(len(CLASSES)):
-        total, weight = torch.zeros(said.shape[1], dtype=torch.float64), 0.0
-        for v in range(VIEWS):
-            for i in range(4):
-                for j in range(4):
-                    total += share[v, k, i, j] * said[v, :, i, j]
-                    weight += float(share[v, k, i, j])
-        means[k] = total / weight if weight > 0 else total
+    total = share.sum((0, 2, 3))
+    means = torch.stack([(share[:, k, None] * said).sum((0, 2, 3)) / total[k].clamp_min(1e-30) for k in range(len(CLASSES))])
     for v, i, j in ((0, 0, 0), (1, 3, 2), (4, 1, 1)):
-        mean = sum(share[v, k, i, j] * means[k] for k in means)
-        wanted = 0.5 * said[v, :, i, j] + 0.5 * mean
+        wanted = 0.5 * said[v, :, i, j] + 0.5 * share[v, :, i, j] @ means
         assert torch.allclose(found[v, :, i, j].double(), wanted, atol=1e-4)
 
 
@@ -152,38 +121,6 @@ def test_a_look_is_the_mean_over_scales_and_mirror_images(teachers: list[MobileN
             features = features.flip(-1) if flip else features
             wanted += torch.nn.functional.interpolate(features, (8, 8), mode="bilinear") / 4
     assert torch.allclose(look(teacher, image.float(), 8), wanted, atol=1e-4 * float(wanted.abs().max()))
-
-
-def unfolded(tensors: dict[str, Tensor], image: Tensor) -> Tensor:
-    """MobileNetV2 in float64, layer by layer as torchvision's modules, with SAME padding of a stride 2 on even sizes."""
-    values = {name: value.double() for name, value in tensors.items()}
-
-    def layer(x: Tensor, conv: str, norm: str, stride: int = 1, groups: int = 1) -> Tensor:
-        weight = values[f"features.{conv}.weight"]
-        if weight.shape[-1] == 3:
-            x = F.pad(x, (0, 1, 0, 1) if stride == 2 else (1, 1, 1, 1))
-        x = F.conv2d(x, weight, stride=stride, groups=groups)
-        parts = [values[f"features.{norm}.{part}"] for part in ("running_mean", "running_var", "weight", "bias")]
-        return F.batch_norm(x, *parts, eps=1e-3)
-
-    x = layer(2 * image.double() - 1, "0.0", "0.1", 2).clamp(0, 6)
-    for block in range(1, 14):
-        stride, y, at = CLASSIFIER.strides[block - 1], x, 0
-        if block > 1:
-            y, at = layer(x, f"{block}.conv.0.0", f"{block}.conv.0.1").clamp(0, 6), 1
-        y = layer(y, f"{block}.conv.{at}.0", f"{block}.conv.{at}.1", stride, y.shape[1]).clamp(0, 6)
-        y = layer(y, f"{block}.conv.{at + 1}", f"{block}.conv.{at + 2}")
-        x = x + y if stride == 1 and x.shape == y.shape else y
-    return x
-
-
-def test_folding_changes_nothing(tmp_path: Path) -> None:
-    tensors = mobilenet_tensors(folded=False)
-    save_file(tensors, tmp_path / "m.safetensors")
-    image = torch.rand(2, 3, 64, 96)
-    found = load_teacher(tmp_path / "m.safetensors")(image)
-    assert found.shape == (2, 4, 4, 6)
-    torch.testing.assert_close(found.double(), unfolded(tensors, image), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(("height", "width"), [(16, 16), (17, 33), (40, 90), (5, 100)])

@@ -2,19 +2,14 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from style_cases import points, references, scene_of, setting
 
 from fprf.errors import DataError
-from fprf.plugins.stylizers.config import AdainConfig, IdentityConfig, LocalAdainConfig, StylizerConfig
+from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig
 from fprf.style.dictionary import Reference, build_dictionary
 from fprf.style.matching import score_spread, share_mean, unit
 from fprf.style.scene import own_style
 from fprf.types import Want
-
-PAPER = LocalAdainConfig(similarity="dot", centred=False, relative=False, temperature=1.0)
-ALL = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), LocalAdainConfig(similarity="dot"), PAPER)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e2, 1e4])
@@ -61,23 +56,9 @@ def test_the_scenes_own_style_gives_the_scene() -> None:
     assert float((out - content).abs().max() / content.abs().max()) < 1e-5
 
 
-@settings(max_examples=20, deadline=None)
-@given(
-    st.integers(1, 20),
-    st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
-    st.sampled_from([0.0, 1e-6, 1.0, 1e4]),
-    st.sampled_from(ALL),
-)
-def test_never_nan_for_degenerate_scenes_and_styles(n: int, here: float, there: float, config: StylizerConfig) -> None:
-    content, semantic = torch.randn(n, 4) * here + 3, torch.randn(n, 3) * here
-    d = build_dictionary([Reference("a", torch.randn(n, 4) * there, torch.randn(n, 3) * there)])
-    out = config.build(dictionary=d, scene=scene_of(content, semantic))(content, semantic)
-    assert bool(out.isfinite().all())
-
-
 def test_other_encoders_references_are_refused() -> None:
     content, semantic = points()
     d = build_dictionary([Reference("a", torch.randn(9, 5), torch.randn(9, 4))])
-    for config in ALL[2:]:
+    for config in (LocalAdainConfig(), RegionAdainConfig()):
         with pytest.raises(DataError, match="5 content and 4 semantic channels"):
             config.build(dictionary=d, scene=scene_of(content, semantic))
