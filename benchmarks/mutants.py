@@ -240,7 +240,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "fprf/style/controls.py": ("style/test_controls.py",),
     "fprf/style/matching.py": ("style/test_matching.py", "ops/test_mixture.py"),
     "fprf/style/regional.py": ("style/test_regional.py",),
-    "fprf/style/statistics.py": ("style/test_statistics.py", "style/test_transport.py"),
+    "fprf/style/statistics.py": ("style/test_statistics.py",),
     "fprf/rendering/stepfun.py": ("rendering/test_stepfun.py",),
     "fprf/rendering/space.py": ("rendering/test_space.py", "ops/test_march.py"),
     "fprf/rendering/renderer.py": ("rendering/test_renderer.py",),
