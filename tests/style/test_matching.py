@@ -18,14 +18,27 @@ from fprf.style.matching import (
 )
 
 
-def plain_attention(q: torch.Tensor, k: torch.Tensor, temperature: float) -> torch.Tensor:
+def plain_shares(
+    x: torch.Tensor,
+    keys: torch.Tensor,
+    temperature: float,
+    centre: torch.Tensor | None = None,
+    prior: torch.Tensor | None = None,
+    faint: float = 0.0,
+) -> torch.Tensor:
     """Paper, Eq. 5 and 6, row by row in float64."""
     out = []
-    for row in q.double():
-        r = torch.tensor([float((row * key).sum()) for key in k.double()], dtype=torch.float64) / temperature
-        e = (r - r.max()).exp()
-        out.append(e / e.sum())
-    return torch.stack(out)
+    for row in x.double():
+        away = row if centre is None else row - centre.double()
+        if centre is not None:
+            size = float(away.norm())
+            away = away / size if size > 1e-6 * float(centre.double().norm()) else 0 * away
+        r = torch.stack([(away * key).sum() for key in keys.double()]) / temperature
+        odds = (r - r.max()).exp() * (1.0 if prior is None else prior.double())
+        odds = odds / odds.sum()
+        odds = torch.where(odds < faint * odds.max(), 0.0, odds)
+        out.append(odds / odds.sum())
+    return torch.stack(out) if out else x.double().new_zeros(0, len(keys))
 
 
 @pytest.mark.parametrize(("norm", "temperature"), [(30.0, 100.0), (100.0, 100.0), (100.0, 1.0), (265.0, 100.0), (1.0, 0.05)])
@@ -34,7 +47,7 @@ def test_attention_is_the_papers_within_the_float32_bound(norm: float, temperatu
     a = attention(q, k, temperature)
     largest = float((q.double() @ k.double().T).abs().max()) / temperature
     bound = 2 * 6e-8 * largest + 8 * 6e-8
-    assert float((a.double() - plain_attention(q, k, temperature)).abs().max()) <= bound
+    assert float((a.double() - plain_shares(q, k, temperature)).abs().max()) <= bound
     torch.testing.assert_close(a.sum(1), torch.ones(40), rtol=0.0, atol=5e-7)
 
 
@@ -46,22 +59,6 @@ def test_spread_follows_the_scale_of_the_scores_and_ignores_common_offsets() -> 
     r = (q.double() @ k.double().T).tolist()
     plain = (sum(sum((x - sum(row) / 6) ** 2 for x in row) for row in r) / 42) ** 0.5
     assert spread == pytest.approx(plain, rel=1e-6)
-
-
-def plain_shares(
-    x: torch.Tensor, keys: torch.Tensor, temperature: float, centre: torch.Tensor | None, prior: torch.Tensor, faint: float
-) -> torch.Tensor:
-    """Row by row in float64."""
-    out = []
-    for row in x.double():
-        away = row if centre is None else row - centre.double()
-        size = 1.0 if centre is None else float(away.norm())
-        away = away / size if size > 1e-6 * float(0.0 if centre is None else centre.double().norm()) else 0 * away
-        odds = (keys.double() @ away / temperature - float((keys.double() @ away / temperature).max())).exp() * prior.double()
-        odds = odds / odds.sum()
-        odds = torch.where(odds < faint * odds.max(), 0.0, odds)
-        out.append(odds / odds.sum())
-    return torch.stack(out) if out else x.double().new_zeros(0, len(keys))
 
 
 @pytest.mark.parametrize("wide", [torch.float32, torch.float64])

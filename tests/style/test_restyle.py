@@ -10,7 +10,6 @@ import torch
 from tiny_world import World
 
 from fprf.errors import ConfigError
-from fprf.io.images import write_image
 from fprf.plugins.stylizers.config import AdainConfig, LocalAdainConfig, RegionAdainConfig, RegionOtConfig, StylizerConfig
 from fprf.style.config import NO_MASK, StyleConfig
 from fprf.style.files import StyleFile, write_style
@@ -18,26 +17,6 @@ from fprf.style.references import Encoders
 from fprf.style.restyle import apply_style
 from fprf.training.loading import Trained
 from fprf.training.views import render_view
-
-
-@pytest.mark.parametrize(("height", "width", "colour"), [(1, 1, (3, 200, 90)), (90, 120, (0, 0, 0)), (2, 300, None)])
-def test_degenerate_photographs_give_finite_pictures(
-    world: World, tmp_path: Path, height: int, width: int, colour: tuple[int, int, int] | None
-) -> None:
-    """One pixel, one colour, a strip of noise: from the file to colours, with every stylizer and any number of clusters."""
-    noise = np.random.default_rng(0).integers(0, 256, (height, width, 3))
-    path = tmp_path / "x.png"
-    write_image(path, (noise if colour is None else np.broadcast_to(colour, (height, width, 3))).astype(np.uint8))
-    trained = world.load()
-    encoders, known = trained.encoders(), trained.known
-    for clusters in (1, 13):
-        for stylizer in (LocalAdainConfig(), RegionOtConfig()):
-            style = StyleConfig(references=(path,), clusters=clusters, stylizer=stylizer, keep_below=-0.5, luminance=0.5)
-            styled = apply_style(trained, StyleFile(style), encoders)
-            assert all(bool(t.isfinite().all()) for t in styled.dictionary[:6])
-            view = render_view(trained.model, known.facts, known.cameras, 1, trained.config.render, styled.restyle)
-            assert bool(view.rgb.isfinite().all()), (stylizer, clusters)
-
 
 SECOND: dict[str, object] = {
     "weights": (5.0, 1.0),
