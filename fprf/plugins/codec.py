@@ -17,21 +17,12 @@ from ..errors import ConfigError, FprfError, PluginError
 from ..io.atomic import write_text
 from . import registry
 from .slots import hints_of, slots
-from .typed_json import Missing, from_json, to_json
+from .typed_json import Missing as Missing
+from .typed_json import from_json as from_json
+from .typed_json import to_json as to_json
 
 if TYPE_CHECKING:
     from ..config import RunConfig
-
-__all__ = [
-    "Missing",
-    "from_json",
-    "load_config",
-    "method_config",
-    "packages_of",
-    "read_json",
-    "save_config",
-    "to_json",
-]
 
 _METHODS = "fprf.methods"
 

@@ -98,26 +98,22 @@ def pretrain_line(encoder: EncoderConfig | Missing, output: Path = Path("decoder
 
 def _chosen(config: PluginConfig, group: str, path: str) -> list[str]:
     if isinstance(config, Missing):
-        return [path, config.name, *_unread(json.loads(config.data), path)]
+        plain = {name: value for name, value in json.loads(config.data).items() if not isinstance(value, dict)}
+        words = [word for name, value in plain.items() for word in _spelled(f"{path}.{name.replace('_', '-')}", value)]
+        return [path, config.name, *words]
     kind = type(config)
-    plain, hints = kind(), hints_of(kind)
+    default, hints = kind(), hints_of(kind)
     flags = [path, name_of(group, kind)]
     for field in dataclasses.fields(config):
         value, flag = getattr(config, field.name), f"{path}.{field.name.replace('_', '-')}"
         slot = next(filter(is_slot, members(hints[field.name])), None)
-        if value == getattr(plain, field.name):
+        if value == getattr(default, field.name):
             continue
         if slot is not None and value is not None:
             flags += _chosen(value, slot.group, flag)
         else:
             flags += _spelled(flag, value)
     return flags
-
-
-def _unread(data: dict[str, Any], path: str) -> list[str]:
-    """The fields of a plug-in that is not installed here, as far as they are plain."""
-    plain = {name: value for name, value in data.items() if not isinstance(value, dict)}
-    return [word for name, value in plain.items() for word in _spelled(f"{path}.{name.replace('_', '-')}", value)]
 
 
 def _spelled(flag: str, value: Any) -> list[str]:
