@@ -12,6 +12,7 @@ import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -60,12 +61,7 @@ def read_style(path: Path) -> StyleFile:
     except ConfigError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
     return StyleFile(
-        replace(
-            style,
-            references=tuple(_found(path, p) for p in style.references),
-            masks=tuple(p if p == NO_MASK else _found(path, p) for p in style.masks),
-            between=None if style.between is None else _found(path, style.between),
-        ),
+        _with_paths(style, partial(_found, path)),
         regions,
         encoder,
         {_found(path, Path(text)): value for text, value in hashes.items()},
@@ -76,17 +72,11 @@ def write_style(path: Path, file: StyleFile, made: Mapping[str, Any] | None = No
     """Write the style with the hashes of its photographs as they are now; `made` is kept beside it for people to read."""
     style = file.style
     masks = [p for p in style.masks if p != NO_MASK]
-    kept = replace(
-        style,
-        references=tuple(_stored(path, p) for p in style.references),
-        masks=tuple(p if p == NO_MASK else _stored(path, p) for p in style.masks),
-        between=None if style.between is None else _stored(path, style.between),
-    )
     whole = {
         "format": _FORMAT,
         "fprf": __version__,
         "plugins": packages_of(style),
-        "style": to_json(kept),
+        "style": to_json(_with_paths(style, partial(_stored, path))),
         "sha256": {_stored(path, p).as_posix(): _hash(p) for p in (*style.references, *masks)},
         "semantic_encoder": file.semantic_encoder,
         "regions": {name: list(key) for name, key in file.regions.items()},
@@ -125,6 +115,15 @@ def with_folders(style: S, report: Callable[[str], None] = warnings.warn) -> S:
         rows |= {file: (weight, mask) for file in photographs([path], report) if file not in rows}
     weights, masks = zip(*rows.values(), strict=True)
     return replace(style, references=tuple(rows), weights=weights if style.weights else (), masks=masks if style.masks else ())
+
+
+def _with_paths(style: StyleConfig, change: Callable[[Path], Path]) -> StyleConfig:
+    return replace(
+        style,
+        references=tuple(map(change, style.references)),
+        masks=tuple(p if p == NO_MASK else change(p) for p in style.masks),
+        between=None if style.between is None else change(style.between),
+    )
 
 
 def _found(file: Path, path: Path) -> Path:

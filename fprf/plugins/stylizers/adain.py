@@ -15,10 +15,11 @@ from ...interfaces import Stylizer
 from ...ops import mixture
 from ...ops.precision import double, full_precision
 from ...style.dictionary import StyleDictionary, code_odds, whole_style
-from ...style.matching import Similarity, compared, point_shares, score_spread, share_mean
+from ...style.matching import compared, point_shares, score_spread, share_mean
 from ...style.scene import SceneStyle, check_fit
 from ...style.statistics import deviation
 from ...types import Want
+from .config import LocalAdainConfig
 
 
 class IdentityStylizer(Stylizer):
@@ -89,39 +90,30 @@ class LocalAdainStylizer(Stylizer):
     style_mean: Annotated[Tensor, "T C"]
     gain: Annotated[Tensor, "T C"]
 
-    def __init__(
-        self,
-        dictionary: StyleDictionary,
-        scene: SceneStyle,
-        *,
-        temperature: float,
-        relative: bool,
-        similarity: Similarity,
-        centred: bool,
-    ) -> None:
+    def __init__(self, dictionary: StyleDictionary, scene: SceneStyle, config: LocalAdainConfig) -> None:
         super().__init__()
         check_fit(dictionary, scene)
         self.matched = len(dictionary.keys) > 1 and dictionary.keys.shape[1] > 0
         centre, theirs = scene.semantic_mean, share_mean(dictionary.keys, code_odds(dictionary).to(dictionary.keys))
         regions, origin = scene.keys, None
-        if not centred:
+        if not config.centred:
             origin = torch.zeros_like(centre) if dictionary.origin is None else dictionary.origin
-            if similarity == "cosine":
+            if config.similarity == "cosine":
                 centre, theirs = origin, origin
             else:
                 regions = regions - origin
-        queries, keys = compared(regions, dictionary.keys, similarity, queries_centre=centre, keys_centre=theirs)
+        queries, keys = compared(regions, dictionary.keys, config.similarity, queries_centre=centre, keys_centre=theirs)
         # The only region of an undivided scene lies at its mean, where it says nothing about scores.
-        spread = score_spread(queries if len(queries) > 1 else keys, keys) if relative else 1.0
-        self.temperature = temperature * spread
+        spread = score_spread(queries if len(queries) > 1 else keys, keys) if config.relative else 1.0
+        self.temperature = config.temperature * spread
         mean, covariance = double(dictionary.mean), double(dictionary.covariance)
         if not self.matched:
             mean, covariance = (part[None] for part in whole_style(dictionary))
         scene_sigma = deviation(double(scene.mean), double(scene.covariance).diagonal())
         gain = deviation(mean, covariance.diagonal(dim1=-2, dim2=-1)) / scene_sigma
         self.register_buffer("content_mean", scene.mean.float())
-        self.register_buffer("centre", centre.float() if similarity == "cosine" else None)
-        self.register_buffer("origin", None if origin is None or similarity == "cosine" else origin.float())
+        self.register_buffer("centre", centre.float() if config.similarity == "cosine" else None)
+        self.register_buffer("origin", None if origin is None or config.similarity == "cosine" else origin.float())
         self.register_buffer("keys", keys.float())
         self.register_buffer("prior", (dictionary.weight / dictionary.weight.amax()).float())
         self.register_buffer("odds", code_odds(dictionary).to(keys.device).float())

@@ -90,14 +90,7 @@ class LocalAdainConfig(StylizerConfig):
     def build(self, *, dictionary: StyleDictionary, scene: SceneStyle) -> Stylizer:
         from .adain import LocalAdainStylizer
 
-        return LocalAdainStylizer(
-            dictionary,
-            scene,
-            temperature=self.temperature,
-            relative=self.relative,
-            similarity=self.similarity,
-            centred=self.centred,
-        )
+        return LocalAdainStylizer(dictionary, scene, self)
 
 
 @dataclass(frozen=True, kw_only=True)
