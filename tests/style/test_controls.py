@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import ConfigError, UsageError
-from fprf.style.config import RegionValue, find_reference, labels, parse_region_value, parse_strength
-from fprf.style.controls import allowed_references, blend_strength, keep_luminance, luma
+from fprf.style.config import RegionValue, find_reference, labels, parse_place, parse_region_value, parse_strength
+from fprf.style.controls import allowed_references, blend_strength, keep_luminance, luma, place_weight
 
 COLOUR = st.tuples(
     *[st.sampled_from([0.0, 1e-7, 0.2, 0.5, 1 / 3, 0.999, 1.0]) | st.floats(0, 1, width=32, allow_subnormal=False)] * 3
@@ -58,6 +58,22 @@ def test_hues_survive_where_there_is_room_and_fade_where_not() -> None:
 def test_pins_exclude_the_others_and_forbidding_leaves_the_rest() -> None:
     allowed = allowed_references(4, 3, pin={0: {1}, 3: {0, 2}}, forbid=[(1, 2), (3, 0)])
     assert allowed.tolist() == [[False, True, False], [True, True, False], [True, True, True], [False, False, True]]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("box:0,-1,-1:1,1,1:0.5", [1.0, 0.84375, 0.5, 0.0, 1.0]),  # a smoothstep from the border's inside to its outside
+        ("box:1,1,1:0,-1,-1", [1.0, 0.0, 0.0, 0.0, 1.0]),
+        ("path:-1,0,0:0.5,0,0:0.5,2,0:1,0.5", [1.0, 0.84375, 0.5, 0.0, 1.0]),
+        ("everywhere", [1.0] * 5),
+    ],
+)
+def test_a_place_is_full_inside_and_fades_over_its_border(text: str, expected: list[float]) -> None:
+    place = parse_place("pin", text)
+    assert place is not None and parse_place("pin", "3") is None
+    points = torch.tensor([[0.5, 0.0, 0.0], [1.125, 0.0, 0.0], [1.25, 0.0, 0.0], [1.6, 0.0, 0.0], [0.4, 0.9, 0.0]])
+    assert place_weight(place, points).tolist() == pytest.approx(expected)
 
 
 PHOTOS = [Path("a/autumn.jpg"), Path("b/night.jpg"), Path("b/7.jpg"), Path("c/night.png")]
