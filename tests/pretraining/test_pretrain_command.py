@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from photo_folder import photo_folder, teacher_files, vgg_file
+from photo_folder import teacher_files, vgg_file
 from torch import Tensor, nn
 
 from fprf.cli.pretrain import run
@@ -22,20 +22,15 @@ from tools.distil.__main__ import main
 QUICK = ["--steps", "2", "--batch", "2"]
 
 
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(photo_folder(tmp_path_factory.mktemp("photos") / "all", 4))
-
-
 def report_of(capsys: pytest.CaptureFixture[str]) -> dict[str, float]:
     found: dict[str, float] = json.loads(capsys.readouterr().out)
     return found
 
 
-def test_content(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "content.safetensors"
-    teacher = ["--teachers", str(vgg_file(tmp_path, 64))]
-    assert main(["content", "--images", photos, *teacher, "--output", str(output), "--size", "32", "--crops", "2", *QUICK]) == 0
+def test_content(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output, teacher = tmp_path / "content.safetensors", str(vgg_file(tmp_path, 64))
+    small = ["--output", str(output), "--size", "32", "--crops", "2", *QUICK]
+    assert main(["content", "--images", str(photos), "--teachers", teacher, *small]) == 0
     report = report_of(capsys)
     assert report["steps"] == 2
     assert 0 < report["relative_l2"] < 10
@@ -47,26 +42,25 @@ def test_content(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "2 steps" in read_weights(output)[1]["made_by"]
 
 
-def test_semantic(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "semantic.safetensors"
-    teachers = ["--teachers", *map(str, teacher_files(tmp_path))]
-    assert (
-        main(["semantic", "--images", photos, *teachers, "--output", str(output), "--size", "64", "--towns", "1", *QUICK]) == 0
-    )
-    said, report = capsys.readouterr(), {}
+def test_semantic(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From photographs and streets."""
+    output, teachers = tmp_path / "semantic.safetensors", map(str, teacher_files(tmp_path))
+    small = ["--output", str(output), "--size", "64", "--towns", "1", *QUICK]
+    assert main(["semantic", "--images", str(photos), "--teachers", *teachers, *small]) == 0
+    said = capsys.readouterr()
     report = json.loads(said.out)
-    assert "crops prepared" in said.err
+    assert "29 crops prepared" in said.err, "four photographs and five views in five palettes"
     assert -1 <= report["teacher_cosine"] <= 1
     assert -1 <= report["night_cosine"] <= 1
     encoder = BundledSemanticConfig(weights=output).build()
     assert encoder(torch.rand(1, 3, 40, 70)).shape == (1, 26 + 25, 5, 9)
 
 
-def test_a_decoder_learns_and_its_report_is_honest(photos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_decoder_learns_and_its_report_is_honest(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output, encoder, found = tmp_path / "d.safetensors", RandomConfig(channels=12).build(), []
     chosen = ["--encoder", "random", "--encoder.channels", "12", "--rate", "0.02", "--batch", "512"]
     for steps in ("1", "300"):
-        assert run(["decoder", "--images", photos, "--output", str(output), *chosen, "--steps", steps]) == 0
+        assert run(["decoder", "--images", str(photos), "--output", str(output), *chosen, "--steps", steps]) == 0
         report = report_of(capsys)
         assert report["encoder"] == encoder.identity
         found.append(report["psnr_db"])

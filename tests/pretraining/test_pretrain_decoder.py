@@ -24,23 +24,18 @@ QUICK = ["--pixels", "60", "--batch", "64", "--size", "24", "--pairs", "1"]
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return str(photo_folder(tmp_path_factory.mktemp("photos") / "all", 5))
-
-
-@pytest.fixture(scope="module")
 def vgg(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(vgg_file(tmp_path_factory.mktemp("vgg")))
 
 
-def made(photos: str, output: Path, *more: str) -> dict[str, float]:
-    assert run(["decoder", "--images", photos, "--output", str(output), *ENCODER, *QUICK, *more]) == 0
+def made(photos: Path, output: Path, *more: str) -> dict[str, float]:
+    assert run(["decoder", "--images", str(photos), "--output", str(output), *ENCODER, *QUICK, *more]) == 0
     report: dict[str, float] = json.loads(report_path(output).read_text())
     return report
 
 
 def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: Path) -> None:
-    photos = str(photo_folder(tmp_path / "photos", 30))  # two of them are held out: one in the style of the other
+    photos = photo_folder(tmp_path / "photos", 30)  # two of them are held out: one in the style of the other
     steps = ["--steps", "300", "--rate", "0.005", "--samples", "0", "--style-weights", vgg, "--every", "1"]
     plain = made(photos, tmp_path / "plain.safetensors", *steps)
     styled = made(photos, tmp_path / "styled.safetensors", *steps, "--style", "0.03")
@@ -48,7 +43,7 @@ def test_the_paper_losses_change_the_decoder_as_they_weigh(vgg: str, tmp_path: P
     assert styled["psnr_db"] < plain["psnr_db"] - 3, "what the style gains, the identity pays"
 
 
-def test_without_weights_for_it_no_style_is_measured(photos: str, vgg: str, tmp_path: Path) -> None:
+def test_without_weights_for_it_no_style_is_measured(photos: Path, vgg: str, tmp_path: Path) -> None:
     steps = ["--steps", "3", "--samples", "0"]
     assert "style_loss" not in made(photos, tmp_path / "a.safetensors", *steps)
     measured = made(photos, tmp_path / "b.safetensors", *steps, "--style-weights", vgg)
@@ -57,7 +52,7 @@ def test_without_weights_for_it_no_style_is_measured(photos: str, vgg: str, tmp_
     assert all(torch.equal(first[name], second[name]) for name in first), "measuring is not training"
 
 
-def test_samples_are_pictures_of_photo_decoded_and_restyled(photos: str, tmp_path: Path) -> None:
+def test_samples_are_pictures_of_photo_decoded_and_restyled(photos: Path, tmp_path: Path) -> None:
     output = tmp_path / "decoder.safetensors"
     made(photos, output, "--steps", "3", "--samples", "1e-9")
     files = sorted(samples_folder(output).iterdir())
@@ -68,12 +63,12 @@ def test_samples_are_pictures_of_photo_decoded_and_restyled(photos: str, tmp_pat
     assert (pictures[0] != pictures[-1]).any()
 
 
-def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: str, tmp_path: Path) -> None:
+def test_the_line_that_users_are_told_makes_a_decoder_that_fits(photos: Path, tmp_path: Path) -> None:
     encoder, output, lite = RandomConfig(channels=4, seed=3), tmp_path / "made.safetensors", fprf_lite()
     config = replace(lite, content=replace(lite.content, encoder=encoder, decoder=MlpDecoderConfig()))
     with pytest.raises(WeightsError) as raised:
         build_decoder(config, encoder=encoder.build().identity, channels=4)
-    line = str(raised.value).split("`")[1].replace("DIR", photos).replace("decoder.safetensors", str(output))
+    line = str(raised.value).split("`")[1].replace("DIR", str(photos)).replace("decoder.safetensors", str(output))
     assert run([*shlex.split(line)[2:], "--steps", "1", "--pixels", "20", "--samples", "0"]) == 0
     fitting = replace(config, content=replace(config.content, decoder=ResidualDecoderConfig(weights=output)))
     build_decoder(fitting, encoder=encoder.build().identity, channels=4)

@@ -106,7 +106,6 @@ def test_crops_are_prepared_once_per_config(tmp_path: Path) -> None:
 
 
 def test_missing_folders_and_photographs_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError):
-        find_photos([tmp_path / "absent"])
-    with pytest.raises(DataError):
-        find_photos([tmp_path])
+    for folder in (tmp_path / "absent", tmp_path):
+        with pytest.raises(DataError, match=folder.name):
+            find_photos([folder])

@@ -6,7 +6,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from network_files import vgg_convolutions
-from photo_folder import photo_folder
 from safetensors.torch import save_file
 
 from fprf.errors import WeightsError
@@ -60,16 +59,11 @@ def test_activations_are_the_convolutions_in_float64() -> None:
         torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
 
 
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return find_photos([photo_folder(tmp_path_factory.mktemp("photos") / "all", 4)])
-
-
-def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: list[Path]) -> None:
+def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: Path) -> None:
     """Colours as features: AdaIN with itself is the crop, so decoding it by doing nothing has neither loss."""
     encoder, net = RandomConfig(channels=3, stride=1).build(), network()
-    made = prepare_crops(encoder, net, photos, side=24, longest=96, seed=0, measure=True)
-    rgb = torch.stack([load_photo(path, 96)[:24, :24].reshape(-1, 3) for path in photos])
+    made = prepare_crops(encoder, net, find_photos([photos]), side=24, longest=96, seed=0, measure=True)
+    rgb = torch.stack([load_photo(path, 96)[:24, :24].reshape(-1, 3) for path in find_photos([photos])])
     seen = net(rgb.view(-1, 24, 24, 3).permute(0, 3, 1, 2))
     statistics = style_statistics(seen)
     mean, std = (half[:, :, None, None] for half in statistics[CONTENT].chunk(2, 1))
@@ -88,9 +82,9 @@ def test_a_perfect_decoder_loses_nothing_on_its_own_crop(photos: list[Path]) -> 
     assert float(upside_down) > float(content), "the content loss sees where things are"
 
 
-def test_gradients_reach_the_decoder_alone(photos: list[Path]) -> None:
+def test_gradients_reach_the_decoder_alone(photos: Path) -> None:
     encoder, net = RandomConfig(channels=3, stride=2).build(), network()
-    crops = prepare_crops(encoder, net, photos, side=16, longest=64, seed=0, measure=True)
+    crops = prepare_crops(encoder, net, find_photos([photos]), side=16, longest=64, seed=0, measure=True)
     decoder = torch.nn.Linear(3, 3)
     losses = restyling_losses(crops, net, lambda f: torch.sigmoid(decoder(f)), torch.tensor([0, 1]), torch.tensor([2, 3]))
     for loss in losses:

@@ -2,19 +2,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from style_cases import points
 
 from fprf.errors import CheckpointError, DataError
 from fprf.style.scene import Membership, from_tensors, region_smoothing, scene_style, to_tensors
 
 
-def points(n: int = 1200, c: int = 5, d: int = 4) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    kind = torch.arange(n) % 3
-    semantic = torch.eye(3, d)[kind] * 5 + torch.randn(n, d) * 0.3 + 20
-    return torch.randn(3, c)[kind] * 3 + torch.randn(n, c) * (kind[:, None] + 1), semantic, torch.rand(n)
+def weighted() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return *points(1200), torch.rand(1200)
 
 
 def test_regions_are_the_clusters_and_their_statistics_those_of_the_soft_membership() -> None:
-    content, semantic, weights = points()
+    content, semantic, weights = weighted()
     scene = scene_style(content, semantic, weights, None, 3, 0)
     assert scene.keys.shape == (3, 4)
     share = Membership(scene)(semantic).double()
@@ -30,7 +29,7 @@ def test_regions_are_the_clusters_and_their_statistics_those_of_the_soft_members
 
 
 def test_without_semantics_there_is_one_region() -> None:
-    content, _, weights = points()
+    content, _, weights = weighted()
     scene = scene_style(content, None, weights, None, 8, 0)
     assert scene.keys.shape == (1, 0) and scene.semantic_mean.shape == (0,)
     torch.testing.assert_close(scene.region_mean[0], scene.mean)
@@ -51,7 +50,7 @@ def test_any_scene_has_a_finite_style(n: int, regions: int, d: int, spread: floa
 
 
 def test_tensors_round_trip_and_runs_without_contacts_are_read() -> None:
-    tensors = to_tensors(scene_style(*points(), None, 3, 0))
+    tensors = to_tensors(scene_style(*weighted(), None, 3, 0))
     assert all(torch.equal(value, tensors[name]) for name, value in from_tensors(tensors)._asdict().items())
     del tensors["contacts"]
     assert torch.equal(from_tensors(tensors).contacts, torch.zeros(3, 3))
@@ -61,7 +60,7 @@ def test_tensors_round_trip_and_runs_without_contacts_are_read() -> None:
     ("name", "value"), [("share", None), ("region_mean", torch.zeros(3, 9)), ("keys", torch.full((3, 4), float("inf")))]
 )
 def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None) -> None:
-    tensors = to_tensors(scene_style(*points(), None, 3, 0))
+    tensors = to_tensors(scene_style(*weighted(), None, 3, 0))
     del tensors[name]
     with pytest.raises(CheckpointError, match=name):
         from_tensors(tensors if value is None else tensors | {name: value})
@@ -71,7 +70,7 @@ def test_damaged_tensors_are_named(name: str, value: torch.Tensor | None) -> Non
 @given(st.integers(1, 6), st.floats(0, 1e4), st.integers(0, 99))
 def test_smoothing_mixes_and_keeps_the_mean_over_the_scene(regions: int, smoothness: float, seed: int) -> None:
     draw = torch.Generator().manual_seed(seed)
-    scene = scene_style(*points(), None, 8, 0)
+    scene = scene_style(*weighted(), None, 8, 0)
     contacts = torch.rand(regions, regions, generator=draw)
     share = torch.rand(regions, generator=draw) + 0.01
     scene = scene._replace(contacts=contacts + contacts.T, share=share / share.sum())

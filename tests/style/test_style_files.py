@@ -89,12 +89,10 @@ def test_a_hand_written_file_says_only_what_it_wants(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("nonsense", "is not JSON"),
-        ("[]", 'expected an object with "format": 1 and "style"'),
         ('{"format": 1}', 'and "style"'),
         ('{"format": 1, "style": {}, "sytle": {}}', "unknown key 'sytle'; did you mean 'style'"),
         ('{"format": 1, "style": {"strenght": 1}}', "has no field 'strenght'; did you mean 'strength'"),
         ('{"format": 1, "style": {"strength": 7}}', "strength: 7.0 must lie in"),
-        ('{"format": 1, "style": {"strength": NaN}}', "NaN is not a number"),
         ('{"format": 1, "style": {"pin": ["3"]}}', "pin: '3' is not REGION=VALUE"),
         ('{"format": 1, "style": {"weights": [1], "references": ["a", "b"]}}', "weights: 1 weights for 2 references"),
         ('{"format": 1, "style": {}, "regions": {"3": [1.0]}}', "regions: '3' is no name"),

@@ -37,12 +37,12 @@ FEATURES = {
 
 @pytest.mark.parametrize(("network", "layer"), FEATURES)
 def test_features_of_fixed_weights(tmp_path: Path, network: str, layer: str) -> None:
-    if network == "espnet":
-        encoder = EspNetConfig(layer=layer, weights=espnet_file(tmp_path)).build()
-    elif network == "deeplab":
-        encoder = DeepLabConfig(layer=layer, weights=deeplab_file(tmp_path)).build()
-    else:
-        encoder = MobileNetV2Config(layer=layer, weights=mobilenet_file(tmp_path, tensorflow=network == "keras")).build()
+    encoder = {
+        "espnet": lambda: EspNetConfig(layer=layer, weights=espnet_file(tmp_path)),
+        "deeplab": lambda: DeepLabConfig(layer=layer, weights=deeplab_file(tmp_path)),
+        "keras": lambda: MobileNetV2Config(layer=layer, weights=mobilenet_file(tmp_path, tensorflow=True)),
+        "torchvision": lambda: MobileNetV2Config(layer=layer, weights=mobilenet_file(tmp_path, tensorflow=False)),
+    }[network]().build()
     y, x = torch.meshgrid(torch.linspace(0, 1, 48), torch.linspace(0, 1, 80), indexing="ij")
     image = torch.stack([(6 * x).sin(), (9 * y).cos(), (12 * x * y).sin()])[None] / 2 + 0.5
     found = encoder(image).double()
