@@ -9,9 +9,9 @@
 Scenes never change: what restyles one returns another, and both share the trained model. Tensors are on the CPU.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -60,17 +60,6 @@ class Shot:
         write_image(Path(path), self.pixels)
 
 
-class _Opened:
-    """Encoders of a run, loaded at the first style and kept for the next."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-
-    @cached_property
-    def encoders(self) -> Encoders:
-        return self.scene.encoders()
-
-
 @dataclass(frozen=True)
 class TrainedScene:
     """A scene, as it was captured or in a style. Make one with `fprf.load`."""
@@ -79,7 +68,8 @@ class TrainedScene:
     """Scene, cameras and run folder, for what this class does not offer."""
     styled: Styled | None = None
     """The style with its dictionary and codes; None = as it was captured."""
-    opened: _Opened = field(kw_only=True, repr=False)
+    encoders: Callable[[], Encoders] = field(kw_only=True, repr=False)
+    """Encoders of the run, loaded at the first style and kept for the next; one function for all styles of a loaded scene."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -166,15 +156,15 @@ class TrainedScene:
     def apply(self, style: StyleConfig | PathLike) -> "TrainedScene":
         """The scene in a style that is written down: a config, or a style.json of `fprf stylize`. Raises as `stylize`."""
         if isinstance(style, StyleConfig):
-            return replace(self, styled=apply_style(self.trained.scene, StyleFile(style), self.opened.encoders))
+            return replace(self, styled=apply_style(self.trained.scene, StyleFile(style), self.encoders()))
         path = Path(style)
         file = read_style(path)
         check_photographs(path, file)
-        return replace(self, styled=apply_style(self.trained.scene, file, self.opened.encoders, (path.resolve(),)))
+        return replace(self, styled=apply_style(self.trained.scene, file, self.encoders(), (path.resolve(),)))
 
     def towards(self, other: "TrainedScene", at: float) -> "TrainedScene":
         """On the way from this style (0) to that of `other` (1), point by point. Raises UsageError without two styles."""
-        if self.styled is None or other.styled is None or self.opened is not other.opened:
+        if self.styled is None or other.styled is None or self.encoders is not other.encoders:
             raise UsageError("towards: both must be styles of one loaded scene; call `stylize` on the same scene for each")
         return replace(self, styled=mixed(self.styled, other.styled, at))
 
@@ -234,4 +224,4 @@ class TrainedScene:
 def open_scene(run: PathLike, *, device: str = "auto", quality: Name | None = None) -> TrainedScene:
     """A run folder as a scene: see `fprf.load`."""
     trained = open_run(Path(run), device, QualityConfig(quality=quality))
-    return TrainedScene(trained, opened=_Opened(trained.scene))
+    return TrainedScene(trained, encoders=cache(trained.scene.encoders))

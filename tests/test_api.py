@@ -45,7 +45,7 @@ def test_scenes_never_change(scene: TrainedScene, world: World) -> None:
     assert set(styled.references) == {"dusk.png", "snow.png"} and scene.references == ()
     assert torch.equal(styled.plain().render(0).rgb, before)
     assert torch.equal(scene.stylize(world.references, strength=0).render(0).rgb, before)
-    assert styled.trained is scene.trained and styled.opened is scene.opened
+    assert styled.trained is scene.trained and styled.encoders is scene.encoders
 
 
 def test_a_style_file_goes_out_and_comes_back(scene: TrainedScene, world: World, tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ from rich.console import Console
 
 from ..errors import UsageError
 from ..evaluation.config import BenchConfig, PeerConfig, ReportConfig, RestyleConfig, SpeedConfig
-from .parsing import load_field_method, parse
+from ..methods import fprf_lite
+from .parsing import as_flag, load_field_method, parse
 from .progress import Display
 from .train import train_scene
 
@@ -58,7 +59,7 @@ def bench_run(prog: str, default: C, args: list[str], measure: "Callable[[C, Pat
 
     `measure` gets the config, the run folder, a temporary folder and a function that shows progress.
     """
-    config = parse(default, _named_run(args), prog=f"{prog} [RUN]", description=_about(default))
+    config = parse(default, as_flag(args, "--run"), prog=f"{prog} [RUN]", description=_about(default))
     with tempfile.TemporaryDirectory(prefix="fprf-bench-") as made:
         folder = Path(made)
         root = config.run or _trained(config, folder / "run")
@@ -93,9 +94,10 @@ def write_report(config: ReportConfig, document: dict[str, Any], page: Callable[
 
 def _restyle(args: list[str]) -> int:
     default = RestyleConfig()
-    config = parse(default, _named_run(args), prog="fprf bench restyle [RUN]", description=_about(default))
+    config = parse(default, as_flag(args, "--run"), prog="fprf bench restyle [RUN]", description=_about(default))
     with tempfile.TemporaryDirectory(prefix="fprf-restyle-") as made:
-        root = config.run or _trained_town(config, Path(made) / "run")
+        town = replace(fprf_lite(), data=Path("town"), output=Path(made) / "run", minutes=config.minutes, device=config.device)
+        root = config.run or train_scene(town, "fprf-lite")
         from ..evaluation.report import printed, provenance
         from ..evaluation.restyle import COLUMNS, restyle, restyle_page, restyle_sheet
         from ..io.images import write_image
@@ -126,21 +128,10 @@ def _peer(args: list[str]) -> int:
     return 0
 
 
-def _named_run(args: list[str]) -> list[str]:
-    """A leading RUN as the flag that it stands for: tyro has no positional argument that may be absent."""
-    return ["--run", *args] if args and not args[0].startswith("-") else args
-
-
 def _trained(config: BenchConfig, output: Path) -> Path:
     method, name = load_field_method(config.method)
     data = config.data or method.data or Path("town")
     return train_scene(replace(method, data=data, output=output, steps=config.steps, minutes=None, device=config.device), name)
-
-
-def _trained_town(config: RestyleConfig, output: Path) -> Path:
-    method, name = load_field_method("fprf-lite")
-    made = replace(method, data=Path("town"), output=output, minutes=config.minutes, device=config.device)
-    return train_scene(made, name)
 
 
 def _beside(page: Path | None, picture: Path | None) -> str | None:

@@ -6,12 +6,14 @@ asked for its flags once, when the script is made, and pressing the key starts n
 
 import contextlib
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from ..errors import FprfError, UsageError
 from ..export.config import KINDS
 from ..plugins.registry import installed
+from .bench import NAMES
+from .main import VERBS, packaged, run_verb
 from .parsing import LIST_FLAGS
 
 _USAGE = """usage: fprf completion bash|zsh|fish
@@ -24,7 +26,7 @@ Make it again after installing a plug-in."""
 
 _WORDS = {
     "pretrain": ("decoder",),
-    "bench": ("speed", "restyle", "peer"),
+    "bench": tuple(NAMES),
     "export": tuple(KINDS),
     "completion": ("bash", "zsh", "fish"),
 }
@@ -48,38 +50,23 @@ def run(args: list[str]) -> int:
         return 0
     if len(args) != 1 or args[0] not in SHELLS:
         raise UsageError(f"fprf completion {' '.join(args)}: name one shell: {', '.join(SHELLS)}")
-    print(script(args[0], offers()), end="")
+    print(SHELLS[args[0]](offers()), end="")
     return 0
 
 
 def offers() -> dict[str, Offer]:
     """Every verb with its words and flags; a verb that cannot say goes without flags."""
-    from .bench import NAMES
-    from .main import VERBS, packaged
-
-    known, described = _WORDS | {"bench": tuple(NAMES)}, {}
+    described = {}
     summaries = {verb: about.summary for verb, about in VERBS.items()}
     for verb, summary in (summaries | {verb: f"of {package}" for verb, package in packaged().items()}).items():
-        words = tuple(installed("fprf.methods")) if verb == "train" else known.get(verb, ())
-        asked: Sequence[str | None] = words if verb in _FIRST or verb == "train" else (None,)
-        flags = {flag for word in asked for flag in _flags(verb, word)}
+        words = tuple(installed("fprf.methods")) if verb == "train" else _WORDS.get(verb, ())
+        heard = io.StringIO()
+        for args in [[word] for word in words] if verb in (*_FIRST, "train") else [[]]:
+            with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit, FprfError):
+                run_verb(verb, [*args, LIST_FLAGS])
+        flags = {line for line in heard.getvalue().splitlines() if line.startswith("--")}
         described[verb] = Offer(summary, words, tuple(sorted({*flags, "--help"})))
     return described
-
-
-def script(shell: str, known: Mapping[str, Offer]) -> str:
-    """The script for a shell."""
-    return SHELLS[shell](known)
-
-
-def _flags(verb: str, word: str | None) -> list[str]:
-    from .main import run_verb
-
-    heard = io.StringIO()
-    args = [LIST_FLAGS] if word is None else [word, LIST_FLAGS]
-    with contextlib.redirect_stdout(heard), contextlib.suppress(SystemExit, FprfError):
-        run_verb(verb, args)
-    return [line for line in heard.getvalue().splitlines() if line.startswith("--")]
 
 
 def _bash(known: Mapping[str, Offer]) -> str:

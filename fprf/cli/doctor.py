@@ -8,7 +8,7 @@ import platform
 import shlex
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
@@ -23,7 +23,7 @@ from ..errors import CheckpointError
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import slots
-from .parsing import parse
+from .parsing import as_flag, parse
 
 _MIB = 1 << 20
 _LEAST_DISK = 1 << 30
@@ -55,13 +55,11 @@ class DoctorConfig:
 
 def run(args: list[str]) -> int:
     """Print the findings; 1 if something that is needed is wrong."""
-    if args and not args[0].startswith("-"):  # tyro has no positional argument that may be absent
-        args = ["--target", *args]
     about = (
         "`fprf doctor` looks over this machine and tests its device, `fprf doctor RUN` a run, `fprf doctor DIR` a scene\n"
         "folder, `fprf doctor METHOD` what a method needs here."
     )
-    config = parse(DoctorConfig(), args, prog="fprf doctor", description=about)
+    config = parse(DoctorConfig(), as_flag(args, "--target"), prog="fprf doctor", description=about)
     target = config.target
     if config.clean:
         findings: Iterator[Finding] = cleaned(feature_folder())
@@ -88,15 +86,19 @@ def machine() -> Iterator[Finding]:
     """Versions, processors, accelerators, optional packages, weights, plug-ins."""
     yield Finding("fprf", f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield from _packages()
-    yield from _guarded("torch", _torch)
+    try:
+        yield from _torch()
+    except Exception as error:  # a broken installation is a finding, not a crash
+        yield Finding("torch", f"{type(error).__name__}: {error}", "pip install --force-reinstall torch")
     yield from speed(os.environ)
-    yield _disk(shutil.disk_usage(Path.cwd()).free)
+    free = shutil.disk_usage(Path.cwd()).free
+    clean = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
+    yield Finding("disk", f"{free / 1024**3:.1f} GiB free here", clean if free < _LEAST_DISK else "")
     yield _cache(feature_folder())
     yield from _weights()
     count = sum(len(registry.installed(group)) for group in registry.groups())
-    bad = registry.unreadable()
     yield Finding("plug-ins", f"{count} installed; `fprf plugins --check` loads each")
-    for complaint in bad:
+    for complaint in registry.unreadable():
         yield Finding("plug-ins", complaint, "reinstall or uninstall that package")
 
 
@@ -183,16 +185,12 @@ def _cache(folder: Path) -> Finding:
     return Finding("features", f"{_size(folder) / _MIB:.0f} MiB of at most {most:.0f} in {folder}; --clean deletes them")
 
 
-def _disk(free: int) -> Finding:
-    remedy = "fprf doctor --clean    # deletes feature targets, which are made again when needed"
-    return Finding("disk", f"{free / 1024**3:.1f} GiB free here", remedy if free < _LEAST_DISK else "")
-
-
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _version(package: str) -> str:
+    """Installed version; empty where it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -222,10 +220,11 @@ def scene_folder(data: Path) -> Iterator[Finding]:
 def run_folder(folder: Path) -> Iterator[Finding]:
     """Config, progress, plug-ins and what was computed of a run. Raises ConfigError where its config cannot be read."""
     from ..plugins.codec import load_config
+    from ..training import checkpoint
 
     config, method = load_config(folder / "config.json")
     yield Finding("run", f"method {method}, scene {config.data}, {config.steps} steps asked for")
-    steps = _steps(folder)
+    steps = checkpoint.steps(folder / "checkpoints")
     again = f"fprf train {shlex.quote(str(folder / 'config.json'))} --output {shlex.quote(str(folder))}"
     if not steps:
         yield Finding("checkpoints", "none is complete", again)
@@ -269,9 +268,9 @@ def _packages() -> Iterator[Finding]:
         extra = requirement.partition("extra == ")[2].strip("\"'")
         if extra in ("test", "dev"):
             continue
-        try:
-            yield Finding(name, version(name))
-        except PackageNotFoundError:
+        if found := _version(name):
+            yield Finding(name, found)
+        else:
             remedy = f'pip install "fprf[{extra}]"' if extra else f"pip install '{requirement}'"
             yield Finding(name, f"not installed{f' (extra {extra})' if extra else ''}", remedy, optional=bool(extra))
 
@@ -284,18 +283,14 @@ def _torch() -> Iterator[Finding]:
         for at in range(torch.cuda.device_count()):
             device = torch.cuda.get_device_properties(at)
             yield Finding(f"cuda:{at}", f"{device.name}, {device.total_memory / 1024**3:.0f} GiB")
-        yield _installed("triton", "kernels for CUDA", "pip install triton")
+        if triton := _version("triton"):
+            yield Finding("triton", f"{triton}, kernels for CUDA")
+        else:
+            yield Finding("triton", "not installed: no kernels for CUDA", "pip install triton", optional=True)
     elif torch.backends.mps.is_available():
         yield Finding("mps", "Apple GPU")
     else:
         yield Finding("accelerator", "none: `--device auto` takes the processor")
-
-
-def _installed(name: str, purpose: str, remedy: str) -> Finding:
-    try:
-        return Finding(name, f"{version(name)}, {purpose}")
-    except PackageNotFoundError:
-        return Finding(name, f"not installed: no {purpose}", remedy, optional=True)
 
 
 def _weights() -> Iterator[Finding]:
@@ -311,20 +306,6 @@ def _weights() -> Iterator[Finding]:
     for folder, pattern in _CACHES:
         cached += sorted((Path.home() / folder).glob(pattern))
     yield Finding("cached", ", ".join(path.name for path in cached) or "no downloads yet")
-
-
-def _steps(folder: Path) -> list[int]:
-    """Steps of the complete checkpoints; complete is what has a manifest."""
-    names = [path.parent.name.removeprefix("step-") for path in folder.glob("checkpoints/step-*/manifest.json")]
-    return sorted(int(name) for name in names if name.isdecimal())
-
-
-def _guarded(what: str, look: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
-    """A broken installation is a finding, not a crash."""
-    try:
-        yield from look()
-    except Exception as error:
-        yield Finding(what, f"{type(error).__name__}: {error}", f"pip install --force-reinstall {what}")
 
 
 _SHIPPED: dict[str, tuple[str, ...]] = {"encoders": ("content", "semantic"), "decoders": ()}

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, 
 from ..errors import ConfigError, PluginError, UsageError
 from ..plugins import registry
 from ..plugins.codec import Missing, load_config, method_config
-from ..plugins.registry import name_of
 from ..plugins.slots import Slot, hints_of, is_slot, members, resolve, slots
 
 if TYPE_CHECKING:
@@ -36,11 +35,13 @@ class Flag(NamedTuple):
     path: str
     """Dotted field names."""
     hint: Any
+    owner: Any
+    """The config that holds it."""
 
     @property
     def text(self) -> str:
         """As it is written on the command line."""
-        return "--" + self.path.replace("_", "-")
+        return f"--{_dashed(self.path)}"
 
     @property
     def optional(self) -> bool:
@@ -61,7 +62,7 @@ class Flag(NamedTuple):
     @property
     def takes(self) -> str:
         """Its values in words."""
-        return " or ".join("none" if hint is type(None) else _words(hint) for hint in _none_last(members(self.hint)))
+        return " or ".join(map(_words, sorted(members(self.hint), key=lambda hint: hint is type(None))))
 
 
 def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
@@ -72,7 +73,7 @@ def flags_of(config: Any, prefix: str = "") -> dict[str, Flag]:
         if dataclasses.is_dataclass(value):
             flags |= flags_of(value, f"{path}.")
         elif not any(is_slot(each) for each in members(hint)):
-            flag = Flag(path, hint)
+            flag = Flag(path, hint, config)
             flags[flag.text] = flag
     return flags
 
@@ -121,14 +122,13 @@ def explain(refusal: str, config: Any, args: Sequence[str], *, positional: Seque
 def _unknown(key: str, config: Any, flags: dict[str, Flag], prog: str) -> str:
     """Message for an unknown flag. Below a slot, its plug-in decides which fields there are."""
     lists = f"; `{prog} --help` lists all"
-    within = [slot for slot in slots(config) if _dashed(key).startswith(f"--{slot.path.replace('_', '-')}.")]
+    within = [slot for slot in slots(config) if _dashed(key).startswith(f"--{_dashed(slot.path)}.")]
     if within:
         slot = within[-1]
         if slot.value is None:
             return f"{key}: {slot.path} is none; choose one with --{slot.path} NAME"
         flags = {text: flag for text, flag in flags.items() if flag.path.startswith(f"{slot.path}.")}
-        name = name_of(slot.kind.group, type(slot.value))
-        lists = f"; {slot.path} is {name}, which takes {', '.join(flags) or 'no flags'}"
+        lists = f"; {slot.path} is {_filled_by(slot)}, which takes {', '.join(flags) or 'no flags'}"
     close = difflib.get_close_matches(_dashed(key), flags, n=1, cutoff=0.8)
     return f"{key}: no such flag{f'; did you mean {close[0]}?' if close else lists}"
 
@@ -172,10 +172,6 @@ def _count(hint: Any) -> int:
     return _MANY if get_origin(hint) in (tuple, list, dict) else 1
 
 
-def _none_last(hints: Sequence[Any]) -> list[Any]:
-    return sorted(hints, key=lambda hint: hint is type(None))
-
-
 def _words(hint: Any) -> str:
     args = get_args(hint)
     if get_origin(hint) is Literal:
@@ -191,7 +187,7 @@ def _words(hint: Any) -> str:
 
 _TRUTHS = (["True"], ["False"], ["true"], ["false"])
 _NONES = (["none"], ["None"])
-_SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
+_SCALARS = {bool: "True or False", int: "a whole number", float: "a number", str: "a text", Path: "a path", type(None): "none"}
 
 
 C = TypeVar("C")
@@ -210,7 +206,7 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     be given. `--help` prints all of it and exits. Raises UsageError, PluginError or ConfigError with one line.
     """
     if LIST_FLAGS in args:
-        print("\n".join(sorted({*flags_of(default), *(f"--{slot.path.replace('_', '-')}" for slot in slots(default))})))
+        print("\n".join(sorted({*flags_of(default), *(f"--{_dashed(slot.path)}" for slot in slots(default))})))
         raise SystemExit(0)
     if DESCRIBE in args:
         print(describe(default, prog=prog, description=description, positional=positional))
@@ -225,7 +221,7 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
     rest = spell(rest, flags)
     heard = io.StringIO()
     try:
-        with contextlib.redirect_stderr(heard), _width(_COLUMNS):
+        with contextlib.redirect_stderr(heard), _page_width():
             parsed = _tyro(config, rest, prog=prog, description=description, positional=positional)
     except SystemExit as end:
         if not end.code:
@@ -235,6 +231,11 @@ def parse(default: C, args: Sequence[str], *, prog: str, description: str, posit
         raise ConfigError(_located(str(fault), flags, rest)) from fault
     sys.stderr.write(heard.getvalue())
     return parsed
+
+
+def as_flag(args: list[str], flag: str) -> list[str]:
+    """A leading word as the value of the flag that it stands for."""
+    return [flag, *args] if args and not args[0].startswith("-") else args
 
 
 def load_method(name: str) -> "tuple[RunConfig, str]":
@@ -262,10 +263,10 @@ def methods() -> Iterator[tuple[str, str]]:
     """Names of the installed methods with the first line of their documentation; a broken one says so instead."""
     for name in registry.installed("fprf.methods"):
         try:
-            lines = (registry.load_object("fprf.methods", name).__doc__ or "").strip().splitlines()
+            about = _first_line(registry.load_object("fprf.methods", name))
         except PluginError as fault:
-            lines = [f"(broken) {fault}"]
-        yield name, lines[0] if lines else ""
+            about = f"(broken) {fault}"
+        yield name, about
 
 
 def _tyro(config: C, args: list[str], *, prog: str, description: str, positional: tuple[str, ...]) -> C:
@@ -320,13 +321,20 @@ def _slot_flags(filled: list[Slot]) -> Any:
     for slot in filled:
         names = [name for name in registry.installed(slot.kind.group) if _may_fill(slot, name)]
         allowed = ", ".join([*names, "none"] if slot.optional else names)
-        about = (slot.kind.__doc__ or "").strip().partition("\n")[0]
-        arg = tyro.conf.arg(name=slot.path, metavar="NAME", help=f"{about} One of {allowed}.")
-        here = "none" if slot.value is None else registry.name_of(slot.kind.group, type(slot.value))
-        rows.append((slot.path.replace(".", "_"), Annotated[str, arg], dataclasses.field(default=here)))
+        arg = tyro.conf.arg(name=slot.path, metavar="NAME", help=f"{_first_line(slot.kind)} One of {allowed}.")
+        rows.append((slot.path.replace(".", "_"), Annotated[str, arg], dataclasses.field(default=_filled_by(slot))))
     kind = dataclasses.make_dataclass("PlugIns", rows, frozen=True, kw_only=True)
     kind.__doc__ = "What fills each slot, by name; its own fields are flags above. `fprf plugins` lists all."
     return kind()
+
+
+def _filled_by(slot: Slot) -> str:
+    """Name of what fills a slot now."""
+    return "none" if slot.value is None else registry.name_of(slot.kind.group, type(slot.value))
+
+
+def _first_line(documented: object) -> str:
+    return (documented.__doc__ or "").strip().partition("\n")[0]
 
 
 def _may_fill(slot: Slot, name: str) -> bool:
@@ -344,10 +352,10 @@ def _located(fault: str, flags: dict[str, Flag], args: Sequence[str]) -> str:
 
 
 @contextlib.contextmanager
-def _width(columns: int) -> Iterator[None]:
+def _page_width() -> Iterator[None]:
     """Help is set for a page, not for a wide screen; tyro asks the environment for the width."""
     before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(min(columns, shutil.get_terminal_size((columns, 24)).columns))
+    os.environ["COLUMNS"] = str(min(_COLUMNS, shutil.get_terminal_size((_COLUMNS, 24)).columns))
     try:
         yield
     finally:
@@ -361,19 +369,19 @@ def describe(config: Any, *, prog: str, description: str, positional: Sequence[s
     """The JSON text of a config that flags change."""
     rows = []
     for text, flag in flags_of(config).items():
-        owner = config
-        *way, name = flag.path.split(".")
-        for part in way:
-            owner = getattr(owner, part)
+        of, _, name = flag.path.rpartition(".")
         given = name if flag.path in positional else text
-        row = {"flag": given, "takes": flag.takes, "default": _written(getattr(owner, name)), "of": ".".join(way)}
-        rows.append(row | {"meaning": meanings(type(owner)).get(name, ""), "positional": flag.path in positional})
-    chosen = []
-    for slot in slots(config):
-        default = "none" if slot.value is None else registry.name_of(slot.kind.group, type(slot.value))
-        about = (slot.kind.__doc__ or "").strip().partition("\n")[0]
-        names = list(registry.installed(slot.kind.group))
-        chosen.append({"flag": f"--{slot.path.replace('_', '-')}", "one of": names, "default": default, "meaning": about})
+        row = {"flag": given, "takes": flag.takes, "default": _written(getattr(flag.owner, name)), "of": of}
+        rows.append(row | {"meaning": meanings(type(flag.owner)).get(name, ""), "positional": flag.path in positional})
+    chosen = [
+        {
+            "flag": f"--{_dashed(slot.path)}",
+            "one of": list(registry.installed(slot.kind.group)),
+            "default": _filled_by(slot),
+            "meaning": _first_line(slot.kind),
+        }
+        for slot in slots(config)
+    ]
     return json.dumps({"prog": prog, "description": description, "flags": rows, "slots": chosen}, indent=1)
 
 
