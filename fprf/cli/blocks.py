@@ -41,7 +41,7 @@ def train_blocks(
     from ..training.prepare import device_of
     from ..training.style_pass import measure_style
 
-    laid = lay_out(config, scene, plan, display.features, folder.saved_facts())
+    laid = lay_out(config, scene, plan, display.count, folder.saved_facts())
     write_down(folder, config, method, laid)
     count = len(plan.boxes.low)
     display.say(f"{scene.name}: {len(scene.train)} + {len(scene.test)} views, {count} blocks and their surroundings")

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING
 
 from ..checks import at_least, positive
@@ -71,13 +72,8 @@ def run(args: list[str]) -> int:
     from .eval import EvalConfig
 
     garden = Path(str(files("fprf") / "garden"))
-    training = replace(
-        fprf_splats(),
-        data=garden,
-        downscale=config.downscale,
-        output=config.output / "run",
-        minutes=config.minutes,
-    )
+    output = config.output / "run"
+    training = replace(fprf_splats(), data=garden, downscale=config.downscale, output=output, minutes=config.minutes)
     verbs = training.verbs()
     with compiling():  # waited for at the end
         root = verbs.train("fprf-splats")
@@ -109,8 +105,8 @@ def run(args: list[str]) -> int:
         write_video(film, frames, fps=12)
     metrics |= {
         "looked_seconds": looked,
-        "new_style_seconds": sum(style.dictionary_seconds for style in styles) / len(styles),
-        "restyled_seconds_per_view": sum(style.view_seconds for style in styles) / (len(styles) * len(views)),
+        "new_style_seconds": fmean(style.metrics["new_style_seconds"] for style in styles),
+        "restyled_seconds_per_view": fmean(style.metrics["each_view_seconds"] for style in styles),
         "total_seconds": time.perf_counter() - start,
     }
     write_json(config.output / "metrics.json", metrics)

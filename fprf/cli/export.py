@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -94,6 +95,7 @@ class _Place(NamedTuple):
     """Inputs of every file of surfaces."""
 
     trained: "Trained"
+    config: ExportConfig
     what: Plan
     looks: Sequence[Look]
     maps: "DepthMaps"
@@ -101,7 +103,7 @@ class _Place(NamedTuple):
     display: Display
 
     def paths(self, base: str, look: Look, ending: str) -> list[Path]:
-        """Return the path of a look's file; None if a single file of another ending is wanted."""
+        """The path of a look's file; none if a single file of another ending is wanted."""
         if self.what.single is None:
             return [self.what.folder / look_file(base, look.name, ending)]
         return [self.what.single] if self.what.single.suffix.lower() == ending else []
@@ -119,7 +121,7 @@ class _Place(NamedTuple):
             self.trained.config.render,
             [look.restyle for look in self.looks],
             tolerance=tolerance,
-            report=lambda done, total: self.display.count(done, total, "colouring"),
+            report=partial(self.display.count, what="colouring"),
         )
 
 
@@ -127,9 +129,18 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
     """Everything that is made of surfaces."""
     if not {"ply", "splat", "glb"} & set(what.kinds):
         return {}
+    from ..export.depth_maps import default_reach, render_depth_maps, spread_views
     from ..export.point_cloud import fuse, origin_of
 
-    maps = _depth_maps(trained, config, display)
+    maps = render_depth_maps(
+        trained.model,
+        trained.known.cameras,
+        spread_views(trained.known.train, config.views),
+        trained.config.render,
+        side=config.side,
+        reach=default_reach(trained.model.space) if config.reach is None else config.reach,
+        report=partial(display.count, what="rendering depth"),
+    )
     counts: dict[str, int] = {}
     cloud = fuse(
         maps,
@@ -137,40 +148,24 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
         most=config.points,
         tolerance=config.tolerance,
         agree=config.agree,
-        report=lambda done, total: display.count(done, total, "fusing"),
+        report=partial(display.count, what="fusing"),
         counts=counts,
     )
-    place = _Place(trained, what, looks, maps, origin_of(cloud), display)
-    pixels = sum(depth.numel() for depth in maps.depth)
+    place = _Place(trained, config, what, looks, maps, origin_of(cloud), display)
     made: dict[str, Any] = {
         "origin": place.origin.tolist(),
         "views": len(maps.depth),
-        "pixels": {"all": pixels, **counts},
+        "pixels": {"all": sum(depth.numel() for depth in maps.depth), **counts},
         "finest_edge": float(cloud.edge.amin()),
     }
     if {"ply", "splat"} & set(what.kinds):
-        made |= _points(place, cloud, config)
+        made |= _points(place, cloud)
     if "glb" in what.kinds:
-        made |= _mesh(place, cloud, config)
+        made |= _mesh(place, cloud)
     return made
 
 
-def _depth_maps(trained: "Trained", config: ExportConfig, display: Display) -> "DepthMaps":
-    from ..export.depth_maps import default_reach, render_depth_maps, spread_views
-
-    known = trained.known
-    return render_depth_maps(
-        trained.model,
-        known.cameras,
-        spread_views(known.train, config.views),
-        trained.config.render,
-        side=config.side,
-        reach=default_reach(trained.model.space) if config.reach is None else config.reach,
-        report=lambda done, total: display.count(done, total, "rendering depth"),
-    )
-
-
-def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
+def _points(place: _Place, cloud: "Cloud") -> dict[str, Any]:
     """Points and splats: one geometry, a colour set for each look."""
     import torch
 
@@ -179,7 +174,7 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     from ..export.splats import surface_discs, write_gaussians, write_splat
     from ..splats.initial import Points
 
-    kinds = place.what.kinds
+    config, kinds = place.config, place.what.kinds
     seen = best_views(place.maps, cloud.point, cloud.normal, cloud.edge, config.witnesses)
     stored = place.colours(cloud.point, seen, config.tolerance)
     solid = stored.presence >= config.presence * expected_presence(place.maps, cloud.point, seen, config.tolerance)
@@ -193,7 +188,7 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     made = {"points": len(cloud.point), "floating": int((~solid).sum()), "splats": len(whole.point)}
     if "splat" in kinds and config.fit > 0:
         first = colours[0] if beyond is None else torch.cat([colours[0], beyond[0]])
-        made["splats"] = _fitted(place, Points(whole.point.numpy(), first.float().numpy()), config)
+        made["splats"] = _fitted(place, Points(whole.point.numpy(), first.float().numpy()))
     for number, look in enumerate(place.looks):
         colour = colours[number]
         every = colour if beyond is None else torch.cat([colour, beyond[number]])
@@ -208,7 +203,7 @@ def _points(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, An
     return made
 
 
-def _fitted(place: _Place, points: "Points", config: ExportConfig) -> int:
+def _fitted(place: _Place, points: "Points") -> int:
     """Write splats that are trained against the field's renders; the number of them."""
     import torch
 
@@ -216,6 +211,7 @@ def _fitted(place: _Place, points: "Points", config: ExportConfig) -> int:
     from ..export.fit import fit_gaussians
     from ..splats.files import write_gaussians
 
+    config = place.config
     views = spread_views(place.trained.known.train, config.views)
     cameras = place.trained.known.cameras.select(torch.tensor(views))
     cameras = replace(cameras, pose=torch.cat([cameras.pose[:, :, :3], cameras.pose[:, :, 3:] - place.origin[:, None]], 2))
@@ -233,17 +229,13 @@ def _fitted(place: _Place, points: "Points", config: ExportConfig) -> int:
     return count
 
 
-def _mesh(place: _Place, cloud: "Cloud", config: ExportConfig) -> dict[str, Any]:
+def _mesh(place: _Place, cloud: "Cloud") -> dict[str, Any]:
     """The mesh in both formats, a file for each look."""
     from ..export.colours import best_views
     from ..export.mesh import build_mesh, write_mesh_glb, write_mesh_ply
 
-    mesh = build_mesh(
-        place.maps,
-        cloud,
-        edge=config.mesh_edge,
-        report=lambda done, total: place.display.count(done, total, "building the mesh"),
-    )
+    config = place.config
+    mesh = build_mesh(place.maps, cloud, edge=config.mesh_edge, report=partial(place.display.count, what="building the mesh"))
     seen = best_views(place.maps, mesh.point, mesh.normal, mesh.edge, config.witnesses)
     for look, colour in zip(place.looks, place.colours(mesh.point, seen, config.tolerance).colours, strict=True):
         for path in place.paths("mesh", look, ".ply"):
@@ -281,9 +273,8 @@ def _tables(trained: "Trained", config: ExportConfig, what: Plan, looks: Sequenc
 
     known, scene = trained.known, load_style(trained.run)[0]
     styled = [(look.name, look.restyle) for look in looks if look.restyle is not None]
-    pairs = colour_pairs(
-        trained.model, scene, known.cameras, known.train, trained.config.render, [restyle for _, restyle in styled]
-    )
+    restyles = [restyle for _, restyle in styled]
+    pairs = colour_pairs(trained.model, scene, known.cameras, known.train, trained.config.render, restyles)
     made: dict[str, Any] = {}
     for number, (name, _) in enumerate(styled):
         weights = {"all": pairs.share.sum(1)}

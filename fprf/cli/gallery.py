@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..checks import at_least, between
 from ..errors import UsageError
-from ..plugins.registry import nearest
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.config import StyleConfig
 from ..style.files import StyleFile, check_photographs, read_style
@@ -17,6 +16,7 @@ from .progress import Display
 from .render import RenderVerbConfig, camera_path, frames_of
 from .showcase import restyled, write_page
 from .style_flags import read_preset, say, with_presets_named
+from .stylize import views_of
 
 if TYPE_CHECKING:
     from ..training.run import Known
@@ -101,7 +101,7 @@ def run(args: list[str]) -> int:
             film = output.with_suffix(".mp4")
             flight = camera_path(known, RenderVerbConfig(path=config.path, frames=config.frames))[0]
             write_video(film, frames_of(scene, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
-    width, height = (int(v) for v in known.cameras.size[views[0]])
+    width, height = known.cameras.size[views[0]].tolist()
     write_page(
         output,
         scene,
@@ -167,17 +167,11 @@ def _named(first: Sequence[Path], more: Sequence[Path]) -> dict[str, Path]:
 
 def _views(known: "Known", config: GalleryConfig) -> list[int]:
     """The views to show. Raises UsageError for a name that the run does not hold, or an empty split."""
-    names = list(known.names)
-    for name in config.views:
-        if name not in names:
-            raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
-    if config.views:
-        return [names.index(name) for name in config.views]
-    all_ = known.split(config.split)
-    if not all_:
+    views = views_of(known, config.views, config.split)
+    if not views:
         raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
-    count = min(config.most, len(all_))
-    return [all_[k * len(all_) // count] for k in range(count)]
+    count = len(views) if config.views else min(config.most, len(views))
+    return [views[k * len(views) // count] for k in range(count)]
 
 
 def _metrics(run: Path) -> dict[str, Any]:

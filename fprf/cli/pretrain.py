@@ -1,7 +1,6 @@
 """`fprf pretrain decoder`: train the decoder D_VGG of an encoder. Prints a report as JSON."""
 
 import json
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TypeVar
 from ..errors import UsageError
 from ..pretraining.config import PretrainConfig, PretrainDecoderConfig
 from .parsing import parse
+from .style_flags import say
 
 _MOVED = ("content", "semantic")
 """Encoders that ship: the repository distils them, not the installed package."""
@@ -45,14 +45,10 @@ def pretrain(
     if config.output is None:
         raise UsageError(f"{prog}: nowhere to write; name the weights file with --output FILE")
     begun = time.monotonic()
-    measured = train(config, config.output, _say)
+    measured = train(config, config.output, say)
     report = {"weights": str(config.output), **measured, "seed": config.seed, "seconds": round(time.monotonic() - begun, 1)}
     from ..pretraining.loop import write_report
 
     write_report(config.output, prog.split()[-1], report)
     print(json.dumps(report, indent=2))
     return 0
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

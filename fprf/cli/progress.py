@@ -52,17 +52,13 @@ class Display:
         elif not self.quiet:
             self._line({"event": text})
 
-    def count(self, done: int, total: int, what: str, detail: str = "", *, seconds_left: float | None = None) -> None:
+    def count(self, done: int, total: int, what: str, *, seconds_left: float | None = None) -> None:
         """`done` of `total` of something."""
         left = "" if seconds_left is None else f"  {_clock(seconds_left)} left"
-        self._bar(what, done / max(1, total), detail or f"{done}/{total}{left}")
+        self._bar(what, done / max(1, total), f"{done}/{total}{left}")
         if not self.live and self._due(done == total):
             ahead = {} if seconds_left is None else {"seconds_left": round(seconds_left)}
             self._line({"event": what, "done": done, "total": total, **ahead})
-
-    def features(self, done: int, total: int, what: str) -> None:
-        """Progress of the feature store."""
-        self.count(done, total, what)
 
     def training(self, report: "Report", what: str = "training") -> None:
         """Progress of training."""

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .progress import Display
@@ -21,15 +22,12 @@ class Shown(NamedTuple):
     name: str
     styled: "Styled"
     views: "list[View]"
-    maps: "list[Picture]"
-    """Match maps, where it has several photographs."""
     sources: list[Path]
     """Its photographs, in the order of its match maps' colours."""
+    maps: "list[Picture]"
+    """Match maps, where it has several photographs."""
     shares: list[float]
-    """Share of what was seen that took its style from each of them."""
-    dictionary_seconds: float
-    view_seconds: float
-    """For all views."""
+    """Share of what was seen that took its style from each of several photographs."""
     metrics: dict[str, Any]
     """Figures beside the style."""
 
@@ -52,22 +50,22 @@ def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: S
         maps = [match_map(scene, styled, view) for view in views]
         summaries = [summarize(each, styled.codes) for each in maps]
         called = dict(zip(labels(file.style.references), file.style.references, strict=True))
+        names = styled.codes.names
+        several = len(names) > 1
         shown.append(
             Shown(
                 name,
                 styled,
                 pictures,
-                [match_picture(each, styled.codes) for each in maps] if len(styled.codes.names) > 1 else [],
-                [called[label] for label in styled.codes.names],
-                [_mean([row["references"][k]["share"] for row in summaries]) for k in range(len(styled.codes.names))],
-                built - start,
-                done - built,
+                [called[label] for label in names],
+                [match_picture(each, styled.codes) for each in maps] if several else [],
+                [fmean(row["references"][k]["share"] for row in summaries) for k in range(len(names))] if several else [],
                 {
-                    "match_score": _mean([row["score"] for row in summaries]),
-                    "match_entropy_bits": _mean([row["entropy_bits"] for row in summaries]),
+                    "match_score": fmean(row["score"] for row in summaries),
+                    "match_entropy_bits": fmean(row["entropy_bits"] for row in summaries),
                     "warp_error": _warped(scene, views, pictures),
                     "new_style_seconds": built - start,
-                    "each_view_seconds": (done - built) / max(1, len(views)),
+                    "each_view_seconds": (done - built) / len(views),
                 },
             )
         )
@@ -98,7 +96,6 @@ def write_page(
 
     limits = depth_limits([view.depth for view in originals], [view.opacity for view in originals])
     called = {path: name for name, path in references.items()}
-    several = [len(each.sources) > 1 for each in shown]
     write_gallery(
         path,
         title=title,
@@ -112,11 +109,11 @@ def write_page(
                 each.name,
                 [to_uint8(view.rgb) for view in each.views],
                 references=[called[path] for path in each.sources],
-                shares=each.shares if many else (),
-                matches=each.maps if many else (),
+                shares=each.shares,
+                matches=each.maps,
                 metrics=each.metrics,
             )
-            for each, many in zip(shown, several, strict=True)
+            for each in shown
         ],
         depth=[depth_image(view.depth, view.opacity, limits) for view in originals],
         metrics=metrics,
@@ -136,7 +133,3 @@ def _warped(scene: "Scene", views: Sequence[int], pictures: "Sequence[View]") ->
     scores = consistency([view.rgb for view in pictures], [view.depth for view in pictures], cameras, pairs)
     rmse = scores["rmse"]
     return None if rmse is None else float(rmse)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / max(1, len(values))

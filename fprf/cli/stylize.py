@@ -1,6 +1,7 @@
 """`fprf stylize RUN --references A.jpg B.jpg`: captured views in the style of photographs."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -76,7 +77,8 @@ def run(args: list[str]) -> int:
 
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
-    views, output = _views(opened.known, config), config.output or config.run / "styles" / _name(config)
+    views = views_of(opened.known, config.views, config.split)
+    output = config.output or config.run / "styles" / _name(config)
     if config.explain and not config.references:
         print_explained(output, Regions(scene, *scene.measured()), None)
         return 0
@@ -106,7 +108,6 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
 
     shown = not config.match_only
     maps = ("match", "score", "entropy") if config.match_only else ("match",) if config.matches else ()
-    made: dict[str, Any] = {}
     rendering, matching, summaries = 0.0, 0.0, {}
     restyled = scene.restyled(styled.restyle) if shown else scene
     with Display() as display:
@@ -129,9 +130,8 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
                     write_pixels(output / f"{name}-match.npz", matched, styled.codes)
         display.count(len(views), len(views), "restyling" if shown else "matching")
     count = max(1, len(views))
-    made = {"match_seconds_per_view": matching / count, "matches": summaries}
-    if shown:
-        made = {"seconds_per_view": rendering / count, **made}
+    made: dict[str, Any] = {"seconds_per_view": rendering / count} if shown else {}
+    made |= {"match_seconds_per_view": matching / count, "matches": summaries}
     what, each = ("views", rendering / count) if shown else ("match maps", matching / count)
     print(f"{len(views)} {what} in {output}  ({each:.2f} s each)")
     return made
@@ -168,13 +168,13 @@ def _print_table(rows: list[tuple[str, ...]]) -> None:
         print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-def _views(known: "Known", config: StylizeConfig) -> list[int]:
-    """The views asked for. Raises UsageError for a name that the run does not hold."""
+def views_of(known: "Known", wanted: Sequence[str], split: str) -> list[int]:
+    """Views by name, or those of a split where none is named. Raises UsageError for a name that the run does not hold."""
     names = list(known.names)
-    for name in config.views:
+    for name in wanted:
         if name not in names:
             raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
-    return [names.index(name) for name in config.views] or list(known.split(config.split))
+    return [names.index(name) for name in wanted] or list(known.split(split))
 
 
 def _name(config: StylizeConfig) -> str:

@@ -181,7 +181,8 @@ def train_scene(
         if prepared.basis is not None:
             folder.save_tensors("basis", prepared.basis.tensors())
         display.say(_described(prepared))
-        log, forecast = EventLog(folder), Forecast(config, method, prepare.device_of(config.device).type)
+        device = prepare.device_of(config.device)
+        log, forecast = EventLog(folder), Forecast(config, method, device.type)
 
         def report(event: "Report") -> None:
             display.training(event)
@@ -197,9 +198,9 @@ def train_scene(
         spent = time.perf_counter() - start
         folder.log({"part": "preparing", "seconds": round(spent, 3)})
         if view is None:
-            model = config.executor.on(prepare.device_of(config.device).type).build().map(train, [None])[0]
+            model = config.executor.on(device.type).build().map(train, [None])[0]
         else:  # here, where its parameters can be looked at
-            model = build_model(config, prepared.facts).to(prepare.device_of(config.device))
+            model = build_model(config, prepared.facts).to(device)
             view.begin(output, model.state_dict, config.device)
             model = train(model)
         trained = time.perf_counter()
@@ -215,7 +216,7 @@ def train_scene(
 
 def _described(prepared: "Prepared") -> str:
     scene, facts = prepared.scene, prepared.facts
-    width, height = (int(v) for v in scene.cameras.size[0])
+    width, height = scene.cameras.size[0].tolist()
     semantics = f", {facts.dim} semantic" if facts.dim else ", no semantic"
     light = ", tones" if facts.exposure else ""
     return (
@@ -226,14 +227,11 @@ def _described(prepared: "Prepared") -> str:
 
 def _check_needs(config: "TrainConfig", method: str, display: "Display") -> None:
     """Raise UsageError where something is missing that nothing downloads, after showing all that is missing."""
-    from ..training.prepare import decoder_needs, plugin_needs, scene_needs
+    from ..training.prepare import plugin_needs, scene_needs
 
-    needs = plugin_needs(config)
-    if config.data is not None and all(need.downloaded for need in needs):
+    if config.data is not None and all(need.downloaded for need in plugin_needs(config)):
         return  # where the scene cannot be read its parser says so
-    needs = [*scene_needs(config), *needs]
-    if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in needs):
-        needs += decoder_needs(config)
+    needs = [*scene_needs(config), *config.verbs().needs()]
     if len(needs) > 1:
         for need in needs:
             display.say(f"missing: {need.what}: {need.remedy}")
@@ -271,7 +269,7 @@ def _told_features(config: "TrainConfig", display: "Display") -> "Callable[[int,
     begun: dict[str, float] = {}
 
     def progress(done: int, total: int, what: str) -> None:
-        display.features(done, total, what)
+        display.count(done, total, what)
         now = time.perf_counter()
         seconds = (now - begun.setdefault(what, now)) / max(done, 1) * total
         if done == _TIMED_VIEWS and config.minutes is not None and seconds > 30 * config.minutes:

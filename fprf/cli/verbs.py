@@ -71,9 +71,9 @@ class FieldVerbs(Verbs):
         from ..training.prepare import decoder_needs, plugin_needs
 
         missing = plugin_needs(self.config)
-        if not any(need.what.startswith(("content.encoder", "content.decoder")) for need in missing):
-            missing = [*missing, *decoder_needs(self.config)]
-        return missing
+        if any(need.what.startswith(("content.encoder", "content.decoder")) for need in missing):
+            return missing
+        return [*missing, *decoder_needs(self.config)]
 
     def evaluate(self, config: "EvalConfig") -> dict[str, object]:
         from .eval import evaluate_fields
