@@ -91,13 +91,7 @@ class TrainedScene:
         return self.cameras.select(torch.tensor([self._number(view)]))
 
     def camera_at(
-        self,
-        position: Sequence[float],
-        target: Sequence[float],
-        *,
-        fov: float = 60.0,
-        width: int = 640,
-        height: int = 480,
+        self, position: Sequence[float], target: Sequence[float], *, fov: float = 60.0, width: int = 640, height: int = 480
     ) -> Cameras:
         """A pinhole camera at a place (world units) that looks at another; `fov` is its vertical angle in degrees.
 

@@ -17,8 +17,7 @@ from ..style.config import StyleConfig
 from ..style.files import StyleFile
 from .parsing import parse
 from .progress import Display
-from .render import RenderVerbConfig, camera_path, frames_of
-from .showcase import restyled, write_page
+from .showcase import frames_of, restyled, write_page
 
 if TYPE_CHECKING:
     from ..style.look import Restyle
@@ -66,6 +65,7 @@ def run(args: list[str]) -> int:
     from ..io.atomic import write_json
     from ..io.video import write_video
     from ..methods import fprf_splats
+    from ..rendering.paths import make_path
     from ..splats.files import write_gaussians
     from ..splats.training import open_gaussians
     from ..training.quality import QualityConfig
@@ -97,7 +97,7 @@ def run(args: list[str]) -> int:
             )
         looks = [styles[0].styled.restyle.faded, *(style.styled.restyle for style in styles[: len(references)])]
         # From one held-out view to the next, where other views surround the camera.
-        tour = camera_path(opened.known, RenderVerbConfig(frames=config.frames, split="test"))[0]
+        tour = make_path(opened.known.cameras, views, "interpolate", config.frames)
         frames = list(frames_of(scene, tour, fading(looks, len(tour)), display))
     film = config.output / "film.mp4"
     if write_video(film, frames, fps=12) == "mp4v":  # browsers do not play that

@@ -13,8 +13,7 @@ from ..style.files import StyleFile, check_photographs, read_style
 from ..training.quality import QualityConfig
 from .parsing import parse
 from .progress import Display
-from .render import RenderVerbConfig, camera_path, frames_of
-from .showcase import restyled, write_page
+from .showcase import frames_of, restyled, write_page
 from .style_flags import read_preset, say, with_presets_named
 from .stylize import views_of
 
@@ -84,6 +83,7 @@ def run(args: list[str]) -> int:
         raise UsageError(f"--output {output}: the page is an .html file; give such a name")
     from ..datamanagers.images import photographs as find_photographs
     from ..io.video import write_video
+    from ..rendering.paths import make_path
     from ..training.loading import open_run
 
     photographs = find_photographs(config.references, say)
@@ -99,7 +99,7 @@ def run(args: list[str]) -> int:
         shown = restyled(scene, chosen, views, display)
         if config.frames:
             film = output.with_suffix(".mp4")
-            flight = camera_path(known, RenderVerbConfig(path=config.path, frames=config.frames))[0]
+            flight = make_path(known.cameras, known.split("all"), config.path, config.frames)
             write_video(film, frames_of(scene, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
     width, height = known.cameras.size[views[0]].tolist()
     write_page(

@@ -3,7 +3,6 @@
 import hashlib
 import shutil
 import time
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -18,14 +17,10 @@ from .style_flags import read_flags, say
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
-    from ..io.images import Picture
     from ..rendering.cameras import Cameras
     from ..style.files import StyleFile
-    from ..style.look import Restyle
     from ..training.film import Take
     from ..training.loading import LoadedRun
-    from ..training.run import Known
-
 
 _NO_FOLDERS = frozenset({".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".mpg", ".png", ".tif", ".webm"})
 """Endings that nobody gives a folder."""
@@ -90,12 +85,16 @@ def run(args: list[str]) -> int:
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
     from ..datamanagers.images import load_image
     from ..io.video import FILMS, missing_frames, write_video
+    from ..rendering.paths import make_path
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
         raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
     opened = open_run(config.run, config.device, config)
-    cameras, names = camera_path(opened.known, config)
+    known, views = opened.known, opened.known.split(config.split)
+    cameras = make_path(known.cameras, views, config.path, config.frames)
+    # Captured views keep the stem of their image.
+    names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
     if config.lens != "own":
         cameras = _all_round(opened, config, cameras)
     takes = _takes(opened.scene, config, file)
@@ -108,7 +107,7 @@ def run(args: list[str]) -> int:
         print(f"{len(paths) - len(todo)} of {len(paths)} frames are there already")
     start = time.perf_counter()
     with Display() as display:
-        _render(opened.scene, config, cameras, takes, dict(zip(paths, range(len(paths)), strict=True)), todo, display)
+        _render(opened.scene, config, cameras, takes, {path: frame for frame, path in enumerate(paths)}, todo, display)
         made = str(config.output)
         if whole:
             codec = write_video(config.output, (load_image(path) for path in paths), config.fps)
@@ -137,8 +136,8 @@ def _render(
     limits = limits_of(scene, cameras) if "depth" in config.show and todo else None
     start = time.perf_counter()
     for done, path in enumerate(todo):
-        each = (time.perf_counter() - start) / done if done else None
-        display.count(done, len(todo), "rendering", seconds_left=None if each is None else each * (len(todo) - done))
+        left = (time.perf_counter() - start) / done * (len(todo) - done) if done else None
+        display.count(done, len(todo), "rendering", seconds_left=left)
         frame = numbers[path]
         if path.suffix == ".exr":
             write_exr(path, planes(cameras, frame, takes, eyes))
@@ -207,29 +206,3 @@ def _styled_take(scene: "Scene", name: str, file: "StyleFile") -> "Take":
         print(note)
     restyled = scene.restyled(styled.restyle)
     return Take(name, lambda frame: restyled, styled)
-
-
-def camera_path(known: "Known", config: RenderVerbConfig) -> tuple["Cameras", list[str]]:
-    """Cameras of the path and a name for each frame; captured views keep the stem of their image."""
-    from ..rendering.paths import make_path
-
-    views = known.split(config.split)
-    cameras = make_path(known.cameras, views, config.path, config.frames)
-    if config.path == "dataset":
-        return cameras, [known.names[view] for view in views]
-    return cameras, [f"{i:05d}" for i in range(len(cameras))]
-
-
-def frames_of(
-    scene: "Scene", cameras: "Cameras", looks: "Callable[[int], Restyle | None]", display: Display
-) -> Iterator["Picture"]:
-    """Colours of a flight one by one, each frame in its own look."""
-    from ..io.images import to_uint8
-
-    before, shown = None, scene
-    for i in range(len(cameras)):
-        display.count(i, len(cameras), "rendering")
-        if (look := looks(i)) is not before:
-            before, shown = look, scene.restyled(look)
-        yield to_uint8(shown.render(cameras, i).rgb)
-    display.count(len(cameras), len(cameras), "rendering")

@@ -78,9 +78,7 @@ def run(args: list[str]) -> int:
     capture = read_capture(config.capture)
     count = len(capture.gaussians)
     with Display() as display:
-        scene = seen_capture(
-            capture, config, config.cache, lambda done, total: display.count(done, total, "looking"), display.say
-        )
+        scene = seen_capture(capture, config, config.cache, functools.partial(display.count, what="looking"), display.say)
         scene.found()
         looked = time.perf_counter() - begun
         named, made, encoders = _styles(config, file), [], scene.encoders()
@@ -89,7 +87,7 @@ def run(args: list[str]) -> int:
             start = time.perf_counter()
             styled = apply_style(scene, each, encoders)
             shown = scene.restyled(styled.restyle)
-            harmonics = shown.shown.harmonics
+            harmonics = shown.shown.harmonics  # computed now, so that its time counts
             if config.output is not None:
                 output = _named(config.output, name)
                 write_capture(output, capture, harmonics, scene.views)
@@ -139,12 +137,7 @@ def _styles(config: RestyleConfig, file: StyleFile) -> list[tuple[str, StyleFile
         return [("", file)]
     alone = []
     for i, path in enumerate(config.references):
-        style = replace(
-            file.style,
-            references=(path,),
-            weights=(),
-            masks=file.style.masks[i : i + 1],
-        )
+        style = replace(file.style, references=(path,), weights=(), masks=file.style.masks[i : i + 1])
         name = path.stem if sum(other.stem == path.stem for other in config.references) == 1 else f"{path.stem}-{i}"
         alone.append((name, file._replace(style=style)))
     return alone
@@ -234,14 +227,9 @@ def _write_page(
 
     assert config.page is not None
     names = labels(config.references)
-    called = dict(zip(names, config.references, strict=True))
     styles = []
     for k, (name, styled, _, seconds) in enumerate(made):
-        of = (
-            [label for label in names if called[label] == config.references[k]]
-            if config.each
-            else list(styled.dictionary.names)
-        )
+        of = [names[k]] if config.each else styled.dictionary.names
         styles.append(
             Style(
                 name or " + ".join(Path(label).stem for label in of),
@@ -256,6 +244,6 @@ def _write_page(
         scene={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
         view_names=[view for view, _ in pictures],
         originals=[row[0] for _, row in pictures],
-        references=[Reference(label, load_image(path)) for label, path in called.items()],
+        references=[Reference(label, load_image(path)) for label, path in zip(names, config.references, strict=True)],
         styles=styles,
     )

@@ -1,7 +1,7 @@
 """A run in several styles, as a gallery page: what `fprf demo` and `fprf gallery` have in common."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,7 +11,9 @@ from .progress import Display
 if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..io.images import Picture
+    from ..rendering.cameras import Cameras
     from ..style.files import StyleFile
+    from ..style.look import Restyle
     from ..style.restyle import Styled
     from ..types import View
 
@@ -71,6 +73,21 @@ def restyled(scene: "Scene", chosen: "Sequence[tuple[str, StyleFile]]", views: S
         )
     display.count(len(chosen), len(chosen), "restyling")
     return shown
+
+
+def frames_of(
+    scene: "Scene", cameras: "Cameras", looks: "Callable[[int], Restyle | None]", display: Display
+) -> Iterator["Picture"]:
+    """Colours of a flight one by one, each frame in its own look."""
+    from ..io.images import to_uint8
+
+    before, shown = None, scene
+    for i in range(len(cameras)):
+        display.count(i, len(cameras), "rendering")
+        if (look := looks(i)) is not before:
+            before, shown = look, scene.restyled(look)
+        yield to_uint8(shown.render(cameras, i).rgb)
+    display.count(len(cameras), len(cameras), "rendering")
 
 
 def write_page(

@@ -97,9 +97,7 @@ def run(args: list[str]) -> int:
     if source.suffix == ".json" and config.output is None:
         config = replace(config, output=source.parent)
     rest, place = take_view(args[1:])
-    others = CHANGED in rest
-    rest = [arg for arg in rest if arg != CHANGED]
-    flags = [arg for arg in rest if arg != PLAN]
+    flags, others = [arg for arg in rest if arg not in (PLAN, CHANGED)], CHANGED in rest
     if LIST_FLAGS in flags:
         print(f"{PLAN}\n{VIEW}\n{CHANGED}")
     about = (
@@ -108,7 +106,7 @@ def run(args: list[str]) -> int:
         f"{CHANGED} goes on with a run although its images are no longer those that it was begun with."
     )
     config = parse(config, flags, prog=f"fprf train {args[0]}", description=about)
-    if len(flags) < len(rest):
+    if PLAN in rest:
         config.verbs().plan(method)
     elif place is None:
         config.verbs().train(method, others=others)
