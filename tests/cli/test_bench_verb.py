@@ -6,22 +6,16 @@ from tiny_world import World
 
 from fprf.cli import main as cli
 
-SMALL = ["--repeats", "2", "--rays", "64", "--device", "cpu"]
-
-
-def bench(world: World, name: str, output: Path, *more: str) -> dict[str, object]:
-    """The JSON of a benchmark of the tiny run."""
-    references = [str(path) for path in world.references]
-    args = ["bench", name, str(world.run), "--references", *references, *SMALL, "--output", str(output), *more]
-    assert cli.main(args) == 0
-    document = json.loads(output.read_text())
-    assert document["benchmark"] == name and document["settings"]["without"] == ""
-    assert document["machine"]["device"] == "cpu" and document["machine"]["cores"] >= 1
-    return document
+SMALL = ["--repeats", "2", "--rays", "64", "--device", "cpu", "--points", "500", "--clusters", "4"]
 
 
 def test_speed(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    document = bench(world, "speed", tmp_path / "speed.json", "--points", "500", "--clusters", "4")
+    output = tmp_path / "speed.json"
+    references = ["--references", *map(str, world.references)]
+    assert cli.main(["bench", "speed", str(world.run), *references, *SMALL, "--output", str(output)]) == 0
+    document = json.loads(output.read_text())
+    assert document["benchmark"] == "speed" and document["settings"]["without"] == ""
+    assert document["machine"]["device"] == "cpu" and document["machine"]["cores"] >= 1
     rows = {row["name"]: row for row in document["rows"]}
     styles = ("region-tone", "region-ot", "local-adain")
     compared = {"train", "render", *(f"stylised, {name}" for name in styles)}

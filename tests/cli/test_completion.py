@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fprf.cli import main as cli
-from fprf.cli.completion import SHELLS, Offer, offers, script
+from fprf.cli.completion import SHELLS, Offer, offers
 
 FEW = {
     "train": Offer("train a scene, or go on where a run stopped", ("fprf", "fprf-lite"), ("--data", "--help", "--steps")),
@@ -13,12 +13,8 @@ FEW = {
 }
 
 
-@pytest.fixture(scope="module")
-def known() -> dict[str, Offer]:
-    return offers()
-
-
-def test_every_verb_has_its_flags(known: dict[str, Offer]) -> None:
+def test_every_verb_has_its_flags() -> None:
+    known = offers()
     assert known.keys() == cli.VERBS.keys()
     assert {"fprf", "fprf-lite"} <= set(known["train"].words)
     assert {"--data", "--steps", "--sampler", "--content.field.resolutions", "--help"} <= set(known["train"].flags)
@@ -30,7 +26,7 @@ def test_every_verb_has_its_flags(known: dict[str, Offer]) -> None:
 
 def completed(words: list[str], folder: Path) -> list[str]:
     """What bash offers for the last of the words."""
-    code = script("bash", FEW) + f"COMP_WORDS=({' '.join(repr(word) for word in words)})\nCOMP_CWORD={len(words) - 1}\n"
+    code = SHELLS["bash"](FEW) + f"COMP_WORDS=({' '.join(repr(word) for word in words)})\nCOMP_CWORD={len(words) - 1}\n"
     code += "_fprf\nprintf '%s\\n' \"${COMPREPLY[@]}\"\n"
     bash = shutil.which("bash")
     assert bash
@@ -52,7 +48,7 @@ def test_bash_completes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("shell", sorted(SHELLS))
 def test_the_scripts_are_whole(shell: str) -> None:
-    text = script(shell, FEW)
+    text = SHELLS[shell](FEW)
     assert text.endswith("\n") and all(word in text for word in ("fprf-lite", "steps", "port"))
     found = shutil.which(shell)
     if found is not None:

@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -14,9 +15,13 @@ KEYS = {
 }  # fmt: skip
 
 
+def evaluated(run: Path, *words: str) -> dict[str, Any]:
+    assert cli.main(["eval", str(run), *words]) == 0
+    return json.loads((run / "metrics.json").read_text())
+
+
 def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval", str(run)]) == 0
-    metrics = json.loads((run / "metrics.json").read_text())
+    metrics = evaluated(run)
     assert metrics.keys() >= KEYS
     assert (metrics["method"], metrics["split"], metrics["views"], metrics["train_steps"]) == ("fprf-lite", "test", 2, 15)
     assert metrics["per_view"].keys() == {"0000", "0008"}
@@ -30,11 +35,8 @@ def test_metrics_table_and_pictures(run: Path, capsys: pytest.CaptureFixture[str
 def test_poses_are_fitted_where_that_is_asked_and_told(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = {"steps": 20, "rays": 256, "rate": 2e-3}
     monkeypatch.setattr("fprf.evaluation.evaluate.AlignmentConfig.__init__.__kwdefaults__", few)
-    assert cli.main(["eval", str(run), "--no-images"]) == 0
-    plain = json.loads((run / "metrics.json").read_text())
+    plain, metrics = (evaluated(run, "--no-images", *words) for words in ([], ["--fit-poses"]))
     assert "fitted_poses" not in plain
-    assert cli.main(["eval", str(run), "--no-images", "--fit-poses"]) == 0
-    metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["fitted_poses"].keys() == {"0000", "0008"}
     for move in metrics["fitted_poses"].values():
         assert move.keys() == {"turn_degrees", "shift"} and move["turn_degrees"] > 0

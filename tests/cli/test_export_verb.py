@@ -22,22 +22,18 @@ def export(world: World, *args: str) -> int:
     return cli.main(["export", str(world.run), *args])
 
 
-def names(folder: Path) -> set[str]:
-    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-
-
-def columns(path: Path, *wanted: str) -> np.ndarray:
-    data = trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
-    return np.stack([data[name].ravel() for name in wanted], 1)
+def reds(path: Path) -> np.ndarray:
+    return trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]["f_dc_0"]
 
 
 def test_cameras_with_pictures_are_a_scene_of_its_own(world: World, tmp_path: Path) -> None:
-    assert export(world, "cameras", "--images", "--references", str(world.references[0]), "--output", str(tmp_path)) == 0
+    style = ["--references", str(world.references[0])]
+    assert export(world, "cameras", "--images", *style, "--output", str(tmp_path)) == 0
     scene, before = parse_scene(tmp_path, 1, None), world.load().known
     assert np.allclose(scene.cameras.pose, before.cameras.pose, atol=1e-12)
     assert scene.train.tolist() == list(before.train) and scene.test.tolist() == list(before.test)
-    assert cli.main(["stylize", str(world.run), "--references", str(world.references[0]), "--split", "all", "--no-matches",
-                     "--output", str(tmp_path / "styled")]) == 0  # fmt: skip
+    styled = [*style, "--split", "all", "--no-matches", "--output", str(tmp_path / "styled")]
+    assert cli.main(["stylize", str(world.run), *styled]) == 0
     for path, name in zip(scene.paths, before.names, strict=True):
         assert np.array_equal(cv2.imread(str(path)), cv2.imread(str(tmp_path / "styled" / f"{name}.png")))
 
@@ -54,10 +50,10 @@ def test_bounds_and_options_reach_the_files(world: World, tmp_path: Path) -> Non
     assert count("--edge", "3")["finest_edge"] >= 3 > every["finest_edge"]
     assert count("--side", "16")["points"] < every["points"]
     assert count("--tolerance", "0.1")["points"] < every["points"]
-    several = columns(tmp_path / "x" / "splats.ply", "f_dc_0")
+    several = reds(tmp_path / "x" / "splats.ply")
     assert every["floating"] == 0
     count("--tolerance", "0.1", "--witnesses", "1")
-    assert not np.array_equal(several, columns(tmp_path / "x" / "splats.ply", "f_dc_0")), "other colours, the same points"
+    assert not np.array_equal(several, reds(tmp_path / "x" / "splats.ply")), "other colours, the same points"
     trained = world.load()
     known = trained.known
     [depth] = render_depth_maps(trained.model, known.cameras, known.train[:1], trained.config.render, side=32, reach=1e9).depth
@@ -72,14 +68,15 @@ def test_one_table_of_another_size(world: World, tmp_path: Path) -> None:
     style = ["--references", str(world.references[0])]
     assert export(world, "lut", *style, "--lut-size", "5", "--output", str(tmp_path / "dusk.cube")) == 0
     lines = (tmp_path / "dusk.cube").read_text().splitlines()
-    assert names(tmp_path) == {"dusk.cube"} and len(lines) == 4 + 5**3 and lines[1] == "LUT_3D_SIZE 5"
+    assert [path.name for path in tmp_path.iterdir()] == ["dusk.cube"]
+    assert len(lines) == 4 + 5**3 and lines[1] == "LUT_3D_SIZE 5"
 
 
 def test_splats_are_fitted_to_the_field(world: World, tmp_path: Path) -> None:
     """Trained ones come nearer to the field's own render than discs do; a style has the same ones in other colours."""
     more = ["--references", str(world.references[1])]
     assert export(world, "splat", *LOOSE, "--output", str(tmp_path / "discs")) == 0
-    assert export(world, "splat", *LOOSE, *more, "--fit", "0.04", "--fit-cap", "500", "--output", str(tmp_path)) == 0
+    assert export(world, "splat", *LOOSE, *more, "--fit", "0.08", "--fit-cap", "500", "--output", str(tmp_path)) == 0
     trained = world.load()
     cameras, view = trained.known.cameras, trained.known.test[0]
     shown = trained.render(cameras, view).rgb

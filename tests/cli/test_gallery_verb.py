@@ -9,25 +9,20 @@ from tiny_world import World
 from fprf.cli import main as cli
 
 
-@pytest.fixture
-def run(world: World, tmp_path: Path) -> Path:
-    shutil.copytree(world.run, tmp_path / "run")
-    (tmp_path / "photos").mkdir()
-    for path in world.references:
-        shutil.copy(path, tmp_path / "photos")
-    (tmp_path / "photos" / "notes.txt").write_text("not a photograph")
-    return tmp_path / "run"
-
-
 def gallery(run: Path, *words: str) -> str:
     assert cli.main(["gallery", str(run), *words, "--device", "cpu"]) == 0
     return (run / "gallery.html").read_text("utf-8")
 
 
-def test_a_folder_of_photographs_becomes_a_page(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_of_photographs_becomes_a_page(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    photos = run.parent / "photos"
+    photos.mkdir()
+    for path in world.references:
+        shutil.copy(path, photos)
+    (photos / "notes.txt").write_text("not a photograph")
+    (photos / "broken.jpg").write_bytes(b"not a photograph")
     (run / "metrics.json").write_text(json.dumps({"psnr": 17.25, "per_view": {"0000": {"psnr": 3.125}}}))
-    (run.parent / "photos" / "broken.jpg").write_bytes(b"not a photograph")
-    page = gallery(run, "--references", str(run.parent / "photos"), "--split", "test")
+    page = gallery(run, "--references", str(photos), "--split", "test")
     assert re.findall(r'data-style="\d".*?<span>([^<]*)</span></button>', page) == ["dusk", "snow", "dusk + snow"]
     assert re.findall(r'data-shot="(\d-\d)"', page) == [f"{style}-{view}" for style in range(3) for view in range(2)]
     assert set(re.findall(r'data-match="(\d-\d)"', page)) == {"2-0", "2-1"}, "match maps where there is a choice"

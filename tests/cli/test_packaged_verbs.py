@@ -42,9 +42,8 @@ class CountConfig(CommandConfig):
 @pytest.fixture
 def packages(tmp_path: Path) -> Iterator[Packages]:
     with packages_in(tmp_path) as found:
-        found.install(
-            "acme-count", {CommandConfig.group: {"count": "acme_count:CountConfig"}}, code={"acme_count": COUNT}, version="0.2"
-        )
+        point = {CommandConfig.group: {"count": "acme_count:CountConfig"}}
+        found.install("acme-count", point, code={"acme_count": COUNT}, version="0.2")
         yield found
 
 

@@ -3,6 +3,7 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_packages import packages_in
@@ -56,19 +57,19 @@ def train(*args: str) -> TrainConfig:
 @pytest.mark.parametrize(
     ("args", "wanted"),
     [
-        (["r"], Verb(run=Path("r"))),
-        (["r", "--references", "a", "b"], Verb(run=Path("r"), references=(Path("a"), Path("b")))),
-        (["--quiet", "r"], Verb(run=Path("r"), quiet=True)),
-        (["r", "--quiet"], Verb(run=Path("r"), quiet=True)),
-        (["r", "--no-quiet"], Verb(run=Path("r"))),
-        (["--strength", "none", "r"], Verb(run=Path("r"))),
-        (["--strength=0.5", "r", "--inner.deep_value", "-2"], Verb(run=Path("r"), strength=0.5, inner=Inner(deep_value=-2))),
-        (["--inner.deep-value=3", "--size", "5", "6", "r"], Verb(run=Path("r"), size=(5, 6), inner=Inner(deep_value=3))),
+        ("r", {}),
+        ("r --references a b", {"references": (Path("a"), Path("b"))}),
+        ("--quiet r", {"quiet": True}),
+        ("r --quiet", {"quiet": True}),
+        ("r --no-quiet", {}),
+        ("--strength none r", {}),
+        ("--strength=0.5 r --inner.deep_value -2", {"strength": 0.5, "inner": Inner(deep_value=-2)}),
+        ("--inner.deep-value=3 --size 5 6 r", {"size": (5, 6), "inner": Inner(deep_value=3)}),
     ],
 )
-def test_flags_stand_anywhere(args: list[str], wanted: Verb) -> None:
-    found = verb(*args)
-    assert found == wanted and type(found) is Verb
+def test_flags_stand_anywhere(args: str, wanted: dict[str, Any]) -> None:
+    found = verb(*args.split())
+    assert found == Verb(run=Path("r"), **wanted) and type(found) is Verb
 
 
 @pytest.mark.parametrize(
@@ -97,8 +98,8 @@ def test_a_mistake_is_one_line(words: str, told: str, capsys: pytest.CaptureFixt
 
 
 def test_slots_and_fields_in_any_order() -> None:
-    config = train("--sampler.samples=7", "--steps", "5", "--content.encoder", "vgg19", "--sampler", "uniform",
-                   "--content.encoder.no-normalise")  # fmt: skip
+    words = "--sampler.samples=7 --steps 5 --content.encoder vgg19 --sampler uniform --content.encoder.no-normalise"
+    config = train(*words.split())
     assert config.sampler == UniformConfig(samples=7) and config.steps == 5
     assert config.content.encoder == Vgg19Config(normalise=False)
     assert config.content.field == fprf_lite().content.field
@@ -133,9 +134,7 @@ def test_methods_by_name_and_by_file(tmp_path: Path) -> None:
     ("source", "message"),
     [
         ("def m(): return 3", "gives int, not a RunConfig"),
-        ("m = 4", "gives int, not a RunConfig"),
         ("def m(): return {}['x']", "failed: KeyError: 'x'"),
-        ("from fprf.config import TrainConfig\ndef m(): return TrainConfig(steps=-1)", "steps: -1 must be at least 0"),
         ("import nothing_like_it", "failed to import"),
     ],
 )

@@ -22,22 +22,18 @@ def test_built_ins_are_listed_and_load(capsys: pytest.CaptureFixture[str], monke
     assert "broken" not in capsys.readouterr().out
 
 
+MINE = ENCODER.format(name="N") + "\nthing = NConfig"
+
+
 @pytest.mark.parametrize(
     ("group", "name", "source", "shown"),
     [
         ("fprf.encoders", "x", "import not_there", "ModuleNotFoundError"),
-        ("fprf.encoders", "x", "thing = 3", "is 3, not a EncoderConfig"),
         ("fprf.encoders", "x", "from fprf.fields.layouts import SingleConfig as thing", "is SingleConfig, not a EncoderConfig"),
-        ("fprf.encoders", "none", ENCODER.format(name="N") + "\nthing = NConfig", "can never be chosen"),
-        ("fprf.encoders", "x", ENCODER.format(name="N").replace("int = 224", "int") + "\nthing = NConfig", "no defaults"),
-        ("fprf.encoders", "vgg19", ENCODER.format(name="N") + "\nthing = NConfig", "several packages provide 'vgg19'"),
-        ("fprf.commands", "x", ENCODER.format(name="N") + "\nthing = NConfig", "not a CommandConfig"),
-        (
-            "fprf.commands",
-            "train",
-            "from fprf.cli.config import CommandConfig as thing",
-            "is never called: fprf has a verb",
-        ),
+        ("fprf.encoders", "none", MINE, "can never be chosen"),
+        ("fprf.encoders", "x", MINE.replace("int = 224", "int"), "no defaults"),
+        ("fprf.encoders", "vgg19", MINE, "several packages provide 'vgg19'"),
+        ("fprf.commands", "train", "from fprf.cli.config import CommandConfig as thing", "is never called: fprf has a verb"),
         ("fprf.methods", "x", "def thing(): return None", "gives NoneType, not a RunConfig"),
     ],
 )

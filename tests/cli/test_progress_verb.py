@@ -1,6 +1,5 @@
 import io
 import json
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -14,12 +13,6 @@ def report(step: int, share: float) -> Report:
     return Report(step, share, 12.34, 20.123, 1000.4, 0.5, {"rgb": 0.01}, 0)
 
 
-def lines(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
-    out, err = capsys.readouterr()
-    assert out == "" and "\x1b" not in err
-    return [json.loads(line) for line in err.splitlines()]
-
-
 def test_off_a_terminal_lines_come_every_few_seconds_and_at_the_end(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -30,18 +23,13 @@ def test_off_a_terminal_lines_come_every_few_seconds_and_at_the_end(
         for step in range(1, 21):
             now[0] += 1.0
             display.training(report(step, step / 20))
-    found = lines(capsys)
+    out, err = capsys.readouterr()
+    assert out == "" and "\x1b" not in err
+    found = [json.loads(line) for line in err.splitlines()]
     assert found[0] == {"event": "begin [bold]"}
     assert [e["step"] for e in found[1:]] == [1, 6, 11, 16, 20]
-    assert found[-1] == {
-        "event": "training",
-        "step": 20,
-        "share": 1.0,
-        "seconds": 12.3,
-        "psnr": 20.12,
-        "rays_per_second": 1000,
-        "seconds_left": 0,
-    }
+    rounded = {"share": 1.0, "seconds": 12.3, "psnr": 20.12, "rays_per_second": 1000, "seconds_left": 0}
+    assert found[-1] == {"event": "training", "step": 20, **rounded}
     assert found[1]["seconds_left"] == round(12.34 * 0.95 / 0.05)
 
 

@@ -17,29 +17,25 @@ from fprf.viewer.live import LiveViewer, ViewAddress
 
 
 @pytest.mark.parametrize(
-    ("args", "rest", "place"),
+    ("words", "rest", "place"),
     [
-        (["--steps", "3"], ["--steps", "3"], None),
-        (["--view"], [], ViewAddress()),
-        (["--view", "--steps", "3"], ["--steps", "3"], ViewAddress()),
-        (
-            ["--steps", "3", "--view", "9000", "--seed", "1"],
-            ["--steps", "3", "--seed", "1"],
-            ViewAddress("127.0.0.1", 9000, True),
-        ),
-        (["--view=0.0.0.0:0"], [], ViewAddress("0.0.0.0", 0, True)),
-        (["--view", "[::1]:81"], [], ViewAddress("::1", 81, True)),
-        (["--view", ":81"], [], ViewAddress("127.0.0.1", 81, True)),
+        ("--steps 3", "--steps 3", None),
+        ("--view", "", ViewAddress()),
+        ("--view --steps 3", "--steps 3", ViewAddress()),
+        ("--steps 3 --view 9000 --seed 1", "--steps 3 --seed 1", ViewAddress("127.0.0.1", 9000, True)),
+        ("--view=0.0.0.0:0", "", ViewAddress("0.0.0.0", 0, True)),
+        ("--view [::1]:81", "", ViewAddress("::1", 81, True)),
+        ("--view :81", "", ViewAddress("127.0.0.1", 81, True)),
     ],
 )
-def test_the_flag_is_taken_out_of_the_others(args: list[str], rest: list[str], place: ViewAddress | None) -> None:
-    assert take_view(args) == (rest, place)
+def test_the_flag_is_taken_out_of_the_others(words: str, rest: str, place: ViewAddress | None) -> None:
+    assert take_view(words.split()) == (rest.split(), place)
 
 
-@pytest.mark.parametrize("args", [["--view", "everywhere"], ["--view=70000"], ["--view="], ["--view", "host:"], ["--view=²"]])
-def test_what_is_no_place_is_refused(args: list[str]) -> None:
+@pytest.mark.parametrize("words", ["--view everywhere", "--view=70000", "--view=", "--view host:", "--view=²"])
+def test_what_is_no_place_is_refused(words: str) -> None:
     with pytest.raises(UsageError, match="--view"):
-        take_view(args)
+        take_view(words.split())
 
 
 @pytest.mark.parametrize("script", [GREEDY, DEAD])

@@ -16,10 +16,8 @@ MISTAKES = f"""
     bench speed nowhere | nowhere: no config.json
     bench profile run | python -m benchmarks profiling
     eval | RUN is missing
-    eval photos | no run folder
     eval absent | no run folder
     eval run --split half | --split half
-    eval run --device tpu | 'tpu'
     eval run --max-memory nan | --max-memory
     eval moved | gone: no such folder
     eval other | its images are not those of the run
@@ -41,7 +39,6 @@ MISTAKES = f"""
     gallery run | --references
     gallery run --references empty | no images
     gallery run --references A.png --output page.pdf | page.pdf
-    gallery run --references A.png --views 0099 | --views 0099
     render run --path spirale | --path spirale
     render run --path path.json | path.json
     render run --show match --path orbit | --show match
@@ -54,7 +51,6 @@ MISTAKES = f"""
     report empty | no events.jsonl
     stylize run | --references
     stylize run --references A.png B.png --weights 1 | --weights
-    stylize run --references A.png --pin 77=A | region 77
     stylize run --references A.png --forbid 0=0 | region 0
     stylize run --references A.png --keep 0000:99,1 | 0000:99,1
     stylize run --references A.png --between absent.json | absent.json
@@ -90,14 +86,13 @@ def _place(_world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).mkdir()
     for name, path in zip("AB", _world.references, strict=True):
         shutil.copy(path, folder / f"{name}.png")
-    config = folder / "moved" / "config.json"
-    config.write_text(config.read_text().replace(str(_world.town), str(folder / "gone")))
     town = shutil.copytree(_world.town, folder / "town-with-other-names")
     (town / "images" / "0003.png").rename(town / "images" / "0103.png")
     manifest = town / "transforms.json"
     manifest.write_text(manifest.read_text().replace("images/0003.png", "images/0103.png"))
-    config = folder / "other" / "config.json"
-    config.write_text(config.read_text().replace(str(_world.town), str(town)))
+    for name, data in (("moved", folder / "gone"), ("other", town)):
+        config = folder / name / "config.json"
+        config.write_text(config.read_text().replace(str(_world.town), str(data)))
     known = folder / "untested" / "scene.json"
     known.write_text(json.dumps(json.loads(known.read_text()) | {"test": []}))
     (folder / "unmeasured" / "style.safetensors").unlink()

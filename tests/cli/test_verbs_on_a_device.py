@@ -77,14 +77,14 @@ def references(world: World) -> list[str]:
     return ["--references", *map(str, world.references), *QUICK]
 
 
+SPIRAL = "--path spiral --frames 2 --resolution 0.5 --show colour depth normals --output OUT"
+EVERYTHING = "ply splat glb cameras lut --images --output OUT"
 VERBS: dict[str, Callable[[World, Path], list[str]]] = {
     "stylize": lambda world, folder: [*VIEW, *between(world, folder)],
     "render": keyed,
-    "render --path": lambda *_: ["--path", "spiral", "--frames", "2", "--resolution", "0.5", "--show", "colour", "depth",
-                                 "normals", "--output", "OUT"],
-    "export": lambda world, _: ["ply", "splat", "glb", "cameras", "lut", "--images", *LOOSE, *references(world),
-                                "--output", "OUT"],
-}  # fmt: skip
+    "render --path": lambda *_: SPIRAL.split(),
+    "export": lambda world, _: [*EVERYTHING.split(), *LOOSE, *references(world)],
+}
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name == "export" else name for name in VERBS])
@@ -108,9 +108,8 @@ def test_eval_copies_each_frame_once(world: World, tmp_path: Path) -> None:
 
 
 def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "fprf.evaluation.evaluate.AlignmentConfig.__init__.__kwdefaults__", {"steps": 2, "rays": 32, "rate": 2e-3}
-    )
+    few = {"steps": 2, "rays": 32, "rate": 2e-3}
+    monkeypatch.setattr("fprf.evaluation.evaluate.AlignmentConfig.__init__.__kwdefaults__", few)
     found = []
     for device in ("cpu", DEVICE):
         shutil.copytree(world.run, tmp_path / device)
