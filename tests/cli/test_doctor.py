@@ -22,11 +22,10 @@ def trained(tmp_path: Path) -> Path:
     folder = tmp_path / "a run"
     folder.mkdir()
     save_config(folder / "config.json", fprf_lite(), "fprf-lite")
-    for step, whole in ((100, True), (LAST, True), (LAST + 1000, False)):
-        place = folder / "checkpoints" / f"step-{step:07d}"
-        place.mkdir(parents=True)
-        if whole:
-            (place / "manifest.json").write_text("{}")
+    for step in (100, LAST, LAST + 1000):
+        (folder / "checkpoints" / f"step-{step:07d}").mkdir(parents=True)
+    for step in (100, LAST):
+        (folder / "checkpoints" / f"step-{step:07d}" / "manifest.json").write_text("{}")
     for name in ("scene.json", "style.safetensors", "metrics.json"):
         (folder / name).write_bytes(b"x" * 1000)
     return folder
@@ -55,10 +54,9 @@ def test_a_missing_plugin_of_a_run_is_named(trained: Path) -> None:
 
 
 def test_scene_folders(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(DataError, match="no such folder"):
-        run([str(tmp_path / "none")])
-    with pytest.raises(DataError, match=r"transforms\.json"):
-        run([str(tmp_path)])
+    for folder in (tmp_path / "none", tmp_path):
+        with pytest.raises(DataError, match=str(folder)):
+            run([str(folder)])
     with pytest.raises(UsageError):
         run(["a", "b"])
     found = _by_name(scene_folder(world.town))
@@ -74,8 +72,9 @@ def test_a_method_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     package, model = (finding for finding in method_needs("fprf") if finding.what == "needs")
     assert "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
     assert model.remedy == "hf download facebook/dino-vits8" and model.optional, "it is downloaded where there is a network"
-    (tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1").mkdir(parents=True)
-    (tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1" / "config.json").touch()
+    snapshot = tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1"
+    snapshot.mkdir(parents=True)
+    (snapshot / "config.json").touch()
     assert [finding for finding in method_needs("fprf") if finding.what == "needs"] == [package]
 
 

@@ -30,8 +30,8 @@ def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "in"
 
 
-def add(folder: Path, k: int, size: tuple[int, int] = (24, 16)) -> None:
-    pixels = np.random.default_rng(k).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+def add(folder: Path, k: int) -> None:
+    pixels = np.random.default_rng(k).integers(0, 256, (16, 24, 3), dtype=np.uint8)
     assert cv2.imwrite(str(folder / f"{k}.png"), pixels)
 
 
@@ -103,12 +103,11 @@ def test_dropped_images_are_told_with_their_reasons(photos: Path, capsys: pytest
     (photos / "empty.jpg").write_bytes(b"")
     plan = {"bare": ["1.png"], "lonely": ["2.png"], "apart": ["3.png", "5.png"], "unposed": ["6.png"]}
     assert process(photos, plan=plan) == 0
-    dropped = {row["image"]: row["step"] for row in report(photos)["dropped"]}
-    assert dropped == {
-        "empty.jpg": "choosing", "1.png": "features", "2.png": "matching",
-        "3.png": "mapping", "5.png": "mapping", "6.png": "mapping",
-    }  # fmt: skip
-    assert report(photos)["images"] == {"given": 12, "used": 11, "posed": 6} and report(photos)["parts"] == [6, 2]
+    told = report(photos)
+    lost = {"empty.jpg": "choosing", "1.png": "features", "2.png": "matching"}
+    lost |= dict.fromkeys(("3.png", "5.png", "6.png"), "mapping")
+    assert {row["image"]: row["step"] for row in told["dropped"]} == lost
+    assert told["images"] == {"given": 12, "used": 11, "posed": 6} and told["parts"] == [6, 2]
     out = capsys.readouterr().out
     assert "6 of 12 images have a pose" in out and "no other image" in out and "process.json" in out
 
@@ -132,14 +131,12 @@ def test_without_pycolmap_it_says_what_to_install(
 ) -> None:
     monkeypatch.setattr("fprf.cli.process.find_spec", lambda name: None)
     assert cli.main(["process", str(tmp_path)]) == 2
-    told = "error: fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'\n"
-    assert capsys.readouterr().err == told
+    assert "pip install 'fprf[sfm]'" in capsys.readouterr().err
 
 
 def test_an_old_pycolmap_is_refused(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "pycolmap.py").write_text("def set_random_seed(seed): pass\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "old"))
+    (tmp_path / "pycolmap.py").write_text("def set_random_seed(seed): pass\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     assert process(photos) == 2
     assert "pycolmap 4 or newer is needed" in capsys.readouterr().err
 

@@ -27,10 +27,10 @@ def test_blocks_are_lines_of_one_chart_and_trouble_is_told(tmp_path: Path, capsy
     for k, block in enumerate(("00", "01")):
         folder = tmp_path / "blocks" / block
         folder.mkdir(parents=True)
-        lines = [
-            {"step": s, "seconds": s / 2, "psnr": 10 + s + k, "skipped_steps": k, "losses": {"rgb": 1 / s}} for s in (1, 2, 3)
-        ]
-        (folder / "events.jsonl").write_text("\n".join(map(json.dumps, [*lines, {"damaged": "<b>step-2</b>"}])))
+        lines: list[dict[str, object]] = [{"damaged": "<b>step-2</b>"}]
+        for s in (1, 2, 3):
+            lines.append({"step": s, "seconds": s / 2, "psnr": 10 + s + k, "skipped_steps": k, "losses": {"rgb": 1 / s}})
+        (folder / "events.jsonl").write_text("\n".join(map(json.dumps, lines)))
     page = tmp_path / "out" / "page.html"
     assert cli.main(["report", str(tmp_path), "--output", str(page)]) == 0
     out = capsys.readouterr().out

@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,8 +15,11 @@ from fprf.style.dictionary import load_dictionary
 MADE = {"dictionary_seconds", "seconds_per_view", "match_seconds_per_view", "codes", "dead_channels", "matches"}
 
 
-def stylize(run: Path, world: World, *args: str) -> int:
-    return cli.main(["stylize", str(run), "--split", "test", "--references", *map(str, world.references), *args])
+def stylize(run: Path, world: World, output: Path, *words: str) -> dict[str, Any]:
+    """Restyle the held-out views with both references; the style file that is written."""
+    references = ["--references", *map(str, world.references)]
+    assert cli.main(["stylize", str(run), "--split", "test", *references, "--output", str(output), *words]) == 0
+    return json.loads((output / "style.json").read_text())
 
 
 def test_folders_stand_for_their_photographs_and_views_are_the_covered_ones(
@@ -39,8 +43,7 @@ def test_folders_stand_for_their_photographs_and_views_are_the_covered_ones(
 
 
 def test_style_json_and_the_dictionary(run: Path, world: World, tmp_path: Path) -> None:
-    assert stylize(run, world, "--output", str(tmp_path / "s"), "--clusters", "3", "--strength", "0.5") == 0
-    found = json.loads((tmp_path / "s" / "style.json").read_text())
+    found = stylize(run, world, tmp_path / "s", "--clusters", "3", "--strength", "0.5")
     dictionary = load_dictionary(tmp_path / "s" / "dictionary.safetensors")
     style, made = found["style"], found["made"]
     assert style["references"] == [str(p) for p in world.references] and style["strength"] == 0.5 and style["clusters"] == 3
@@ -54,7 +57,7 @@ def test_style_json_and_the_dictionary(run: Path, world: World, tmp_path: Path) 
 
 def test_a_style_file_is_the_same_style_again_and_flags_come_over_it(run: Path, world: World, tmp_path: Path) -> None:
     wishes = ["--clusters", "3", "--pin", "0002:15,20=snow", "--keep", "1", "--luminance", "0.5", "--stylizer", "region-adain"]
-    assert stylize(run, world, *wishes, "--output", str(tmp_path / "a")) == 0
+    first = stylize(run, world, tmp_path / "a", *wishes)
     file = ["--style", str(tmp_path / "a" / "style.json")]
     again = ["stylize", str(run), "--split", "test", *file, "--output"]
     assert cli.main([*again, str(tmp_path / "b")]) == 0
@@ -62,15 +65,14 @@ def test_a_style_file_is_the_same_style_again_and_flags_come_over_it(run: Path, 
     for name in ("0000.png", "0000-match.png", "0008.png"):
         a, b, c = (cv2.imread(str(tmp_path / folder / name)) for folder in "abc")
         assert np.array_equal(a, b) and np.array_equal(a, c) == ("match" in name)
-    first, again = (json.loads((tmp_path / folder / "style.json").read_text()) for folder in "ab")
-    assert first.pop("made") and again.pop("made") and first == again
-    third = json.loads((tmp_path / "c" / "style.json").read_text())["style"]
-    assert third == first["style"] | {"strength": 0.5}
+    second, third = (json.loads((tmp_path / folder / "style.json").read_text()) for folder in "bc")
+    assert first.pop("made") and second.pop("made") and first == second
+    assert third["style"] == first["style"] | {"strength": 0.5}
 
 
 def test_a_style_of_another_scene_finds_its_regions_by_their_keys(run: Path, world: World, tmp_path: Path) -> None:
     """The same scene with its regions in another order stands for another scene: numbers differ, semantics don't."""
-    assert stylize(run, world, "--keep", "0", "--output", str(tmp_path / "a"), "--no-matches") == 0
+    stylize(run, world, tmp_path / "a", "--keep", "0", "--no-matches")
     other = shutil.copytree(run, tmp_path / "other")
     tensors = load_file(other / "style.safetensors")
     turned = {k: v.flip(0) if k in ("keys", "region_mean", "region_covariance", "share") else v for k, v in tensors.items()}
@@ -79,13 +81,13 @@ def test_a_style_of_another_scene_finds_its_regions_by_their_keys(run: Path, wor
     assert cli.main(["stylize", str(other), *file, "--output", str(tmp_path / "b")]) == 0
     a, b = (cv2.imread(str(tmp_path / folder / "0000.png")).astype(int) for folder in "ab")
     assert np.abs(a - b).max() <= 1
-    wrong = tmp_path / "wrong"
-    assert stylize(other, world, "--keep", "0", "--output", str(wrong), "--no-matches") == 0
-    assert np.abs(a - cv2.imread(str(wrong / "0000.png"))).max() > 1
+    stylize(other, world, tmp_path / "wrong", "--keep", "0", "--no-matches")
+    assert np.abs(a - cv2.imread(str(tmp_path / "wrong" / "0000.png"))).max() > 1
 
 
 def test_explain_lists_regions_and_renders_nothing(run: Path, world: World, capsys: pytest.CaptureFixture[str]) -> None:
-    assert stylize(run, world, "--explain", "--clusters", "3", "--keep", "1") == 0
+    words = ["--explain", "--clusters", "3", "--keep", "1"]
+    assert cli.main(["stylize", str(run), "--references", *map(str, world.references), *words]) == 0
     folder, out = run / "styles" / "dusk+snow", capsys.readouterr().out
     assert {p.name for p in folder.iterdir()} == {"explain.json", "explain.png", "dictionary.safetensors", "style.json"}
     listed = json.loads((folder / "explain.json").read_text())
@@ -97,16 +99,14 @@ def test_explain_lists_regions_and_renders_nothing(run: Path, world: World, caps
 
 
 def test_match_maps_alone(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    args = ["--match-only", "--views", "0003", "0001", "--pixels", "--clusters", "2", "--output", str(tmp_path / "m")]
-    assert stylize(run, world, *args) == 0
-    expected = {
-        f"{view}-{kind}" for view in ("0001", "0003") for kind in ("match.png", "score.png", "entropy.png", "match.npz")
-    }
+    words = ["--match-only", "--views", "0003", "0001", "--pixels", "--clusters", "2"]
+    made = stylize(run, world, tmp_path / "m", *words)["made"]
+    kinds = ("match.png", "score.png", "entropy.png", "match.npz")
+    expected = {f"{view}-{kind}" for view in ("0001", "0003") for kind in kinds}
     assert {p.name for p in (tmp_path / "m").iterdir()} == expected | {"dictionary.safetensors", "style.json"}
-    made = json.loads((tmp_path / "m" / "style.json").read_text())["made"]
     assert made.keys() == MADE - {"seconds_per_view"} and made["matches"].keys() == {"0003", "0001"}
     assert "2 match maps in" in capsys.readouterr().out
     with np.load(tmp_path / "m" / "0003-match.npz") as file:
         assert file["reference"].shape == (24, 32)
-    assert stylize(run, world, "--match-only", "--explain", "--output", str(tmp_path / "both")) == 0
+    stylize(run, world, tmp_path / "both", "--match-only", "--explain")
     assert {"explain.json", "0000-score.png"} < {p.name for p in (tmp_path / "both").iterdir()}
