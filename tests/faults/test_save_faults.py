@@ -5,12 +5,12 @@ import resource
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import safetensors.torch
 import torch
-from forked import DEAD, Deadly, forked
 from tiny_world import World
 
 from fprf.errors import CheckpointError, DataError
@@ -19,6 +19,39 @@ from fprf.training.model import Model, build_model
 from fprf.training.run import held
 
 Trainer = tuple[Model, torch.optim.Optimizer]
+
+DEAD = 73
+
+
+def forked(work: Callable[[], object]) -> int:
+    """The exit code of a process that did the work: 0 done, 1 an exception."""
+    process = os.fork()
+    if process == 0:
+        code = 1
+        try:
+            work()
+            code = 0
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+class Deadly:
+    """Ends the process before the `at`-th call of whatever it was put around, as a kill would: nothing is cleaned up."""
+
+    NAMES = ("open", "fsync", "replace", "unlink", "rmdir", "mkdir", "close")
+
+    def __init__(self, at: int) -> None:
+        self.left = at
+
+    def around(self, function: Callable[..., object]) -> Callable[..., object]:
+        def call(*args: object, **named: object) -> object:
+            if self.left == 0:
+                os._exit(DEAD)
+            self.left -= 1
+            return function(*args, **named)
+
+        return call
 
 
 @pytest.fixture
