@@ -18,7 +18,6 @@ MISTAKES = f"""
     eval | RUN is missing
     eval absent | no run folder
     eval run --split half | --split half
-    eval run --max-memory nan | --max-memory
     eval moved | gone: no such folder
     eval other | its images are not those of the run
     eval untested | --split test
@@ -50,24 +49,19 @@ MISTAKES = f"""
     report absent | no such folder
     report empty | no events.jsonl
     stylize run | --references
-    stylize run --references A.png B.png --weights 1 | --weights
     stylize run --references A.png --forbid 0=0 | region 0
     stylize run --references A.png --keep 0000:99,1 | 0000:99,1
     stylize run --references A.png --between absent.json | absent.json
     stylize run --references A.png --views 000 | --views 000
     stylize run --references A.png --stylizer region-to | 'region-tone'
     stylize unmeasured --references A.png | fprf train
-    train fprf-litee | 'fprf-lite'
     train --sampler uniform | --sampler
-    train fprf-lite --steps -1 | --steps
     train fprf-lite --loss.rgb 0 --loss.content 0 --loss.semantic 0 | nothing would be learnt
     train absent/config.json | absent/config.json
     train fprf-lite | --data
     train fprf-lite --data absent | absent: no such folder
     train fprf-lite --data empty | but nothing
-    train run | not a method
     train run/config.json --device tpu | 'tpu'
-    trian | 'train'
     view run --port 70000 | --port
     view run --pixels 3 | --pixels
     view run --token short | --token

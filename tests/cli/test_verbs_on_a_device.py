@@ -116,3 +116,6 @@ def test_poses_are_fitted_on_the_device(world: World, tmp_path: Path, monkeypatc
         ran(["eval", str(tmp_path / device), "--fit-poses", "--images", "false"], device)
         found.append(content(tmp_path / device / "metrics.json"))
     assert found[0] == found[1]
+    assert found[0]["fitted_poses"].keys() == {"0000", "0008"}
+    for move in found[0]["fitted_poses"].values():
+        assert move.keys() == {"turn_degrees", "shift"} and move["turn_degrees"] > 0

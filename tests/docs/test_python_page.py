@@ -15,11 +15,8 @@ from tiny_world import World
 from fprf.methods import fprf_splats
 from fprf.splats.files import read_capture
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "python.md"
-
-
-def blocks(page: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE, NOTEBOOK = DOCS / "python.md", DOCS / "tour.ipynb"
 
 
 def test_the_page_runs(
@@ -31,15 +28,12 @@ def test_the_page_runs(
     for name, reference in zip(("autumn.jpg", "night.jpg"), world.references, strict=True):
         cv2.imwrite(name, cv2.imread(str(reference)))
     names: dict[str, object] = {}
-    for block in blocks(PAGE):
+    for block in re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE):
         exec(compile(block, str(PAGE), "exec"), names)
     told = capsys.readouterr().out
     assert "torch.Size([120, 160, 3])" in told and "'autumn.jpg'" in told and "'night.jpg'" in told
     made = {path.name for path in tmp_path.iterdir()}
     assert {"autumn.png", "film.mp4", "mine.json", "between-0.png", "between-2.png"} <= made
-
-
-NOTEBOOK = Path(__file__).resolve().parents[2] / "docs" / "tour.ipynb"
 
 
 def cells(kind: str) -> list[str]:

@@ -60,8 +60,8 @@ def test_links_lead_to_the_same_files(hooks: ModuleType, source: str, page: str,
     assert hooks.moved(text, source, page) == wanted
 
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "defaults.md").read_text("utf-8")
-SECTIONS = dict(re.findall(r"^## fprf (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
+DEFAULTS = (ROOT / "docs" / "defaults.md").read_text("utf-8")
+SECTIONS = dict(re.findall(r"^## fprf (.*?)\n(.*?)(?=^## |\Z)", DEFAULTS, re.DOTALL | re.MULTILINE))
 ROW = re.compile(r"^\| `(--[\w.-]+)` \| `([^`]*)` \| (.+) \| .*\|$", re.MULTILINE)
 
 

@@ -14,6 +14,7 @@ from tiny_world import World, flags
 from fprf.cli import main as cli
 from fprf.training import checkpoint
 
+pytestmark = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="sizes of processes are read from /proc")
 BEGIN = """
 import json, re, resource, sys
 from dataclasses import replace
@@ -98,7 +99,6 @@ def python(text: str, *args: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(words, capture_output=True, text=True, timeout=250, env=environment)
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="sizes of processes are read from /proc")
 def test_renders_with_too_little_memory_for_their_chunk_are_the_same(world: World) -> None:
     done = python(RENDER, world.run)
     assert done.returncode == 0, done.stderr
@@ -108,12 +108,8 @@ def test_renders_with_too_little_memory_for_their_chunk_are_the_same(world: Worl
 
 
 @pytest.mark.fault
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="sizes of processes are read from /proc")
 def test_training_with_too_little_memory_ends_in_one_line_and_keeps_its_checkpoint(world: World, tmp_path: Path) -> None:
-    args = flags(world, tmp_path / "run")
-    args[args.index("--datamanager.rays") + 1] = "20000"
-    args[args.index("--steps") + 1] = "6"
-    args += ["--checkpoint-minutes", "1e-9"]
+    args = [*flags(world, tmp_path / "run"), *["--datamanager.rays", "20000", "--steps", "6", "--checkpoint-minutes", "1e-9"]]
     done = python(TRAIN, *args)
     assert done.returncode == 2, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
@@ -126,7 +122,6 @@ def test_training_with_too_little_memory_ends_in_one_line_and_keeps_its_checkpoi
     assert checkpoint.steps(root)[-1] == 6
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="sizes of processes are read from /proc")
 def test_a_picture_that_does_not_fit_is_not_called_damaged(tmp_path: Path) -> None:
     image = tmp_path / "large.png"
     image.write_bytes(cv2.imencode(".png", np.zeros((6000, 6000, 3), np.uint8))[1].tobytes())

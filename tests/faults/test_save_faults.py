@@ -5,7 +5,8 @@ import resource
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -36,22 +37,15 @@ def forked(work: Callable[[], object]) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
 
-class Deadly:
-    """Ends the process before the `at`-th call of whatever it was put around, as a kill would: nothing is cleaned up."""
+def deadly(function: Callable[..., object], calls: Iterator[int], at: int) -> Callable[..., object]:
+    """Ends the process before the `at`-th of all calls, as a kill would: nothing is cleaned up."""
 
-    NAMES = ("open", "fsync", "replace", "unlink", "rmdir", "mkdir", "close")
+    def call(*args: object, **named: object) -> object:
+        if next(calls) == at:
+            os._exit(DEAD)
+        return function(*args, **named)
 
-    def __init__(self, at: int) -> None:
-        self.left = at
-
-    def around(self, function: Callable[..., object]) -> Callable[..., object]:
-        def call(*args: object, **named: object) -> object:
-            if self.left == 0:
-                os._exit(DEAD)
-            self.left -= 1
-            return function(*args, **named)
-
-        return call
+    return call
 
 
 @pytest.fixture
@@ -95,9 +89,9 @@ def test_a_save_that_dies_at_any_call_leaves_the_old_or_the_new(root: Path, trai
         mark(model, 12)
 
         def save(at: int = at) -> None:
-            deadly = Deadly(at)
-            for name in Deadly.NAMES:
-                monkeypatch.setattr(os, name, deadly.around(getattr(os, name)))
+            calls = count()
+            for name in ("open", "fsync", "replace", "unlink", "rmdir", "mkdir", "close"):
+                monkeypatch.setattr(os, name, deadly(getattr(os, name), calls, at))
             checkpoint.save(root, model, optimizer, step=12, seconds=6.0)
 
         code = forked(save)
@@ -157,8 +151,8 @@ def test_every_tensor_byte_and_every_cut_is_found(world: World, tmp_path: Path) 
         raw = path.read_bytes()
         start = 8 + int.from_bytes(raw[:8], "little") if name != "manifest.json" else len(raw)
         for part in range(50):
-            if start + part * (len(raw) - start) // 50 < len(raw):
-                at = start + part * (len(raw) - start) // 50
+            at = start + part * (len(raw) - start) // 50
+            if at < len(raw):
                 path.write_bytes(raw[:at] + bytes([raw[at] ^ 16]) + raw[at + 1 :])
                 with pytest.raises(CheckpointError, match="is damaged"):
                     checkpoint.load(tmp_path / "c", step)

@@ -7,9 +7,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import pytest
 import torch
 from tiny_world import World, flags, parameters
@@ -22,13 +22,9 @@ from fprf.training.run import Run
 @pytest.mark.fault
 def test_kills_at_random_moments_leave_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of its own: threads of this one would not survive a fork."""
-    words = [
-        sys.executable,
-        *["-m", "benchmarks", "kills", "--kills", "5", "--steps", "25", "--output"],
-        str(tmp_path / "kills.json"),
-    ]
+    words = ["-m", "benchmarks", "kills", "--kills", "5", "--steps", "25", "--output", str(tmp_path / "kills.json")]
     here, environment = Path(__file__).parents[2], os.environ | {"TMPDIR": str(tmp_path)}
-    subprocess.run(words, check=True, cwd=here, timeout=280, env=environment, capture_output=True)
+    subprocess.run([sys.executable, *words], check=True, cwd=here, timeout=280, env=environment, capture_output=True)
     found = json.loads((tmp_path / "kills.json").read_text())
     assert found["kills"] >= 5 and found["bitwise_equal"] == found["runs"] > 0
     assert not found["unfinished_files_left"] and not found["other_failures"]
@@ -38,19 +34,16 @@ def test_kills_at_random_moments_leave_the_same_bits(tmp_path: Path, monkeypatch
 def test_an_image_that_is_gone_or_changed_is_named(
     world: World, tmp_path: Path, harm: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    town = tmp_path / "town"
-    shutil.copytree(world.town, town)
+    town = shutil.copytree(world.town, tmp_path / "town")
     image = sorted((town / "images").iterdir())[3]
     raw = image.read_bytes()
     if harm == "gone":
         image.unlink()
     elif harm == "rotated":
-        import cv2
-
         image.write_bytes(cv2.imencode(".png", cv2.imread(str(image)).swapaxes(0, 1))[1].tobytes())
     else:
         image.write_bytes({"empty": b"", "cut": raw[: len(raw) // 2], "text": b"not an image"}[harm])
-    args = [str(town) if arg == str(world.town) else arg for arg in flags(world, tmp_path / "run")]
+    args = [*flags(world, tmp_path / "run"), "--data", str(town)]
     assert cli.main(["train", "fprf-lite", *args]) == 2
     (error,) = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("{")]
     assert error.startswith("error: ") and image.name in error
@@ -58,11 +51,9 @@ def test_an_image_that_is_gone_or_changed_is_named(
 
 
 def test_an_image_that_is_another_at_the_second_start_is_named(
-    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    world: World, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    town, run = tmp_path / "town", tmp_path / "run"
-    shutil.copytree(world.town, town)
-    shutil.copytree(world.run, run)
+    town = shutil.copytree(world.town, tmp_path / "town")
     images = sorted((town / "images").iterdir())
     images[3].write_bytes(images[4].read_bytes())  # of the same shape
     args = ["train", str(run / "config.json"), "--data", str(town), "--steps", "16"]
@@ -74,17 +65,11 @@ def test_an_image_that_is_another_at_the_second_start_is_named(
     assert checkpoint.steps(run / "checkpoints")[-1] == 16
 
 
-def start(args: Sequence[str], **environment: str) -> subprocess.Popen[str]:
-    words = [sys.executable, "-m", "fprf", *args]
-    return subprocess.Popen(words, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
 @pytest.mark.fault
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_from_outside_saves_and_ends_with_130(world: World, tmp_path: Path, number: int) -> None:
-    args = flags(world, tmp_path / "run")
-    args[args.index("--steps") + 1] = "100000"
-    process = start(["train", "fprf-lite", *args])
+    words = [sys.executable, "-m", "fprf", "train", "fprf-lite", *flags(world, tmp_path / "run"), "--steps", "100000"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         end = time.monotonic() + 200
         events = tmp_path / "run" / "events.jsonl"
@@ -106,7 +91,7 @@ def test_places_names_clocks_and_languages_of_all_kinds(world: World, tmp_path: 
     place = tmp_path / "with space" / "ünïcode 場面 'quotes'" / ("x" * 200)
     place.mkdir(parents=True)
     shutil.copytree(world.town, place / "town")
-    args = [str(place / "town") if arg == str(world.town) else arg for arg in flags(world, place / "run")]
+    args = [*flags(world, place / "run"), "--data", str(place / "town")]
     environment = {k: v for k, v in os.environ.items() if k not in ("HOME", "LANG", "TERM")}
     environment |= {"LC_ALL": "C", "TZ": "Pacific/Kiritimati", "PYTHONUTF8": "0", "XDG_CACHE_HOME": str(place / "cache")}
     done = subprocess.run([sys.executable, "-m", "fprf", "train", "fprf-lite", *args], env=environment, capture_output=True)
