@@ -25,11 +25,8 @@ class CountConfig(CommandConfig):
 
     positional: ClassVar[tuple[str, ...]] = ("folder",)
     folder: Path = Path()
-    """The folder."""
     step: int = 1
-    """Count by."""
     sampler: SamplerConfig = UniformConfig()
-    """A slot."""
 
     def run(self) -> int:
         if not self.folder.is_dir():

@@ -7,6 +7,7 @@ from tiny_world import World, flags, parameters
 
 from fprf.cli import main as cli
 from fprf.cli.train import train_scene
+from fprf.datamanagers.batches import RayBatches
 from fprf.errors import UsageError
 from fprf.methods import fprf_lite
 from fprf.plugins import registry
@@ -49,8 +50,6 @@ def test_another_config_in_an_existing_run_is_refused_before_any_work(
 def test_an_interrupt_is_130_and_the_run_goes_on(
     world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from fprf.datamanagers.batches import RayBatches
-
     whole = RayBatches.batch
 
     def stop(self: RayBatches, step: int) -> object:
@@ -62,8 +61,10 @@ def test_an_interrupt_is_130_and_the_run_goes_on(
     assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run")]) == 130
     assert capsys.readouterr().err.endswith("interrupted\n")
     assert checkpoint.steps(tmp_path / "run" / "checkpoints") == [3]
-    monkeypatch.undo()
-    assert cli.main(["eval", str(tmp_path / "run")]) in (0, 2)
+    monkeypatch.setattr(RayBatches, "batch", whole)
+    assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run")]) == 0
+    here, there = parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15)
+    assert here.keys() == there.keys() and all(here[name].equal(there[name]) for name in here)
 
 
 def test_everything_that_is_missing_is_listed_at_once(
