@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..checks import at_least, between
+from ..checks import at_least
 from ..errors import UsageError
 from ..plugins.stylizers.config import StylizerConfig
 from ..style.config import StyleConfig
@@ -66,12 +66,22 @@ class GalleryConfig(QualityConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        between("strength", self.strength, 0.0, 1.0)
-        between("luminance", self.luminance, 0.0, 1.0)
-        at_least("clusters", self.clusters, 1)
-        between("blend", self.blend, 0.0, 1.0)
+        self.style_of()
         at_least("most", self.most, 1)
         at_least("frames", self.frames, 0)
+
+    def style_of(self, *references: Path) -> StyleFile:
+        """The style of some photographs. Raises ConfigError for a value out of its range."""
+        return StyleFile(
+            StyleConfig(
+                references=references,
+                strength=self.strength,
+                luminance=self.luminance,
+                clusters=self.clusters,
+                blend=self.blend,
+                stylizer=self.stylizer,
+            )
+        )
 
 
 def run(args: list[str]) -> int:
@@ -126,20 +136,7 @@ def run(args: list[str]) -> int:
 
 def _chosen(config: GalleryConfig, photographs: list[Path]) -> list[tuple[str, StyleFile]]:
     """The styles with their names. Raises UsageError where there are none."""
-
-    def of(*references: Path) -> StyleFile:
-        return StyleFile(
-            StyleConfig(
-                references=references,
-                strength=config.strength,
-                luminance=config.luminance,
-                clusters=config.clusters,
-                blend=config.blend,
-                stylizer=config.stylizer,
-            )
-        )
-
-    chosen = [(name, of(path)) for name, path in _named(photographs, ()).items()]
+    chosen = [(name, config.style_of(path)) for name, path in _named(photographs, ()).items()]
     for path in config.styles:
         file = read_style(path)
         check_photographs(path, file)
@@ -148,7 +145,7 @@ def _chosen(config: GalleryConfig, photographs: list[Path]) -> list[tuple[str, S
         chosen.append((own if own not in taken else f"{own} ({len(chosen) + 1})", file))
     if config.together and len(photographs) > 1:
         names = list(_named(photographs, ()))
-        chosen.append((" + ".join(names) if len(names) <= 3 else f"all {len(names)}", of(*photographs)))
+        chosen.append((" + ".join(names) if len(names) <= 3 else f"all {len(names)}", config.style_of(*photographs)))
     if not chosen:
         raise UsageError("fprf gallery: name photographs with --references, or style files with --styles")
     return chosen
