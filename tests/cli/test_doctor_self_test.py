@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -69,10 +70,8 @@ def test_a_wrong_kernel_of_the_cpu_is_found(monkeypatch: pytest.MonkeyPatch, cap
 def test_a_device_that_fails_or_is_absent_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def broken(*args: object, **kwargs: object) -> object:
-        raise RuntimeError("CUDA error: no kernel image is available\nfor execution")
-
-    monkeypatch.setattr(device_check, "render_view", broken)
+    broken = RuntimeError("CUDA error: no kernel image is available\nfor execution")
+    monkeypatch.setattr(device_check, "render_view", Mock(side_effect=broken))
     assert "no kernel image" in told("cpu")["self-test"].found and told("cpu")["self-test"].remedy
     assert cli.main(["doctor", "--device", "cuda:7"]) == 2
     assert capsys.readouterr().err.count("\n") == 1

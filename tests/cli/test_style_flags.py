@@ -69,7 +69,6 @@ def test_what_does_not_fit_together_is_named(file: Path) -> None:
         (ConfigError, "weights: 1 weights for 2 references", ["RUN", "--style", str(file), "--references", "x.jpg", "y.jpg"]),
         (ConfigError, r"none\.json: cannot be read", ["RUN", "--style", "none.json"]),
         (UsageError, "--style", ["RUN", "--style"]),
-        (UsageError, "RUN is missing", ["--style", str(file)]),
     ):
         with pytest.raises(kind, match=told):
             read(*words)
