@@ -11,7 +11,7 @@ finer nodes then hold the coarse scene, which training sharpens. Parts that cons
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated
 
 import torch
@@ -45,28 +45,22 @@ class Member(nn.Module):
 class Members(ABC):
     """Members by number: in memory, or fetched when they are asked for."""
 
+    held: Sequence[Member]
+    """Those that live as long as the model, whose parameters are its own."""
+
     @abstractmethod
     def member(self, number: int) -> Member:
         """One of them."""
-
-    @property
-    @abstractmethod
-    def held(self) -> Sequence[Member]:
-        """Those that live as long as the model, whose parameters are its own."""
 
 
 class Held(Members):
     """Members that are all in memory."""
 
     def __init__(self, members: Sequence[Member]) -> None:
-        self._members = tuple(members)
+        self.held = members
 
     def member(self, number: int) -> Member:
-        return self._members[number]
-
-    @property
-    def held(self) -> Sequence[Member]:
-        return self._members
+        return self.held[number]
 
 
 _SHARED = -1.0
@@ -94,13 +88,7 @@ class BlockedField(ContentField):
         """Blended density; points are those of the scene's space."""
         groups = self.router(points)
         samples = [self._group(points, group) for group in groups]
-        index = torch.cat([group.at for group in groups])
-        density, latent = (torch.cat(parts) for parts in zip(*samples, strict=True))
-        if len(groups) == 1:
-            return FieldSample(density, latent)
-        back = torch.empty_like(index)
-        back[index] = torch.arange(len(index), device=index.device)
-        return FieldSample(density.index_select(0, back), latent.index_select(0, back))
+        return FieldSample(*_joined([group.at for group in groups], *zip(*samples, strict=True)))
 
     def content(self, latent: Annotated[Tensor, "M L"], view: Annotated[Tensor, "M 3"]) -> Annotated[Tensor, "M C"]:
         owner, points = latent[:, 0].detach(), latent[:, 1:4].detach()
@@ -120,18 +108,13 @@ class BlockedField(ContentField):
                 place = index[group.at]
                 features.append(self._shared(points[place], view[place], group))
                 places.append(place)
-        if len(features) == 1:
-            return features[0]
         if not features:
             return self.members.held[0].field.content(latent[:, 4:], view)
-        order = torch.cat(places)
-        back = torch.empty_like(order)
-        back[order] = torch.arange(len(order), device=order.device)
-        return torch.cat(features).index_select(0, back)
+        return _joined(places, features)[0]
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the members that are held, added up: each is regularised as if alone."""
-        return _added([member.field.penalties() for member in self.members.held])
+        return add_penalties(member.field.penalties() for member in self.members.held)
 
     def _group(self, points: Tensor, group: Group) -> tuple[Tensor, Tensor]:
         here = points[group.at]
@@ -175,16 +158,11 @@ class BlockedSemantic(SemanticField):
                 if group.weight is not None:
                     densities.append(member.field.density(at).density)
             outputs.append(_mixed(features, densities, group))
-        if len(outputs) == 1:
-            return outputs[0]
-        index = torch.cat([group.at for group in groups])
-        back = torch.empty_like(index)
-        back[index] = torch.arange(len(index), device=index.device)
-        return torch.cat(outputs).index_select(0, back)
+        return _joined([group.at for group in groups], outputs)[0]
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the members that are held, added up."""
-        return _added([member.semantic.penalties() for member in self.members.held if member.semantic is not None])
+        return add_penalties(member.semantic.penalties() for member in self.members.held if member.semantic is not None)
 
 
 def _mixed(features: list[Tensor], densities: list[Tensor], group: Group) -> Tensor:
@@ -194,9 +172,22 @@ def _mixed(features: list[Tensor], densities: list[Tensor], group: Group) -> Ten
     return (torch.stack(features, 1) * share[..., None]).sum(1)
 
 
-def _added(terms: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    names = {name for each in terms for name in each}
-    return {name: torch.stack([each[name] for each in terms if name in each]).sum() for name in sorted(names)}
+def _joined(at: list[Tensor], *columns: Sequence[Tensor]) -> list[Tensor]:
+    """Columns of values of groups in the order of the points; `at` are the points that the parts of a column belong to."""
+    if len(at) == 1:
+        return [parts[0] for parts in columns]
+    order = torch.cat(at)
+    back = torch.empty_like(order)
+    back[order] = torch.arange(len(order), device=order.device)
+    return [torch.cat(list(parts)).index_select(0, back) for parts in columns]
+
+
+def add_penalties(terms: Iterable[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Penalties of several parts by name; those of one name are added up."""
+    added: dict[str, Tensor] = {}
+    for each in terms:
+        added |= {name: added[name] + value if name in added else value for name, value in each.items()}
+    return added
 
 
 class _Routed(nn.Module):
@@ -213,12 +204,7 @@ class _Routed(nn.Module):
             here = points[group.at]
             values = [self.members.member(number).proposal(self.level, here) for number in group.members]
             outputs.append(values[0] if group.weight is None else (torch.stack(values, -1) * group.weight).sum(-1))
-        if len(outputs) == 1:
-            return outputs[0]
-        index = torch.cat([group.at for group in groups])
-        back = torch.empty_like(index)
-        back[index] = torch.arange(len(index), device=index.device)
-        return torch.cat(outputs).index_select(0, back)
+        return _joined([group.at for group in groups], outputs)[0]
 
 
 class BlockedSampler(Sampler):
@@ -245,9 +231,7 @@ class BlockedSampler(Sampler):
 
     def penalties(self) -> dict[str, Tensor]:
         """Those of the samplers of the members that are held, added up."""
-        terms = [member.sampler.penalties() for member in self.members.held]
-        names = {name for each in terms for name in each}
-        return {name: torch.stack([each[name] for each in terms if name in each]).sum() for name in sorted(names)}
+        return add_penalties(member.sampler.penalties() for member in self.members.held)
 
 
 def inherit(member: Member, around: Member) -> None:
@@ -298,6 +282,8 @@ def _leave(chart: Chart, cube: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N
 
 def _understood(part: nn.Module) -> bool:
     """True if a part consists of planes, linear maps and offsets alone."""
-    place = {id(p) for module in part.modules() if isinstance(module, Planes) for p in module.parameters()}
-    maps = {id(p) for module in part.modules() if isinstance(module, nn.Linear) for p in module.parameters()}
-    return bool(place) and all(id(p) in place | maps or p.ndim == 1 for p in part.parameters())
+    modules = [module for module in part.modules() if isinstance(module, Planes | nn.Linear)]
+    known = {id(p) for module in modules for p in module.parameters()}
+    return any(isinstance(module, Planes) for module in modules) and all(
+        id(p) in known or p.ndim == 1 for p in part.parameters()
+    )

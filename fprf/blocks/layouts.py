@@ -53,12 +53,16 @@ def within(
     return torch.maximum(low, torch.minimum(ends[0], least) - room), torch.minimum(high, torch.maximum(ends[1], most) + room)
 
 
+def _unturned(low: Annotated[Tensor, "Z 3"], high: Annotated[Tensor, "Z 3"], margin: float) -> Boxes:
+    return Boxes(low, high, torch.eye(3, dtype=low.dtype).expand(len(low), 3, 3).clone(), margin)
+
+
 class SingleLayout(BlockLayout):
     """The default."""
 
     def cut(self, site: Site) -> Boxes:
         low, high = bounds(site)
-        return Boxes(low[None], high[None], torch.eye(3, dtype=low.dtype)[None], 0.0)
+        return _unturned(low[None], high[None], 0.0)
 
 
 class GridLayout(BlockLayout):
@@ -76,16 +80,10 @@ class GridLayout(BlockLayout):
         margin = self.config.margin * min(float(high[a] - low[a]) / n for a, n in enumerate(counts))
         low, high = low - margin, high + margin  # what is found on the region's border lies inside its blocks
         sides = [torch.linspace(float(low[a]), float(high[a]), n + 1, dtype=low.dtype) for a, n in enumerate(counts)]
-        cells = []
-        for i in range(counts[0]):
-            for j in range(counts[1]):
-                first = torch.stack([sides[0][i], sides[1][j], low[2]])
-                last = torch.stack([sides[0][i + 1], sides[1][j + 1], high[2]])
-                if _holds(site, first, last):
-                    cells.append((first, last))
-        corners = torch.stack([torch.stack(cell) for cell in cells])
-        turn = torch.eye(3, dtype=low.dtype).expand(len(cells), 3, 3).clone()
-        return Boxes(corners[:, 0], corners[:, 1], turn, margin)
+        lows = torch.cartesian_prod(sides[0][:-1], sides[1][:-1], low[2:])
+        highs = torch.cartesian_prod(sides[0][1:], sides[1][1:], high[2:])
+        kept = torch.tensor([_holds(site, *cell) for cell in zip(lows, highs, strict=True)])
+        return _unturned(lows[kept], highs[kept], margin)
 
 
 def _holds(site: Site, low: torch.Tensor, high: torch.Tensor) -> bool:
@@ -121,8 +119,7 @@ class AdaptiveLayout(BlockLayout):
         margin = self.config.margin * smallest if len(leaves) > 1 else 0.0
         # What is found on the region's border lies inside its blocks.
         lows, highs = torch.where(lows <= low, lows - margin, lows), torch.where(highs >= high, highs + margin, highs)
-        turn = torch.eye(3, dtype=low.dtype).expand(len(leaves), 3, 3).clone()
-        return Boxes(lows, highs, turn, margin)
+        return _unturned(lows, highs, margin)
 
     def _split(self, node: _Node, place: Tensor, weight: Tensor, smallest: float) -> list[_Node]:
         axis = int((node.high - node.low)[:2].argmax())
@@ -252,7 +249,7 @@ def _box(site: Site, stretch: _Stretch) -> tuple[Tensor, Tensor, Tensor, Tensor]
     up = axis.new_tensor([0.0, 0.0, 1.0])
     turn = torch.stack([axis, torch.linalg.cross(up, axis), up])
     local = here @ turn.T
-    low, high = local.amin(0) - REACH, local.amax(0) + REACH
+    low, high, free = local.amin(0) - REACH, local.amax(0) + REACH, local.new_ones(2, 3)
     for plane in stretch.planes:
         slope = float(plane.normal @ axis)
         if abs(slope) < 0.5:  # a cut along the segment says nothing about where it ends
@@ -260,15 +257,9 @@ def _box(site: Site, stretch: _Stretch) -> tuple[Tensor, Tensor, Tensor, Tensor]
         ends = float((plane.point - here.mean(0)) @ plane.normal) / slope + float(here.mean(0) @ axis)
         # A cut that is not quite across leaves some of the segment's own cameras beyond it.
         if slope > 0:
-            high[0] = min(float(high[0]), max(ends, float(local[:, 0].amax())))
+            high[0], free[1, 0] = min(float(high[0]), max(ends, float(local[:, 0].amax()))), 0.0
         else:
-            low[0] = max(float(low[0]), min(ends, float(local[:, 0].amin())))
-    cuts = low.clone(), high.clone()
+            low[0], free[0, 0] = max(float(low[0]), min(ends, float(local[:, 0].amin()))), 0.0
     turned = Site(site.position @ turn.T, site.rays, site.points @ turn.T, site.unit)
-    low, high = within(turned, low, high)
-    free = low.new_ones(2, 3)
-    if any(float(plane.normal @ axis) < -0.5 for plane in stretch.planes):
-        low[0], free[0, 0] = cuts[0][0], 0.0
-    if any(float(plane.normal @ axis) > 0.5 for plane in stretch.planes):
-        high[0], free[1, 0] = cuts[1][0], 0.0
-    return low, high, turn, free
+    inner_low, inner_high = within(turned, low, high)
+    return torch.where(free[0] > 0, inner_low, low), torch.where(free[1] > 0, inner_high, high), turn, free

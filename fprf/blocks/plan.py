@@ -10,7 +10,7 @@ times as far as the farthest point that is seen in it or its neighbours, and wit
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
 import cv2
@@ -27,7 +27,7 @@ from ..io.images import Picture
 from ..rendering.cameras import Cameras, rays_through
 from ..rendering.space import Space
 from ..types import Boxes, Site
-from .routing import chart_of, local, surroundings_of
+from .routing import local, surroundings_of
 
 FLAT = 0.3
 """Cameras spread over a plane if their third extent is below this share of their second ..."""
@@ -134,13 +134,8 @@ def _centres(low: Tensor, high: Tensor) -> Tensor:
     return ((high - 0.5).ceil() - (low - 0.5).ceil()).clamp_min(0).long()
 
 
-def visible(tiles: Tiles, boxes: Boxes) -> Annotated[Tensor, "M Z TILES TILES"]:
-    """True where the rays of a tile meet a block, margins included, before they end."""
-    return torch.stack([meets(tiles, boxes, block) for block in range(len(boxes.low))], 1)
-
-
 def meets(tiles: Tiles, boxes: Boxes, block: int) -> Annotated[Tensor, "M TILES TILES"]:
-    """`visible` for one block, by the slab test."""
+    """True where the rays of a tile meet a block, margins included, before they end: the slab test."""
     low, high = (boxes.low[block] - boxes.margin).to(tiles.origin), (boxes.high[block] + boxes.margin).to(tiles.origin)
     origin = local(tiles.origin, boxes.turn[block])[:, None, None]
     direction = local(tiles.direction.reshape(-1, 3), boxes.turn[block]).view(tiles.direction.shape)
@@ -205,11 +200,6 @@ class Plan:
         """int64 training views that a block learns from."""
         return self.views[(self.seen[:, block] & (self.pixels > 0)).flatten(1).any(1)]
 
-    def mask(self, block: int, view: int, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
-        """The pixels of a training view of (width, height) that a block learns from."""
-        at = int((self.views == view).nonzero()[0, 0])
-        return pixel_mask(self.seen[at, block], size)
-
 
 def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
     """Cut the scene and find out who sees what. Raises ConfigError where a block would have nothing to learn from."""
@@ -219,15 +209,14 @@ def make_plan(scene: Scene, layout: LayoutConfig) -> Plan:
     seen, pixels = [], []
     for views in torch.split(scene.train, VIEWS):
         tiles = tile_rays(scene, space, views, sightings)
-        seen.append(visible(tiles, boxes))
+        seen.append(torch.stack([meets(tiles, boxes, block) for block in range(len(boxes.low))], 1))
         pixels.append(tiles.pixels)
-    tiles_seen, counts = torch.cat(seen), torch.cat(pixels)
-    whole = Plan(space=space, boxes=boxes, views=scene.train, seen=tiles_seen, pixels=counts)
+    whole = Plan(space=space, boxes=boxes, views=scene.train, seen=torch.cat(seen), pixels=torch.cat(pixels))
     used = (whole.rays > 0).nonzero()[:, 0]
     if not len(used):
         raise ConfigError(f"{scene.name}: no training view sees any block of this layout; choose another --blocks")
     kept = Boxes(boxes.low[used], boxes.high[used], boxes.turn[used], boxes.margin)
-    return Plan(space=space, boxes=kept, views=scene.train, seen=tiles_seen[:, used], pixels=counts)
+    return replace(whole, boxes=kept, seen=whole.seen[:, used])
 
 
 def boxes_to(boxes: Boxes) -> dict[str, Any]:
@@ -274,9 +263,9 @@ def top_view(scene: Scene, plan: Plan) -> Picture:
     turn = torch.tensor(plan.space.rotation, dtype=torch.float64)
     ahead = -scene.cameras.pose[scene.train][:, :, 2] @ turn.T
     long = 10 * step
-    for start, end in zip(place(site.position), place(site.position + long * ahead), strict=True):
-        cv2.line(sheet, _at(start), _at(end), _CAMERA, 1, cv2.LINE_AA)
-        cv2.circle(sheet, _at(start), 2, _CAMERA, -1, cv2.LINE_AA)
+    for start, end in zip(place(site.position).tolist(), place(site.position + long * ahead).tolist(), strict=True):
+        cv2.line(sheet, start, end, _CAMERA, 1, cv2.LINE_AA)
+        cv2.circle(sheet, start, 2, _CAMERA, -1, cv2.LINE_AA)
     _scale(sheet, step / plan.space.scale)
     return sheet
 
@@ -284,30 +273,14 @@ def top_view(scene: Scene, plan: Plan) -> Picture:
 def _boxes(sheet: Picture, plan: Plan, place) -> None:  # type: ignore[no-untyped-def]
     for block in range(len(plan.boxes.low)):
         colour = _COLOURS[block % len(_COLOURS)]
-        chart = chart_of(plan.boxes, block)
-        for low, high, thick in (
-            (chart.low, chart.high, 1),
-            (plan.boxes.low[block], plan.boxes.high[block], 2),
-        ):
-            corners = torch.stack(
-                [
-                    torch.stack([x, y, low[2]])
-                    for x, y in ((low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1]))
-                ]
-            )
-            ring = place(corners @ plan.boxes.turn[block]).astype(np.int32)
+        low, high, turn = plan.boxes.low[block], plan.boxes.high[block], plan.boxes.turn[block]
+        for margin, thick in ((plan.boxes.margin, 1), (0.0, 2)):
+            ends = torch.stack([low - margin, high + margin])
+            corners = torch.stack([ends[[0, 1, 1, 0], 0], ends[[0, 0, 1, 1], 1], ends[[0, 0, 0, 0], 2]], 1)
+            ring = place(corners @ turn).astype(np.int32)
             cv2.polylines(sheet, [ring], True, colour, thick, cv2.LINE_AA)
-        middle = place(((plan.boxes.low[block] + plan.boxes.high[block]) / 2 @ plan.boxes.turn[block])[None])[0]
-        cv2.putText(
-            sheet,
-            f"{block:02d}",
-            (int(middle[0]) - 16, int(middle[1]) + 10),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.9,
-            colour,
-            2,
-            cv2.LINE_AA,
-        )
+        x, y = place((low + high) / 2 @ turn).tolist()
+        cv2.putText(sheet, f"{block:02d}", (x - 16, y + 10), cv2.FONT_HERSHEY_SIMPLEX, 0.9, colour, 2, cv2.LINE_AA)
 
 
 def _scale(sheet: Picture, unit: float) -> None:
@@ -320,7 +293,3 @@ def _scale(sheet: Picture, unit: float) -> None:
     cv2.putText(
         sheet, f"{length:g} world units", (BORDER + pixels + 10, y + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA
     )
-
-
-def _at(point: np.ndarray) -> tuple[int, int]:
-    return int(point[0]), int(point[1])

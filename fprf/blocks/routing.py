@@ -15,6 +15,7 @@ say. The chart of the surroundings contracts: all blocks together fill the inner
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, NamedTuple
@@ -54,11 +55,12 @@ def window(points: Annotated[Tensor, "N 3"], boxes: Boxes, block: int) -> Annota
     return (rise * rise * (3 - 2 * rise)).prod(-1)
 
 
-def shares(points: Annotated[Tensor, "N 3"], boxes: Boxes) -> Annotated[Tensor, "N Z+1"]:
-    """Weight of every block at every point, the surroundings last; rows are at least 0 and sum to 1."""
-    if not len(boxes.low):
+def shares(points: Annotated[Tensor, "N 3"], boxes: Boxes, blocks: Sequence[int] | None = None) -> Annotated[Tensor, "N Z+1"]:
+    """Weight of some blocks, or of every one, at every point, the surroundings last; rows are at least 0 and sum to 1."""
+    chosen = range(len(boxes.low)) if blocks is None else blocks
+    if not chosen:
         return points.new_ones(len(points), 1)
-    windows = torch.stack([window(points, boxes, block) for block in range(len(boxes.low))], -1)
+    windows = torch.stack([window(points, boxes, block) for block in chosen], -1)
     total = windows.sum(-1, keepdim=True)
     return torch.cat([windows / total.clamp_min(1), (1 - total).clamp_min(0)], -1)
 
@@ -195,7 +197,7 @@ class Blend(Router):
     def __init__(self, boxes: Boxes) -> None:
         self.boxes = boxes
         self.around = len(boxes.low)
-        whole = surroundings_of(_reaching(boxes))
+        whole = surroundings_of(Boxes(boxes.low - boxes.margin, boxes.high + boxes.margin, boxes.turn, 0.0))
         low, high = whole.low[:2], whole.high[:2]
         self.low, self.step = low, float((high - low).amax()) / TABLE
         counts = ((high - low) / self.step).ceil().long().clamp_min(1)
@@ -225,10 +227,7 @@ class Blend(Router):
         """Groups of the points of one set."""
         if not members:
             return [Group((self.around,), index, None)]
-        here = points[index]
-        windows = torch.stack([window(here, self.boxes, block) for block in members], -1)
-        total = windows.sum(-1, keepdim=True)
-        weight = torch.cat([windows / total.clamp_min(1), (1 - total).clamp_min(0)], -1)
+        weight = shares(points[index], self.boxes, members)
         weight = torch.where(weight > SLIGHT, weight, torch.zeros_like(weight))
         most, best = weight.max(-1)
         alone = most >= weight.sum(-1)
@@ -249,38 +248,18 @@ class Blend(Router):
 
     def _tabulate(self) -> tuple[Tensor, list[tuple[int, ...]]]:
         """Set of blocks whose reach, seen from above, may touch each cell of the table; sets are numbered as they come."""
-        middle = torch.stack(
-            torch.meshgrid(
-                self.low[1] + (torch.arange(self.rows, dtype=torch.float64) + 0.5) * self.step,
-                self.low[0] + (torch.arange(self.columns, dtype=torch.float64) + 0.5) * self.step,
-                indexing="ij",
-            ),
-            -1,
-        ).reshape(-1, 2)
-        middle = torch.cat([middle.flip(1), middle.new_zeros(len(middle), 1)], 1)
-        touched = torch.zeros(len(middle), self.around, dtype=torch.bool)
-        for block in range(self.around):
-            chart = chart_of(self.boxes, block)
-            # A cell reaches half its diagonal around its middle; turned boxes are level, so heights don't matter.
-            room = chart.low.new_full((3,), 0.75 * self.step)
-            room[2] = torch.inf
-            touched[:, block] = Chart(chart.low - room, chart.high + room, chart.turn).inside(middle)
-        sets, number = torch.unique(touched, dim=0, return_inverse=True)
-        names = [tuple(row.nonzero()[:, 0].tolist()) for row in sets]
-        # The empty set comes first, whether or not a cell has it: it is what lies beyond the table.
-        if () in names:
-            first = names.index(())
-            order = [first, *(k for k in range(len(names)) if k != first)]
-            rank = torch.empty(len(names), dtype=torch.int64)
-            rank[torch.tensor(order)] = torch.arange(len(names))
-            return rank[number], [names[k] for k in order]
-        return number + 1, [(), *names]
+        column, row = (torch.arange(count, dtype=torch.float64) + 0.5 for count in (self.columns, self.rows))
+        y, x = torch.meshgrid(self.low[1] + row * self.step, self.low[0] + column * self.step, indexing="ij")
+        middle = torch.stack([x, y, torch.zeros_like(x)], -1).view(-1, 3)
+        # A cell reaches half its diagonal around its middle; turned boxes are level, so heights don't matter.
+        room = middle.new_tensor([0.75 * self.step, 0.75 * self.step, torch.inf])
+        charts = [chart_of(self.boxes, block) for block in range(self.around)]
+        touched = [Chart(chart.low - room, chart.high + room, chart.turn).inside(middle) for chart in charts]
+        # Rows come sorted. The empty set is first, whether or not a cell has it: it is what lies beyond the table.
+        sets, number = torch.unique(torch.stack(touched, 1), dim=0, return_inverse=True)
+        names = [tuple(each.nonzero()[:, 0].tolist()) for each in sets]
+        return (number, names) if not names[0] else (number + 1, [(), *names])
 
 
 def _all(points: Tensor) -> Annotated[Tensor, "N"]:
     return torch.arange(len(points), device=points.device)
-
-
-def _reaching(boxes: Boxes) -> Boxes:
-    """The boxes with their margins."""
-    return Boxes(boxes.low - boxes.margin, boxes.high + boxes.margin, boxes.turn, 0.0)

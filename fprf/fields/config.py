@@ -51,8 +51,7 @@ class PlanesConfig(ContentFieldConfig):
     """Spherical-harmonics degree of the viewing direction (1 = none)."""
 
     def __post_init__(self) -> None:
-        _check_planes("content.field", self.resolutions, self.channels)
-        _check_network("content.field", self.hidden, self.layers)
+        _check("content.field", self)
         between("content.field.degree", self.degree, 1, 4)
 
     def build(self, *, channels: int, seed: int) -> ContentField:
@@ -75,8 +74,7 @@ class SemanticPlanesConfig(SemanticFieldConfig):
     """Hidden layers of the semantic network."""
 
     def __post_init__(self) -> None:
-        _check_planes("semantic.field", self.resolutions, self.channels)
-        _check_network("semantic.field", self.hidden, self.layers)
+        _check("semantic.field", self)
 
     def build(self, *, channels: int, seed: int) -> SemanticField:
         from .planes import SemanticPlanes
@@ -84,14 +82,11 @@ class SemanticPlanesConfig(SemanticFieldConfig):
         return SemanticPlanes(self, channels=channels, seed=seed)
 
 
-def _check_planes(name: str, resolutions: tuple[int, ...], channels: int) -> None:
-    if not resolutions:
+def _check(name: str, config: PlanesConfig | SemanticPlanesConfig) -> None:
+    if not config.resolutions:
         raise ConfigError(f"{name}.resolutions: none given; name at least one")
-    for r in resolutions:
+    for r in config.resolutions:
         at_least(f"{name}.resolutions", r, 2)
-    at_least(f"{name}.channels", channels, 1)
-
-
-def _check_network(name: str, hidden: int, layers: int) -> None:
-    at_least(f"{name}.hidden", hidden, 1)
-    at_least(f"{name}.layers", layers, 0)
+    at_least(f"{name}.channels", config.channels, 1)
+    at_least(f"{name}.hidden", config.hidden, 1)
+    at_least(f"{name}.layers", config.layers, 0)

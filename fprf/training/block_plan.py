@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -227,45 +227,32 @@ def estimates(config: TrainConfig, scene: Scene, plan: Plan) -> list[Estimate]:
     parameters = sum(p.numel() for p in around.member.parameters())
     batch = config.datamanager.batch_rays()
     area = scene.cameras.size.prod(-1)
-    rows = []
     everything = int(area[scene.train].sum())
-    numbers = plan.rays.tolist()
-    speed = {
-        id(built): seconds_per_step(config, facts, scene, built, batch)
-        for built in {id(b): b for b in (around, block)}.values()
-    }
+    span = plan.boxes.high.amax(0) - plan.boxes.low.amin(0)
 
-    def row(name: str, views: torch.Tensor, rays: int, extent: tuple[float, float, float], members: int, built: Built) -> None:
+    def row(name: str, views: Tensor, rays: int, span: Annotated[Tensor, "3"], members: int, step_seconds: float) -> Estimate:
         pixels = 3 * int(area[views].sum())
         images = pixels if pixels <= HELD else 0  # else they lie in a mapped file
         held = members * parameters * 4
         working = _WORKING * batch * 64
-        seconds = config.steps * speed[id(built)]
-        rows.append(
-            Estimate(
-                name,
-                len(views),
-                rays,
-                extent,
-                (held * _STATE + images + working) / _MIB,
-                (parameters * 4 + 2 * 3 * held + pixels - images) / _MIB,
-                seconds,
-            )
+        along, across, up = (span / plan.space.scale).tolist()
+        return Estimate(
+            name,
+            len(views),
+            rays,
+            (along, across, up),
+            (held * _STATE + images + working) / _MIB,
+            (parameters * 4 + 2 * 3 * held + pixels - images) / _MIB,
+            config.steps * step_seconds,
         )
 
+    step_seconds = seconds_per_step(config, facts, scene, around, batch)
+    rows = [row("surroundings" if plan.cut else "whole", plan.views, everything, span, 1, step_seconds)]
     if plan.cut:
-        span = plan.boxes.high.amax(0) - plan.boxes.low.amin(0)
-        row("surroundings", plan.views, everything, _metric(span, plan), 1, around)
-    for z, rays in enumerate(numbers):
-        extent = _metric(plan.boxes.high[z] - plan.boxes.low[z], plan)
-        row(
-            f"{z:02d}" if plan.cut else "whole",
-            plan.views_of(z) if plan.cut else plan.views,
-            rays if plan.cut else everything,
-            extent,
-            1 + plan.cut,
-            block,
-        )
+        step_seconds = seconds_per_step(config, facts, scene, block, batch)
+        spans = plan.boxes.high - plan.boxes.low
+        for z, rays in enumerate(plan.rays.tolist()):
+            rows.append(row(f"{z:02d}", plan.views_of(z), rays, spans[z], 2, step_seconds))
     if config.minutes is not None:
         limit = 60 * config.minutes / sum(r.seconds for r in rows)
         rows = [replace(r, seconds=r.seconds * min(1.0, limit)) for r in rows]
@@ -318,11 +305,6 @@ def seconds_per_step(config: TrainConfig, facts: Facts, scene: Scene, built: Bui
         result = loop.step(step, 0.0)
     result(0.0, 0.0)  # waits for the device
     return (time.perf_counter() - start) / _STEPS
-
-
-def _metric(span: torch.Tensor, plan: Plan) -> tuple[float, float, float]:
-    a, b, c = (float(v) / plan.space.scale for v in span)
-    return a, b, c
 
 
 def _feature_mib(scene: Scene, facts: Facts) -> float:

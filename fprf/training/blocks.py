@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from ..blocks.fields import BlockedField, BlockedSampler, BlockedSemantic, Held, Member, Members, inherit
 from ..blocks.plan import boxes_from, pixel_mask
-from ..blocks.routing import Chart, Everywhere, Inset, Router, chart_of, surroundings_of
+from ..blocks.routing import Everywhere, Inset, Router, chart_of, surroundings_of
 from ..config import RESUMABLE, TrainConfig
 from ..datamanagers.basis import Basis
 from ..datamanagers.scene import Scene
@@ -41,8 +41,8 @@ from ..rendering.renderer import Parts
 from ..types import Boxes
 from . import tensorfiles
 from .camera_optimizers import Poses, Tones
-from .checkpoint import reached
-from .model import Facts, Model, build_decoder, poses_of, tones_of
+from .checkpoint import misfit, reached
+from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of
 from .prepare import Prepared, build_encoders, cache_folder, scene_of
 from .run import Run, held
 from .trainer import Report, train
@@ -76,16 +76,6 @@ def folder_of(root: Path, block: int) -> Path:
     return root / "blocks" / ("surroundings" if block == SURROUNDINGS else f"{block:02d}")
 
 
-def member_of(config: TrainConfig, facts: Facts, chart: Chart) -> Member:
-    """Fields and sampler of a block at their seeded start."""
-    return Member(
-        chart,
-        config.sampler.build(seed=config.seed),
-        config.content.field.build(channels=facts.channels, seed=config.seed + 1),
-        config.semantic.field.build(channels=facts.dim, seed=config.seed + 2) if facts.dim else None,
-    )
-
-
 def assemble(
     config: TrainConfig,
     facts: Facts,
@@ -93,7 +83,7 @@ def assemble(
     router: Router,
     decoder: Decoder,
     tones: Tones | None,
-    poses: Poses | None = None,
+    poses: Poses | None,
 ) -> Model:
     """A model whose points are routed to members."""
     return Model(
@@ -112,7 +102,7 @@ def assemble(
 def surroundings(config: TrainConfig, facts: Facts, boxes: Boxes) -> Built:
     """The coarse scene that everything starts from. Raises PluginError where a part breaks its contract at once."""
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
-    member = member_of(config, facts, surroundings_of(boxes))
+    member = Member(surroundings_of(boxes), *build_fields(config, facts))
     model = assemble(config, facts, Held([member]), Everywhere(), decoder, tones_of(facts), poses_of(config, facts))
     check_parts(config, model.parts, facts.channels, facts.dim)
     return Built(model, member)
@@ -126,27 +116,29 @@ def inset(
     Poses start as theirs too, and are refined further from the `views` that the block learns from.
     """
     chart = chart_of(boxes, block)
-    member = member_of(config, facts, chart)
+    member = Member(chart, *build_fields(config, facts))
     inherit(member, around.member)
     decoder = copy.deepcopy(around.model.decoder).requires_grad_(False)
-    tones = copy.deepcopy(around.model.tones)
-    held = Held([member, copy.deepcopy(around.member)])
-    still = None if tones is None else tones.requires_grad_(False)
-    poses = around.model.poses
+    tones, poses = copy.deepcopy(around.model.tones), around.model.poses
+    if tones is not None:
+        tones.requires_grad_(False)
     if poses is not None:
         others = set(range(len(facts.centres))) - set([] if views is None else views.tolist())
         poses = poses.going_on(torch.tensor(facts.centres, dtype=torch.float64), tuple(sorted(others)))
-    return Built(assemble(config, facts, held, Inset(chart), decoder, still, poses), member)
+    members = Held([member, copy.deepcopy(around.member)])
+    return Built(assemble(config, facts, members, Inset(chart), decoder, tones, poses), member)
+
+
+def _kept(built: Built) -> dict[str, nn.Module]:
+    """Parts that stay when a block is finished, by their names in its file."""
+    model = built.model
+    parts = {"member": built.member, "decoder": model.decoder, "tones": model.tones, "poses": model.poses}
+    return {kind: part for kind, part in parts.items() if part is not None}
 
 
 def save_finished(folder: Path, built: Built, *, asked: dict[str, Any], step: int, seconds: float) -> None:
     """Write the kept member and the decoder, then that the block is done."""
-    tensors = {f"member.{name}": t for name, t in built.member.state_dict().items()}
-    tensors |= {f"decoder.{name}": t for name, t in built.model.decoder.state_dict().items()}
-    if built.model.tones is not None:
-        tensors |= {f"tones.{name}": t for name, t in built.model.tones.state_dict().items()}
-    if built.model.poses is not None:
-        tensors |= {f"poses.{name}": t for name, t in built.model.poses.state_dict().items()}
+    tensors = {f"{kind}.{name}": t for kind, part in _kept(built).items() for name, t in part.state_dict().items()}
     manifest = tensorfiles.save(folder / "block.safetensors", tensors)
     write_json(folder / "done.json", {"format": _FORMAT, "asked": asked, "step": step, "seconds": seconds, "tensors": manifest})
 
@@ -179,12 +171,16 @@ def load_finished(folder: Path, *, verify: bool = True) -> Finished:
 def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
     """Give a `member`, `decoder`, `tones` or `poses` its tensors of a finished block: mapped from the file, not copied."""
     own = {name.removeprefix(f"{kind}."): t for name, t in tensors.items() if name.startswith(f"{kind}.")}
-    now = module.state_dict()
-    wrong = [name for name, t in now.items() if name not in own or own[name].shape != t.shape]
-    wrong += [name for name in own if name not in now]
-    if wrong:
-        raise CheckpointError(f"block: {kind} {wrong[0]} does not fit the config; it was changed since the block was trained")
+    wrong = misfit(module, own)
+    if wrong is not None:
+        raise CheckpointError(f"block: {kind} {wrong} does not fit the config; it was changed since the block was trained")
     module.load_state_dict(own, assign=True)
+
+
+def restore_all(built: Built, tensors: dict[str, Tensor]) -> None:
+    """Give a member and the rest of its model the tensors of a finished block."""
+    for kind, part in _kept(built).items():
+        restore(part, kind, tensors)
 
 
 def load_boxes(root: Path) -> Boxes:
@@ -259,22 +255,22 @@ def train_block(task: BlockTask, report: Callable[[Report], None], begun: Callab
 
 def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callable[[Model], None]) -> bool:
     root = Path(task.root)
-    run = Run(root)
+    run, folder = Run(root), folder_of(root, task.block)
     config = run.load_config()[0].fields_only(root)
-    facts, boxes = run.load_known().facts, load_boxes(root)
-    folder = folder_of(root, task.block)
-    scene = scene_of(replace(config, data=Path(task.data)))
-    own = _scene_of(scene, folder)
-    asked = asked_of(config, facts, scene, boxes, task.block, tensorfiles.read(folder / RAYS))
+    facts, boxes, rays = run.load_known().facts, load_boxes(root), tensorfiles.read(folder / RAYS)
+    scene, views = scene_of(replace(config, data=Path(task.data))), rays["views"]
+    if len(views) and int(views.max()) >= len(scene.paths):
+        raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
+    asked = asked_of(config, facts, scene, boxes, task.block, rays)
     done = read_done(folder)
     if done is not None and done["asked"] == asked:
         return False
     config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
     _begin(folder, asked["task"])
-    manager = _manager(run, config, facts, own, folder)
-    built = built_block(root, config, facts, boxes, task.block, own.train)
+    own = replace(scene, train=views)
+    built = built_block(root, config, facts, boxes, task.block, views)
     block_run = Run(folder)
-    prepared, lead = Prepared(own, manager, facts, None), 0
+    prepared, lead = Prepared(own, _manager(run, config, facts, own, rays), facts, None), 0
     if task.block != SURROUNDINGS:
         lead = load_finished(folder_of(root, SURROUNDINGS), verify=False).step
         config = replace(config, optimizer=replace(config.optimizer, warm_up=min(config.optimizer.warm_up, WARM_UP)))
@@ -299,17 +295,8 @@ def _begin(folder: Path, task: str) -> None:
     write_json(mark, {"task": task})
 
 
-def _scene_of(scene: Scene, folder: Path) -> Scene:
-    """The scene with the training views that a block learns from."""
-    views = tensorfiles.read(folder / RAYS)["views"]
-    if len(views) and int(views.max()) >= len(scene.paths):
-        raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
-    return replace(scene, train=views)
-
-
-def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, folder: Path) -> DataManager:
+def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, rays: dict[str, Tensor]) -> DataManager:
     """The block's own batches: its views, its pixels, the whole scene's basis; features are in the cache."""
-    rays = tensorfiles.read(folder / RAYS)
     slots = {view: slot for slot, view in enumerate(rays["views"].tolist())}
 
     def seen(view: int) -> Tensor:
@@ -337,11 +324,6 @@ def built_block(root: Path, config: TrainConfig, facts: Facts, boxes: Boxes, blo
         return around
     finished = load_finished(folder_of(root, SURROUNDINGS)).tensors
     own = {name: tensor.clone() for name, tensor in finished.items()}  # training writes to them, the file stays
-    restore(around.member, "member", own)
-    restore(around.model.decoder, "decoder", own)
-    if around.model.tones is not None:
-        restore(around.model.tones, "tones", own)
-    if around.model.poses is not None:
-        restore(around.model.poses, "poses", own)
+    restore_all(around, own)
     around.member.requires_grad_(True)
     return inset(config, facts, boxes, block, around, views)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
 from ..io.atomic import remove_unfinished, write_json
@@ -88,38 +88,26 @@ def tidy(root: Path) -> None:
 
 def load(root: Path, step: int, *, verify: bool = True) -> Saved:
     """One checkpoint. Its tensors are mapped from files: only to `verify` them they are read. Raises CheckpointError."""
-    folder = _folder(root, step)
-    try:
-        manifest = _read(folder / "manifest.json")
-        at, seconds = int(manifest["step"]), float(manifest["seconds"])
-        entries = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as e:
-        raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
-    if at != step or not math.isfinite(seconds):
-        raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
-    files = [(folder / f"{name}.safetensors", entries[name]) for name in entries]
-    model, optimizer = (tensorfiles.load(*each) if verify else tensorfiles.read(each[0]) for each in files)
-    return Saved(at, seconds, model, optimizer)
+    folder, manifest = _folder(root, step), _read(root, step)
+    files = {name: (folder / f"{name}.safetensors", entries) for name, entries in manifest.files.items()}
+    model, optimizer = (
+        tensorfiles.load(*files[name]) if verify else tensorfiles.read(files[name][0]) for name in ("model", "optimizer")
+    )
+    return Saved(step, manifest.seconds, model, optimizer)
 
 
 def reached(root: Path) -> tuple[int, float]:
     """Step and seconds of the newest checkpoint, (0, 0) without one. Raises CheckpointError."""
     kept = steps(root)
-    if not kept:
-        return 0, 0.0
-    manifest = _folder(root, kept[-1]) / "manifest.json"
-    try:
-        return kept[-1], float(_read(manifest)["seconds"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:
-        raise CheckpointError(f"{manifest}: cannot be read ({e!r})") from e
+    return (kept[-1], _read(root, kept[-1]).seconds) if kept else (0, 0.0)
 
 
 def digest(root: Path) -> str:
     """Return a short key of the tensors in the newest checkpoint's manifest; empty without one."""
     kept = steps(root)
     try:
-        return f"{_checksum(_read(_folder(root, kept[-1]) / 'manifest.json')):08x}" if kept else ""
-    except (OSError, ValueError):
+        return f"{_read(root, kept[-1]).checksum:08x}" if kept else ""
+    except CheckpointError:
         return ""
 
 
@@ -127,12 +115,26 @@ def _checksum(manifest: dict[str, Any]) -> int:
     return zlib.crc32(json.dumps(manifest, sort_keys=True).encode())
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """A manifest, checked; those of before had no checksum of their own. Raises ValueError among others."""
-    manifest: dict[str, Any] = json.loads(path.read_text())
-    if manifest.pop("crc32", None) not in (None, _checksum(manifest)):
-        raise ValueError("its checksum differs")
-    return manifest
+class _Manifest(NamedTuple):
+    seconds: float
+    files: dict[str, dict[str, Any]]
+    checksum: int
+
+
+def _read(root: Path, step: int) -> _Manifest:
+    """A manifest, checked; those of before had no checksum of their own. Raises CheckpointError."""
+    folder = _folder(root, step)
+    try:
+        manifest: dict[str, Any] = json.loads((folder / "manifest.json").read_text())
+        if manifest.pop("crc32", None) not in (None, checksum := _checksum(manifest)):
+            raise ValueError("its checksum differs")
+        at, seconds = int(manifest["step"]), float(manifest["seconds"])
+        files = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as e:
+        raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
+    if at != step or not math.isfinite(seconds):
+        raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
+    return _Manifest(seconds, files, checksum)
 
 
 def load_latest(root: Path, *, verify: bool = True) -> tuple[Saved | None, list[str]]:
@@ -148,13 +150,19 @@ def load_latest(root: Path, *, verify: bool = True) -> tuple[Saved | None, list[
     return None, damaged
 
 
+def misfit(module: nn.Module, tensors: Mapping[str, Tensor]) -> str | None:
+    """Name of a tensor that is absent, of another shape, or not the module's; None where all are those of its state."""
+    own = module.state_dict()
+    wrong = [name for name in own if name not in tensors or own[name].shape != tensors[name].shape]
+    wrong += [name for name in tensors if name not in own]
+    return wrong[0] if wrong else None
+
+
 def restore(saved: Saved, model: Model, optimizer: torch.optim.Optimizer | None) -> None:
     """Put a checkpoint into a model and its optimiser. Raises CheckpointError where they are of another config."""
-    own = model.state_dict()
-    wrong = [n for n in own if n not in saved.model or own[n].shape != saved.model[n].shape]
-    wrong += [n for n in saved.model if n not in own]
-    if wrong:
-        raise CheckpointError(f"checkpoint of step {saved.step}: {wrong[0]} does not fit the config; it was changed since")
+    wrong = misfit(model, saved.model)
+    if wrong is not None:
+        raise CheckpointError(f"checkpoint of step {saved.step}: {wrong} does not fit the config; it was changed since")
     model.load_state_dict(saved.model)
     if optimizer is None:
         return

@@ -2,7 +2,6 @@
 
 import copy
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Generic, NamedTuple, TypeVar
@@ -25,7 +24,7 @@ from ..style.references import Encoders
 from ..style.scene import SceneStyle, from_tensors
 from ..types import Boxes, View
 from . import checkpoint
-from .blocks import SURROUNDINGS, assemble, folder_of, load_boxes, load_finished, read_done, restore, surroundings
+from .blocks import SURROUNDINGS, assemble, folder_of, load_boxes, load_finished, read_done, restore, restore_all, surroundings
 from .model import Model, build_model
 from .prepare import device_of
 from .quality import QualityConfig, at_quality
@@ -44,18 +43,13 @@ class Shelf(Members):
         *,
         device: torch.device,
         limit: int | None,
-        told: Callable[[int], None] = lambda block: None,
     ) -> None:
-        self._root, self._boxes, self._around = root, boxes, around
-        self._device, self._told = device, told
+        self._root, self._boxes, self._device = root, boxes, device
+        self.held = (around,)
         self._here: OrderedDict[int, Member] = OrderedDict()
         self._verified: set[int] = set()
         size = sum(t.numel() * t.element_size() for t in around.state_dict().values())
         self._room = None if limit is None else max(1, limit // size - 1)
-
-    @property
-    def held(self) -> Sequence[Member]:
-        return (self._around,)
 
     @property
     def here(self) -> tuple[int, ...]:
@@ -65,7 +59,7 @@ class Shelf(Members):
     def member(self, number: int) -> Member:
         """A block by its number; the surroundings come after the last one. Raises CheckpointError for a missing block."""
         if number == len(self._boxes.low):
-            return self._around
+            return self.held[0]
         if number in self._here:
             self._here.move_to_end(number)
             return self._here[number]
@@ -75,8 +69,7 @@ class Shelf(Members):
         return member
 
     def _fetch(self, number: int) -> Member:
-        self._told(number)
-        member = copy.deepcopy(self._around)
+        member = copy.deepcopy(self.held[0])
         member.chart = chart_of(self._boxes, number)
         finished = load_finished(folder_of(self._root, number), verify=number not in self._verified)
         restore(member, "member", finished.tensors)
@@ -240,24 +233,19 @@ def _load_blocks(
     boxes, facts = load_boxes(run.root), known.facts
     around = surroundings(config, facts, boxes)
     finished = load_finished(folder_of(run.root, SURROUNDINGS))
-    restore(around.member, "member", finished.tensors)
-    restore(around.model.decoder, "decoder", finished.tensors)
-    if around.model.tones is not None:
-        restore(around.model.tones, "tones", finished.tensors)
-    if around.model.poses is not None:
-        restore(around.model.poses, "poses", finished.tensors)
+    restore_all(around, finished.tensors)
     limit = None if max_memory is None else int(max_memory * _MIB)
     shelf = Shelf(run.root, boxes, around.member.to(device), device=device, limit=limit)
     model = assemble(config, facts, shelf, Blend(boxes), around.model.decoder, around.model.tones, around.model.poses)
     model.requires_grad_(False)
-    done = [read_done(folder_of(run.root, block)) for block in range(len(boxes.low))]
-    steps = [int(each["step"]) for each in done if each is not None]
-    seconds = finished.seconds + sum(float(each["seconds"]) for each in done if each is not None)
-    if len(steps) < len(done):
+    blocks = [read_done(folder_of(run.root, block)) for block in range(len(boxes.low))]
+    done = [each for each in blocks if each is not None]
+    if len(done) < len(blocks):
         again = f"fprf train {run.root / 'config.json'}"
         raise CheckpointError(
-            f"{run.root}: {len(done) - len(steps)} of {len(done)} blocks are not finished; go on with `{again}`"
+            f"{run.root}: {len(blocks) - len(done)} of {len(blocks)} blocks are not finished; go on with `{again}`"
         )
+    steps, seconds = [int(each["step"]) for each in done], finished.seconds + sum(float(each["seconds"]) for each in done)
     return Trained(run, config, method, _where_refined(known, model), model.to(device).eval(), min(steps), seconds)
 
 

@@ -7,9 +7,10 @@ from typing import Annotated
 import torch
 from torch import Tensor, nn
 
+from ..blocks.fields import add_penalties
 from ..config import TrainConfig
 from ..errors import WeightsError
-from ..interfaces import Decoder
+from ..interfaces import ContentField, Decoder, Sampler, SemanticField
 from ..plugins.decoders.config import pretrain_line
 from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
@@ -87,11 +88,8 @@ class Model(nn.Module):
 
     def penalties(self) -> dict[str, Tensor]:
         """Regularisers of all parts by name; those of one name are added up."""
-        terms = self.field.penalties()
-        for part in (self.sampler, self.semantic):
-            for name, value in (part.penalties() if part is not None else {}).items():
-                terms = {**terms, name: terms[name] + value if name in terms else value}
-        return terms
+        parts = (self.field, self.sampler, self.semantic)
+        return add_penalties(part.penalties() for part in parts if part is not None)
 
     @cached_property
     def penalty_names(self) -> frozenset[str]:
@@ -117,19 +115,21 @@ def poses_of(config: TrainConfig, facts: Facts) -> Poses | None:
     return Poses(torch.tensor(facts.centres, dtype=torch.float64), facts.held, reach=facts.reach, pace=config.poses)
 
 
+def build_fields(config: TrainConfig, facts: Facts) -> tuple[Sampler, ContentField, SemanticField | None]:
+    """Sampler, content and semantic field at their seeded start."""
+    return (
+        config.sampler.build(seed=config.seed),
+        config.content.field.build(channels=facts.channels, seed=config.seed + 1),
+        config.semantic.field.build(channels=facts.dim, seed=config.seed + 2) if facts.dim else None,
+    )
+
+
 def build_model(config: TrainConfig, facts: Facts) -> Model:
     """The model at its seeded start.
 
     Raises WeightsError where no decoder fits the content encoder, PluginError where a part breaks its contract at once.
     """
     decoder = build_decoder(config, encoder=facts.content_encoder, channels=facts.channels)
-    semantic = config.semantic.field.build(channels=facts.dim, seed=config.seed + 2) if facts.dim else None
-    parts = Parts(
-        facts.space,
-        config.sampler.build(seed=config.seed),
-        config.content.field.build(channels=facts.channels, seed=config.seed + 1),
-        semantic,
-        decoder,
-    )
+    parts = Parts(facts.space, *build_fields(config, facts), decoder)
     check_parts(config, parts, facts.channels, facts.dim)
     return Model(parts, tones_of(facts), poses_of(config, facts))

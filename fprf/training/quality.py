@@ -123,6 +123,7 @@ def mixed_tone(tones: "Tones | None", known: "Known", texts: tuple[str, ...]) ->
 
 def _resampled(trained: "Trained", samples: float) -> "Trained":
     from ..blocks.fields import BlockedSampler
+    from .checkpoint import misfit
     from .model import Model
 
     old = trained.model.sampler
@@ -131,17 +132,12 @@ def _resampled(trained: "Trained", samples: float) -> "Trained":
     except NotImplementedError:  # a plug-in that does not say
         raise PluginError(f"samples: {type(trained.config.sampler).__name__} does not scale; leave --samples at 1") from None
     sampler = scaled.build(seed=trained.config.seed)
-    if trained.known.facts.space.kind == "open":  # what proposes lies in the blocks
-        assert isinstance(old, BlockedSampler)
-        routed = BlockedSampler(sampler, old.members, old.router).requires_grad_(False)
-        parts = trained.model.parts._replace(sampler=routed.to(trained.model.device))
-        model = Model(parts, trained.model.tones)
-        return replace(trained, config=replace(trained.config, sampler=scaled), model=model.eval())
-    state, own = old.state_dict(), sampler.state_dict()
-    if state.keys() != own.keys() or any(state[name].shape != own[name].shape for name in own):
+    if isinstance(old, BlockedSampler):  # what proposes lies in the blocks
+        sampler = BlockedSampler(sampler, old.members, old.router)
+    elif misfit(sampler, state := old.state_dict()) is None:
+        sampler.load_state_dict(state)
+    else:
         raise UsageError("samples: this run's sampler has learnt for its own number of samples; leave --samples at 1")
-    sampler.load_state_dict(state)
-    sampler.requires_grad_(False)
-    parts = trained.model.parts._replace(sampler=sampler.to(trained.model.device))
+    parts = trained.model.parts._replace(sampler=sampler.requires_grad_(False).to(trained.model.device))
     model = Model(parts, trained.model.tones)
     return replace(trained, config=replace(trained.config, sampler=scaled), model=model.eval())

@@ -27,37 +27,31 @@ def _checksum(tensor: Tensor) -> int:
     return zlib.crc32(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().data)
 
 
-def _entries(plain: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:
-    return {
+def save(path: Path, tensors: Mapping[str, Tensor], *, sealed: bool = False) -> dict[str, dict[str, Any]]:
+    """Write the tensors; the answer holds checksum and finiteness of each, and so does the file where it is `sealed`.
+
+    Raises DataError, with what is needed and what is free, where the system refuses.
+    """
+    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    entries = {
         name: {"crc32": _checksum(t), "finite": bool(torch.isfinite(t).all()) if t.is_floating_point() else True}
         for name, t in plain.items()
     }
-
-
-def _write(path: Path, plain: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Raises DataError, with what is needed and what is free, where the system refuses."""
     with atomic_path(path) as temporary:
         try:
-            safetensors.torch.save_file(plain, temporary, metadata)
+            safetensors.torch.save_file(plain, temporary, {_MANIFEST: json.dumps(entries)} if sealed else None)
         except SafetensorError as error:
             match = _SYSTEM.search(str(error))
             if match is None:
                 raise
             needed = sum(t.nbytes for t in plain.values())
             raise unwritable(path, OSError(int(match[1]), str(error)), needed) from error
-
-
-def save(path: Path, tensors: Mapping[str, Tensor]) -> dict[str, dict[str, Any]]:
-    """Write the tensors; the answer holds checksum and finiteness of each. Raises DataError where the system refuses."""
-    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    _write(path, plain)
-    return _entries(plain)
+    return entries
 
 
 def save_sealed(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """Write the tensors with their own manifest inside. Raises DataError where the system refuses."""
-    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    _write(path, plain, {_MANIFEST: json.dumps(_entries(plain))})
+    save(path, tensors, sealed=True)
 
 
 def load_sealed(path: Path) -> dict[str, Tensor]:

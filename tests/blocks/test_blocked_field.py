@@ -45,15 +45,11 @@ class Counting(Members):
     """Members that remember who was asked for."""
 
     def __init__(self, inner: Sequence[Member]) -> None:
-        self.inner, self.asked = inner, set[int]()
+        self.inner, self.held, self.asked = inner, inner[-1:], set[int]()
 
     def member(self, number: int) -> Member:
         self.asked.add(number)
         return self.inner[number]
-
-    @property
-    def held(self) -> Sequence[Member]:
-        return self.inner[-1:]
 
 
 def points_of(boxes: Boxes, count: int) -> Tensor:

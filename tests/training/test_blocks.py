@@ -18,7 +18,8 @@ from block_world import BlockWorld, block_flags, digests, done_of, small, steps_
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fprf.blocks.plan import boxes_from, boxes_to
+from fprf.blocks.fields import Member
+from fprf.blocks.plan import boxes_from, boxes_to, pixel_mask
 from fprf.cli.train import train_scene
 from fprf.errors import CheckpointError, DataError
 from fprf.fields.layouts import AdaptiveConfig, SingleConfig, StreetConfig
@@ -86,10 +87,9 @@ def test_each_block_knows_its_views_and_tiles(block_world: BlockWorld) -> None:
         assert torch.equal(rays["views"], plan.views_of(block))
         counted = 0
         for view, seen in zip(rays["views"].tolist(), rays["seen"], strict=True):
-            mask = plan.mask(block, view, (32, 24))
             at = int((plan.views == view).nonzero()[0, 0])
             assert torch.equal(seen.bool(), plan.seen[at, block])
-            counted += int(mask.sum())
+            counted += int(pixel_mask(seen.bool(), (32, 24)).sum())
         assert counted == document["rays"][block]
     around = tensorfiles.read(block_world.root / "blocks/surroundings/rays.safetensors")
     assert torch.equal(around["views"], scene.train) and bool(around["seen"].bool().all())
@@ -191,14 +191,13 @@ def test_cut_off_anywhere_the_next_call_finishes_it(before: list[str], order: li
 _MIB = 1 << 20
 
 
-def shelf_of(root: Path, limit: int | None, told: list[int] | None = None) -> Shelf:
+def shelf_of(root: Path, limit: int | None) -> Shelf:
     run = Run(root)
     config, _ = run.load_config()
     boxes = load_boxes(root)
     around = surroundings(config, run.load_known().facts, boxes).member
     restore(around, "member", load_finished(folder_of(root, SURROUNDINGS)).tensors)
-    note = (lambda block: None) if told is None else told.append
-    return Shelf(root, boxes, around, device=torch.device("cpu"), limit=limit, told=note)
+    return Shelf(root, boxes, around, device=torch.device("cpu"), limit=limit)
 
 
 def size_of(root: Path) -> int:
@@ -207,20 +206,16 @@ def size_of(root: Path) -> int:
 
 
 def test_the_least_recently_used_goes_first(block_world: BlockWorld) -> None:
-    told: list[int] = []
     room = 2
-    shelf = shelf_of(block_world.root, (room + 1) * size_of(block_world.root), told)
-    kept: list[int] = []
-    fetched = []
+    shelf = shelf_of(block_world.root, (room + 1) * size_of(block_world.root))
+    kept: dict[int, Member] = {}
     for block in (0, 1, 0, 2, 1, 0, 0, 2, 1, 2):
-        if block in kept:
-            kept.remove(block)
-        else:
-            fetched.append(block)
-        kept = [*kept, block][-room:]
-        shelf.member(block)
-        assert list(shelf.here) == kept
-    assert told == fetched
+        old, found = kept.pop(block, None), shelf.member(block)
+        assert old is None or found is old, "what is at hand is not fetched again"
+        kept[block] = found
+        if len(kept) > room:
+            kept.pop(next(iter(kept)))
+        assert shelf.here == tuple(kept)
 
 
 def test_pictures_do_not_depend_on_the_limit(block_world: BlockWorld) -> None:
