@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-from ..errors import ConfigError
+
 from ..interfaces import ContentField, SemanticField
 from ..ops import dense, march, triplane, triplane_numba
 from ..types import FieldSample
@@ -63,18 +63,8 @@ def weights(network: nn.Sequential) -> list[Tensor]:
     return [layer.weight for layer in network if isinstance(layer, nn.Linear)]
 
 
-MAX_DEGREE = 4
-
-
-def count(degree: int) -> int:
-    """Number of functions of a degree: its square. Raises ConfigError outside 1..4."""
-    if not 1 <= degree <= MAX_DEGREE:
-        raise ConfigError(f"degree: {degree} must lie in [1, {MAX_DEGREE}]")
-    return degree * degree
-
-
 def harmonics(view: Annotated[Tensor, "N 3"], degree: int) -> Annotated[Tensor, "N degree**2"]:
-    """Values at unit directions."""
+    """Values of the spherical harmonics below a degree, 1 to 4, at unit directions."""
     x, y, z = view.unbind(-1)
     columns = [torch.full_like(x, 0.28209479177387814)]
     if degree > 1:
@@ -136,7 +126,7 @@ class PlanesField(ContentField):
         self.degree = config.degree
         self.planes = Planes(config.resolutions, config.channels, generator=generator)
         self.to_density = linear(self.planes.out, 1, generator=generator)
-        inputs = self.planes.out + count(config.degree)
+        inputs = self.planes.out + config.degree**2
         self.to_content = mlp(inputs, config.hidden, config.layers, channels, generator=generator)
         # Decoders expect features of about their training scale; zero start would stall behind a frozen decoder.
         self.offset = nn.Parameter(torch.zeros(channels))

@@ -1,4 +1,4 @@
-"""Scenes without images: cameras over a plane or along a path, and points that they see."""
+"""Scenes without images: cameras over a plane or along a path, and points that they see; rows of blocks."""
 
 import math
 from pathlib import Path
@@ -6,9 +6,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from fprf.blocks.routing import surroundings_of
 from fprf.datamanagers.scene import Scene
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
+from fprf.types import Boxes
 
 
 def cameras_at(position: Tensor, ahead: Tensor, upright: Tensor, size: tuple[int, int] = (64, 48)) -> Cameras:
@@ -56,3 +58,15 @@ def drone(side: float = 90.0, rows: int = 7, height: float = 30.0, points: int =
     ground = torch.rand(points, 3, dtype=torch.float64, generator=draw) * torch.tensor([side + 20, side + 20, 4.0]).double()
     ground[:, :2] -= 10
     return scene_of(cameras_at(position, ahead, north), ground)
+
+
+def boxes_in_a_row(count: int, margin: float = 0.3) -> Boxes:
+    low = torch.tensor([[2.0 * i, -1.0, 0.0] for i in range(count)], dtype=torch.float64)
+    return Boxes(low, low + torch.tensor([2.0, 2.0, 1.5]), torch.eye(3, dtype=torch.float64).expand(count, 3, 3), margin)
+
+
+def points_around(boxes: Boxes, count: int, seed: int = 5) -> Tensor:
+    """Uniform in the bounds of all blocks, widened by 1."""
+    whole = surroundings_of(boxes)
+    draw = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return (whole.low - 1 + draw * (whole.high - whole.low + 2)).float()

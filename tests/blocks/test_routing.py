@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from block_scenes import boxes_in_a_row as row
+from block_scenes import points_around
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
@@ -11,12 +13,6 @@ from torch import Tensor
 
 from fprf.blocks.routing import Blend, Group, chart_of, local, shares, surroundings_of, window
 from fprf.types import Boxes
-
-
-def row(count: int, margin: float = 0.3) -> Boxes:
-    low = torch.tensor([[2.0 * i, -1.0, 0.0] for i in range(count)], dtype=torch.float64)
-    high = torch.tensor([[2.0 * i + 2, 1.0, 1.5] for i in range(count)], dtype=torch.float64)
-    return Boxes(low, high, torch.eye(3, dtype=torch.float64).expand(count, 3, 3), margin)
 
 
 def ring(count: int) -> Boxes:
@@ -47,16 +43,10 @@ def dense(groups: list[Group], points: int, members: int) -> torch.Tensor:
     return weight
 
 
-def spread(boxes: Boxes, count: int, seed: int) -> torch.Tensor:
-    whole = surroundings_of(boxes)
-    draw = torch.rand(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return (whole.low - 1 + draw * (whole.high - whole.low + 2)).float()
-
-
 @settings(max_examples=5, deadline=None)
 @given(st.sampled_from([row(1), row(4), row(3, 0.9), ring(7), ring(16)]), st.integers(0, 2**31 - 1))
 def test_blending_is_what_the_windows_say(boxes: Boxes, seed: int) -> None:
-    points = spread(boxes, 400, seed)
+    points = points_around(boxes, 400, seed)
     groups = Blend(boxes)(points)
     assert sorted(torch.cat([g.at for g in groups]).tolist()) == list(range(400)), "each point in one group"
     found, wanted = dense(groups, 400, len(boxes.low) + 1), shares(points, boxes).double()
