@@ -16,6 +16,7 @@ from fprf.fields.layouts import LayoutConfig, StreetConfig
 from fprf.methods import fprf_lite
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.town.write import write_town
+from fprf.training import tensorfiles
 
 VIEWS, STEPS = 12, 6
 BLOCKS = StreetConfig(segments=3)
@@ -59,17 +60,6 @@ def small(town: Path, output: Path, blocks: LayoutConfig = BLOCKS, steps: int = 
     )
 
 
-def block_flags(town: Path, output: Path, steps: int = STEPS) -> list[str]:
-    """`small` on the command line, from the method `fprf-lite`."""
-    words = f"""--data {town} --output {output} --downscale 1 --steps {steps} --device cpu --blocks street --blocks.segments 3
-        --datamanager.rays 128 --datamanager.semantic-share 0.5 --sampler.samples 12 --sampler.final 8
-        --sampler.resolutions 8 --sampler.anneal-steps 4 --content.field.resolutions 8 --content.field.channels 8
-        --content.field.hidden 16 --content.field.layers 1 --semantic.field.resolutions 8 --semantic.field.channels 8
-        --semantic.field.hidden 16 --semantic.field.layers 1 --semantic.dim 8 --loss.penalty-every 2
-        --optimizer.warm-up 2 --statistics.rays 512 --statistics.regions 3"""
-    return words.split()
-
-
 def made(folder: Path) -> TrainConfig:
     """Train it in `folder / "run"`."""
     config = small(town_in(folder), folder / "run")
@@ -79,8 +69,6 @@ def made(folder: Path) -> TrainConfig:
 
 def tensors_of(root: Path, name: str) -> dict[str, torch.Tensor]:
     """The finished tensors of a block."""
-    from fprf.training import tensorfiles
-
     return {k: t.clone() for k, t in tensorfiles.read(root / "blocks" / name / "block.safetensors").items()}
 
 

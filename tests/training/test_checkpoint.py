@@ -33,18 +33,16 @@ def root(world: World, tmp_path: Path) -> Path:
 
 def test_everything_comes_back(world: World, tmp_path: Path) -> None:
     model, optimizer = fresh(world)
-    folder = checkpoint.save(tmp_path, model, optimizer, step=3, seconds=1.5)
-    assert sorted(p.name for p in folder.iterdir()) == ["manifest.json", "model.safetensors", "optimizer.safetensors"]
+    assert checkpoint.reached(tmp_path) == (0, 0.0) and not checkpoint.digest(tmp_path)
+    checkpoint.save(tmp_path, model, optimizer, step=3, seconds=1.5)
     saved, damaged = checkpoint.load_latest(tmp_path)
-    assert saved is not None and not damaged and (saved.step, saved.seconds) == (3, 1.5)
+    assert saved is not None and not damaged
+    assert (saved.step, saved.seconds) == checkpoint.reached(tmp_path) == (3, 1.5) and checkpoint.digest(tmp_path)
     other = build_model(world.config, world.prepared.facts)
     again = torch.optim.Adam(other.learned(), lr=1e-3, fused=True)
     checkpoint.restore(saved, other, again)
-    for (name, a), b in zip(model.state_dict().items(), other.state_dict().values(), strict=True):
-        assert torch.equal(a, b), name
-    for index, moments in optimizer.state_dict()["state"].items():
-        for key, value in moments.items():
-            assert torch.equal(value, again.state_dict()["state"][index][key]), (index, key)
+    torch.testing.assert_close(other.state_dict(), model.state_dict(), atol=0, rtol=0)
+    torch.testing.assert_close(again.state_dict(), optimizer.state_dict(), atol=0, rtol=0)
 
 
 def test_a_past_that_was_gone_back_from_is_dropped(world: World, root: Path) -> None:
@@ -54,31 +52,22 @@ def test_a_past_that_was_gone_back_from_is_dropped(world: World, root: Path) -> 
     assert checkpoint.steps(root) == [5, 7]
 
 
-def test_tidying_removes_what_was_cut_short_and_nothing_else(root: Path) -> None:
+def test_what_was_cut_short_does_not_count_and_tidying_removes_nothing_else(root: Path) -> None:
+    """A kill between the tensors and the manifest leaves files without one."""
     whole = {p: p.read_bytes() for p in root.rglob("*") if p.is_file()}
-    cut = root / "step-0000020"
+    cut, mine = root / "step-0000020", root / "step-by-step" / "manifest.json"
     shutil.copytree(root / "step-0000009", cut)
     (cut / "manifest.json").unlink()
     for name in (".model.0123abcd.safetensors", ".tmpAb12Cd"):
         (root / "step-0000009" / name).write_bytes(b"cut")
-    mine = root / "step-by-step" / "notes.txt"
     mine.parent.mkdir()
     mine.write_text("mine")
-    checkpoint.tidy(root)
-    assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == whole | {mine: b"mine"} and not cut.exists()
-    checkpoint.tidy(root / "absent")
-
-
-def test_what_was_cut_short_does_not_count(root: Path) -> None:
-    """A kill between the tensors and the manifest leaves files without one."""
-    cut = root / "step-0000020"
-    shutil.copytree(root / "step-0000009", cut)
-    (cut / "manifest.json").unlink()
-    (root / "step-soon").mkdir()
-    (root / "step-soon" / "manifest.json").write_text("{}")
     saved, damaged = checkpoint.load_latest(root)
     assert saved is not None and saved.step == 9 and not damaged
     assert checkpoint.steps(root) == [5, 9]
+    checkpoint.tidy(root)
+    assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == whole | {mine: b"mine"} and not cut.exists()
+    checkpoint.tidy(root / "absent")
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "optimizer.safetensors", "manifest.json"])
@@ -115,8 +104,7 @@ def test_no_harm_to_a_manifest_is_more_than_damage(root: Path, data: st.DataObje
 
 def test_parameters_that_are_not_finite_are_not_resumed_from(world: World, root: Path) -> None:
     model, optimizer = fresh(world)
-    with torch.no_grad():
-        model.learned()[0].view(-1)[0] = float("nan")
+    model.learned()[0].detach().view(-1)[0] = float("nan")
     checkpoint.save(root, model, optimizer, step=12, seconds=0.0)
     saved, damaged = checkpoint.load_latest(root)
     assert saved is not None and saved.step == 9 and "was not finite when saved" in damaged[0]
@@ -126,11 +114,11 @@ def test_a_checkpoint_of_another_config_is_refused(world: World, root: Path) -> 
     saved, _ = checkpoint.load_latest(root)
     assert saved is not None
     model, _ = fresh(world)
-    name = next(iter(saved.model))
+    name, *others = saved.model
     for tensors in (
-        {k: v for k, v in saved.model.items() if k != name},
+        {other: saved.model[other] for other in others},
         saved.model | {name: torch.zeros(3)},
         saved.model | {"extra": torch.zeros(3)},
     ):
-        with pytest.raises(CheckpointError, match="does not fit the config; it was changed since"):
+        with pytest.raises(CheckpointError):
             checkpoint.restore(saved._replace(model=tensors), model, None)

@@ -12,17 +12,15 @@ from fprf.cli.train import train_scene
 from fprf.config import IncompleteConfig
 from fprf.errors import CheckpointError, UsageError
 from fprf.training.loading import load_run
-from fprf.training.views import render_view
 
 
 @pytest.fixture
 def moved(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The run on a stranger's machine: another place, no images, no cache."""
     shutil.copytree(world.run, tmp_path / "elsewhere" / "run")
-    scene = tmp_path / "elsewhere" / "run" / "scene.json"
-    scene.write_text(scene.read_text().replace(str(world.town), "/nowhere/at/all"))
-    config = tmp_path / "elsewhere" / "run" / "config.json"
-    config.write_text(config.read_text().replace(str(world.town), "/nowhere/at/all"))
+    for name in ("scene.json", "config.json"):
+        file = tmp_path / "elsewhere" / "run" / name
+        file.write_text(file.read_text().replace(str(world.town), "/nowhere/at/all"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "no-cache"))
     monkeypatch.chdir(tmp_path)
     return Path("elsewhere/run")
@@ -33,7 +31,7 @@ def test_a_moved_run_renders_the_same_bits(world: World, moved: Path) -> None:
     assert there.method == "fprf-lite" and there.step == 15 and there.seconds > 0 and there.damaged == ()
     assert there.known.data == "/nowhere/at/all"
     for v in there.known.test:
-        a, b = (render_view(t.model, t.known.facts, t.known.cameras, v, t.config.render) for t in (here, there))
+        a, b = (trained.render(trained.cameras, v) for trained in (here, there))
         assert torch.equal(a.rgb, b.rgb) and torch.equal(a.depth, b.depth)
 
 
@@ -41,8 +39,7 @@ def test_rendering_needs_no_encoder(moved: Path) -> None:
     path = moved / "config.json"
     path.write_text(path.read_text().replace('"bundled-content"', '"gone-content"').replace('"bundled-semantic"', '"gone"'))
     trained = load_run(moved)
-    view = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render)
-    assert bool(view.rgb.isfinite().all())
+    assert bool(trained.render(trained.cameras, 0).rgb.isfinite().all())
 
 
 def test_a_damaged_newest_checkpoint_is_stepped_over_and_named(world: World, moved: Path) -> None:
@@ -77,7 +74,6 @@ def test_a_run_of_a_method_with_fields_of_its_own(world: World, moved: Path, tmp
             train_scene(replace(config, knob=8, output=moved), "acme", quiet=True)  # type: ignore[call-arg]
     there = load_run(moved)
     assert isinstance(there.config, IncompleteConfig) and there.method == "acme"
-    a, b = (render_view(t.model, t.known.facts, t.known.cameras, 0, t.config.render) for t in (trained, there))
-    assert torch.equal(a.rgb, b.rgb)
+    assert torch.equal(trained.render(trained.cameras, 0).rgb, there.render(there.cameras, 0).rgb)
     there.run.save_config(there.config, there.method)
     assert (moved / "config.json").read_text() == saved

@@ -1,5 +1,6 @@
 """Quality presets, reduced resolution and the light of a view at render time."""
 
+import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,11 +17,10 @@ from fprf.training.camera_optimizers import Tones
 from fprf.training.loading import Trained
 from fprf.training.model import Model
 from fprf.training.quality import PRESETS, QualityConfig, at_quality
-from fprf.training.views import cache_view, render_view
 
 
 def picture(trained: Trained) -> torch.Tensor:
-    return render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render).rgb
+    return trained.render(trained.known.cameras, 0).rgb
 
 
 def test_trained_parameters_are_kept_and_the_first_model_is_not_touched(world: World) -> None:
@@ -33,17 +33,17 @@ def test_trained_parameters_are_kept_and_the_first_model_is_not_touched(world: W
     assert not torch.equal(picture(finer), before) and torch.equal(picture(trained), before)
 
 
-def test_a_sampler_that_does_not_scale(world: World) -> None:
+def test_samplers_that_do_not_scale_or_that_learn_for_their_number_of_samples(world: World) -> None:
     trained = world.load()
-    config = replace(trained.config, sampler=SamplerConfig())
-    with pytest.raises(PluginError, match=r"samples: SamplerConfig does not scale; leave --samples at 1"):
-        at_quality(replace(trained, config=config), QualityConfig(quality="best"))
-    assert at_quality(replace(trained, config=config), QualityConfig(quality="standard")).model is trained.model
+    learning = ProposalConfig(samples=(16,), final=8, resolutions=(4,))
+    for sampler, error in ((SamplerConfig(), PluginError), (learning, UsageError)):
+        other = replace(trained, config=replace(trained.config, sampler=sampler))
+        with pytest.raises(error):
+            at_quality(other, QualityConfig(quality="best"))
+        assert at_quality(other, QualityConfig(quality="standard")).model is trained.model
 
 
 def test_eval_takes_it(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import json
-
     shutil.copytree(world.run, tmp_path / "run")
     kept = {}
     for name in (None, *PRESETS):
@@ -57,11 +57,11 @@ def test_eval_takes_it(world: World, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--quality great: it takes draft or standard or best" in capsys.readouterr().err
 
 
-def test_a_reduced_view_is_the_small_oneenlarged(world: World) -> None:
+def test_a_reduced_view_is_the_small_one_enlarged(world: World) -> None:
     trained = world.load()
-    known, render = trained.known, trained.config.render
-    whole, half = (render_view(trained.model, known.facts, known.cameras, 2, replace(render, resolution=r)) for r in (1.0, 0.5))
-    small = render_view(trained.model, known.facts, known.cameras.scaled(2), 2, render)
+    known = trained.known
+    whole, half = (trained.render(known.cameras, 2, resolution=resolution) for resolution in (1.0, 0.5))
+    small = trained.render(known.cameras.scaled(2), 2)
     assert half.rgb.shape == whole.rgb.shape and half.depth.shape == whole.depth.shape == half.opacity.shape
     assert float(half.rgb.min()) >= 0 and float(half.rgb.max()) <= 1
     assert {*half.depth.flatten().tolist()} == {*small.depth.flatten().tolist()}, "no depth that nobody measured"
@@ -82,9 +82,8 @@ def lit(world: World) -> Trained:
 
 def shown(trained: Trained, *tone: str) -> tuple[torch.Tensor, torch.Tensor]:
     chosen = at_quality(trained, QualityConfig(tone=tone))
-    known, render = chosen.known, chosen.config.render
-    view = (chosen.model, known.facts, known.cameras, known.test[0], render)
-    return render_view(*view).rgb, cache_view(*view).restyled().rgb
+    view = chosen.known.cameras, chosen.known.test[0]
+    return chosen.render(*view).rgb, chosen.cached(*view).restyled().rgb
 
 
 def factors(trained: Trained, views: Sequence[int]) -> torch.Tensor:
@@ -109,13 +108,6 @@ def test_between_two_views_means_of_logarithms_are_taken(world: World) -> None:
     for texts, share in (((str(a), str(b)), 0.5), ((f"{a}=1", f"{b}=3"), 0.25), ((f"{a}=0.5", f"{b}=0"), 1.0)):
         wanted = plain * (share * log[0] + (1 - share) * log[1]).exp()
         torch.testing.assert_close(shown(trained, *texts)[0], wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)
-
-
-def test_a_sampler_that_learns_for_its_number_of_samples(world: World) -> None:
-    trained = world.load()
-    config = replace(trained.config, sampler=ProposalConfig(samples=(16,), final=8, resolutions=(4,)))
-    with pytest.raises(UsageError):
-        at_quality(replace(trained, config=config), QualityConfig(samples=2.0))
 
 
 @pytest.mark.parametrize("tone", ["nowhere", "0=x", "99", "1=-2", "0", "1=0"])

@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
+from fprf.config import TrainConfig
 from fprf.rendering.cameras import Cameras, rays_through
 from fprf.rendering.renderer import march
-from fprf.style.scene import from_tensors
+from fprf.style.scene import SceneStyle, from_tensors
+from fprf.training.run import Run
 from fprf.training.style_pass import lattice, measure_style
 
 SIZES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=5)
@@ -42,21 +44,21 @@ def test_the_lattice_covers_every_view_by_its_share(sizes: list[tuple[int, int]]
         assert abs(int((view == one).sum()) - count * pixels / int(area.sum())) <= 1
 
 
+def measured(world: World, config: TrainConfig) -> SceneStyle:
+    scene = world.prepared.scene
+    return measure_style(config, world.load().model, scene.cameras, scene.train)
+
+
 def test_statistics_do_not_depend_on_the_chunk(world: World) -> None:
-    trained, scene = world.load(), world.prepared.scene
     whole, small = (
-        measure_style(
-            replace(world.config, render=replace(world.config.render, chunk=chunk)), trained.model, scene.cameras, scene.train
-        )
-        for chunk in (4096, 97)
+        measured(world, replace(world.config, render=replace(world.config.render, chunk=chunk))) for chunk in (4096, 97)
     )
-    for name, a, b in zip(whole._fields, whole, small, strict=True):
-        assert torch.allclose(a, b, rtol=1e-4, atol=1e-5), name
+    torch.testing.assert_close(whole, small, rtol=1e-4, atol=1e-5)
 
 
 def test_statistics_are_those_of_the_kept_samples(world: World) -> None:
     trained, scene = world.load(), world.prepared.scene
-    style = measure_style(world.config, trained.model, scene.cameras, scene.train)
+    style = measured(world, world.config)
     view, pixel = lattice(scene.cameras, scene.train, world.config.statistics.rays)
     with torch.inference_mode():
         rays = trained.model.space.rays(*rays_through(scene.cameras, view, pixel))
@@ -70,13 +72,10 @@ def test_statistics_are_those_of_the_kept_samples(world: World) -> None:
 
 
 def test_regions_share_out_the_scene(world: World) -> None:
-    trained, scene = world.load(), world.prepared.scene
-    style = measure_style(world.config, trained.model, scene.cameras, scene.train)
+    style, saved = measured(world, world.config), from_tensors(Run(world.run).load_tensors("style"))
     assert 1 <= len(style.share) <= world.config.statistics.regions
     assert float(style.share.sum()) == pytest.approx(1, abs=1e-5)
-    assert all(torch.equal(a, b) for a, b in zip(style, from_tensors(trained.run.load_tensors("style")), strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(style, saved, strict=True))
     assert torch.allclose(style.contacts, style.contacts.T) and 0 < float(style.contacts.sum()) < 1
-    one = measure_style(
-        replace(world.config, statistics=replace(world.config.statistics, regions=1)), trained.model, scene.cameras, scene.train
-    )
+    one = measured(world, replace(world.config, statistics=replace(world.config.statistics, regions=1)))
     assert len(one.share) == 1 and torch.allclose(one.mean, style.mean)

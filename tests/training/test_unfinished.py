@@ -10,7 +10,6 @@ from tiny_world import World
 from fprf.errors import CheckpointError
 from fprf.training.loading import load_run, load_style
 from fprf.training.unfinished import UnfinishedFields
-from fprf.training.views import render_view
 
 
 @pytest.fixture
@@ -27,15 +26,14 @@ def test_a_run_that_has_just_begun_renders_and_with_its_parameters_is_the_run(wo
     unfinished, last = UnfinishedFields(fresh, "cpu"), world.load()
     trained = unfinished.trained
     assert not trained.model.training and not any(p.requires_grad for p in trained.model.parameters())
-    facts, cameras, config = trained.known.facts, trained.known.cameras, trained.config.render
-    start = render_view(trained.model, facts, cameras, 0, config).rgb
+    start = trained.render(trained.cameras, 0).rgb
     assert unfinished.scene(last.model.state_dict()) is trained
-    end = render_view(trained.model, facts, cameras, 0, config).rgb
-    assert torch.equal(end, render_view(last.model, facts, cameras, 0, config).rgb) and not torch.equal(start, end)
+    end = trained.render(trained.cameras, 0).rgb
+    assert torch.equal(end, last.render(last.cameras, 0).rgb) and not torch.equal(start, end)
 
 
 def test_parameters_of_another_config_are_refused(fresh: Path) -> None:
-    with pytest.raises(CheckpointError, match="not those of its config"):
+    with pytest.raises(CheckpointError):
         UnfinishedFields(fresh, "cpu").scene({"x": torch.zeros(3)})
 
 
