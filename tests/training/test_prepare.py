@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
-from fprf.datamanagers.scene import Scene
 from fprf.errors import PluginError, UsageError
 from fprf.methods import fprf, fprf_lite
 from fprf.training.model import build_model
@@ -53,32 +52,22 @@ def test_tones_are_learnt_where_exposures_differ(world: World) -> None:
     evenly = replace(scene, exposure=torch.full((len(scene.paths),), 3.0, dtype=torch.float64))
     unevenly = replace(scene, exposure=torch.linspace(1.0, 4.0, len(scene.paths), dtype=torch.float64))
 
-    def learnt(tones: bool | None, scene: Scene) -> bool:
-        return bool(exposure_of(tones, scene, image))
-
-    assert [learnt(None, each) for each in (scene, evenly, unevenly)] == [False, False, True]
-    assert [learnt(own, each) for own in (True, False) for each in (evenly, unevenly)] == [True, True, False, False]
+    for tones, expected in ((None, [False, False, True]), (True, [True] * 3), (False, [False] * 3)):
+        assert [bool(exposure_of(tones, each, image)) for each in (scene, evenly, unevenly)] == expected
     saved = replace(world.prepared.facts, exposure=(0.0,) * len(scene.paths))
     for facts in (saved, world.prepared.facts):
         assert exposure_of(world.config.tones, unevenly, image, facts) == facts.exposure
 
 
 def test_the_start_is_a_function_of_the_seed(world: World) -> None:
-    facts = world.prepared.facts
-    torch.manual_seed(1)
-    first = build_model(world.config, facts).state_dict()
-    torch.manual_seed(2)
-    second = build_model(world.config, facts).state_dict()
-    other = build_model(replace(world.config, seed=1), facts).state_dict()
-    assert first.keys() == second.keys() == other.keys()
-    assert all(torch.equal(first[name], second[name]) for name in first)
+    """And its parts draw independently."""
+    first, second, other = (
+        build_model(replace(world.config, seed=seed), world.prepared.facts).state_dict() for seed in (0, 0, 1)
+    )
+    torch.testing.assert_close(first, second, atol=0, rtol=0)
     moved = {name for name in first if not torch.equal(first[name], other[name])}
     assert moved == {name for name in first if not name.startswith("decoder.")} - {"field.offset"}, "that one starts at 0"
-
-
-def test_the_parts_draw_independently(world: World) -> None:
-    model = build_model(world.config, world.prepared.facts)
-    tables = [value.flatten()[:8] for name, value in model.state_dict().items() if name.endswith("planes.table")]
+    tables = [value.flatten()[:8] for name, value in first.items() if name.endswith("planes.table")]
     assert len(tables) == 3
     assert not any(torch.equal(a, b) for i, a in enumerate(tables) for b in tables[:i])
 
@@ -103,10 +92,8 @@ def test_photographs_are_reduced_as_far_as_docs_say() -> None:
 def test_more_time_and_fewer_images_never_reduce_further(side: int, views: int, minutes: float, more: float, gpu: bool) -> None:
     device = "cuda" if gpu else "cpu"
     found = factor(side, side, views, minutes, device)
-    assert (
-        factor(side, side, views, minutes * more, device) <= found
-        and factor(side, side, max(1, views // 2), minutes, device) <= found
-    )
+    assert factor(side, side, views, minutes * more, device) <= found
+    assert factor(side, side, max(1, views // 2), minutes, device) <= found
     assert factor(max(1, side // 2), side, views, minutes, device) <= found
     least = (1e6 if gpu else 0.2e6) / 4
     assert found == 1 or side * side / found**2 > least / 2.25
@@ -142,13 +129,9 @@ def test_hours_are_told_once_from_the_first_steps() -> None:
     slow = Forecast(fprf(), "fprf", "cpu")
     assert slow(event(1, 100.0)) == "" and slow(event(2, 103.0)) == "", "the first step compiles"
     assert "30,000 steps at 3 s a step take 25 hours" in slow(event(3, 106.0)) and slow(event(9, 124.0)) == ""
-    quick = (
-        Forecast(fprf_lite(), "fprf-lite", "cpu"),
-        Forecast(replace(fprf(), minutes=9), "fprf", "cpu"),
-        Forecast(fprf(), "fprf", "cuda"),
-    )
-    for each, pace in zip(quick, (0.1, 3.0, 3.0), strict=True):
-        assert not any(each(event(step, 5 + pace * step)) for step in range(1, 200))
+    for config, device, pace in ((fprf_lite(), "cpu", 0.1), (replace(fprf(), minutes=9), "cpu", 3.0), (fprf(), "cuda", 3.0)):
+        quick = Forecast(config, "fprf", device)
+        assert not any(quick(event(step, 5 + pace * step)) for step in range(1, 200))
 
 
 @pytest.mark.parametrize("name", ["gpu", "", "cuda:99"])
