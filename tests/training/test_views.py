@@ -20,15 +20,21 @@ from fprf.style.look import Restyle
 from fprf.style.match_maps import match_map
 from fprf.style.restyle import restyle
 from fprf.style.scene import own_style
-from fprf.training.loading import load_style
-from fprf.training.views import cache_view, render_view, view_parts
+from fprf.training.loading import Trained, load_style
+from fprf.training.views import view_parts
 
 STYLIZERS = (IdentityConfig(), AdainConfig(), LocalAdainConfig(), RegionAdainConfig(), RegionOtConfig())
 
 
+def rendering(world: World, **fields: object) -> Trained:
+    """The run with other fields of its render config."""
+    trained = world.load()
+    return replace(trained, config=replace(trained.config, render=replace(trained.config.render, **fields)))  # type: ignore[arg-type]
+
+
 def test_a_view_is_an_image_with_metres(world: World) -> None:
     trained = world.load()
-    view = render_view(trained.model, trained.known.facts, trained.known.cameras, 3, trained.config.render)
+    view = trained.render(trained.cameras, 3)
     assert view.rgb.shape == (24, 32, 3) and view.depth.shape == view.opacity.shape == (24, 32)
     assert float(view.rgb.min()) >= 0 and float(view.rgb.max()) <= 1 and bool(view.rgb.isfinite().all())
     assert bool((view.depth > 0).all()) and bool(((view.opacity >= 0) & (view.opacity <= 1)).all())
@@ -36,11 +42,7 @@ def test_a_view_is_an_image_with_metres(world: World) -> None:
 
 
 def test_a_view_does_not_depend_on_the_chunk(world: World) -> None:
-    trained = world.load()
-    views = [
-        render_view(trained.model, trained.known.facts, trained.known.cameras, 1, replace(trained.config.render, chunk=chunk))
-        for chunk in (8192, 100, 7)
-    ]
+    views = [rendering(world, chunk=chunk).render(world.load().cameras, 1) for chunk in (8192, 100, 7)]
     for other in views[1:]:
         assert torch.allclose(views[0].rgb, other.rgb, atol=1e-5)
         assert torch.allclose(views[0].depth, other.depth, rtol=1e-4)
@@ -51,10 +53,7 @@ def test_strength_0_is_the_plain_render_bit_for_bit(world: World, stylizer: Styl
     trained = world.load()
     styled = restyle(trained, world.references, stylizer, strength=0.0)
     for v in trained.known.test:
-        plain, same = (
-            render_view(trained.model, trained.known.facts, trained.known.cameras, v, trained.config.render, how)
-            for how in (None, styled.restyle)
-        )
+        plain, same = trained.render(trained.cameras, v), trained.restyled(styled.restyle).render(trained.cameras, v)
         assert torch.equal(plain.rgb, same.rgb) and torch.equal(plain.depth, same.depth)
 
 
@@ -63,19 +62,16 @@ def test_the_scenes_own_style_returns_the_render(world: World, stylizer: Stylize
     """Identity: 40 dB is promised; on this model 99 dB (differences of one rounding) were measured for all three."""
     trained = world.load()
     scene, _ = load_style(trained.run)
-    how = Restyle(stylizer.build(dictionary=own_style(scene), scene=scene))
+    own = trained.restyled(Restyle(stylizer.build(dictionary=own_style(scene), scene=scene)))
     for v in trained.known.split("all"):
-        plain = render_view(trained.model, trained.known.facts, trained.known.cameras, v, trained.config.render)
-        again = render_view(trained.model, trained.known.facts, trained.known.cameras, v, trained.config.render, how)
-        assert psnr(plain.rgb, again.rgb) >= 40
+        assert psnr(trained.render(trained.cameras, v).rgb, own.render(trained.cameras, v).rgb) >= 40
 
 
 @pytest.mark.parametrize("stylizer", STYLIZERS[1:], ids=lambda s: type(s).__name__)
 def test_a_foreign_style_changes_colour_and_nothing_else(world: World, stylizer: StylizerConfig) -> None:
     trained = world.load()
     styled = restyle(trained, world.references, stylizer)
-    plain = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render)
-    other = render_view(trained.model, trained.known.facts, trained.known.cameras, 0, trained.config.render, styled.restyle)
+    plain, other = trained.render(trained.cameras, 0), trained.restyled(styled.restyle).render(trained.cameras, 0)
     assert psnr(plain.rgb, other.rgb) < 40
     assert torch.equal(plain.depth, other.depth) and torch.equal(plain.opacity, other.opacity) and plain.kept == other.kept
 
@@ -87,16 +83,9 @@ def test_matches_are_shares_of_the_codes(world: World, stylizer: StylizerConfig)
     match = match_map(trained, styled, 0).taken
     assert match.shape == (24, 32, len(styled.dictionary.keys)) and float(match.min()) >= 0
     assert torch.allclose(match.sum(-1), torch.ones(24, 32), atol=1e-4)
-
-
-def test_empty_space_matches_nothing(world: World) -> None:
-    trained = world.load()
-    styled = restyle(trained, world.references, RegionOtConfig())
     with torch.no_grad():
-        weight = trained.model.get_parameter("field.to_density.weight")
-        weight.fill_(-1e6)
-    match = match_map(trained, styled, 0).taken
-    assert float(match.abs().max()) == 0
+        trained.model.get_parameter("field.to_density.weight").fill_(-1e6)
+    assert not match_map(trained, styled, 0).taken.any(), "empty space matches nothing"
 
 
 @pytest.mark.parametrize(
@@ -105,23 +94,21 @@ def test_empty_space_matches_nothing(world: World) -> None:
     ids=lambda given: type(given).__name__ if isinstance(given, StylizerConfig) else None,
 )
 def test_a_restyle_is_the_restyled_render(world: World, stylizer: StylizerConfig, strength: float, chunk: int) -> None:
-    trained = world.load()
-    config, known = replace(trained.config.render, chunk=chunk), trained.known
-    cached = cache_view(trained.model, known.facts, known.cameras, 2, config)
+    trained = rendering(world, chunk=chunk)
+    cached = trained.cached(trained.cameras, 2)
     look = restyle(trained, world.references, stylizer, strength=strength, clusters=3).restyle
     for style in (None, look, None):
-        found, wanted = cached.restyled(style), render_view(trained.model, known.facts, known.cameras, 2, config, style)
-        assert torch.equal(found.rgb, wanted.rgb)
-        assert torch.equal(found.depth, wanted.depth) and torch.equal(found.opacity, wanted.opacity)
-        assert found.kept == wanted.kept
+        found, wanted = cached.restyled(style), trained.restyled(style).render(trained.cameras, 2)
+        torch.testing.assert_close(found, wanted, atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("budget", [0.0, 0.2])
 def test_budget_and_background_hold(world: World, budget: float) -> None:
-    trained = world.load()
-    facts, render = replace(trained.known.facts, background=(1.0, 0.0, 0.5)), replace(trained.config.render, budget=budget)
-    cached = cache_view(trained.model, facts, trained.known.cameras, 1, render)
-    assert torch.equal(cached.restyled().rgb, render_view(trained.model, facts, trained.known.cameras, 1, render).rgb)
+    trained = rendering(world, budget=budget)
+    facts = replace(trained.known.facts, background=(1.0, 0.0, 0.5))
+    trained = replace(trained, known=replace(trained.known, facts=facts))
+    cached = trained.cached(trained.cameras, 1)
+    assert torch.equal(cached.restyled().rgb, trained.render(trained.cameras, 1).rgb)
     assert sum(part.rays for part in cached.parts) == 32 * 24
     per_sample = 4 * (1 + 48 + trained.known.facts.dim) + 8
     kept = sum(len(part.kept.ray) for part in cached.parts)
@@ -129,10 +116,10 @@ def test_budget_and_background_hold(world: World, budget: float) -> None:
 
 
 def test_chunk_by_chunk_nothing_is_computed_ahead_and_means_are_those_of_match_maps(world: World) -> None:
-    trained = world.load()
-    known, config = trained.known, replace(trained.config.render, chunk=100)
+    trained = rendering(world, chunk=100)
+    known = trained.known
     stylizer = restyle(trained, world.references, RegionOtConfig(), clusters=3).restyle.stylizer
-    parts = view_parts(trained.model, known.facts, known.cameras, 2, config)
+    parts = view_parts(trained.model, known.facts, known.cameras, 2, trained.config.render)
     first = next(parts)
     assert first.rays == 100 and first.semantic is not None
     wanted, _ = trained.paint(known.cameras, 2, pixel_grid(known.cameras, 2)[:100], lambda y, _: stylizer.match(y))

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -26,50 +25,47 @@ STYLIZERS = (AdainConfig(colours=0.5), LocalAdainConfig(similarity="dot"), Regio
 PLACES: tuple[tuple[str, Callable[[], Any]], ...] = (("cpu", backend.plain), (str(CUDA), pretend_cuda))
 
 
-class Here:
-    """The tiny world on a device with its encoders and a dictionary, made once."""
-
-    def __init__(self, world: World, device: str) -> None:
-        self.trained: Trained = load_run(world.run, device)
-        self.encoders: Encoders = self.trained.encoders()
-        read = [encode_photograph(path, self.encoders, name=path.name) for path in world.references]
-        assert all(part.device == torch.device(device) for r in read for part in (r.content, r.semantic, r.colour))
-        self.dictionary: StyleDictionary = build_dictionary(read, clusters=3, seed=0)
-        self.paths = world.references
+Made = tuple[Trained, Encoders, StyleDictionary]
 
 
 @pytest.fixture(scope="module")
-def _made() -> dict[str, Here]:
+def _made() -> dict[str, Made]:
     return {}
 
 
-def here(world: World, made: dict[str, Here], device: str) -> Here:
-    """Within the device's own rules."""
+def shown(world: World, made: dict[str, Made], device: str, stylizer: StylizerConfig) -> list[torch.Tensor]:
+    """The tables of a style, and what a view shows in it: rendered, from a cached view, as a match map.
+
+    Within the device's own rules; its run, encoders and dictionary are made once.
+    """
     if device not in made:
-        made[device] = Here(world, device)
-    return made[device]
+        trained = load_run(world.run, device)
+        encoders = trained.encoders()
+        read = [encode_photograph(path, encoders, name=path.name) for path in world.references]
+        assert all(part.device == torch.device(device) for r in read for part in (r.content, r.semantic, r.colour))
+        made[device] = trained, encoders, build_dictionary(read, clusters=3, seed=0)
+    trained, encoders, dictionary = made[device]
+    style = StyleConfig(references=world.references, stylizer=stylizer, keep=("0",), strength=0.8, luminance=0.2)
+    styled = dress(trained, StyleFile(style), encoders, dictionary)
+    view = trained.restyled(styled.restyle).render(trained.cameras, 3)
+    again = trained.cached(trained.cameras, 3).restyled(styled.restyle)
+    return [*dictionary[:6], *view[:3], again.rgb, *match_map(trained, styled, 3)]
 
 
-def shown(at: Here, stylizer: StylizerConfig, references: tuple[Path, ...]) -> list[torch.Tensor]:
-    """What a view shows in a look: rendered, from a cached view, as a match map; and what is kept of it."""
-    trained, facts = at.trained, at.trained.known.facts
-    cameras, config = trained.known.cameras, trained.config.render
-    style = StyleConfig(references=references, stylizer=stylizer, keep=("0",), strength=0.8, luminance=0.2)
-    styled = dress(trained, StyleFile(style), at.encoders, at.dictionary)
-    view = render_view(trained.model, facts, cameras, 3, config, styled.restyle)
-    again = cache_view(trained.model, facts, cameras, 3, config).restyled(styled.restyle)
-    return [*view[:3], again.rgb, *match_map(trained, styled, 3)]
-
-
-@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda config: type(config).__name__)
-def test_every_stylizer(world: World, _made: dict[str, Here], stylizer: StylizerConfig) -> None:
+@pytest.mark.parametrize(
+    ("other", "stylizer"),
+    [*((PLACES[1], each) for each in STYLIZERS), (("mps:0", lambda: pretend_cuda(mps=True)), RegionToneConfig())],
+    ids=lambda given: type(given).__name__ if isinstance(given, StylizerConfig) else given[0],
+)
+def test_every_stylizer(
+    world: World, _made: dict[str, Made], other: tuple[str, Callable[[], Any]], stylizer: StylizerConfig
+) -> None:
+    """Also on a device without float64."""
     found = []
-    for device, within in PLACES:
+    for device, within in (PLACES[0], other):
         with within():
-            found.append(shown(here(world, _made, device), stylizer, world.references))
+            found.append(shown(world, _made, device, stylizer))
     assert all(torch.equal(a, b) and b.device.type == "cpu" for a, b in zip(*found, strict=True))
-    ours, theirs = (_made[device].dictionary for device, _ in PLACES)
-    assert all(torch.equal(a, b) for a, b in zip(ours[:6], theirs[:6], strict=True)), "tables lie on the CPU"
 
 
 def test_a_frame_is_one_copy_whatever_its_chunks(world: World) -> None:
@@ -95,21 +91,11 @@ def test_a_frame_is_one_copy_whatever_its_chunks(world: World) -> None:
     assert torch.equal(*pictures)
 
 
-def test_a_device_without_float64(world: World, _made: dict[str, Here]) -> None:
-    found = []
-    for device, within in (PLACES[0], ("mps:0", lambda: pretend_cuda(mps=True))):
-        with within():
-            found.append(shown(here(world, _made, device), RegionToneConfig(), world.references))
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-
-
 def test_blocks_of_a_large_scene(block_world: BlockWorld) -> None:
     found = []
     for device, within in PLACES:
         with within():
             trained = load_run(block_world.root, device, max_memory=1.0)
-            view = render_view(trained.model, trained.known.facts, trained.known.cameras, 2, trained.config.render)
-            found.append(view[:3])
+            found.append(trained.render(trained.cameras, 2)[:3])
     # Off the CPU points are turned into a block without a matrix product: sums of three, in another order.
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(*found, rtol=1e-5, atol=1e-5)
