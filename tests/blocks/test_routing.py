@@ -15,20 +15,15 @@ from fprf.blocks.routing import Blend, Group, chart_of, local, shares, surroundi
 from fprf.types import Boxes
 
 
+def turned(angle: float) -> Tensor:
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
 def ring(count: int) -> Boxes:
     """Turned boxes around a circle."""
-    angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
-    zero, one = torch.zeros_like(angle), torch.ones_like(angle)
-    turn = torch.stack(
-        [
-            torch.stack([-angle.sin(), angle.cos(), zero], 1),
-            torch.stack([-angle.cos(), -angle.sin(), zero], 1),
-            torch.stack([zero, zero, one], 1),
-        ],
-        1,
-    )
-    centre = 5 * torch.stack([angle.cos(), angle.sin(), zero], 1)
-    middle = (turn @ centre[:, :, None])[:, :, 0]
+    turn = torch.stack([turned(2 * math.pi * k / count) for k in range(count)])
+    middle = torch.tensor([[0.0, -5.0, 0.0]], dtype=torch.float64).repeat(count, 1)
     half = torch.tensor([5 * math.pi / count, 1.0, 1.0], dtype=torch.float64)
     return Boxes(middle - half, middle + half, turn, 0.25)
 
@@ -90,11 +85,6 @@ def test_surroundings_hold_everything_and_blocks_fill_their_inner_half() -> None
 def grid(columns: int, rows: int, margin: float = 0.2, side: float = 1.0) -> Boxes:
     low = torch.tensor([[side * i, side * j, 0.0] for i in range(columns) for j in range(rows)], dtype=torch.float64)
     return Boxes(low, low + side, torch.eye(3, dtype=torch.float64).expand(len(low), 3, 3), margin)
-
-
-def turned(angle: float) -> Tensor:
-    c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 def bend() -> Boxes:

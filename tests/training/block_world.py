@@ -7,18 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tiny_world import tiny
 
 from fprf.cli.train import train_scene
-from fprf.config import StatisticsConfig, TrainConfig
-from fprf.datamanagers.config import RayBatchesConfig
-from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
+from fprf.config import TrainConfig
 from fprf.fields.layouts import LayoutConfig, StreetConfig
-from fprf.methods import fprf_lite
-from fprf.plugins.samplers.config import ProposalConfig
 from fprf.town.write import write_town
 from fprf.training import tensorfiles
 
-VIEWS, STEPS = 12, 6
+STEPS = 6
 BLOCKS = StreetConfig(segments=3)
 
 
@@ -34,35 +31,15 @@ class BlockWorld:
         return self.folder / "run"
 
 
-def town_in(folder: Path) -> Path:
-    town = folder / "town"
-    write_town(town, seed=0, palette="day", views=VIEWS, width=32, height=24)
-    return town
-
-
 def small(town: Path, output: Path, blocks: LayoutConfig = BLOCKS, steps: int = STEPS) -> TrainConfig:
-    lite = fprf_lite()
-    return replace(
-        lite,
-        data=town,
-        output=output,
-        downscale=1,
-        steps=steps,
-        device="cpu",
-        blocks=blocks,
-        datamanager=RayBatchesConfig(rays=128, semantic_share=0.5),
-        sampler=ProposalConfig(samples=(12,), final=8, resolutions=(8,), anneal_steps=4),
-        content=replace(lite.content, field=PlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1)),
-        semantic=replace(lite.semantic, field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=8),
-        loss=replace(lite.loss, penalty_every=2),
-        optimizer=replace(lite.optimizer, warm_up=2),
-        statistics=StatisticsConfig(rays=512, regions=3),
-    )
+    return replace(tiny(town, output), blocks=blocks, steps=steps)
 
 
 def made(folder: Path) -> TrainConfig:
     """Train it in `folder / "run"`."""
-    config = small(town_in(folder), folder / "run")
+    town = folder / "town"
+    write_town(town, seed=0, palette="day", views=12, width=32, height=24)
+    config = small(town, folder / "run")
     train_scene(config, "fprf-lite", quiet=True)
     return config
 

@@ -299,12 +299,17 @@ def test_two_workers_on_a_block_the_second_is_told_and_changes_nothing(block_wor
     assert not (root / "blocks/01/.lock").exists()
 
 
-def test_another_task_in_the_folder_starts_anew(block_world: BlockWorld, tmp_path: Path) -> None:
-    root = copy_of(block_world, tmp_path)
-    config, method = Run(root).load_config()
-    Run(root).save_config(replace(config, seed=5), method)
+@pytest.mark.parametrize("other", ["seed", "images"])
+def test_another_task_in_the_folder_starts_anew(block_world: BlockWorld, tmp_path: Path, other: str) -> None:
+    root, town = copy_of(block_world, tmp_path), tmp_path / "town"
+    shutil.copytree(block_world.config.data or "", town)
+    if other == "seed":
+        config, method = Run(root).load_config()
+        Run(root).save_config(replace(config, seed=5), method)
+    else:
+        shutil.copy(town / "images/0004.png", town / "images/0003.png")
     (root / "blocks/00/events.jsonl").write_text('{"step": 99}\n')
-    assert train_block(task(block_world, root, 0), lambda event: None)
+    assert train_block(replace(task(block_world, root, 0), data=str(town)), lambda event: None)
     assert not same(root, block_world.root, "00")
     assert done_of(root, "00")["step"] == 6 and not (root / "blocks/00/events.jsonl").exists()
 
@@ -334,19 +339,6 @@ def test_another_cut_trains_only_the_blocks_that_it_concerns(block_world: BlockW
     assert len([one for one in second.values() if one in first.values()]) == 3
     assert first["01"] == second["02"]
     load_run(root, "cpu")
-
-
-def test_a_block_whose_images_changed_is_trained_again(block_world: BlockWorld, tmp_path: Path) -> None:
-    from fprf.datamanagers.images import load_image
-    from fprf.io.images import write_image
-
-    root, town = copy_of(block_world, tmp_path), tmp_path / "town"
-    shutil.copytree(block_world.config.data, town)
-    picture = town / "images/0003.png"
-    write_image(picture, 255 - load_image(picture))
-    moved = replace(task(block_world, root, 0), data=str(town))
-    assert train_block(moved, lambda event: None)
-    assert not same(root, block_world.root, "00")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,28 +85,22 @@ def shown(trained: Trained, *tone: str) -> tuple[torch.Tensor, torch.Tensor]:
     return chosen.render(*view).rgb, chosen.cached(*view).restyled().rgb
 
 
-def factors(trained: Trained, views: Sequence[int]) -> torch.Tensor:
+def test_colours_are_multiplied_by_a_view_s_light_or_the_mean_of_logarithms_of_several(world: World) -> None:
+    trained = lit(world)
     assert trained.model.tones is not None
-    return trained.model.tones(torch.tensor(list(views))).detach()
-
-
-def test_a_view_s_light_multiplies_colours(world: World) -> None:
-    trained = lit(world)
-    view = trained.known.train[2]
-    plain, _ = shown(trained)
-    for text in (trained.known.names[view], str(view), f"{view}=7"):
-        for image in shown(trained, text):
-            torch.testing.assert_close(image, (plain * factors(trained, [view])[0]).clamp(0, 1), atol=1e-6, rtol=1e-5)
-
-
-def test_between_two_views_means_of_logarithms_are_taken(world: World) -> None:
-    trained = lit(world)
     a, b = trained.known.train[:2]
-    plain, _ = shown(trained)
-    log = factors(trained, (a, b)).log()
-    for texts, share in (((str(a), str(b)), 0.5), ((f"{a}=1", f"{b}=3"), 0.25), ((f"{a}=0.5", f"{b}=0"), 1.0)):
-        wanted = plain * (share * log[0] + (1 - share) * log[1]).exp()
-        torch.testing.assert_close(shown(trained, *texts)[0], wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)
+    log = trained.model.tones(torch.tensor([a, b])).detach().log()
+    for texts, share in (
+        ((trained.known.names[a],), 1.0),
+        ((str(b),), 0.0),
+        ((f"{a}=7",), 1.0),
+        ((str(a), str(b)), 0.5),
+        ((f"{a}=1", f"{b}=3"), 0.25),
+        ((f"{a}=0.5", f"{b}=0"), 1.0),
+    ):
+        wanted = shown(trained)[0] * (share * log[0] + (1 - share) * log[1]).exp()
+        for image in shown(trained, *texts):
+            torch.testing.assert_close(image, wanted.clamp(0, 1), atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("tone", ["nowhere", "0=x", "99", "1=-2", "0", "1=0"])
