@@ -1,6 +1,7 @@
 """A town of twelve small pictures in three blocks of a few thousand numbers each, trained for six steps."""
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from fprf.config import TrainConfig
 from fprf.fields.layouts import LayoutConfig, StreetConfig
 from fprf.town.write import write_town
 from fprf.training import tensorfiles
+from fprf.training.blocks import folder_of
 
 STEPS = 6
 BLOCKS = StreetConfig(segments=3)
@@ -62,3 +64,11 @@ def done_of(root: Path, name: str) -> dict[str, Any]:
 def steps_of(root: Path, name: str) -> list[int]:
     """Steps that events.jsonl of a block speaks of."""
     return [json.loads(line)["step"] for line in (root / "blocks" / name / "events.jsonl").read_text().splitlines()]
+
+
+def unfinish(root: Path, block: int) -> Path:
+    """The folder of a block, as it was before its first step."""
+    folder = folder_of(root, block)
+    shutil.rmtree(folder / "checkpoints")
+    (folder / "done.json").unlink()
+    return folder

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from block_world import BlockWorld, digests, done_of, small, steps_of, tensors_of
+from block_world import BlockWorld, digests, done_of, small, steps_of, tensors_of, unfinish
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -84,15 +84,11 @@ def test_each_block_knows_its_views_and_tiles(block_world: BlockWorld) -> None:
     document = json.loads((block_world.root / "blocks.json").read_text())
     assert document["rays"] == plan.rays.tolist() and len(document["rays"]) == 3
     for block in range(3):
-        rays = tensorfiles.read(block_world.root / f"blocks/{block:02d}/rays.safetensors")
+        rays = tensorfiles.read(folder_of(block_world.root, block) / RAYS)
         assert torch.equal(rays["views"], plan.views_of(block))
-        counted = 0
-        for view, seen in zip(rays["views"].tolist(), rays["seen"], strict=True):
-            at = int((plan.views == view).nonzero()[0, 0])
-            assert torch.equal(seen.bool(), plan.seen[at, block])
-            counted += int(pixel_mask(seen.bool(), (32, 24)).sum())
-        assert counted == document["rays"][block]
-    around = tensorfiles.read(block_world.root / "blocks/surroundings/rays.safetensors")
+        assert torch.equal(rays["seen"].bool(), plan.seen[torch.isin(plan.views, rays["views"]), block])
+        assert sum(int(pixel_mask(seen.bool(), (32, 24)).sum()) for seen in rays["seen"]) == document["rays"][block]
+    around = tensorfiles.read(folder_of(block_world.root, SURROUNDINGS) / RAYS)
     assert torch.equal(around["views"], scene.train) and bool(around["seen"].bool().all())
 
 
@@ -108,17 +104,15 @@ def test_the_cut_comes_back_from_its_file(block_world: BlockWorld, tmp_path: Pat
 
 
 def test_what_makes_it_another_task_and_what_does_not(block_world: BlockWorld) -> None:
-    base, block = block_world.config, 1
-    was = asked(block_world, block)
-    assert was == asked(block_world, block, steps=99, minutes=3.0, checkpoint_minutes=1.0, device="auto")
-    digests = {
-        asked(block_world, block),
-        asked(block_world, block, seed=1),
-        asked(block_world, block, optimizer=replace(base.optimizer, rate=1e-3)),
-        asked(block_world, block, content=replace(base.content, moves_density=True)),
-        asked(block_world, block, loss=replace(base.loss, rgb=2.0)),
-    }
-    assert len(digests) == 5 and was in digests
+    base, was = block_world.config, asked(block_world, 1)
+    assert was == asked(block_world, 1, steps=99, minutes=3.0, checkpoint_minutes=1.0, device="auto")
+    others: list[dict[str, Any]] = [
+        {"seed": 1},
+        {"optimizer": replace(base.optimizer, rate=1e-3)},
+        {"content": replace(base.content, moves_density=True)},
+        {"loss": replace(base.loss, rgb=2.0)},
+    ]
+    assert len({was, *(asked(block_world, 1, **other) for other in others)}) == 5
 
 
 def test_one_block_has_no_surroundings(block_world: BlockWorld) -> None:
@@ -224,14 +218,6 @@ def task(world: BlockWorld, root: Path, block: int) -> BlockTask:
 def copy_of(world: BlockWorld, folder: Path) -> Path:
     shutil.copytree(world.root, folder / "run")
     return folder / "run"
-
-
-def unfinish(root: Path, block: int) -> Path:
-    """The folder of a block, as it was before its first step."""
-    folder = folder_of(root, block)
-    shutil.rmtree(folder / "checkpoints")
-    (folder / "done.json").unlink()
-    return folder
 
 
 def same(root: Path, other: Path, name: str) -> bool:

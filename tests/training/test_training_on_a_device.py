@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from block_world import BlockWorld, tensors_of
+from block_world import BlockWorld, tensors_of, unfinish
 from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import Altered, Change, World, events, parameters, spoilt, stopping
 
@@ -241,18 +241,16 @@ def test_features_are_made_on_the_device(world: World, tmp_path: Path, monkeypat
 
 def test_a_block_is_trained_on_a_device(block_world: BlockWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A block inside of surroundings that the CPU has trained."""
-    block, name = 1, "01"
     root, steps = tmp_path / "run", Steps(monkeypatch)
     shutil.copytree(block_world.root, root)
     config, method = Run(root).load_config()
     Run(root).save_config(replace(config, device="cuda:0"), method)
-    shutil.rmtree(root / "blocks" / name / "checkpoints")
-    (root / "blocks" / name / "done.json").unlink()
+    unfinish(root, 1)
     with pretend_cuda() as steps.seen:
-        task = BlockTask(root=str(root), data=str(block_world.config.data), block=block, minutes=None, quiet=True)
+        task = BlockTask(root=str(root), data=str(block_world.config.data), block=1, minutes=None, quiet=True)
         assert train_block(task, lambda event: None)
     assert set(steps.waits) == {0} and set(steps.uploads[2:]) == {0}
-    found, expected = tensors_of(root, name), tensors_of(block_world.root, name)
+    found, expected = tensors_of(root, "01"), tensors_of(block_world.root, "01")
     assert found.keys() == expected.keys()
     for key, value in expected.items():
         assert (found[key] - value).double().norm() <= 1e-5 * value.double().norm(), key
