@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor, nn
 
-
 from ..interfaces import ContentField, SemanticField
 from ..ops import dense, march, triplane, triplane_numba
 from ..types import FieldSample
