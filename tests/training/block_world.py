@@ -11,7 +11,7 @@ import torch
 from tiny_world import tiny
 
 from fprf.cli.train import train_scene
-from fprf.config import TrainConfig
+from fprf.config import StatisticsConfig, TrainConfig
 from fprf.fields.layouts import LayoutConfig, StreetConfig
 from fprf.town.write import write_town
 from fprf.training import tensorfiles
@@ -34,7 +34,17 @@ class BlockWorld:
 
 
 def small(town: Path, output: Path, blocks: LayoutConfig = BLOCKS, steps: int = STEPS) -> TrainConfig:
-    return replace(tiny(town, output), blocks=blocks, steps=steps)
+    config = tiny(town, output)
+    return replace(
+        config,
+        blocks=blocks,
+        steps=steps,
+        datamanager=replace(config.datamanager, rays=128),
+        sampler=replace(config.sampler, samples=(12,), anneal_steps=4),
+        content=replace(config.content, field=replace(config.content.field, resolutions=(8,), hidden=16)),
+        optimizer=replace(config.optimizer, warm_up=2),
+        statistics=StatisticsConfig(rays=512, regions=3),
+    )
 
 
 def made(folder: Path) -> TrainConfig:

@@ -115,7 +115,12 @@ def test_what_makes_it_another_task_and_what_does_not(block_world: BlockWorld) -
     assert len({was, *(asked(block_world, 1, **other) for other in others)}) == 5
 
 
-def test_one_block_has_no_surroundings(block_world: BlockWorld) -> None:
+def test_a_plan_has_a_line_for_each_block_but_one_block_has_no_surroundings(block_world: BlockWorld) -> None:
+    scene, plan = plan_scene(block_world.config)
+    around, *blocks, whole = estimates(replace(block_world.config, minutes=1e-3), scene, plan)
+    assert [row.name for row in (around, *blocks, whole)] == ["surroundings", "00", "01", "02", "together"]
+    assert [row.rays for row in blocks] == plan.rays.tolist() and around.rays == 10 * 32 * 24
+    assert whole.seconds == pytest.approx(0.06) and whole.memory_mib == max(row.memory_mib for row in blocks)
     for layout in (SingleConfig(), StreetConfig(segments=1)):
         config = replace(small(block_world.config.data, block_world.root), blocks=layout)
         (row,) = estimates(config, *plan_scene(config))
