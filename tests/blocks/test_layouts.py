@@ -2,13 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from block_scenes import drone, street
 from torch import Tensor
 
 from fprf.blocks.layouts import bounds
-from fprf.blocks.plan import open_space, site_of
+from fprf.blocks.plan import BORDER, SIDE, make_plan, open_space, site_of, top_view
 from fprf.blocks.routing import shares
 from fprf.datamanagers.scene import Scene, find_sightings
 from fprf.fields.layouts import AdaptiveConfig, GridConfig, LayoutConfig, SingleConfig, StreetConfig
@@ -66,6 +67,14 @@ def test_a_grid_has_equal_cells_that_share_faces() -> None:
     assert torch.allclose(sides, sides[:1].expand_as(sides))
     assert torch.equal(boxes.high[0, 1], boxes.low[1, 1]) and torch.equal(boxes.high[0, 0], boxes.low[2, 0])
     assert boxes.margin == pytest.approx(0.1 * float(sides[0, :2].min()), rel=0.2)
+
+
+def test_the_top_view_shows_every_block_on_the_ground() -> None:
+    scene = drone()
+    picture = top_view(scene, make_plan(scene, GridConfig(cells=(3, 2))))
+    colours, count = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
+    assert max(picture.shape) == SIDE + 2 * BORDER
+    assert len(colours[count > 1000]) >= 2 + 6, "paper, points, and a colour for each block"
 
 
 @pytest.mark.parametrize("budget", [8_000, 30_000, 120_000])
