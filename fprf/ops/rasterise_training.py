@@ -34,6 +34,8 @@ class Target(NamedTuple):
     """Blurred photographs, as SSIM needs them (`photometric.blurred`)."""
     valid: Floats | None
     """1 where the photograph counts, 0 elsewhere, in the shape of the gradient; None = everywhere."""
+    sky: Floats | None = None
+    """1 where the photograph shows sky, 0 elsewhere, [H16, W16] flat; None = not known."""
 
 
 class Learnt(NamedTuple):
@@ -69,7 +71,7 @@ def learn(
     numbers a Gaussian; `ssim` the share of 1 - SSIM in the loss; renders are multiplied by `factors`, one a channel, before
     they are compared.
     """
-    width, height, camera, planes, blurred, valid = target
+    width, height, camera, planes, blurred, valid, _ = target
     entries, out, left = _render(blocks, count, bands, splats, target, background)
     shown, pull = _exposed(out, target, factors), np.zeros(3, np.float32)
     l1, similar, slope = photometric.loss(shown, planes, blurred, width, height, ssim)
@@ -97,18 +99,20 @@ def errors(
     target: Target,
     background: tuple[float, float, float],
     factors: Annotated[Floats, "3"] | None = None,
-) -> Annotated[Floats, "count"]:
-    """Errors of a view by Gaussian: the sum over pixels of its weight times |render - photograph|."""
+) -> Annotated[Floats, "count 3"]:
+    """Sums over the pixels of a view of each Gaussian's weight: times |render - photograph|, where there is sky, and of all."""
     entries, out, _ = _render(blocks, count, bands, splats, target, background)
     area = _area(target)
     apart = np.abs(_exposed(out, target, factors) - target.planes)[: 3 * area]
     if target.valid is not None:
         apart *= target.valid[: 3 * area]
     pixels, sums = np.zeros(8 * area, np.float32), np.empty((count, 8), np.float32)
-    pixels[:area] = apart.reshape(3, area).sum(0)
+    pixels[:area], pixels[2 * area : 3 * area] = apart.reshape(3, area).sum(0), 1
+    if target.sky is not None:
+        pixels[area : 2 * area] = target.sky
     summed = rasterise_gradient_kernels.lift(entries, splats, target.width, target.height, pixels)
     rasterise_gradient_kernels.lift_values(summed, entries.first_slot, count, sums.reshape(-1), 8, 0, 8)
-    return sums[:, 0]
+    return sums[:, :3]
 
 
 def _area(target: Target) -> int:

@@ -40,10 +40,9 @@ from .gaussians import Gaussians
 from .learner import MOVES, Learner
 from .photographs import make_levels
 from .training import (
-    CUT,
     Prepared,
-    clear_of,
     gaussians_of,
+    limit_widths,
     load_photographs,
     prepare,
     reach_of,
@@ -261,8 +260,8 @@ def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, s
     tones = _tones_of(facts, start)
     tones = tones and tones.going_on(_others(scene, list(cell.windows)))
     levels = make_levels(own, images, masks, near)
-    clear = clear_of(scene)  # of all cameras: what lies before those of other cells is part of the union
-    learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, clear, cut_every=CUT, tones=tones)
+    narrow = limit_widths(scene, near, cells=True)  # of all cameras: what lies before those of other cells is part of the union
+    learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, narrow, tones=tones)
     # As if the number had grown from the beginning of the schedule.
     passed = min(config.overview / config.grow, 0.99)
     begun = max(1, round((len(gaussians) / cap**passed) ** (1 / (1 - passed))))

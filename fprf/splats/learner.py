@@ -28,6 +28,8 @@ _DEAD = 0.005
 """Opacity below which a Gaussian is moved elsewhere."""
 _SETTLE, _SORT_EVERY, _LAST = 200, 5, 0.85
 """Steps before the first relocation; relocations between sorts; share of training after which nothing is moved any more."""
+_SKY, _SEEN = 0.7, 1.0
+"""Share of a Gaussian's weight in sky, and its least weight in pixels of the views that judge, from which on it is moved."""
 _JUDGES = 8
 """Views whose errors say where Gaussians are split."""
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
@@ -35,6 +37,10 @@ _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
 _GAIN, _EXPONENT = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
+
+
+Narrow = Callable[[Annotated[Floats, "B R L"], int], None]
+"""Cuts standard deviations (logarithms in rows 3 to 5 of the blocks) in place after a step."""
 
 
 class Step(NamedTuple):
@@ -51,8 +57,8 @@ class Step(NamedTuple):
 class Learner:
     """Gaussians in training. `reach` is the radius of the cameras' positions in world units: the unit of the means' rate.
 
-    Only Gaussians whose means are `inside` are split or moved; None = all. Every `cut_every` steps `widest` tells the greatest
-    logarithms of standard deviations from the blocks' means; None = none is limited.
+    Only Gaussians whose means are `inside` are split or moved; None = all. After each step `narrow` may cut the standard
+    deviations in the blocks; None = none is limited.
     With `tones` each view's factors are learnt as well, with `poses` where each view was taken. `only` colours learns harmonics
     alone, `only` poses neither Gaussians nor factors.
     """
@@ -64,14 +70,13 @@ class Learner:
         reach: float,
         room: int,
         inside: Callable[[Annotated[Tensor, "N 3"]], Annotated[Tensor, "N"]] | None = None,
-        widest: Callable[[Annotated[Floats, "B 3 L"]], Annotated[Floats, "B 1 L"]] | None = None,
+        narrow: Narrow | None = None,
         *,
-        cut_every: int = 10,
         tones: Tones | None = None,
         poses: Poses | None = None,
         only: Literal["colours", "poses"] | None = None,
     ) -> None:
-        self.inside, self.widest, self.cut_every = inside, widest, cut_every
+        self.inside, self.narrow = inside, narrow
         self.config, self.levels, self.reach = config, levels, reach
         self.bands = (config.degree + 1) ** 2
         self.room = -(-room // LANES) * LANES
@@ -129,9 +134,8 @@ class Learner:
         )  # fmt: skip
         if not math.isfinite(measured.l1 + measured.ssim):
             return None
-        if self.widest is not None and step % self.cut_every == 0:
-            rows = self.blocks.reshape(-1, self.rows, LANES)
-            np.minimum(rows[:, 3:6], self.widest(rows[:, :3]), out=rows[:, 3:6])
+        if self.narrow is not None:
+            self.narrow(self.blocks.reshape(-1, self.rows, LANES)[: -(-self.count // LANES)], step)
         self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)
         self._learn_pose(view, target, torch.from_numpy(measured.of_camera), self.config.poses * 0.1**share)
         moved = (step + 1) % self.config.relocate_every == 0 and self.only is None
@@ -202,16 +206,17 @@ class Learner:
         """
         draw = np.random.default_rng((self.config.seed, step, 1))
         views = draw.permutation(list(level))[:_JUDGES]
-        chance = np.zeros(self.count)
+        shown = np.zeros((self.count, 3))
         for view in views:
             target, background = self._target(level, view), self.config.background
-            chance += errors(self.blocks, self.count, self.bands, self.splats, target, background, self._factors(view))
+            shown += errors(self.blocks, self.count, self.bands, self.splats, target, background, self._factors(view))
         parts = [each.reshape(-1, self.rows, LANES) for each in (self.blocks, self.first, self.second)]
         blocks, first, second = parts
         means = blocks[:, :3].transpose(0, 2, 1).reshape(-1, 3)
         opacity = 1 / (1 + np.exp(-blocks[:, 10].reshape(-1)[: self.count].astype(np.float64)))
-        chance = np.nan_to_num(chance * opacity)
-        transparent = opacity < _DEAD
+        chance = np.nan_to_num(shown[:, 0] * opacity)
+        # What shows almost only in the sky floats before it.
+        transparent = (opacity < _DEAD) | (shown[:, 1] > _SKY * np.maximum(shown[:, 2], _SEEN))
         if self.inside is not None:
             inside = self.inside(torch.from_numpy(means[: self.count])).numpy()
             chance, transparent = chance * inside, transparent & inside

@@ -1,6 +1,7 @@
 """Photographs as the rasteriser sees the world: through a pinhole, with what lies beyond a lens's picture left out."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import cv2
@@ -86,10 +87,16 @@ def distorted(
     return torch.from_numpy(np.atleast_3d(_sampled(image.numpy(), place.numpy(), cv2.INTER_LINEAR if linear else _SHARPEST)))
 
 
-def make_levels(scene: Scene, images: Mapping[int, Image], masks: Mapping[int, NDArray[np.bool_]], near: float) -> list[Level]:
+def make_levels(
+    scene: Scene,
+    images: Mapping[int, Image],
+    masks: Mapping[int, NDArray[np.bool_]],
+    near: float,
+    skies: Mapping[int, NDArray[np.bool_]] = MappingProxyType({}),
+) -> list[Level]:
     """The training views at their own size, at half of it and so on, until the longer side has less than 240 pixels.
 
-    A view counts where its mask, if it has one, is true.
+    A view counts where its mask, if it has one, is true; where `skies` are true it shows sky.
     """
     views = scene.train.tolist()
     cameras = {view: cover(scene.cameras, view, near)[0] for view in views}
@@ -101,20 +108,29 @@ def make_levels(scene: Scene, images: Mapping[int, Image], masks: Mapping[int, N
         camera = cameras[view]
         image, valid = undistorted(scene.cameras, view, images[view], camera)
         if view in masks:
-            white = np.repeat(masks[view][..., None], 3, 2).astype(np.uint8) * 255
-            seen = undistorted(scene.cameras, view, white, camera)[0][..., 0] > 254
+            seen = _undistorted_mask(scene.cameras, view, masks[view], camera)
             valid = seen if valid is None else valid & seen
+        sky = _undistorted_mask(scene.cameras, view, skies[view], camera) if view in skies else None
         colours: Floats = np.divide(image, 255, dtype=np.float32)
         for k, level in enumerate(levels):
             size = (max(1, camera.width >> k), max(1, camera.height >> k))
             shrink = torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]], dtype=torch.float64)
             small = camera._replace(intrinsics=camera.intrinsics * shrink, width=size[0], height=size[1])
             reduced: Floats = np.asarray(cv2.resize(colours, size, interpolation=cv2.INTER_AREA), np.float32) if k else colours
-            used = valid
-            if valid is not None and k:
-                used = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-            level[view] = _target(small, reduced, used)
+            level[view] = _target(small, reduced, _resized(valid, size), _resized(sky, size))
     return levels
+
+
+def _undistorted_mask(cameras: Cameras, view: int, mask: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
+    white = np.repeat(mask[..., None], 3, 2).astype(np.uint8) * 255
+    return np.asarray(undistorted(cameras, view, white, camera)[0][..., 0] > 254)
+
+
+def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    """A mask at a size (width, height): pixels all of which it holds."""
+    if mask is None or mask.shape[::-1] == size:
+        return mask
+    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
 
 
 def moved_camera(camera: Floats, turn: Annotated[Tensor, "3"], shift: Annotated[Tensor, "3"]) -> Floats:
@@ -126,13 +142,14 @@ def moved_camera(camera: Floats, turn: Annotated[Tensor, "3"], shift: Annotated[
     return out
 
 
-def _target(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None) -> Target:
+def _target(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, sky: NDArray[np.bool_] | None) -> Target:
     width, height = camera.width, camera.height
     planes = _planes(colours)
     used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2).astype(np.float32))
     if used is not None:
         used = used[: _area(width, height) * 3 + 64]
-    return Target(width, height, camera_array(camera, True), planes, blurred(planes, width, height), used)
+    above = None if sky is None else _planes(np.repeat(sky[..., None], 3, 2).astype(np.float32))[: _area(width, height)]
+    return Target(width, height, camera_array(camera, True), planes, blurred(planes, width, height), used, above)
 
 
 def _area(width: int, height: int) -> int:

@@ -35,7 +35,7 @@ from ..training.unfinished import UnfinishedRun
 from .config import GaussiansConfig
 from .gaussians import Gaussians
 from .initial import Points, initial_points, surroundings
-from .learner import MOVES, Learner, Step
+from .learner import MOVES, Learner, Narrow, Step
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import Floats, make_levels
 from .scene import Semantics, SplatScene, find_semantics, load_semantics, semantics_tensors
@@ -51,9 +51,9 @@ _SURROUNDINGS = 10
 """Gaussians, at most, for one of the surroundings."""
 _WIDE = 0.2
 """Greatest standard deviation of one of them, as a share of their distance."""
-CUT, _CLEAR, _TOGETHER = 100, 0.25, 256
-"""In scenes of cells: steps between cuts of what became too wide; greatest standard deviation, as a share of the distance to
-the nearest camera; Gaussians whose distances are taken together."""
+_CLEAR, _CLEAR_CELLS, _TOGETHER = 0.5, 0.25, 256
+"""Greatest standard deviation as a share of the distance to the nearest camera, and in scenes of cells; Gaussians whose
+distances are taken together."""
 _FIT_RATE, _FIT_STEPS = 2e-3, 120
 """Of the poses of views that the scene is not learnt from: `GaussiansConfig.poses`, and steps of each view."""
 _SOME = 4000
@@ -115,16 +115,15 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
     near = find_near(scene, points)
-    levels = make_levels(scene, images, masks, near)
     far = surroundings(scene, images, points, config.surroundings) if config.surroundings else None
     room = max(config.cap, len(points.position) + config.surroundings)
     sphere = _Sphere.around(far) if far is not None else None
+    # Without surroundings nothing else could show the sky.
+    skies = _load_masks(scene.sky_masks, images) if config.masks and sphere is not None else {}
+    levels = make_levels(scene, images, masks, near, skies)
     inside = None if sphere is None else sphere.encloses
-    widest = clear_of(scene) if config.cells > 1 else None if sphere is None else sphere.widest
-    cut_every = CUT if config.cells > 1 else 10
-    learner = Learner(
-        config, levels, reach_of(scene), room, inside, widest, cut_every=cut_every, tones=tones_of(facts), poses=poses_of(facts)
-    )
+    narrow = limit_widths(scene, near, cells=config.cells > 1, sphere=sphere)
+    learner = Learner(config, levels, reach_of(scene), room, inside, narrow, tones=tones_of(facts), poses=poses_of(facts))
     learner.begin(points, draw, far)
     return Prepared(scene, learner, near, origin, facts=facts)
 
@@ -147,17 +146,19 @@ class _Sphere(NamedTuple):
         return apart < 0.5 * self.radius
 
     def widest(self, means: Annotated[Floats, "B 3 L"]) -> Annotated[Floats, "B 1 L"]:
-        """Logarithms of the greatest standard deviations: one that reached the cameras would be drawn before the scene."""
+        """Logarithms of the greatest standard deviations."""
         square = np.square(means - self.centre.numpy()[:, None]).sum(1, keepdims=True)
         return np.where(square < (0.5 * self.radius) ** 2, np.float32(np.inf), np.float32(math.log(_WIDE * self.radius)))
 
 
-def clear_of(scene: Scene) -> Callable[[Annotated[Floats, "B 3 L"]], Annotated[Floats, "B 1 L"]]:
-    """Logarithms of the greatest standard deviations in large scenes: shares of the distance to the nearest training camera.
+def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | None = None) -> Narrow:
+    """Keep standard deviations below a share of the distance to the nearest training camera.
 
-    Of thousands of photographs each is seen rarely, and a Gaussian that grows where some are taken covers others as haze.
+    What reaches a camera is drawn before the whole scene as haze, and mixes the semantics of everything. Of thousands of
+    photographs each is seen rarely, so scenes of cells have a lower limit. Nothing nearer than `near` is drawn.
     """
     centres = scene.cameras.pose[scene.train][:, :, 3].float().contiguous()
+    share, every = (_CLEAR_CELLS, 100) if cells else (_CLEAR, 20)
 
     def nearest(points: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N"]:
         # Points lie within a ball, so the camera nearest to one of them is among those nearest to its centre.
@@ -166,12 +167,19 @@ def clear_of(scene: Scene) -> Callable[[Annotated[Floats, "B 3 L"]], Annotated[F
         some = centres[apart <= 1.001 * (apart.amin() + 2 * radius)]
         return torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
 
-    def widest(means: Annotated[Floats, "B 3 L"]) -> Annotated[Floats, "B 1 L"]:
-        points = torch.from_numpy(means).transpose(1, 2).reshape(-1, 3)
-        near = torch.cat([nearest(part) for part in torch.split(points, _TOGETHER)])
-        return (_CLEAR * near).clamp_min(1e-12).log().view(len(means), 1, -1).numpy()
+    def narrow(rows: Annotated[Floats, "B R L"], step: int) -> None:
+        if sphere is not None and step % 10 == 0:
+            np.minimum(rows[:, 3:6], sphere.widest(rows[:, :3]), out=rows[:, 3:6])
+        if step % every:
+            return
+        block, lane = np.nonzero(rows[:, 3:6].max(1) > math.log(share * near))
+        if not len(block):
+            return
+        points = torch.from_numpy(rows[block, :3, lane])
+        widest = torch.cat([share * nearest(part) for part in torch.split(points, _TOGETHER)]).clamp_min(1e-12).log()
+        rows[block, 3:6, lane] = np.minimum(rows[block, 3:6, lane], widest[:, None].numpy())
 
-    return widest
+    return narrow
 
 
 def load_photographs(
@@ -179,12 +187,13 @@ def load_photographs(
 ) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]]]:
     """Images of views, and the masks of those that have one."""
     images = dict(zip(views, load_images(scene, config.background, views), strict=True))
-    masks = {}
-    for view in views:
-        path = scene.masks[view] if config.masks and scene.masks else None
-        if path is not None:
-            masks[view] = load_mask(path, (images[view].shape[1], images[view].shape[0]))
-    return images, masks
+    return images, _load_masks(scene.masks if config.masks else (), images)
+
+
+def _load_masks(paths: tuple[Path | None, ...], images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
+    """The masks of the views that have one, at the size of their images."""
+    named = {view: paths[view] for view in images} if paths else {}
+    return {view: load_mask(path, images[view].shape[1::-1]) for view, path in named.items() if path is not None}
 
 
 def reach_of(scene: Scene) -> float:
