@@ -319,9 +319,8 @@ def _slot_flags(filled: list[Slot]) -> Any:
 
     rows: list[tuple[str, Any, Any]] = []
     for slot in filled:
-        names = [name for name in registry.installed(slot.kind.group) if _may_fill(slot, name)]
-        allowed = ", ".join([*names, "none"] if slot.optional else names)
-        arg = tyro.conf.arg(name=slot.path, metavar="NAME", help=f"{_first_line(slot.kind)} One of {allowed}.")
+        about = f"{_first_line(slot.kind)} One of {', '.join(slot.choices)}."
+        arg = tyro.conf.arg(name=slot.path, metavar="NAME", help=about)
         rows.append((slot.path.replace(".", "_"), Annotated[str, arg], dataclasses.field(default=_filled_by(slot))))
     kind = dataclasses.make_dataclass("PlugIns", rows, frozen=True, kw_only=True)
     kind.__doc__ = "What fills each slot, by name; its own fields are flags above. `fprf plugins` lists all."
@@ -335,12 +334,6 @@ def _filled_by(slot: Slot) -> str:
 
 def _first_line(documented: object) -> str:
     return (documented.__doc__ or "").strip().partition("\n")[0]
-
-
-def _may_fill(slot: Slot, name: str) -> bool:
-    """False for what is known, without importing anything, to be of another kind that shares the group."""
-    known = registry.peek(slot.kind.group, name)
-    return not isinstance(known, type) or issubclass(known, slot.kind)
 
 
 def _located(fault: str, flags: dict[str, Flag], args: Sequence[str]) -> str:
@@ -376,7 +369,7 @@ def describe(config: Any, *, prog: str, description: str, positional: Sequence[s
     chosen = [
         {
             "flag": f"--{_dashed(slot.path)}",
-            "one of": list(registry.installed(slot.kind.group)),
+            "one of": slot.choices,
             "default": _filled_by(slot),
             "meaning": _first_line(slot.kind),
         }

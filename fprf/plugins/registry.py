@@ -40,6 +40,11 @@ def installed(group: str) -> Mapping[str, tuple[Entry, ...]]:
     return _scan().groups.get(group, MappingProxyType({}))
 
 
+def choices(group: str, kind: type = object) -> list[str]:
+    """Names of a group that may be of the kind: all but those known, without importing anything, to be of another."""
+    return [name for name in installed(group) if not isinstance(known := peek(group, name), type) or issubclass(known, kind)]
+
+
 def groups() -> tuple[str, ...]:
     """Every group that some package registers in."""
     return tuple(sorted(_scan().groups))
@@ -55,13 +60,13 @@ def forget() -> None:
     _scan.cache_clear()
 
 
-def entry(group: str, name: str) -> Entry:
-    """The one entry of that name. Raises PluginError where there is none or more than one."""
+def entry(group: str, name: str, kind: type = object) -> Entry:
+    """The one entry of that name. Raises PluginError where there is none or more than one; others of the kind are named."""
     entries = installed(group).get(name, ())
     if not entries:
+        others = choices(group, kind)
         raise PluginError(
-            f"{group}: no plug-in {name!r} is installed{nearest(name, installed(group))} "
-            f"(installed: {', '.join(installed(group)) or 'none'}); "
+            f"{group}: no plug-in {name!r} is installed{nearest(name, others)} (installed: {', '.join(others) or 'none'}); "
             "after adding an entry point to a package, install that package again"
         )
     if len(entries) > 1:
@@ -70,9 +75,12 @@ def entry(group: str, name: str) -> Entry:
     return entries[0]
 
 
-def load_object(group: str, name: str) -> object:
-    """Import the one plug-in of that name. Raises PluginError where it is missing, ambiguous or fails to import."""
-    plugin = entry(group, name)
+def load_object(group: str, name: str, kind: type = object) -> object:
+    """Import the one plug-in of that name. Raises PluginError where it is missing, ambiguous or fails to import.
+
+    The kind, of which the object may yet not be, says which others that error names.
+    """
+    plugin = entry(group, name, kind)
     try:
         loaded: object = plugin.point.load()
     except KeyboardInterrupt:
@@ -87,13 +95,13 @@ def load_object(group: str, name: str) -> object:
 
 def load(group: str, name: str, kind: type[T]) -> type[T]:
     """Import the one plug-in of that name, a subclass of `kind`. Raises PluginError."""
-    loaded = load_object(group, name)
+    loaded = load_object(group, name, kind)
     if isinstance(loaded, type) and issubclass(loaded, kind):
         return loaded
     shown = loaded.__name__ if isinstance(loaded, type) else repr(loaded)
     raise PluginError(
         f"{group}: {name!r} ({entry(group, name).origin}) is {shown}, not a {kind.__name__}; "
-        "choose a plug-in of that kind, or correct its entry point"
+        f"choose one of that kind ({', '.join(choices(group, kind)) or 'none is installed'}), or correct its entry point"
     )
 
 

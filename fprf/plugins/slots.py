@@ -27,6 +27,12 @@ class Slot(NamedTuple):
     optional: bool
     """None is allowed."""
 
+    @property
+    def choices(self) -> list[str]:
+        """What `--path` takes: the names of its kind, and `none` where that is allowed."""
+        names = registry.choices(self.kind.group, self.kind)
+        return [*names, "none"] if self.optional else names
+
 
 def members(hint: Any) -> tuple[Any, ...]:
     """The alternatives of a union; the hint itself otherwise."""
@@ -103,8 +109,7 @@ def resolve(config: C, args: Sequence[str]) -> tuple[C, list[str]]:
 def _fill(config: C, slot: Slot, name: str) -> C:
     if name == "none":
         if not slot.optional:
-            allowed = ", ".join(registry.installed(slot.kind.group))
-            raise UsageError(f"--{slot.path}: cannot be none; allowed are {allowed}")
+            raise UsageError(f"--{slot.path}: cannot be none; allowed are {', '.join(slot.choices)}")
         return replace(config, slot.path, None)
     try:
         chosen = registry.load(slot.kind.group, name, slot.kind)

@@ -4,7 +4,7 @@ from typing import ClassVar
 import pytest
 from fake_packages import ENCODER, Packages
 
-from fprf.errors import PluginError, UsageError
+from fprf.errors import FprfError, PluginError, UsageError
 from fprf.methods import fprf
 from fprf.plugins.config import PluginConfig
 from fprf.plugins.encoders.config import RandomConfig
@@ -88,6 +88,13 @@ def test_errors_say_which_slot() -> None:
         resolve(fprf(), ["--sampler", "unifrom"])
     with pytest.raises(PluginError, match=r"^--content.field: .*not a ContentFieldConfig"):
         resolve(fprf(), ["--content.field", "semantic-planes"])
+
+
+@pytest.mark.parametrize("name", ["semantic-planes", "semantic-plains", "none"])
+def test_a_refusal_offers_no_plugin_of_another_kind(name: str) -> None:
+    with pytest.raises(FprfError, match=r"(?<!-)\bplanes\b") as caught:
+        resolve(fprf(), ["--content.field", name])
+    assert "semantic-planes" not in str(caught.value).replace(f"'{name}'", "")
 
 
 def test_types_that_cannot_be_resolved_are_named(packages: Packages) -> None:
