@@ -42,7 +42,7 @@ class RenderVerbConfig(StyleConfig, QualityConfig):
     frames: int = 120
     """Frames of a spiral or orbit; about as many of an interpolation."""
     fps: float = 24.0
-    """Frames per second of a film."""
+    """Frames per second of a film, in [1, 1000]."""
     style: Path | None = None
     """A style file, as `fprf stylize` writes it; flags come over it."""
     keyframes: Path | None = None
@@ -84,12 +84,14 @@ def run(args: list[str]) -> int:
     description = "Fly through a trained scene, plain or restyled, to a film or frames."
     config, file = read_flags(RenderVerbConfig(), args, prog="fprf render", description=description, positional=("run",))
     from ..datamanagers.images import load_image
-    from ..io.video import FILMS, missing_frames, write_video
+    from ..io.video import FILMS, MAX_FPS, missing_frames, write_video
     from ..rendering.paths import make_path
     from ..training.loading import open_run
 
     if config.output.suffix.lower() in _NO_FOLDERS:
         raise UsageError(f"--output {config.output}: films end in {' '.join(FILMS)}; give such a name, or a folder for frames")
+    if config.fps > MAX_FPS:
+        raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
     opened = open_run(config.run, config.device, config)
     known, views = opened.known, opened.known.split(config.split)
     cameras = make_path(known.cameras, views, config.path, config.frames)

@@ -27,6 +27,8 @@ _ANIMATIONS: dict[str, tuple[Codec, str, list[int]]] = {
 """Animated pictures by ending: their format, the ending that OpenCV knows it by, and its options."""
 FILMS = (".mp4", *_ANIMATIONS)
 """Endings of the films that can be written."""
+MAX_FPS = 1000
+"""Frames per second of a film, at most: animated pictures count whole milliseconds."""
 
 
 def _even(frame: Picture) -> Picture:
@@ -85,8 +87,8 @@ def write_video(path: Path, frames: Iterable[Picture], fps: float, *, h264: bool
     """
     if path.suffix.lower() not in FILMS:
         raise UsageError(f"{path}: films end in {' '.join(FILMS)}; give such a name, or a folder for single pictures")
-    if not 0 < fps <= 1000:
-        raise UsageError(f"{path}: {fps} frames a second; must lie in (0, 1000]")
+    if not 0 < fps <= MAX_FPS:
+        raise UsageError(f"{path}: {fps} frames a second; must lie in (0, {MAX_FPS}]")
     rate = Fraction(fps).limit_denominator(1001)
     even = _alike(frames, path)
     first = next(even, None)

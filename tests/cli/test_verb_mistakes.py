@@ -44,6 +44,7 @@ MISTAKES = f"""
     render run --show colour normals --lens stereo | --show
     render run --styles dusk --path orbit | NAME=
     render run --path orbit --frames 2 --output a.mov | .mp4
+    render run --path orbit --frames 2 --fps 1e9 --output a.mp4 | --fps 1e+09
     render run --keyframes absent.json | absent.json
     render run --keyframes keys.json --references A.png | --keyframes
     report absent | no such folder
