@@ -12,7 +12,7 @@ from ..errors import UsageError
 from ..training.quality import QualityConfig, at_quality
 from .parsing import parse
 from .progress import Display
-from .verbs import verbs_of
+from .verbs import verbs_of, views_of
 
 if TYPE_CHECKING:
     from ..datamanagers.images import Image
@@ -58,9 +58,7 @@ def evaluate_fields(config: EvalConfig) -> dict[str, object]:
     scene = scene_of(replace(trained.config, data=data))
     if tuple(view_names(scene.paths)) != trained.known.names:
         raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
-    views = trained.known.split(config.split)
-    if not views:
-        raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
+    views = views_of(trained.known, config.split)
     fitted: dict[str, object] = {}
     with Display() as display:
         if config.fit_poses:

@@ -15,7 +15,7 @@ from .parsing import parse
 from .progress import Display
 from .showcase import frames_of, restyled, write_page
 from .style_flags import read_preset, say, with_presets_named
-from .stylize import views_of
+from .verbs import views_of
 
 if TYPE_CHECKING:
     from ..training.run import Known
@@ -164,9 +164,7 @@ def _named(first: Sequence[Path], more: Sequence[Path]) -> dict[str, Path]:
 
 def _views(known: "Known", config: GalleryConfig) -> list[int]:
     """The views to show. Raises UsageError for a name that the run does not hold, or an empty split."""
-    views = views_of(known, config.views, config.split)
-    if not views:
-        raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
+    views = views_of(known, config.split, config.views)
     count = len(views) if config.views else min(config.most, len(views))
     return [views[k * len(views) // count] for k in range(count)]
 

@@ -14,6 +14,7 @@ from ..style.keyframes import keyed_looks, read_keyframes
 from ..training.quality import QualityConfig
 from .progress import Display
 from .style_flags import read_flags, say
+from .verbs import views_of
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
@@ -93,7 +94,8 @@ def run(args: list[str]) -> int:
     if config.fps > MAX_FPS:
         raise UsageError(f"--fps {config.fps:g}: a film has at most {MAX_FPS} frames a second")
     opened = open_run(config.run, config.device, config)
-    known, views = opened.known, opened.known.split(config.split)
+    known = opened.known
+    views = views_of(known, config.split) if config.path in ("interpolate", "dataset") else []
     cameras = make_path(known.cameras, views, config.path, config.frames)
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import UsageError
 from .progress import Display
-from .verbs import Verbs
+from .verbs import Verbs, views_of
 
 if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
@@ -63,9 +63,7 @@ class SplatVerbs(Verbs):
         scene = scene_of(replace(self.config, data=data))
         if tuple(view_names(scene.paths)) != known.names:
             raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
-        views = known.split(config.split)
-        if not views:
-            raise UsageError(f"--split {config.split}: the run holds no such views; choose another split")
+        views = views_of(known, config.split)
         shown, tones = opened.scene, load_tones(opened.run)
 
         def draw(view: int) -> "View":
@@ -78,7 +76,7 @@ class SplatVerbs(Verbs):
         with Display() as display:
             if config.fit_poses:
                 display.say(f"fitting the poses of {len(views)} views")
-                moves = fit_poses(self.config, scene, opened, list(views))
+                moves = fit_poses(self.config, scene, opened, views)
                 known = replace(known, cameras=moved_cameras(known.cameras, moves))
             scores, images = judge_views(known, scene, views, draw, display.count, masks=self.config.masks)
         if config.fit_poses:

@@ -1,25 +1,22 @@
 """`fprf stylize RUN --references A.jpg B.jpg`: captured views in the style of photographs."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..errors import UsageError
-from ..plugins.registry import nearest
 from ..style.config import StyleConfig
 from ..style.files import write_style
 from ..training.quality import QualityConfig
 from .progress import Display
 from .style_flags import read_flags
+from .verbs import views_of
 
 if TYPE_CHECKING:
     from ..interfaces import Scene
     from ..style.match_maps import Region
     from ..style.regions import Regions
     from ..style.restyle import Styled
-    from ..training.run import Known
 
 _LONGEST = 80
 """Characters of a style's default name."""
@@ -77,7 +74,7 @@ def run(args: list[str]) -> int:
 
     opened = open_run(config.run, config.device, config)
     scene = opened.scene
-    views = views_of(opened.known, config.views, config.split)
+    views = views_of(opened.known, config.split, config.views)
     output = config.output or config.run / "styles" / _name(config)
     if config.explain and not config.references:
         print_explained(output, Regions(scene, *scene.measured()), None)
@@ -166,15 +163,6 @@ def _print_table(rows: list[tuple[str, ...]]) -> None:
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     for row in rows:
         print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def views_of(known: "Known", wanted: Sequence[str], split: str) -> list[int]:
-    """Views by name, or those of a split where none is named. Raises UsageError for a name that the run does not hold."""
-    names = list(known.names)
-    for name in wanted:
-        if name not in names:
-            raise UsageError(f"--views {name}: no such view in the run{nearest(name, names)} ({names[0]} … {names[-1]})")
-    return [names.index(name) for name in wanted] or list(known.split(split))
 
 
 def _name(config: StylizeConfig) -> str:

@@ -1,14 +1,19 @@
 """Functions of the command line for each kind of scene."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from ..errors import UsageError
+from ..plugins.registry import nearest
 
 if TYPE_CHECKING:
     from ..config import TrainConfig
     from ..export.config import ExportConfig
     from ..plugins.config import Need
     from ..style.files import StyleFile
+    from ..training.run import Known
     from ..viewer.live import LiveViewer
     from .eval import EvalConfig
 
@@ -48,6 +53,21 @@ def verbs_of(run: Path) -> Verbs:
     from ..training.run import Run
 
     return Run(run).load_config()[0].verbs()
+
+
+def views_of(known: "Known", split: str, names: Sequence[str] = ()) -> list[int]:
+    """Views by name, or those of a split where none is named.
+
+    Raises UsageError for a name that the run does not hold, or a split without views.
+    """
+    held = list(known.names)
+    for name in names:
+        if name not in held:
+            raise UsageError(f"--views {name}: no such view in the run{nearest(name, held)} ({held[0]} … {held[-1]})")
+    views = [held.index(name) for name in names] or list(known.split(split))
+    if not views:
+        raise UsageError(f"--split {split}: the run holds no such views; choose another split")
+    return views
 
 
 class FieldVerbs(Verbs):

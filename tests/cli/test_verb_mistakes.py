@@ -36,8 +36,11 @@ MISTAKES = f"""
     export run ply {LOOSE} --presence 1 --output out | --presence
     export run ply --tolerance 1e-6 --output out | no surface
     gallery run | --references
+    gallery untested --references A.png --split test | --split test
     gallery run --references empty | no images
     gallery run --references A.png --output page.pdf | page.pdf
+    render untested --split test | --split test
+    render untested --path dataset --split test | --split test
     render run --path spirale | --path spirale
     render run --path path.json | path.json
     render run --show match --path orbit | --show match
@@ -55,6 +58,7 @@ MISTAKES = f"""
     stylize run --references A.png --between absent.json | absent.json
     stylize run --references A.png --views 000 | --views 000
     stylize run --references A.png --stylizer region-to | 'region-tone'
+    stylize untested --references A.png --split test | --split test
     stylize unmeasured --references A.png | fprf train
     train --sampler uniform | --sampler
     train fprf-lite --loss.rgb 0 --loss.content 0 --loss.semantic 0 | nothing would be learnt
