@@ -1,18 +1,16 @@
 """Files that are whole or absent: written beside their final name, flushed to disk, then renamed over it."""
 
-import errno
 import json
 import os
 import re
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..errors import DataError, NumericsError
 
-_HOPELESS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 _UNFINISHED = re.compile(r"\..{1,40}\.[0-9a-f]{8}(\.\w+)?|\.tmp\w{6}")
 """Hidden names of `atomic_path`, and of safetensors beside them."""
 
@@ -30,10 +28,16 @@ def unwritable(path: Path, error: OSError, needed: int | None = None) -> DataErr
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete what killed processes left directly in a folder. Only where nobody else writes."""
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if _UNFINISHED.fullmatch(path.name) and path.is_file():
-            path.unlink(missing_ok=True)
+    """Delete what killed processes left directly in a folder. Only where nobody else writes.
+
+    Raises DataError where the system refuses.
+    """
+    try:
+        for path in folder.iterdir() if folder.is_dir() else ():
+            if _UNFINISHED.fullmatch(path.name) and path.is_file():
+                path.unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error) from error
 
 
 def _flush(path: Path, mode: int) -> None:
@@ -44,17 +48,28 @@ def _flush(path: Path, mode: int) -> None:
         os.close(handle)
 
 
+def _is_refusal(error: OSError, temporary: Path) -> bool:
+    """True where the system refuses to write to `temporary`; False for an error about another file, a pipe or a network.
+
+    An error of a file that is open names none.
+    """
+    if error.filename is None:
+        return error.errno is not None and not isinstance(error, (ConnectionError, TimeoutError))
+    return str(temporary) in (str(error.filename), str(error.filename2))
+
+
 @contextmanager
 def atomic_path(final: Path) -> Iterator[Path]:
     """A hidden name beside `final` to write to; it becomes `final` when the block ends, and is removed if it fails.
 
     Keeps the ending of the name, which encoders choose their format by. Creates the folder. A reader sees the old file
     or the new one, whenever the process dies. Raises DataError where `final` is a folder, its folder is a file, or the
-    system refuses: a full disk, a folder without permission.
+    system refuses: a full disk, a folder without permission, a name that is too long. Errors of the block about other files
+    are passed on.
     """
-    if final.is_dir():
-        raise DataError(f"{final}: a folder is in the place of a file to be written; remove it or choose another name")
     try:
+        if final.is_dir():
+            raise DataError(f"{final}: a folder is in the place of a file to be written; remove it or choose another name")
         final.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise DataError(f"{final}: {error.filename} is a file, not a folder; choose another output") from error
@@ -62,17 +77,26 @@ def atomic_path(final: Path) -> Iterator[Path]:
         raise unwritable(final, error) from error
     # The stem is cut so that a name of the longest length allowed (255 bytes) still has a temporary one.
     temporary = final.with_name(f".{final.stem[:40]}.{secrets.token_hex(4)}{final.suffix}")
+    block_ended = False
     try:
         yield temporary
+        block_ended = True
         _flush(temporary, os.O_RDWR)
         os.replace(temporary, final)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno in _HOPELESS:
+        with suppress(OSError):  # it would hide the error that led here
+            temporary.unlink()
+        if isinstance(error, OSError) and (block_ended or _is_refusal(error, temporary)):
             raise unwritable(final, error) from error
         raise
-    if os.name == "posix":  # elsewhere a folder cannot be opened; the rename is then as durable as the system makes it
+    if os.name != "posix":  # a folder cannot be opened there; the rename is then as durable as the system makes it
+        return
+    try:
         _flush(final.parent, os.O_RDONLY)
+    except PermissionError:  # a folder that may be written to but not read: the same
+        pass
+    except OSError as error:
+        raise unwritable(final, error) from error
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from ..errors import DataError, UsageError
-from .atomic import atomic_path, write_bytes, write_json
+from .atomic import atomic_path, unwritable, write_bytes, write_json
 from .images import Picture, checked, write_image
 
 if TYPE_CHECKING:
@@ -155,6 +155,7 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     """Frames that are not there yet; all, where the folder was rendered from something else than `key` says.
 
     The key is written down at once, so that what is rendered from now on counts. Frames are whole or absent.
+    Raises DataError where the system refuses to write there.
     """
     record = folder / _RECORD
     try:
@@ -163,7 +164,10 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
         known = None
     if known == key:
         return [path for path in paths if not path.is_file()]
-    for path in paths:
-        path.unlink(missing_ok=True)
+    try:
+        for path in paths:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error) from error
     write_json(record, {"key": key})
     return list(paths)

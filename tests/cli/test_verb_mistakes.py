@@ -39,6 +39,7 @@ MISTAKES = f"""
     gallery untested --references A.png --split test | --split test
     gallery run --references empty | no images
     gallery run --references A.png --output page.pdf | page.pdf
+    gallery run --references A.png --output /proc/x.html | /proc/x.html: cannot be written
     render untested --split test | --split test
     render untested --path dataset --split test | --split test
     render run --path spirale | --path spirale
@@ -47,6 +48,7 @@ MISTAKES = f"""
     render run --show colour normals --lens stereo | --show
     render run --styles dusk --path orbit | NAME=
     render run --path orbit --frames 2 --output a.mov | .mp4
+    render run --path orbit --frames 2 --output path.json | path.json: cannot be written
     render run --path orbit --frames 2 --fps 1e9 --output a.mp4 | --fps 1e+09
     render run --keyframes absent.json | absent.json
     render run --keyframes keys.json --references A.png | --keyframes

@@ -1,6 +1,8 @@
+import errno
 import json
 import math
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -51,6 +53,62 @@ def test_a_failing_flush_or_rename_leaves_the_old_file(tmp_path: Path, monkeypat
                 write_text(final, "new")
         assert final.read_text() == "old"
         assert list(tmp_path.iterdir()) == [final]
+
+
+def test_whatever_the_system_refuses_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    final = tmp_path / "m.json"
+    final.write_text("old")
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EINVAL, "Invalid argument")
+
+    for name in ("fsync", "replace", "open"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, refuse)
+            with pytest.raises(DataError, match=r"m\.json: cannot be written \(Invalid argument"):
+                write_text(final, "new")
+        assert final.read_text() == "old" and list(tmp_path.iterdir()) == [final]
+    with pytest.raises(DataError, match=r"cannot be written \(File name too long"):
+        write_text(tmp_path / ("x" * 300), "new")
+    for named in (True, False):  # PyAV names no file
+        with pytest.raises(DataError, match=r"cannot be written"), atomic_path(final) as temporary:
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory", str(temporary) if named else None)
+    (tmp_path / ".m.0badf00d.json").touch()
+    monkeypatch.setattr(os, "unlink", refuse)
+    with pytest.raises(DataError, match=r"cannot be written \(Invalid argument"):
+        remove_unfinished(tmp_path)
+    with pytest.raises(ValueError, match="x"), atomic_path(final):
+        raise ValueError("x")
+
+
+def test_a_folder_that_refuses_new_files_is_named() -> None:
+    place = Path("/proc/x.html")
+    if not place.parent.is_dir():
+        pytest.skip("no folder that refuses everybody")
+    with pytest.raises(DataError, match=r"^/proc/x\.html: cannot be written \(No such file or directory"):
+        write_text(place, "")
+
+
+@pytest.mark.parametrize("failure", [FileNotFoundError(errno.ENOENT, "", "photo.jpg"), BrokenPipeError(errno.EPIPE, "")])
+def test_what_the_block_meets_elsewhere_is_passed_on(tmp_path: Path, failure: OSError) -> None:
+    with pytest.raises(type(failure)), atomic_path(tmp_path / "film.mp4"):
+        raise failure
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_flushed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fsync = os.fsync
+
+    def refuse(handle: int, number: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", lambda handle: refuse(handle, errno.EACCES))
+    write_text(tmp_path / "x", "new")
+    monkeypatch.setattr(os, "fsync", lambda handle: refuse(handle, errno.EIO))
+    with pytest.raises(DataError, match=r"x: cannot be written \(Input/output error"):
+        write_text(tmp_path / "x", "newer")
 
 
 def test_unfinished_files_and_no_others_are_removed(tmp_path: Path) -> None:

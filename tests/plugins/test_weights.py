@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from network_files import deeplab_file, mobilenet_tensors
 
-from fprf.errors import WeightsError
+from fprf.errors import DataError, WeightsError
 from fprf.plugins.encoders.config import (
     DeepLabConfig,
     EncoderConfig,
@@ -45,7 +45,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
         raise OSError("disk full")
 
     monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(DataError, match="disk full"):
         write_weights(path, {"a": torch.ones(2)}, {})
     assert torch.equal(read_weights(path)[0]["a"], torch.zeros(2))
 
