@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from .. import __version__
-from ..errors import CheckpointError
+from ..errors import CheckpointError, ConfigError
 from ..plugins import registry
 from ..plugins.codec import Missing
 from ..plugins.slots import slots
@@ -48,9 +48,17 @@ class DoctorConfig:
     target: Path | None = None
     """A run, a scene folder or a method; none = this machine."""
     device: str = "auto"
-    """Device of this machine that is tested: cpu, cuda, mps, or auto."""
+    """Device of this machine that is tested: cpu, cuda, mps, or auto; not with a target."""
     clean: bool = False
     """Delete the cached feature targets of all scenes; they are made again when needed."""
+
+    def __post_init__(self) -> None:
+        if self.target is not None and self.device != "auto":
+            raise ConfigError(
+                f"device: {self.device} is tested only where no target is given; leave out --device or {self.target}"
+            )
+        if self.clean and (self.target is not None or self.device != "auto"):
+            raise ConfigError(f"clean: only deletes; leave out --clean or {self.target or '--device'}")
 
 
 def run(args: list[str]) -> int:

@@ -15,6 +15,9 @@ MISTAKES = f"""
     bench sped | no such benchmark
     bench speed nowhere | nowhere: no config.json
     bench profile run | python -m benchmarks profiling
+    doctor run --device x | --device
+    doctor run --clean | --clean
+    doctor --clean --device cpu | --clean
     eval | RUN is missing
     eval absent | no run folder
     eval run --split half | --split half
