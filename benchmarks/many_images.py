@@ -13,8 +13,10 @@ import resource
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -51,16 +53,15 @@ def part(folder: Path, cache: Path, limit: int, batches: int, held: bool) -> dic
     import torch
 
     from fprf.datamanagers import batches as module
-    from fprf.datamanagers.batches import allocate_pixels
     from fprf.datamanagers.config import RayBatchesConfig
     from fprf.datamanagers.parsers.config import parse_scene
 
     scene = parse_scene(folder, 1, None)
-    if held:
-        module.room_for = lambda pixels, where: allocate_pixels(pixels, where, sys.maxsize)
     resource.setrlimit(resource.RLIMIT_DATA, (limit << 20, limit << 20))
     start = time.perf_counter()
-    manager = RayBatchesConfig(rays=2048).build(scene=scene, content=None, semantic=None, dim=0, cache=cache, seed=0)
+    allocate = partial(module.allocate_pixels, held=sys.maxsize) if held else module.allocate_pixels
+    with patch.object(module, "allocate_pixels", allocate):
+        manager = RayBatchesConfig(rays=2048).build(scene=scene, content=None, semantic=None, dim=0, cache=cache, seed=0)
     loaded = time.perf_counter() - start
     start, seen = time.perf_counter(), set()
     for step in range(batches):
