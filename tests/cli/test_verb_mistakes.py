@@ -40,7 +40,7 @@ MISTAKES = f"""
     export run ply --tolerance 1e-6 --output out | no surface
     gallery run | --references
     gallery untested --references A.png --split test | --split test
-    gallery run --references empty | no images
+    gallery run --references empty | no image
     gallery run --references A.png --output page.pdf | page.pdf
     gallery run --references A.png --output /proc/x.html | /proc/x.html: cannot be written
     render untested --split test | --split test
