@@ -1,6 +1,5 @@
 """`fprf report RUN`: how training went, as a page of charts and a line each on the terminal."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..errors import CheckpointError
+from ..io.strict_json import parse_json
 from .parsing import parse
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def _print(histories: "Sequence[History]", parts: list[tuple[str, float]], notes
 def _json(path: Path) -> dict[str, Any]:
     """A JSON object beside the events; an empty one where it is absent or damaged: the report goes without."""
     try:
-        content = json.loads(path.read_text("utf-8"))
+        content = parse_json(path.read_text("utf-8"))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -1,6 +1,5 @@
 """Frames to a film or to numbered pictures, one frame in memory at a time; to an animated picture, all of them."""
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 from itertools import chain, pairwise
@@ -13,6 +12,7 @@ import numpy as np
 from ..errors import DataError, UsageError
 from .atomic import atomic_path, unwritable, write_bytes, write_json
 from .images import Picture, checked, write_image
+from .strict_json import parse_json
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -159,7 +159,7 @@ def missing_frames(folder: Path, key: str, paths: Sequence[Path]) -> list[Path]:
     """
     record = folder / _RECORD
     try:
-        known = json.loads(record.read_text("utf-8")).get("key")
+        known = parse_json(record.read_text("utf-8")).get("key")
     except (OSError, ValueError, AttributeError):
         known = None
     if known == key:

@@ -7,14 +7,13 @@ Where that method is not installed, fields that fprf does not know are kept as d
 """
 
 import json
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..errors import ConfigError, FprfError, PluginError
 from ..io.atomic import write_text
+from ..io.strict_json import parse_json
 from . import registry
 from .slots import hints_of, slots
 from .typed_json import Missing as Missing
@@ -113,7 +112,7 @@ def packages_of(config: object) -> dict[str, str]:
 
 
 def read_json(path: Path, name: str = "a config.json") -> Any:
-    """Strict JSON: no duplicate keys, no NaN, no numbers beyond float64.
+    """Strict JSON of a file (see `parse_json`).
 
     Raises ConfigError, which asks for `name` where there is no such file.
     """
@@ -124,13 +123,9 @@ def read_json(path: Path, name: str = "a config.json") -> Any:
     except UnicodeDecodeError as fault:
         raise ConfigError(f"{path}: is not UTF-8 text ({fault.reason} at byte {fault.start})") from fault
     try:
-        return json.loads(text, object_pairs_hook=_unique, parse_constant=_not_json, parse_float=_number)
-    except ConfigError as fault:
+        return parse_json(text)
+    except ValueError as fault:
         raise ConfigError(f"{path}: {fault}") from fault
-    except json.JSONDecodeError as fault:
-        raise ConfigError(f"{path}: is not JSON: line {fault.lineno}, column {fault.colno}: {fault.msg}") from fault
-    except (ValueError, RecursionError) as fault:  # a number of thousands of digits; a thousand nested brackets
-        raise ConfigError(f"{path}: is not a config: {fault}") from fault
 
 
 def _check(whole: Any) -> None:
@@ -152,24 +147,3 @@ def _check(whole: Any) -> None:
     plugins = whole["plugins"]
     if not isinstance(plugins, dict) or not all(isinstance(v, str) for v in plugins.values()):
         raise ConfigError("plugins: expected an object of texts")
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> Mapping[str, Any]:
-    members: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in members:
-            raise ConfigError(f"the key {key!r} stands twice in one object")
-        members[key] = value
-    return members
-
-
-def _number(text: str) -> float:
-    # Of a plug-in that is not installed nothing is known: its numbers are kept as they are, and must be written again.
-    value = float(text)
-    if not math.isfinite(value):
-        raise ConfigError(f"{text} is beyond the largest number of float64, 1.8e308")
-    return value
-
-
-def _not_json(constant: str) -> NoReturn:
-    raise ConfigError(f"{constant} is not a number that JSON knows")

@@ -149,8 +149,8 @@ def test_a_file_that_was_edited_wrongly_is_refused(
         (b'{"format": 1, "config": {"x": -1e999}}', "-1e999 is beyond the largest number of float64"),
         (b'{"format": 1, "format": 1}', "the key 'format' stands twice"),
         (b"\xff\xfe", "is not UTF-8 text"),
-        (b"[" * 100_000, "is not a config"),
-        (b'{"format": ' + b"9" * 5000 + b"}", "is not a config"),
+        (b"[" * 100_000, "is nested too deeply"),
+        (b'{"format": ' + b"9" * 5000 + b"}", "is beyond the largest number of float64"),
     ],
 )
 def test_a_file_that_is_no_config_is_refused(tmp_path: Path, text: bytes, message: str) -> None:

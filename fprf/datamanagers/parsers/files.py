@@ -4,7 +4,6 @@ Whatever the bytes, the outcome is a value or a DataError of one line; nothing i
 Links inside the folder are followed: only what a file *says* must stay inside.
 """
 
-import json
 import math
 import re
 import zipfile
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
+from ...io.strict_json import parse_json
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 
@@ -40,38 +40,11 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_json(path: Path) -> Json:
-    """A JSON value without NaN, Infinity, numbers beyond float64, or repeated keys."""
-
-    def refuse(text: str) -> float:
-        raise ValueError(f"{text} is not a JSON number")
-
-    def real(text: str) -> float:
-        value = float(text)
-        return value if math.isfinite(value) else refuse(text)
-
-    def integer(text: str) -> int:
-        if len(text) > 300:
-            raise ValueError(f"{text[:12]}... is too large")
-        return int(text)
-
-    def once(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
-        members: dict[str, Json] = {}
-        for key, value in pairs:
-            if key in members:
-                raise ValueError(f"the key {key!r} occurs twice in one object")
-            members[key] = value
-        return members
-
+    """The strict JSON value of a file (see `parse_json`)."""
     data = read_bytes(path)
     try:
-        value: Json = json.loads(
-            data.decode("utf-8-sig"),
-            parse_constant=refuse,
-            parse_float=real,
-            parse_int=integer,
-            object_pairs_hook=once,
-        )
-    except (ValueError, RecursionError) as error:
+        value: Json = parse_json(data.decode("utf-8-sig"))
+    except ValueError as error:
         raise DataError(f"{path}: no valid JSON ({error}); write it again with the tool it came from") from error
     return value
 
