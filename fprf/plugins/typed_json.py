@@ -69,13 +69,13 @@ def leaves(config: object) -> dict[str, Any]:
     return values
 
 
-def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None) -> T:
-    """The config of that type. Raises ConfigError naming the field by its dotted path.
+def from_json(data: Any, kind: type[T], *, packages: Mapping[str, str] | None = None, path: str = "config") -> T:
+    """The config of that type. Raises ConfigError naming the field by its dotted path, of which `path` is the start.
 
     A key that is absent takes the code's default; an unknown one is refused. `packages` says by dotted path which
     package each plug-in came from, for the message about a missing one.
     """
-    value: T = _Reader(packages or {}).read(data, kind, "config")
+    value: T = _Reader(packages or {}).read(data, kind, path)
     return value
 
 

@@ -28,11 +28,12 @@ from ..config import RESUMABLE
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError
 from ..io.atomic import write_json
-from ..plugins.codec import to_json
+from ..io.strict_json import open_json
+from ..plugins.codec import from_json, to_json
 from ..training import checkpoint
 from ..training.camera_optimizers import Tones
 from ..training.model import Facts
-from ..training.run import Run, held
+from ..training.run import Run, begin, held
 from ..training.trainer import Report
 from .cells import Cell, cut
 from .config import GaussiansConfig
@@ -52,9 +53,11 @@ from .training import (
     train,
 )
 
-_FORMAT, _VIEWS = 6, "views.json"
+_FORMAT, _VIEWS, _WRITTEN = 6, "views.json", "train again to write it"
 OVERVIEW = "overview"
 """Folder of the whole scene in a run."""
+_WINDOWS = tuple[tuple[int, int, int, int, int], ...]
+"""Type of a cell's windows in the file: view, left, top, width, height of each."""
 _MOMENTS = "first", "second", "weight"
 _PIXELS, _SMALLEST = 16_000_000, 4
 """Pixels of all photographs that the whole scene is trained on, at most; how far they are reduced before some are left out."""
@@ -113,8 +116,10 @@ def write_cells(root: Path, scene: Scene, data: Path, count: int) -> list[Cell]:
             for cell in cells
         ],
     }
-    if file.is_file() and json.loads(file.read_text()) != document:
-        shutil.rmtree(root / "cells", ignore_errors=True)
+    if file.is_file():
+        with open_json(file, "remove it and train again") as before:
+            if before != document:
+                shutil.rmtree(root / "cells", ignore_errors=True)
     write_json(file, document)
     (root / _VIEWS).unlink(missing_ok=True)
     if all(path is None or path.is_relative_to(data) for path in (*scene.paths, *scene.masks)):
@@ -135,35 +140,36 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
     if not file.is_file():
         return scene_of(replace(config, data=data))
     known = Run(root).load_known()
-    try:
-        document = json.loads(file.read_text())
-        paths, masks = (tuple(name and data / name for name in document[kind]) for kind in ("paths", "masks"))
-        if len(paths) != len(known.cameras):
-            raise ValueError(f"{len(paths)} images for {len(known.cameras)} cameras")
-    except (OSError, ValueError, KeyError, TypeError) as e:
-        raise CheckpointError(f"{file}: cannot be read ({e!r}); train again to write it") from e
+    with open_json(file, _WRITTEN) as document:
+        paths = from_json(document["paths"], tuple[str, ...], path="paths")
+        masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
+        if len(paths) != len(known.cameras) or len(masks) not in (0, len(paths)):
+            raise ValueError(f"{len(paths)} images and {len(masks)} masks for {len(known.cameras)} cameras")
     train, test = torch.tensor(known.train), torch.tensor(known.test, dtype=torch.int64)
-    return Scene(name=known.name, paths=paths, cameras=known.cameras, train=train, test=test, masks=masks)
+    return Scene(
+        name=known.name,
+        paths=tuple(data / name for name in paths),
+        cameras=known.cameras,
+        train=train,
+        test=test,
+        masks=tuple(None if name is None else data / name for name in masks),
+    )
 
 
 def read_cells(root: Path) -> list[Cell]:
     """The cells of a run. Raises CheckpointError where the file cannot be read."""
-    file = root / "cells.json"
-    try:
-        document = json.loads(file.read_text())
-        frame = torch.tensor(document["frame"], dtype=torch.float64)
+    with open_json(root / "cells.json", _WRITTEN) as document:
+        frame = torch.tensor(document["frame"], dtype=torch.float64).reshape(3, 3)
         return [
             Cell(
                 frame=frame,
                 low=_bounds(each["low"], -math.inf),
                 high=_bounds(each["high"], math.inf),
                 border=_bounds(each["border"], 0.0),
-                windows={view: (left, top, width, height) for view, left, top, width, height in each["windows"]},
+                windows={v: (x, y, w, h) for v, x, y, w, h in from_json(each["windows"], _WINDOWS, path="windows")},
             )
             for each in document["cells"]
         ]
-    except (OSError, ValueError, KeyError, TypeError) as e:
-        raise CheckpointError(f"{file}: cannot be read ({e!r}); train again to write it") from e
 
 
 def _bound(value: float) -> float | None:
@@ -172,7 +178,7 @@ def _bound(value: float) -> float | None:
 
 
 def _bounds(values: list[float | None], infinite: float) -> Tensor:
-    return torch.tensor([infinite if value is None else value for value in values], dtype=torch.float64)
+    return torch.tensor([infinite if value is None else value for value in values], dtype=torch.float64).reshape(3)
 
 
 def train_overview(
@@ -186,13 +192,13 @@ def train_overview(
     folder = root / OVERVIEW
     task = _task(config, scene, scene.train.tolist())
     done, kept = _read_done(folder), checkpoint.steps(folder / "checkpoints")
-    if done is not None and done["task"] == task and kept:
+    if done is not None and done.get("task") == task and kept:
         try:
             checkpoint.load(folder / "checkpoints", kept[-1])  # verified here, once for all cells
         except CheckpointError as e:
             raise CheckpointError(f"{e}, or remove {folder} and train it again") from e
         return False
-    _begin(folder, task)
+    begin(folder, task)
     # Smaller images, then fewer, where memory would not be bounded: at most as many pixels of all together.
     pixels, factor = int(scene.cameras.size[scene.train].prod(1).sum()), 2
     while factor < _SMALLEST and pixels > factor**2 * _PIXELS:
@@ -235,7 +241,7 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
         asked = {"format": _FORMAT, "task": named, "steps": config.steps, "minutes": config.minutes}
         if _read_done(folder) == asked:
             return False
-        _begin(folder, named)
+        begin(folder, named)
         steps = max(1, round((1 - config.overview) * config.steps))
         own = replace(config, rate=_RATE * config.rate, steps=steps, minutes=task.minutes)
         facts = Run(root).load_known().facts
@@ -286,15 +292,6 @@ def _tones_of(facts: Facts, start: checkpoint.Saved) -> Tones | None:
     return tones
 
 
-def _begin(folder: Path, task: str) -> None:
-    """Note what a folder is trained as; what it was trained as before is removed."""
-    mark = folder / "task.json"
-    if not mark.is_file() or json.loads(mark.read_text()) != task:
-        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(mark, task)
-
-
 def _task(config: GaussiansConfig, scene: Scene, views: list[int], cell: Cell | None = None, start: str = "") -> str:
     """Digest of what is asked for, steps and minutes aside; while it stays the same, what was trained stays good."""
     tree = to_json(config)
@@ -315,13 +312,11 @@ def _task(config: GaussiansConfig, scene: Scene, views: list[int], cell: Cell | 
 
 
 def _read_done(folder: Path) -> dict[str, Any] | None:
-    try:
-        document: dict[str, Any] = json.loads((folder / "done.json").read_text())
-    except FileNotFoundError:
+    file = folder / "done.json"
+    if not file.is_file():
         return None
-    except (OSError, ValueError) as e:
-        raise CheckpointError(f"{folder / 'done.json'}: cannot be read ({e}); remove it and train again") from e
-    return document
+    with open_json(file, "remove it and train again") as document:
+        return from_json(document, dict[str, Any], path="done")
 
 
 def unite(root: Path, cells: Sequence[Cell]) -> int:

@@ -4,7 +4,6 @@ Images are decoded one at a time and features are mapped from their files, so me
 semantic basis, one unit of each loss and one cache serve all blocks.
 """
 
-import json
 import os
 import shutil
 import time
@@ -30,7 +29,7 @@ from . import tensorfiles
 from .blocks import RAYS, SURROUNDINGS, Built, asked_of, folder_of, inset, surroundings
 from .model import Facts, build_decoder
 from .prepare import Prepared, behind, build_encoders, cache_folder, device_of, exposure_of, facts_of, scene_of
-from .run import Run
+from .run import Run, task_of
 from .trainer import Loop, optimizer_of
 
 
@@ -122,10 +121,9 @@ def trained_tasks(root: Path) -> dict[Path, str]:
     """Folders of blocks in a run, whatever their numbers, and what each was begun as."""
     tasks = {}
     for mark in sorted((root / "blocks").glob("*/task.json")):
-        try:
-            tasks[mark.parent] = str(json.loads(mark.read_text())["task"])
-        except (OSError, ValueError, KeyError, TypeError):
-            continue  # cut short while it was written: as good as not begun
+        match task_of(mark.parent):
+            case {"task": str(task)}:
+                tasks[mark.parent] = task
     return tasks
 
 

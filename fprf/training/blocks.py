@@ -16,7 +16,6 @@ four blocks came out 1.9 dB better after 200 steps each than from seeded planes.
 import copy
 import hashlib
 import json
-import shutil
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,7 +34,8 @@ from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, ConfigError
 from ..interfaces import DataManager, Decoder
 from ..io.atomic import write_json
-from ..plugins.codec import to_json
+from ..io.strict_json import open_json
+from ..plugins.codec import from_json, to_json
 from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
 from ..types import Boxes
@@ -44,7 +44,7 @@ from .camera_optimizers import Poses, Tones
 from .checkpoint import misfit, reached
 from .model import Facts, Model, build_decoder, build_fields, poses_of, tones_of
 from .prepare import Prepared, build_encoders, cache_folder, scene_of
-from .run import Run, held
+from .run import Run, begin, held
 from .trainer import Report, train
 
 FREE = (*RESUMABLE, "blocks", "executor", "statistics", "render")
@@ -63,8 +63,21 @@ class Built(NamedTuple):
     member: Member
 
 
-class Finished(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Done:
     """Content of a block's done.json."""
+
+    format: int
+    asked: dict[str, Any]
+    """See `asked_of`."""
+    step: int
+    seconds: float
+    tensors: dict[str, Any]
+    """Manifest of block.safetensors."""
+
+
+class Finished(NamedTuple):
+    """A finished block."""
 
     step: int
     seconds: float
@@ -143,15 +156,13 @@ def save_finished(folder: Path, built: Built, *, asked: dict[str, Any], step: in
     write_json(folder / "done.json", {"format": _FORMAT, "asked": asked, "step": step, "seconds": seconds, "tensors": manifest})
 
 
-def read_done(folder: Path) -> dict[str, Any] | None:
-    """done.json, or None where the block is not finished."""
-    try:
-        document: dict[str, Any] = json.loads((folder / "done.json").read_text())
-    except FileNotFoundError:
+def read_done(folder: Path) -> Done | None:
+    """done.json, or None where the block is not finished. Raises CheckpointError."""
+    file = folder / "done.json"
+    if not file.is_file():
         return None
-    except (OSError, ValueError) as e:
-        raise CheckpointError(f"{folder / 'done.json'}: cannot be read ({e}); remove it and train again") from e
-    return document if document.get("format") == _FORMAT else None
+    with open_json(file, "remove it and train again") as document:
+        return from_json(document, Done, path="done") if document["format"] == _FORMAT else None
 
 
 def load_finished(folder: Path, *, verify: bool = True) -> Finished:
@@ -160,12 +171,8 @@ def load_finished(folder: Path, *, verify: bool = True) -> Finished:
     if done is None:
         again = f"fprf train {folder.parent.parent / 'config.json'}"
         raise CheckpointError(f"{folder}: this block is not finished; go on with `{again}`")
-    try:
-        step, seconds, manifest = int(done["step"]), float(done["seconds"]), dict(done["tensors"])
-    except (KeyError, TypeError, ValueError) as e:
-        raise CheckpointError(f"{folder / 'done.json'}: cannot be read ({e!r}); remove it and train again") from e
     file = folder / "block.safetensors"
-    return Finished(step, seconds, tensorfiles.load(file, manifest) if verify else tensorfiles.read(file))
+    return Finished(done.step, done.seconds, tensorfiles.load(file, done.tensors) if verify else tensorfiles.read(file))
 
 
 def restore(module: nn.Module, kind: str, tensors: dict[str, Tensor]) -> None:
@@ -185,14 +192,10 @@ def restore_all(built: Built, tensors: dict[str, Tensor]) -> None:
 
 def load_boxes(root: Path) -> Boxes:
     """Read the boxes of a run's blocks. Raises CheckpointError."""
-    path = root / "blocks.json"
-    try:
-        document: dict[str, Any] = json.loads(path.read_text())
+    with open_json(root / "blocks.json", "train the scene again") as document:
         if document["format"] != 1:
             raise ValueError(f"format {document['format']!r}, this fprf reads 1")
         return boxes_from(document["boxes"])
-    except (OSError, ValueError, KeyError, TypeError) as e:
-        raise CheckpointError(f"{path}: cannot be read ({e}); train the scene again") from e
 
 
 def asked_of(
@@ -263,10 +266,10 @@ def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callab
         raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
     asked = asked_of(config, facts, scene, boxes, task.block, rays)
     done = read_done(folder)
-    if done is not None and done["asked"] == asked:
+    if done is not None and done.asked == asked:
         return False
     config = replace(config, minutes=task.minutes)  # its part alone is not what was asked: it changes from call to call
-    _begin(folder, asked["task"])
+    begin(folder, {"task": asked["task"]})
     own = replace(scene, train=views)
     built = built_block(root, config, facts, boxes, task.block, views)
     block_run = Run(folder)
@@ -279,20 +282,6 @@ def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callab
     step, seconds = reached(block_run.checkpoints)
     save_finished(folder, built, asked=asked, step=step, seconds=seconds)
     return True
-
-
-def _begin(folder: Path, task: str) -> None:
-    """Clear what was trained as something else; what belongs to this task stays, so that it is gone on with."""
-    mark = folder / "task.json"
-    known = json.loads(mark.read_text()).get("task") if mark.is_file() else None
-    (folder / "done.json").unlink(missing_ok=True)
-    if known == task:
-        return
-    mark.unlink(missing_ok=True)
-    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-    for name in ("block.safetensors", "events.jsonl"):
-        (folder / name).unlink(missing_ok=True)
-    write_json(mark, {"task": task})
 
 
 def _manager(run: Run, config: TrainConfig, facts: Facts, scene: Scene, rays: dict[str, Tensor]) -> DataManager:

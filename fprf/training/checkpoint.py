@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from ..errors import CheckpointError, DataError
 from ..io.atomic import remove_unfinished, write_json
+from ..io.strict_json import open_json
 from . import tensorfiles
 from .model import Model
 
@@ -123,18 +124,14 @@ class _Manifest(NamedTuple):
 
 def _read(root: Path, step: int) -> _Manifest:
     """A manifest, checked; those of before had no checksum of their own. Raises CheckpointError."""
-    folder = _folder(root, step)
-    try:
-        manifest: dict[str, Any] = json.loads((folder / "manifest.json").read_text())
+    with open_json(_folder(root, step) / "manifest.json", "use another checkpoint") as manifest:
         if manifest.pop("crc32", None) not in (None, checksum := _checksum(manifest)):
             raise ValueError("its checksum differs")
         at, seconds = int(manifest["step"]), float(manifest["seconds"])
         files = {name: dict(manifest["files"][name]) for name in ("model", "optimizer")}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as e:
-        raise CheckpointError(f"{folder}: its manifest cannot be read ({e!r})") from e
-    if at != step or not math.isfinite(seconds):
-        raise CheckpointError(f"{folder}: its manifest speaks of step {at} after {seconds} s; use another checkpoint")
-    return _Manifest(seconds, files, checksum)
+        if at != step or not math.isfinite(seconds):
+            raise ValueError(f"it speaks of step {at} after {seconds} s")
+        return _Manifest(seconds, files, checksum)
 
 
 def load_latest(root: Path, *, verify: bool = True) -> tuple[Saved | None, list[str]]:

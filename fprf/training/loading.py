@@ -245,7 +245,7 @@ def _load_blocks(
         raise CheckpointError(
             f"{run.root}: {len(blocks) - len(done)} of {len(blocks)} blocks are not finished; go on with `{again}`"
         )
-    steps, seconds = [int(each["step"]) for each in done], finished.seconds + sum(float(each["seconds"]) for each in done)
+    steps, seconds = [each.step for each in done], finished.seconds + sum(each.seconds for each in done)
     return Trained(run, config, method, _where_refined(known, model), model.to(device).eval(), min(steps), seconds)
 
 

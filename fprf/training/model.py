@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..blocks.fields import add_penalties
+from ..checks import between
 from ..config import TrainConfig
 from ..errors import WeightsError
 from ..interfaces import ContentField, Decoder, Sampler, SemanticField
@@ -28,6 +29,10 @@ def build_decoder(config: TrainConfig, *, encoder: str, channels: int) -> Decode
     except WeightsError as error:
         line = pretrain_line(config.content.encoder)
         raise WeightsError(f"{error}; `{line}` makes its decoder, --content.decoder.weights FILE names it") from error
+
+
+_MOST_CHANNELS, _FARTHEST = 2**16, 1e30
+"""Bounds of what a spoilt file may ask for: memory, and distances that float32 holds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +62,12 @@ class Facts:
     """Of the cameras, in the world, as the capture says; empty where poses are not refined."""
     reach: float = 1.0
     """World distance that views commonly see: the unit in which cameras are shifted."""
+
+    def __post_init__(self) -> None:
+        for name in ("channels", "dim"):
+            between(name, getattr(self, name), 0, _MOST_CHANNELS)
+        for name in ("near", "far"):
+            between(f"space.{name}", getattr(self.space, name), 0, _FARTHEST)
 
 
 class Model(nn.Module):

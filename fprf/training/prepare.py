@@ -287,7 +287,7 @@ class Outcome(NamedTuple):
 def outcome(root: Path, config: TrainConfig, scene: Scene) -> Outcome | None:
     """Outcome by a run's events.jsonl, or those of its blocks; None where no step was made."""
     try:
-        trained = [history for history in read_history(root) if history.step and history.values["psnr"][-1] is not None]
+        trained = [history for history in read_history(root) if history.values.get("psnr", [None])[-1] is not None]
     except CheckpointError:
         return None
     blocks = [history for history in trained if history.name] or trained

@@ -16,8 +16,8 @@ import dataclasses
 import errno
 import hashlib
 import json
-import math
 import os
+import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -33,17 +33,19 @@ from ..config import RunConfig
 from ..datamanagers.scene import Scene
 from ..errors import CheckpointError, DataError, UsageError
 from ..io.atomic import unwritable, write_json
-from ..plugins.codec import load_config, save_config
+from ..io.strict_json import open_json, parse_json
+from ..plugins.codec import from_json, load_config, save_config
 from ..rendering.cameras import Cameras
 from ..rendering.paths import well_covered
-from ..rendering.space import Space
 from . import tensorfiles
 from .model import Facts
 
 FORMAT = 1
 _SHOWN = 8
 """Views of the split `covered`, at most."""
-_CAMERA = ("pose", "focal", "centre", "size", "distortion", "lens")
+_CAMERA = {"pose": (3, 4), "focal": (2,), "centre": (2,), "size": (2,), "distortion": (6,), "lens": ()}
+"""Fields of the cameras, and the shape of each for one view."""
+_INTEGERS = ("size", "lens")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,30 +111,26 @@ class Run:
 
     def load_known(self) -> Known:
         """Read scene.json. Raises CheckpointError."""
-        path = self.root / "scene.json"
-        try:
-            document: dict[str, Any] = json.loads(path.read_text())
+        with open_json(self.root / "scene.json", "train the scene again, or use the fprf that wrote it") as document:
             if document["format"] != FORMAT:
-                raise CheckpointError(
-                    f"{path}: is of format {document['format']!r}, this fprf reads {FORMAT}; use the one that wrote it"
-                )
-            facts = dict(document["facts"])
-            space = {k: _tupled(v) for k, v in facts.pop("space").items()}
-            raw = document["cameras"]
-            cameras = Cameras(
-                *(torch.tensor(raw[key], dtype=torch.int64 if key in ("size", "lens") else torch.float64) for key in _CAMERA)
-            )
+                raise ValueError(f"format {document['format']!r}, this fprf reads {FORMAT}")
+            names = from_json(document["names"], tuple[str, ...], path="names")
+            train, test = (from_json(document[key], tuple[int, ...], path=key) for key in ("train", "test"))
+            if not all(0 <= view < len(names) for view in (*train, *test)):
+                raise ValueError(f"train or test numbers a view beyond its {len(names)}")
+            cameras = {}
+            for key, shape in _CAMERA.items():
+                numbers = torch.tensor(document["cameras"][key], dtype=torch.int64 if key in _INTEGERS else torch.float64)
+                cameras[key] = numbers.reshape(len(names), *shape)
             return Known(
-                name=document["name"],
-                data=document["data"],
-                names=tuple(document["names"]),
-                cameras=cameras,
-                train=tuple(document["train"]),
-                test=tuple(document["test"]),
-                facts=Facts(space=Space(**space), **{k: _tupled(v) for k, v in facts.items()}),
+                name=from_json(document["name"], str, path="name"),
+                data=from_json(document["data"], str, path="data"),
+                names=names,
+                cameras=Cameras(**cameras),
+                train=train,
+                test=test,
+                facts=from_json(document["facts"], Facts, path="facts"),
             )
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as e:
-            raise CheckpointError(f"{path}: cannot be read ({e!r}); train the scene again") from e
 
     def saved_facts(self) -> Facts | None:
         """Facts of the run's scene; None before it wrote scene.json. Raises CheckpointError."""
@@ -166,8 +164,27 @@ def view_names(paths: Sequence[Path]) -> list[str]:
     return [f"{i:05d}-{p.stem}" for i, p in enumerate(paths)]
 
 
-def _tupled(value: Any) -> Any:
-    return tuple(_tupled(v) for v in value) if isinstance(value, list) else value
+_TASK = "task.json"
+
+
+def task_of(folder: Path) -> Any:
+    """Task that a block or cell was begun as; None where its task.json is absent or damaged, which is as good as not begun."""
+    try:
+        with open_json(folder / _TASK, "") as task:
+            return task
+    except CheckpointError:
+        return None
+
+
+def begin(folder: Path, task: object) -> None:
+    """Begin a block or cell as `task`, a JSON value, or resume it: what was trained there as another one is removed."""
+    (folder / "done.json").unlink(missing_ok=True)
+    if task_of(folder) == task:
+        return
+    shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+    for name in (_TASK, "block.safetensors", "events.jsonl"):
+        (folder / name).unlink(missing_ok=True)
+    write_json(folder / _TASK, task)
 
 
 try:
@@ -269,11 +286,8 @@ def check_images(root: Path, scene: Scene, hashes: Mapping[str, str]) -> None:
     path = root / IMAGES
     if not path.exists():
         return
-    try:
-        document = json.loads(path.read_text())
-        before = {str(name): str(mark) for name, mark in document["images"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CheckpointError(f"{path}: cannot be read ({error!r}); remove it, and the images are taken as they are") from error
+    with open_json(path, "remove it, and the images are taken as they are") as document:
+        before = from_json(document["images"], dict[str, str], path="images")
     files = dict(zip(view_names(scene.paths), scene.paths, strict=True))
     changed = [f"{files[name]} is another" for name in hashes if name in before and before[name] != hashes[name]]
     changed += [f"{files[name]} is new" for name in hashes if name not in before]
@@ -323,7 +337,7 @@ def _history(name: str, file: Path) -> History:
     for event in _events(file):
         if "part" in event and _number(event.get("seconds")) is not None:
             parts[str(event["part"])] = parts.get(str(event["part"]), 0.0) + float(event["seconds"])
-        elif isinstance(event.get("step"), int) and _number(event.get("seconds")) is not None:
+        elif type(step := event.get("step")) is int and abs(step) < _LAST and _number(event.get("seconds")) is not None:
             while lines and lines[-1]["step"] >= event["step"]:
                 lines.pop()
             lines.append(event)
@@ -338,14 +352,19 @@ def _history(name: str, file: Path) -> History:
 def _events(file: Path) -> Iterator[dict[str, Any]]:
     for line in file.read_text("utf-8", errors="replace").splitlines():
         try:
-            event = json.loads(line)
+            event = parse_json(line, nan=True)
         except ValueError:
             continue
         if isinstance(event, dict):
             yield event
 
 
+_LARGEST, _LAST = 3.4e38, 2**63
+"""Bounds of figures (training computes in float32) and of steps: with those beyond, sums and charts would overflow."""
+
+
 def _number(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    """A figure as training writes it; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
         return None
     return float(value)
