@@ -43,7 +43,7 @@ from .scene import Semantics, SplatScene, find_semantics, load_semantics, semant
 _PATIENCE = 3
 """Steps in a row without a finite loss after which training gives up."""
 _SMOOTHING = 0.95
-_VIEWS, _SEEN = 32, 400
+_VIEWS, _SEEN = 32, 240
 """Training views that semantics are found in, at most; their longest side in pixels."""
 _PIXELS = 640 * 360
 """Of an image, where nobody says how far to reduce them."""
