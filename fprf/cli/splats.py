@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import UsageError
 from .progress import Display
-from .verbs import Verbs, views_of
+from .verbs import Verbs
 
 if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
@@ -53,18 +53,13 @@ class SplatVerbs(Verbs):
         import torch
 
         from ..evaluation.evaluate import described, judge_views
-        from ..splats.training import fit_poses, load_tones, open_gaussians, scene_of
+        from ..splats.training import fit_poses, load_tones, open_gaussians
         from ..training.camera_optimizers import moved_cameras
-        from ..training.run import view_names
-        from .eval import store
+        from .eval import store, views_to_judge
 
         opened = open_gaussians(config.run, self.config, config)
-        data, known = config.data or self.config.data, opened.known
-        scene = scene_of(replace(self.config, data=data))
-        if tuple(view_names(scene.paths)) != known.names:
-            raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
-        views = views_of(known, config.split)
-        shown, tones = opened.scene, load_tones(opened.run)
+        known, shown, tones = opened.known, opened.scene, load_tones(opened.run)
+        scene, views = views_to_judge(config, self.config, known)
 
         def draw(view: int) -> "View":
             if tones is None:
