@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from ...datamanagers.images import header_of
 from ...errors import DataError
-from ..gaussians import COUNTS, Gaussians
-from .base import Bools, Capture, Floats, assembled, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
+from ..gaussians import COUNTS, Gaussians, from_arrays
+from .base import Bools, Capture, Floats, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
@@ -62,7 +62,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
     labels, rest = pictures.palette()
     alpha = base[:, 3:] if version == 2 else pictures.decoded("sh0", base, 4)[:, 3:]
     constants = pictures.decoded("sh0", base[:, :3] if version == 2 else base, 3 if version == 2 else 4)[:, :3]
-    gaussians = assembled(
+    gaussians = from_arrays(
         np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)),
         quaternions,
         pictures.decoded("scales", scale[:, :3], 3),
@@ -177,13 +177,11 @@ class _Pictures:
     def numbers(self, group: str, name: str, length: int) -> Floats:
         """A list of so many finite numbers."""
         value = self.meta[group].get(name) if isinstance(self.meta.get(group), dict) else None
-        if not isinstance(value, list) or len(value) != length:
-            raise self._wrong(f"{group}.{name} is no list of {length} numbers")
         # Exporters write null in the place of the first number of a codebook that is not finite.
-        if name == "codebook" and value and value[0] is None:
-            value = [value[1], *value[1:]]
+        if name == "codebook" and isinstance(value, list) and value[:1] == [None]:
+            value = value[1:2] + value[1:]
         try:
-            values = np.array(value, dtype=np.float64)
+            values = np.array(value if isinstance(value, list) else None, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             values = np.array([np.nan])
         if values.shape != (length,) or not np.isfinite(values).all():

@@ -11,15 +11,14 @@ import itertools
 import struct
 import zlib
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..gaussians import COUNTS, Gaussians
-from .base import Bools, Capture, Floats, assembled, logit, short, sigmoid, smallest_three, steps, three_to_four
+from ..gaussians import COUNTS, Gaussians, from_arrays
+from .base import Bools, Capture, Floats, logit, short, sigmoid, smallest_three, steps, three_to_four
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
@@ -79,7 +78,7 @@ def read_spz(path: Path, data: bytes) -> Capture:
         quaternions[:, _TURN] = found
     bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
     harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
-    gaussians = assembled(
+    gaussians = from_arrays(
         points * _AXES,
         quaternions * np.concatenate([[1.0], _AXES]),
         scales.reshape(count, 3) / 16 - 10,
@@ -173,7 +172,12 @@ def _zipped(data: bytes) -> bytes:
 def _frames(path: Path, data: bytes, header: _Header) -> list[bytes]:
     """The streams of version 4; harmonics of degree 0 have none."""
     from_, sizes = _toc(path, data, header)
-    zstd = _zstd(path)
+    try:
+        import zstandard as zstd
+    except ImportError:
+        raise DataError(
+            f"{path}: .spz of version 4 is read with zstandard; pip install zstandard, or save as version 3"
+        ) from None
     streams = []
     for (size, raw), wanted in zip(sizes, header.sizes, strict=False):
         if raw != wanted:
@@ -220,13 +224,3 @@ def _framed(data: bytes, streams: list[bytes], keep: tuple[int, ...]) -> bytes:
         start += size
     table = b"".join(_ENTRY.pack(len(frame), raw) for frame, (_, raw) in zip(frames, sizes, strict=True))
     return b"".join([data[:at], table, *frames, data[start:]])
-
-
-def _zstd(path: Path) -> ModuleType:
-    try:
-        import zstandard
-    except ImportError:
-        raise DataError(
-            f"{path}: .spz of version 4 is read with zstandard; pip install zstandard, or save as version 3"
-        ) from None
-    return zstandard
