@@ -126,8 +126,7 @@ def make_levels(
 
 
 def _undistorted_mask(cameras: Cameras, view: int, mask: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
-    white = np.repeat(mask[..., None], 3, 2).astype(np.uint8) * 255
-    return np.asarray(undistorted(cameras, view, white, camera)[0][..., 0] > 254)
+    return np.asarray(undistorted(cameras, view, mask.astype(np.uint8) * 255, camera)[0] > 254)
 
 
 def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.bool_] | None:

@@ -299,7 +299,7 @@ class _Meter:
 
     def __init__(self, before: float) -> None:
         self.before, self.begun = before, time.perf_counter()
-        self.steps = self.skipped = self.failed = self.pixels = 0
+        self.skipped = self.failed = self.pixels = 0
         self.means: dict[str, float] = {}
 
     def clock(self, now: float) -> float:
@@ -308,15 +308,14 @@ class _Meter:
 
     def add(self, step: Step | None) -> None:
         """Count a step."""
-        self.steps += 1
         if step is None:
             self.skipped, self.failed = self.skipped + 1, self.failed + 1
             return
         self.failed = 0
         self.pixels += step.pixels
-        for name, value in (("rgb", step.squared), ("l1", step.l1), ("ssim", step.ssim), ("gaussians", float(step.gaussians))):
-            keep = 0.0 if name == "gaussians" else _SMOOTHING
-            self.means[name] = keep * self.means.get(name, value) + (1 - keep) * value
+        for name, value in (("rgb", step.squared), ("l1", step.l1), ("ssim", step.ssim)):
+            self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
+        self.means["gaussians"] = float(step.gaussians)
 
     def report(self, step: int, share: float, seconds: float) -> Report:
         """Return the progress."""

@@ -326,7 +326,8 @@ def _around(up: Annotated[Tensor, "3"], count: int, begin: float = 0.0) -> Annot
     """Directions across `up`, spread evenly, turned by `begin` of the angle between them."""
     basis = torch.linalg.qr(torch.cat([up[:, None], torch.eye(3, dtype=up.dtype)[:, up.abs().argsort()[:2]]], 1))[0]
     turn = (torch.arange(count, dtype=torch.float64) + begin) * (2 * math.pi / count)
-    return turn.cos()[:, None] * basis[:, 1] + turn.sin()[:, None] * basis[:, 2]
+    ring: Tensor = turn.cos()[:, None] * basis[:, 1] + turn.sin()[:, None] * basis[:, 2]
+    return ring
 
 
 def _quantiles(values: Tensor, weights: Tensor, shares: tuple[float, ...]) -> Tensor:

@@ -52,7 +52,6 @@ _SPAN = 8.0
 
 
 class _Element(NamedTuple):
-    name: str
     table: NDArray[np.void]
     offset: int
     """Of its first byte in the file."""
@@ -244,7 +243,7 @@ def _parse(path: Path, data: bytes) -> tuple[list[str], dict[str, _Element]]:
         kind, count = np.dtype([(each[2], _TYPES[each[1]]) for each in properties]), int(words[2])
         if offset + count * kind.itemsize > len(data):
             raise short(path, len(data), offset + count * kind.itemsize, f"element {words[1]} of {count} rows")
-        elements[words[1]] = _Element(words[1], np.frombuffer(data, kind, count, offset), offset)
+        elements[words[1]] = _Element(np.frombuffer(data, kind, count, offset), offset)
         offset += count * kind.itemsize
     return comments, elements
 
