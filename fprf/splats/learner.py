@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..ops.harmonics import HARMONIC
 from ..ops.rasterise_kernels import FIXED, SLOTS
@@ -86,9 +86,9 @@ class Learner:
         self.weight[:] = 0
         self.tones, self.poses, self.only = tones, poses, only
         self.corrections = {
-            f"{kind}.{name}": (parameter.detach(), *_view_moments(parameter))
+            f"{kind}.{name}": (each.detach(), torch.zeros_like(each), torch.zeros_like(each), torch.zeros(each.shape[:1]))
             for kind, module in (("tones", tones), ("poses", poses))
-            for name, parameter in (module.named_parameters() if module is not None else ())
+            for name, each in (module.named_parameters() if module is not None else ())
         }
         """What is learnt of each view: the parameter, its moments and the steps of each view."""
 
@@ -301,11 +301,6 @@ MOVES = "poses.moves"
 """Name in checkpoints of where views were moved: `Poses.moved_by`."""
 _KEPT = "value", "first", "second", "steps"
 """Names in checkpoints of what `Learner.corrections` holds."""
-
-
-def _view_moments(parameter: nn.Parameter) -> tuple[Tensor, Tensor, Tensor]:
-    """Room for the moments of a parameter, and for the steps of each view."""
-    return torch.zeros_like(parameter), torch.zeros_like(parameter), parameter.new_zeros(parameter.shape[:1])
 
 
 def _adam(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:

@@ -26,12 +26,12 @@ from fprf.splats.views import draw
 
 SHAPE = ("means", "quaternions", "log_scales", "logits")
 COUNT = 600
-STEP = {  # half a step of positions (of their range), ln-scales (of theirs), opacities, mean colours and harmonics
+STEP = {  # most that positions in [-2, 2], ln-scales, opacities, mean colours and harmonics change by: half a step
     ".ply": (0.0, 0.0, 1e-7, 0.0, 0.0),
-    ".compressed.ply": (0.5 / 1023, 0.5 / 1023, 0.5 / 255, 0.5 / 255, 0.5 * 8 / 256),
-    ".splat": (0.0, 1e-7, 0.5 / 255, 0.5 / 255, None),
-    ".spz": (2**-22, 0.5 / 16, 0.5 / 255, 0.5 / 255 * 0.282 / 0.15, 0.5 / 128),
-    ".sog": (4e-5, None, 0.5 / 255, None, None),
+    ".compressed.ply": (2 / 1023, 2 / 1023, 0.5 / 255, 0.65 / 255, 4 / 256),
+    ".splat": (0.0, 4e-7, 0.5 / 255, 0.5 / 255, 0.0),
+    ".spz": (2**-20, 0.5 / 16, 0.5 / 255, 0.5 / 255 * 0.282 / 0.15, 0.5 / 128),
+    ".sog": (1.6e-4, 0.5 / 16, 0.5 / 255, 0.02, 0.01),
 }
 
 
@@ -95,19 +95,11 @@ def test_written_gaussians_come_back_within_a_step(ending: str, degree: int, tmp
     if ending in (".compressed.ply", ".sog"):
         made = made.select(torch.from_numpy(spatial_order(made.means.numpy())))
     assert found.degree == (0 if ending == ".splat" else degree)
-    at, scale, opacity, tint, rest = STEP[ending]
-
-    def off(name: str) -> float:
-        return float((getattr(found, name) - getattr(made, name)).abs().max())
-
     slack = 1e-6
-    assert off("means") <= at * 4 + slack
-    assert off("log_scales") <= (0.5 / 16 if scale is None else scale * (1 if ending == ".spz" else 4)) + slack
-    assert off("opacities") <= opacity + slack
-    assert off("colours") <= (0.02 if tint is None else tint * (1.3 if ending == ".compressed.ply" else 1)) + slack
-    if degree and ending != ".splat":
-        error = (found.harmonics[:, 1:] - made.harmonics[:, 1:]).abs().max()
-        assert error <= (0.01 if rest is None else rest) + slack
+    for name, most in zip(("means", "log_scales", "opacities", "colours"), STEP[ending], strict=False):
+        assert (getattr(found, name) - getattr(made, name)).abs().max() <= most + slack
+    rest = found.harmonics[:, 1:] - made.harmonics[:, 1 : found.harmonics.shape[1]]
+    assert (rest.abs() <= STEP[ending][-1] + slack).all()
     turned = (torch.nn.functional.normalize(found.quaternions, dim=1) * made.quaternions).sum(1).abs()
     # Half a step of 8 bits in each of four components, at most.
     assert turned.min() >= 1 - 0.5 * 4 * (0.5 / 127) ** 2 - slack
@@ -284,7 +276,7 @@ def test_gaussians_that_are_not_finite_are_read_and_told(tmp_path: Path) -> None
 
 
 def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:
-    data = written(tmp_path / "x.ply", cloud(1, 4)).data
+    data, spz, sog = (written(tmp_path / f"x{ending}", cloud(1, 4)).data for ending in (".ply", ".spz", ".sog"))
     for name, content in (
         ("2d.ply", data.replace(b"scale_2", b"scale_9")),
         ("2dgs.ply", data.replace(b"format", b"comment SplatRenderMode: 2dgs\nformat", 1)),
@@ -294,6 +286,10 @@ def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:
         ("degree.ply", data.replace(b"f_rest_8", b"g_rest_8")),
         ("x.obj", data),
         ("x.splat", b"abc"),
+        ("short.spz", spz[:-9]),
+        ("other.spz", data),
+        ("short.sog", sog[:-9]),
+        ("meta.json", b"{}"),
         ("none/x.ply", None),
     ):
         if content is not None:
