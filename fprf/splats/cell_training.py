@@ -101,23 +101,29 @@ def write_cells(root: Path, scene: Scene, data: Path, count: int) -> list[Cell]:
     """
     cells = cut(scene, count)
     file = root / "cells.json"
-    boxes = [
-        {
-            "low": [_bound(x) for x in cell.low.tolist()],
-            "high": [_bound(x) for x in cell.high.tolist()],
-            "border": cell.border.tolist(),
-            "windows": [[view, *window] for view, window in cell.windows.items()],
-        }
-        for cell in cells
-    ]
-    document = {"format": _FORMAT, "frame": cells[0].frame.tolist(), "cells": boxes}
+    document = {
+        "format": _FORMAT,
+        "frame": cells[0].frame.tolist(),
+        "cells": [
+            {
+                "low": [_bound(x) for x in cell.low.tolist()],
+                "high": [_bound(x) for x in cell.high.tolist()],
+                "border": cell.border.tolist(),
+                "windows": [[view, *window] for view, window in cell.windows.items()],
+            }
+            for cell in cells
+        ],
+    }
     if file.is_file() and json.loads(file.read_text()) != document:
         shutil.rmtree(root / "cells", ignore_errors=True)
     write_json(file, document)
     (root / _VIEWS).unlink(missing_ok=True)
     if all(path is None or path.is_relative_to(data) for path in (*scene.paths, *scene.masks)):
-        paths, masks = ([path and path.relative_to(data).as_posix() for path in of] for of in (scene.paths, scene.masks))
-        write_json(root / _VIEWS, {"paths": paths, "masks": masks})
+        files = {"paths": scene.paths, "masks": scene.masks}
+        write_json(
+            root / _VIEWS,
+            {name: [path and path.relative_to(data).as_posix() for path in paths] for name, paths in files.items()},
+        )
     return cells
 
 
