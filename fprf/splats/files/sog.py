@@ -83,7 +83,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
             entries = np.where(seen[:, None, None], mixed, rest)
             name = said["shN"]["files"][0]
             index, said["shN"] = _quantized(entries, said["shN"])
-            new[name] = _webp(_palette_picture(index, pictures.picture(name, _PALETTE * max(COUNTS))))
+            new[name] = _webp(_palette_picture(index))
         new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
         return bundle(new, like=data)
 
@@ -129,8 +129,7 @@ def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
             entries,
             {"count": used, "bands": gaussians.degree, "codebook": [], "files": ["shN_centroids.webp", "shN_labels.webp"]},
         )
-        rows = np.zeros((-(-used // _ROW), _ROW * entries.shape[1], 4), np.uint8)
-        pictures["shN_centroids.webp"] = _palette_picture(index, rows)
+        pictures["shN_centroids.webp"] = _palette_picture(index)
         pictures["shN_labels.webp"] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
     files = {name: _webp(picture) for name, picture in pictures.items()}
     return bundle({**files, "meta.json": json.dumps(meta, separators=(",", ":")).encode()})
@@ -297,12 +296,10 @@ def _picture(rows: NDArray[np.integer[Any]], shape: tuple[int, int]) -> _Bytes:
     return pixels.reshape(*shape, 4)
 
 
-def _palette_picture(index: NDArray[np.integer[Any]], like: _Bytes) -> _Bytes:
+def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
     """Entries [E K-1 3] in rows of 64."""
-    out = np.full_like(like, 255)
-    flat = out.reshape(-1, 4)
-    flat[: index.shape[0] * index.shape[1], :3] = index.reshape(-1, 3)
-    return out
+    entries, coefficients, _ = index.shape
+    return _picture(index.reshape(-1, 3), (-(-entries // _ROW), _ROW * coefficients))
 
 
 def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
