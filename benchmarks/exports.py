@@ -27,7 +27,7 @@ from fprf.io.images import write_image
 from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import pinhole
 from fprf.splats.files import Capture, read_capture
-from fprf.splats.views import camera_of
+from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw as draw_capture
 
 from .common import ROOT, report

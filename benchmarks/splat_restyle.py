@@ -147,7 +147,8 @@ def rim_ratio(scene: Any, new: Any) -> float:
 
 def standing_out(scene: Any, harmonics: Any, view: int) -> tuple[float, float]:
     """How much brighter than their surroundings pixels are, at depth edges and elsewhere."""
-    from fprf.splats.views import camera_of, draw
+    from fprf.splats.photographs import camera_of
+    from fprf.splats.views import draw
     from fprf.style.controls import luma
 
     gaussians = scene.gaussians if harmonics is None else scene.gaussians.recoloured(harmonics)

@@ -5,6 +5,11 @@ import torch
 from fprf.splats.gaussians import HARMONIC, Gaussians
 
 
+def equal(a: Gaussians, b: Gaussians) -> bool:
+    """True where all numbers are the same."""
+    return all(map(torch.equal, vars(a).values(), vars(b).values()))
+
+
 def ball(count: int, degree: int = 1, seed: int = 0) -> Gaussians:
     """Opaque Gaussians within a unit ball; y points down. Green and rough above, grey and even below."""
     draw = torch.Generator().manual_seed(seed)

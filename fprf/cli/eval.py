@@ -15,7 +15,9 @@ from .progress import Display
 from .verbs import verbs_of, views_of
 
 if TYPE_CHECKING:
+    from ..config import RunConfig
     from ..datamanagers.images import Image
+    from ..datamanagers.scene import Scene
     from ..training.run import Known
 
 
@@ -50,15 +52,9 @@ def evaluate_fields(config: EvalConfig) -> dict[str, object]:
     """Judge a run of fields."""
     from ..evaluation.evaluate import align, described, judge
     from ..training.loading import load_run
-    from ..training.prepare import scene_of
-    from ..training.run import view_names
 
     trained = at_quality(load_run(config.run, config.device, config.max_memory), config)
-    data = config.data or trained.config.data
-    scene = scene_of(replace(trained.config, data=data))
-    if tuple(view_names(scene.paths)) != trained.known.names:
-        raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
-    views = views_of(trained.known, config.split)
+    scene, views = views_to_judge(config, trained.config, trained.known)
     fitted: dict[str, object] = {}
     with Display() as display:
         if config.fit_poses:
@@ -66,6 +62,20 @@ def evaluate_fields(config: EvalConfig) -> dict[str, object]:
             fitted = {"fitted_poses": {trained.known.names[view]: described(move) for view, move in moves.items()}}
         metrics, images = judge(trained, scene, views, display.count)
     return store(config, trained.known, trained.method, views, metrics | fitted, images)
+
+
+def views_to_judge(config: EvalConfig, trained: "RunConfig", known: "Known") -> "tuple[Scene, list[int]]":
+    """The scene that a run was trained on, from where it lies now, and the views of the split.
+
+    Raises UsageError where its images are not those of the run, or the split has no views.
+    """
+    from ..training.run import view_names
+
+    trained = replace(trained, data=config.data or trained.data)
+    scene = trained.read_scene()
+    if tuple(view_names(scene.paths)) != known.names:
+        raise UsageError(f"{trained.data}: its images are not those of the run; name the folder with --data")
+    return scene, views_of(known, config.split)
 
 
 def store(

@@ -2,13 +2,14 @@
 
 import hashlib
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UsageError
-from .progress import Display
-from .verbs import Verbs, views_of
+from .progress import Display, EventLog
+from .verbs import Verbs
 
 if TYPE_CHECKING:
     from ..datamanagers.scene import Scene
@@ -53,18 +54,13 @@ class SplatVerbs(Verbs):
         import torch
 
         from ..evaluation.evaluate import described, judge_views
-        from ..splats.training import fit_poses, load_tones, open_gaussians, scene_of
+        from ..splats.training import fit_poses, load_tones, open_gaussians
         from ..training.camera_optimizers import moved_cameras
-        from ..training.run import view_names
-        from .eval import store
+        from .eval import store, views_to_judge
 
         opened = open_gaussians(config.run, self.config, config)
-        data, known = config.data or self.config.data, opened.known
-        scene = scene_of(replace(self.config, data=data))
-        if tuple(view_names(scene.paths)) != known.names:
-            raise UsageError(f"{data}: its images are not those of the run; name the folder with --data")
-        views = views_of(known, config.split)
-        shown, tones = opened.scene, load_tones(opened.run)
+        known, shown, tones = opened.known, opened.scene, load_tones(opened.run)
+        scene, views = views_to_judge(config, self.config, known)
 
         def draw(view: int) -> "View":
             if tones is None:
@@ -143,7 +139,6 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
     from ..splats.cell_training import OVERVIEW
     from ..splats.training import facts_of, lit, prepare, scene_of, state_of, train, with_downscale
     from ..training.run import Run, check_images, held, image_hashes, save_image_hashes
-    from .progress import EventLog
     from .train import check_same, default_output, finish_view
 
     start = time.perf_counter()
@@ -179,16 +174,9 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
             return output
         light = ", tones" if prepared.learner.tones is not None else ""
         display.say(f"{_described(scene)}, {prepared.learner.count} Gaussians at {prepared.origin}{light}")
-        log = EventLog(folder)
+        report = _reporter(display, folder, view=view)
         spent = time.perf_counter() - start
         folder.log({"part": "preparing", "seconds": round(spent, 3)})
-
-        def report(event: "Report") -> None:
-            display.training(event)
-            log(event)
-            if view is not None:
-                view(event)
-
         if view is not None:
             learner, near = prepared.learner, prepared.near
             view.begin(output, lambda: state_of(learner.gaussians(), near), "cpu")
@@ -214,19 +202,13 @@ def _described(scene: "Scene") -> str:
 def _train_cells(config: "GaussiansConfig", folder: "Run", scene: "Scene", display: Display, start: float) -> None:
     """Train the whole scene coarsely, then all cells, those with the largest windows first, and write their union."""
     from ..splats.cell_training import CellTask, train_overview, unite, write_cells
-    from .progress import EventLog
 
     assert config.data is not None
     cells = write_cells(folder.root, scene, config.data, config.cells)
     pixels = [sum(width * height for _, _, width, height in cell.windows.values()) for cell in cells]
     whole = int(scene.cameras.size[scene.train].prod(1).sum())
     display.say(f"{_described(scene)}, {len(cells)} cells, whose windows are {sum(pixels) / whole:.2f} times the photographs")
-    log = EventLog(folder)
-
-    def report(event: "Report") -> None:
-        display.training(event, "whole scene")
-        log(event)
-
+    report = _reporter(display, folder, "whole scene")
     if not train_overview(folder.root, config, scene, report, spent=time.perf_counter() - start):
         display.say("the whole scene is trained already")
     root, data = str(folder.root.resolve()), str(config.data.resolve() if config.data.exists() else config.data)
@@ -244,14 +226,23 @@ def run_cell(task: "CellTask") -> None:
     """Train one cell, here or on a worker, and show how it goes."""
     from ..splats.cell_training import folder_of, train_cell
     from ..training.run import Run
-    from .progress import EventLog
 
-    log = EventLog(Run(folder_of(Path(task.root), task.cell)))
+    name = f"cell {task.cell:02d}"
     with Display(quiet=task.quiet) as display:
+        if not train_cell(task, _reporter(display, Run(folder_of(Path(task.root), task.cell)), name)):
+            display.say(f"{name} is finished already")
 
-        def report(event: "Report") -> None:
-            display.training(event, f"cell {task.cell:02d}")
-            log(event)
 
-        if not train_cell(task, report):
-            display.say(f"cell {task.cell:02d} is finished already")
+def _reporter(
+    display: Display, folder: "Run", name: str = "training", view: "LiveViewer | None" = None
+) -> "Callable[[Report], None]":
+    """Progress of what is trained for the display, the run folder and the viewer."""
+    log = EventLog(folder)
+
+    def report(event: "Report") -> None:
+        display.training(event, name)
+        log(event)
+        if view is not None:
+            view(event)
+
+    return report

@@ -80,11 +80,8 @@ def judge_views(
         if before is not None:
             warped.add(i - 1, i, before.rgb, render.rgb, before.depth, render.depth)
         before = render
-        width, height = (int(v) for v in cameras.size[view])
-        pixels += width * height
-        truth = torch.from_numpy(load_image(scene.paths[view], (width, height), known.facts.background)).float() / 255
-        mask = scene.masks[view] if scene.masks and masks else None
-        where = None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
+        truth, where = _photograph(known, scene, view, masks)
+        pixels += truth.shape[0] * truth.shape[1]
         rows[known.names[view]] = image_metrics(render.rgb, truth, where)
     progress(len(views), len(views), "rendering")
     means = mean_metrics(rows.values())
@@ -100,6 +97,16 @@ def judge_views(
         "consistency": warped.summary(),
         "per_view": rows,
     }, images
+
+
+def _photograph(
+    known: Known, scene: Scene, view: int, masks: bool
+) -> tuple[Annotated[Tensor, "H W 3"], Annotated[Tensor, "H W"] | None]:
+    """The image of a view at the size of its camera, in [0, 1], and where it counts; None = everywhere."""
+    width, height = known.cameras.size[view].tolist()
+    image = torch.from_numpy(load_image(scene.paths[view], (width, height), known.facts.background)).float() / 255
+    mask = scene.masks[view] if scene.masks and masks else None
+    return image, None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,10 +134,7 @@ def align(
     reach = facts.reach if facts.centres else reach_of(scene, facts.space)
     for done, view in enumerate(views):
         progress(done, len(views), "fitting poses")
-        width, height = (int(v) for v in cameras.size[view])
-        truth = torch.from_numpy(load_image(scene.paths[view], (width, height), facts.background)).float() / 255
-        mask = scene.masks[view] if scene.masks and trained.config.datamanager.masks else None
-        where = None if mask is None else torch.from_numpy(load_mask(mask, (width, height)))
+        truth, where = _photograph(trained.known, scene, view, trained.config.datamanager.masks)
         moves[view] = align_view(trained, cameras, view, truth, reach, config or AlignmentConfig(), where)
         pose[view] = moved(pose[view][None], moves[view][None, :3], moves[view][None, 3:])[0]
     progress(len(views), len(views), "fitting poses")

@@ -45,6 +45,7 @@ from .training import (
     gaussians_of,
     limit_widths,
     load_photographs,
+    other_views,
     prepare,
     reach_of,
     refined,
@@ -217,7 +218,7 @@ def train_overview(
     small = replace(small, train=small.train[:: -(-pixels // (factor**2 * _PIXELS))])
     own = replace(own, steps=max(own.steps, _VISITS * len(small.train)))
     facts = Run(root).load_known().facts
-    facts = replace(facts, held=_others(small, small.train.tolist()) if facts.exposure or facts.centres else ())
+    facts = replace(facts, held=other_views(small, small.train.tolist()) if facts.exposure or facts.centres else ())
     train(own, prepare(own, small, saved=facts), Run(folder), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})
     return True
@@ -264,7 +265,7 @@ def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, s
     around = int(cell.around(gaussians.means).sum())
     cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
     tones = _tones_of(facts, start)
-    tones = tones and tones.going_on(_others(scene, list(cell.windows)))
+    tones = tones and tones.going_on(other_views(scene, cell.windows))
     levels = make_levels(own, images, masks, near)
     narrow = limit_widths(scene, near, cells=True)  # of all cameras: what lies before those of other cells is part of the union
     learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, narrow, tones=tones)
@@ -274,11 +275,6 @@ def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, s
     moments = {name: start.optimizer[name][shown] for name in _MOMENTS}
     learner.restore(gaussians, {**moments, "begun": torch.tensor(begun)})
     return Prepared(own, learner, near, "the whole scene", start.step, (config.overview, 1.0))
-
-
-def _others(scene: Scene, views: list[int]) -> tuple[int, ...]:
-    """Numbers of the views that are not among some."""
-    return tuple(sorted(set(range(len(scene.paths))) - set(views)))
 
 
 def _tones_of(facts: Facts, start: checkpoint.Saved) -> Tones | None:
@@ -352,9 +348,8 @@ def _mean_tones(start: Tones | None, found: list[dict[str, Tensor]], cells: Sequ
     views = len(start.exposure)
     total, count = torch.zeros(views, 3), torch.zeros(views, 1)
     for each, cell in zip(found, cells, strict=True):
-        used = torch.zeros(views, dtype=torch.bool)
-        used[list(cell.windows)] = True
-        tones = start.going_on(tuple((~used).nonzero()[:, 0].tolist()))
+        used = list(cell.windows)
+        tones = start.going_on(tuple(sorted(set(range(views)) - set(used))))
         tones.load_state_dict({name: each[f"tones.{name}.value"] for name in ("gain", "exponent")})
         total[used] += tones.gains().detach()[used]
         count[used] += 1

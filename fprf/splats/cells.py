@@ -158,23 +158,16 @@ def cut(scene: Scene, count: int) -> list[Cell]:
 
 def _widened(cells: list[Cell], scene: Scene) -> list[Cell]:
     """The same cells with the outermost windows of each photograph reaching its edges: few points lie there, but it shows."""
-    outermost: dict[int, tuple[int, int, int, int]] = {}
-    for cell in cells:
-        for view, (left, top, width, height) in cell.windows.items():
-            far = outermost.get(view, (left, top, left + width, top + height))
-            outermost[view] = (min(far[0], left), min(far[1], top), max(far[2], left + width), max(far[3], top + height))
-    widened = []
-    for cell in cells:
-        windows = {}
-        for view, (left, top, width, height) in cell.windows.items():
-            first_x, first_y, last_x, last_y = outermost[view]
-            right, bottom = left + width, top + height
-            left, top = 0 if left == first_x else left, 0 if top == first_y else top
-            right = int(scene.cameras.size[view, 0]) if right == last_x else right
-            bottom = int(scene.cameras.size[view, 1]) if bottom == last_y else bottom
-            windows[view] = (left, top, right - left, bottom - top)
-        widened.append(replace(cell, windows=windows))
-    return widened
+    widened: list[dict[int, Window]] = [{} for _ in cells]
+    for view in sorted({view for cell in cells for view in cell.windows}):
+        own = [k for k, cell in enumerate(cells) if view in cell.windows]
+        window = np.array([cells[k].windows[view] for k in own])
+        first, last = window[:, :2], window[:, :2] + window[:, 2:]
+        first = np.where(first == first.min(0), 0, first)
+        last = np.where(last == last.max(0), scene.cameras.size[view].numpy(), last)
+        for k, (left, top), (width, height) in zip(own, first.tolist(), (last - first).tolist(), strict=True):
+            widened[k][view] = (left, top, width, height)
+    return [replace(cell, windows=windows) for cell, windows in zip(cells, widened, strict=True)]
 
 
 def _bisected(

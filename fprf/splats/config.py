@@ -110,24 +110,16 @@ class GaussiansConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least("initial", self.initial, 1)
+        for name in ("initial", "passes", "cap", "pixels_per_gaussian", "cells", "regions", "relocate_every"):
+            at_least(name, getattr(self, name), 1)
         at_least("surroundings", self.surroundings, 0)
-        at_least("passes", self.passes, 1)
-        at_least("cap", self.cap, 1)
-        at_least("pixels_per_gaussian", self.pixels_per_gaussian, 1)
-        at_least("cells", self.cells, 1)
-        at_least("regions", self.regions, 1)
         if self.degree not in range(4):
             raise ConfigError(f"degree: {self.degree}; 0, 1, 2 or 3 are possible")
-        for name in ("ssim", "coarse"):
+        for name in ("grow", "overview", "rate"):
+            positive(name, getattr(self, name))
+        for name in ("ssim", "coarse", "grow", "poses"):
             between(name, getattr(self, name), 0.0, 1.0)
-        positive("grow", self.grow)
-        between("grow", self.grow, 0.0, 1.0)
-        positive("overview", self.overview)
         between("overview", self.overview, 0.0, 0.9)
-        at_least("relocate_every", self.relocate_every, 1)
-        positive("rate", self.rate)
-        between("poses", self.poses, 0.0, 1.0)
         for part in self.background:
             between("background", part, 0.0, 1.0)
 

@@ -5,10 +5,12 @@ the real spherical harmonics Y of `fields.harmonics`.
 """
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import DataError
@@ -68,10 +70,25 @@ class Gaussians:
         """The same Gaussians with other harmonics."""
         return replace(self, harmonics=harmonics)
 
-    def part(self, rows: slice) -> "Gaussians":
-        """Some of the Gaussians, without a copy."""
-        return Gaussians(*(getattr(self, field.name)[rows] for field in fields(self)))
+    def select(self, index: Annotated[Tensor, "M"] | slice) -> "Gaussians":
+        """Some of the Gaussians, in the order of `index` (int64, or a mask of all); without a copy those of a slice."""
+        return Gaussians(*(part[index] for part in vars(self).values()))
 
-    def select(self, index: Annotated[Tensor, "M"]) -> "Gaussians":
-        """Some of the Gaussians, in the order of `index` (int64, or a mask of all)."""
-        return Gaussians(*(getattr(self, field.name)[index] for field in fields(self)))
+
+def from_arrays(
+    means: NDArray[Any], quaternions: NDArray[Any], log_scales: NDArray[Any], logits: NDArray[Any], harmonics: NDArray[Any]
+) -> Gaussians:
+    """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
+    parts = (means, quaternions, log_scales, logits, harmonics)
+    return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
+
+
+def morton_order(cells: Annotated[NDArray[np.int64], "N 3"]) -> NDArray[np.int64]:
+    """Indices along a Morton curve (Z-order) of cells, 0 to 1023 a side: neighbours in space follow each other."""
+    code = np.zeros(len(cells), np.int64)
+    for axis in range(3):
+        v = cells[:, axis]
+        for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+            v = (v | v << shift) & mask
+        code |= v << axis
+    return np.argsort(code, kind="stable")

@@ -1,17 +1,19 @@
 """Where Gaussians begin: at the reconstruction's points, else at points matched between posed views, else anywhere in view."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene
 from ..rendering.cameras import project
+from .gaussians import morton_order
 from .photographs import cover, undistorted
 
 Doubles = NDArray[np.float64]
@@ -43,7 +45,8 @@ def initial_points(scene: Scene, images: Mapping[int, Image], count: int, rng: n
         position = scene.points.double().numpy()
         position = position[np.isfinite(position).all(1)]
         chosen = rng.permutation(len(position))[:count]
-        points, kind = _coloured(scene, images, position[np.sort(chosen)]), "points of the reconstruction"
+        position, kind = position[np.sort(chosen)], "points of the reconstruction"
+        points = Points(position, _mean_colours(scene, images, position)[0])
     else:
         points, kind = _matched(scene, images), "points matched between views"
         if len(points.position) < _ENOUGH:
@@ -103,18 +106,14 @@ def spatial_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[n
     """Indices along a Morton curve: what is near in space is then near in memory."""
     low, high = np.percentile(position, 2, axis=0), np.percentile(position, 98, axis=0)
     cell = np.clip((position - low) / np.maximum(high - low, 1e-9) * 1023, 0, 1023).astype(np.int64)
-    code = np.zeros(len(position), np.int64)
-    for axis in range(3):
-        v = cell[:, axis]
-        for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
-            v = (v | v << shift) & mask
-        code |= v << axis
-    return np.argsort(code, kind="stable")
+    return morton_order(cell)
 
 
-def _coloured(scene: Scene, images: Mapping[int, Image], position: Doubles) -> Points:
-    """Points with the mean colour of the training views that have them in the picture."""
-    return Points(position, _mean_colours(scene, images, position)[0])
+def projected(scene: Scene, points: Annotated[Tensor, "P 3"]) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+    """For each training view: its number, pixels and depths of points, and which of them it has in the picture."""
+    for view in scene.train.tolist():
+        pixel, depth = project(scene.cameras, torch.full((len(points),), view), points)
+        yield view, pixel, depth, (depth > 0) & (pixel >= 0).all(-1) & (pixel < scene.cameras.size[view]).all(-1)
 
 
 def _mean_colours(
@@ -122,14 +121,10 @@ def _mean_colours(
 ) -> tuple[Annotated[NDArray[np.float32], "P 3"], Annotated[NDArray[np.bool_], "P"]]:
     """Mean colours over the training views that have points in the picture, grey where none has; and where one has."""
     total, count = np.zeros((len(position), 3)), np.zeros(len(position))
-    points = torch.from_numpy(position)
-    for view in scene.train.tolist():
-        pixel, depth = project(scene.cameras, torch.full((len(points),), view), points)
-        width, height = scene.cameras.size[view].tolist()
-        x, y = pixel.nan_to_num(-1.0).floor().long().unbind(-1)
-        inside = ((depth > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)).numpy()
-        total[inside] += images[view][y.numpy()[inside], x.numpy()[inside]]
-        count[inside] += 1
+    for view, pixel, _, inside in projected(scene, torch.from_numpy(position)):
+        x, y = pixel[inside].long().numpy().T
+        total[inside.numpy()] += images[view][y, x]
+        count[inside.numpy()] += 1
     colour = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None] / 255, 0.5)
     return colour.astype(np.float32), count > 0
 

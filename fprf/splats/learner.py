@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..ops.harmonics import HARMONIC
 from ..ops.rasterise_kernels import FIXED, SLOTS
@@ -20,7 +20,7 @@ from ..ops.simd import LANES, aligned
 from ..rendering.splines import rotations
 from ..training.camera_optimizers import Poses, Tones
 from .config import GaussiansConfig
-from .gaussians import Gaussians
+from .gaussians import Gaussians, from_arrays
 from .initial import Points, spacing, spatial_order
 from .photographs import Floats, Level, moved_camera
 
@@ -86,9 +86,9 @@ class Learner:
         self.weight[:] = 0
         self.tones, self.poses, self.only = tones, poses, only
         self.corrections = {
-            f"{kind}.{name}": (parameter.detach(), *_view_moments(parameter))
+            f"{kind}.{name}": (each.detach(), torch.zeros_like(each), torch.zeros_like(each), torch.zeros(each.shape[:1]))
             for kind, module in (("tones", tones), ("poses", poses))
-            for name, parameter in (module.named_parameters() if module is not None else ())
+            for name, each in (module.named_parameters() if module is not None else ())
         }
         """What is learnt of each view: the parameter, its moments and the steps of each view."""
 
@@ -108,15 +108,10 @@ class Learner:
             position, colour = np.concatenate([position, far]), np.concatenate([colour, surroundings.colour])
             size = np.concatenate([size, spacing(far) * _START_SCALE])
             logit = np.concatenate([logit, np.full(len(far), math.log(_FAR_OPACITY / (1 - _FAR_OPACITY)))])
-        count = self.count = self.begun = len(position)
-        rows = np.zeros((self.rows, self.room), np.float32)
-        rows[6], rows[10] = 1, -20
-        rows[0:3, :count] = position.T
-        rows[3:6, :count] = np.log(size)
-        rows[6:10, :count] = rng.normal(size=(4, count))
-        rows[10, :count] = logit
-        rows[11:14, :count] = (colour.T - 0.5) / HARMONIC
-        self.blocks = _blocks(rows)
+        harmonics = np.zeros((len(position), self.bands, 3), np.float32)
+        harmonics[:, 0] = (colour - 0.5) / HARMONIC
+        turns, sizes = rng.normal(size=(4, len(position))).T, np.repeat(np.log(size)[:, None], 3, 1)
+        self.start_from(from_arrays(position, turns, sizes, logit, harmonics))
 
     def step(self, step: int, share: float) -> Step | None:
         """Learn from one view; None where the loss was not finite, and nothing was changed."""
@@ -254,14 +249,19 @@ class Learner:
 
     def gaussians(self) -> Gaussians:
         """The Gaussians as they are now."""
-        rows = torch.from_numpy(_rows(self.blocks, self.rows)[:, : self.count].T.copy())
+        rows = self._by_gaussian(self.blocks)
         parts = (rows[:, :3], rows[:, 6:10], rows[:, 3:6], rows[:, 10], rows[:, 11:].reshape(-1, self.bands, 3))
         return Gaussians(*(part.contiguous() for part in parts))
+
+    def _by_gaussian(self, blocks: Floats) -> Annotated[Tensor, "N R"]:
+        """A copy of blocks, a row a Gaussian."""
+        rows = blocks.reshape(-1, self.rows, LANES).transpose(0, 2, 1).reshape(-1, self.rows)
+        return torch.from_numpy(rows[: self.count].copy())
 
     def moments(self) -> dict[str, Tensor]:
         """Return the rest of a checkpoint: Adam's moments and the weight in the second, exposures, poses, the number at the
         start."""
-        first, second = (torch.from_numpy(_rows(x, self.rows)[:, : self.count].T.copy()) for x in (self.first, self.second))
+        first, second = self._by_gaussian(self.first), self._by_gaussian(self.second)
         weight = torch.from_numpy(self.weight[: self.count].copy())
         tensors = {"first": first, "second": second, "weight": weight, "begun": torch.tensor(self.begun)}
         for name, kept in self.corrections.items():
@@ -303,11 +303,6 @@ _KEPT = "value", "first", "second", "steps"
 """Names in checkpoints of what `Learner.corrections` holds."""
 
 
-def _view_moments(parameter: nn.Parameter) -> tuple[Tensor, Tensor, Tensor]:
-    """Room for the moments of a parameter, and for the steps of each view."""
-    return torch.zeros_like(parameter), torch.zeros_like(parameter), parameter.new_zeros(parameter.shape[:1])
-
-
 def _adam(kept: Sequence[Tensor], gradient: Tensor, rate: float) -> None:
     """One step of Adam, in place, on a value, its two moments and the number of steps."""
     value, first, second, steps = kept
@@ -322,12 +317,7 @@ def _at(index: NDArray[np.int64]) -> tuple[NDArray[np.int64], slice, NDArray[np.
     return index // LANES, slice(None), index % LANES
 
 
-def _rows(blocks: Floats, rows: int) -> Floats:
-    """Blocks as [rows, room], a copy."""
-    return np.ascontiguousarray(blocks.reshape(-1, rows, LANES).transpose(1, 0, 2)).reshape(rows, -1)
-
-
-def _blocks(rows: Floats) -> Floats:
+def _blocks(rows: Annotated[Floats, "R room"]) -> Floats:
     blocks = aligned(rows.size)
     blocks.reshape(-1, len(rows), LANES)[:] = rows.reshape(len(rows), -1, LANES).transpose(1, 0, 2)
     return blocks

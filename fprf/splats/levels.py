@@ -23,7 +23,7 @@ from torch import Tensor
 
 from ..io.atomic import atomic_path
 from ..ops.rasterise import Pinhole
-from ..rendering.splines import rotations
+from ..rendering.splines import quaternions, rotations
 from .gaussians import Gaussians
 from .initial import spatial_order
 
@@ -291,28 +291,9 @@ def _merged(gaussians: Gaussians) -> tuple[Gaussians, NDArray[np.float64]]:
     area = values[:, 1:].prod(1).sqrt()
     opacity = (weight.sum((1, 2)) / area).clamp(1e-6, _OPAQUE)
     harmonics = _merged_harmonics(gaussians.harmonics, index, share)
-    parts = (mean, _quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
+    parts = (mean, quaternions(vectors), 0.5 * values.log(), torch.logit(opacity), harmonics)
     apart = torch.linalg.eigvalsh(between)[:, -1].clamp_min(0).sqrt()
     return Gaussians(*(part.float() for part in parts)), apart.numpy()
-
-
-def _quaternions(turns: Annotated[Tensor, "N 3 3"]) -> Annotated[Tensor, "N 4"]:
-    """wxyz, by the largest of the four components (Shepperd 1978)."""
-    a, b, c = turns.diagonal(dim1=1, dim2=2).unbind(1)
-    squares = torch.stack([1 + a + b + c, 1 + a - b - c, 1 - a + b - c, 1 - a - b + c], 1)
-    x, y, z = turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]
-    p, q, r = turns[:, 1, 0] + turns[:, 0, 1], turns[:, 0, 2] + turns[:, 2, 0], turns[:, 2, 1] + turns[:, 1, 2]
-    rows = torch.stack(
-        [
-            torch.stack([squares[:, 0], x, y, z], 1),
-            torch.stack([x, squares[:, 1], p, q], 1),
-            torch.stack([y, p, squares[:, 2], r], 1),
-            torch.stack([z, q, r, squares[:, 3]], 1),
-        ],
-        1,
-    )
-    quaternions = rows[torch.arange(len(turns)), squares.argmax(1)]
-    return torch.nn.functional.normalize(quaternions, dim=1)
 
 
 def _rows(gaussians: Gaussians) -> Annotated[Tensor, "N 11+3K"]:

@@ -15,6 +15,7 @@ from ..datamanagers.scene import Scene
 from ..errors import DataError
 from ..ops.photometric import WINDOW, blurred, slack
 from ..ops.rasterise import Pinhole, camera_array
+from ..ops.rasterise_kernels import SIDE
 from ..ops.rasterise_training import Target
 from ..rendering.cameras import Cameras, pixel_grid, project, rays_through
 from ..training.camera_optimizers import rotated
@@ -31,13 +32,16 @@ Level = dict[int, Target]
 """Training views at one scale, by view; their sizes may differ."""
 
 
-def pinhole(cameras: Cameras, view: int, near: float) -> Pinhole:
-    """The camera of a view without its lens. Raises DataError for a panorama."""
+def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
+    """A view without its lens as the rasteriser takes it: OpenCV's axes, world to camera. Raises DataError for a panorama."""
     if int(cameras.lens[view]) == _PANORAMA:
         raise DataError("Gaussians are drawn through pinholes: a panorama has to be cut into views first")
-    (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
     width, height = cameras.size[view].tolist()
-    return Pinhole(_intrinsics(fx, fy, cx, cy), _world_to_camera(cameras.pose[view]), width, height, near)
+    pose = cameras.pose[view]
+    turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype)).T
+    world_to_camera = torch.eye(4, dtype=torch.float64)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = turn, -turn @ pose[:, 3]
+    return Pinhole(_intrinsics(cameras.focal[view], cameras.centre[view]), world_to_camera, width, height, near)
 
 
 def undistorted(cameras: Cameras, view: int, image: Image, camera: Pinhole) -> tuple[Image, NDArray[np.bool_] | None]:
@@ -65,7 +69,7 @@ def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[
 
     The second is None where the view is a pinhole itself.
     """
-    plain = pinhole(cameras, view, near)
+    plain = camera_of(cameras, view, near)
     if int(cameras.lens[view]) == 0:
         return plain, None
     width, height = plain.width, plain.height
@@ -76,8 +80,8 @@ def cover(cameras: Cameras, view: int, near: float) -> tuple[Pinhole, Annotated[
     focal = cameras.focal[view]
     low, high = (tangent * focal).amin(0).floor() - 2, (tangent * focal).amax(0).ceil() + 2
     wide, tall = (high - low).int().tolist()
-    intrinsics = _intrinsics(float(focal[0]), float(focal[1]), float(-low[0]), float(-low[1]))
-    return Pinhole(intrinsics, plain.world_to_camera, wide, tall, near), (tangent * focal - low).view(height, width, 2)
+    camera = plain._replace(intrinsics=_intrinsics(focal, -low), width=wide, height=tall)
+    return camera, (tangent * focal - low).view(height, width, 2)
 
 
 def distorted(
@@ -122,8 +126,7 @@ def make_levels(
 
 
 def _undistorted_mask(cameras: Cameras, view: int, mask: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
-    white = np.repeat(mask[..., None], 3, 2).astype(np.uint8) * 255
-    return np.asarray(undistorted(cameras, view, white, camera)[0][..., 0] > 254)
+    return np.asarray(undistorted(cameras, view, mask.astype(np.uint8) * 255, camera)[0] > 254)
 
 
 def _resized(mask: NDArray[np.bool_] | None, size: tuple[int, int]) -> NDArray[np.bool_] | None:
@@ -144,24 +147,17 @@ def moved_camera(camera: Floats, turn: Annotated[Tensor, "3"], shift: Annotated[
 
 def _target(camera: Pinhole, colours: Floats, valid: NDArray[np.bool_] | None, sky: NDArray[np.bool_] | None) -> Target:
     width, height = camera.width, camera.height
-    planes = _planes(colours)
-    used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2).astype(np.float32))
-    if used is not None:
-        used = used[: _area(width, height) * 3 + 64]
-    above = None if sky is None else _planes(np.repeat(sky[..., None], 3, 2).astype(np.float32))[: _area(width, height)]
+    planes = _planes(colours, slack(width + -width % SIDE))
+    used = None if valid is None or valid.all() else _planes(np.repeat(valid[..., None], 3, 2), 64)
+    above = None if sky is None else _planes(sky[..., None], 0)
     return Target(width, height, camera_array(camera, True), planes, blurred(planes, width, height), used, above)
 
 
-def _area(width: int, height: int) -> int:
-    return (-(-width // 16) * 16) * (-(-height // 16) * 16)
-
-
-def _planes(image: Floats) -> Floats:
-    height, width = image.shape[:2]
-    tall, wide = -(-height // 16) * 16, -(-width // 16) * 16
-    out = np.zeros(3 * tall * wide + slack(wide), np.float32)
-    out[: 3 * tall * wide].reshape(3, tall, wide)[:, :height, :width] = image.transpose(2, 0, 1)
-    return out
+def _planes(image: NDArray[Any], behind: int) -> Floats:
+    """An image [H W C] as the kernels take it, [C H16 W16] flat and float32, with so many zeros behind."""
+    height, width, _ = image.shape
+    padded = np.pad(image, ((0, -height % SIDE), (0, -width % SIDE), (0, 0))).transpose(2, 0, 1)
+    return np.append(padded, np.zeros(behind, np.float32)).astype(np.float32, copy=False)
 
 
 def _sampled(image: NDArray[Any], place: NDArray[np.float64], interpolation: int = _SHARPEST) -> NDArray[Any]:
@@ -170,13 +166,7 @@ def _sampled(image: NDArray[Any], place: NDArray[np.float64], interpolation: int
     return np.asarray(cv2.remap(np.ascontiguousarray(image), x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-
-
-def _world_to_camera(pose: Annotated[Tensor, "3 4"]) -> Annotated[Tensor, "4 4"]:
-    """OpenGL camera to world, turned into world to OpenCV camera."""
-    turn = (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype)).T
-    out = torch.eye(4, dtype=torch.float64)
-    out[:3, :3], out[:3, 3] = turn, -turn @ pose[:, 3]
+def _intrinsics(focal: Annotated[Tensor, "2"], centre: Annotated[Tensor, "2"]) -> Annotated[Tensor, "3 3"]:
+    out = torch.eye(3, dtype=torch.float64)
+    out[[0, 1], [0, 1]], out[:2, 2] = focal.double(), centre.double()
     return out

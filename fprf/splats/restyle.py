@@ -86,11 +86,8 @@ def _change(
     for part in look.parts:
         if part.share == 0 or part.strength == 0:
             continue
-        acts = (
-            part.share
-            * part.strength
-            * (semantic.new_ones(len(semantic), 1) if part.regions is None else part.regions(semantic))
-        )
+        regions = semantic.new_ones(len(semantic), 1) if part.regions is None else part.regions(semantic)
+        acts = part.share * part.strength * regions
         added = _added(part, semantic)
         for place, other in part.places:
             inside = place_weight(place, means)[:, None]
@@ -108,8 +105,8 @@ def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tenso
         return (belongs @ torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)).view(-1, 4, 3)
     # An affine stylizer is known by what it makes of black and of each channel alone.
     black = part.stylizer(semantic.new_zeros(len(semantic), 3), semantic)
-    rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black for axis in torch.eye(3)]
-    return part.features * torch.stack([*(row - axis for row, axis in zip(rows, torch.eye(3), strict=True)), black], 1)
+    rows = [part.stylizer(axis.expand(len(semantic), 3), semantic) - black - axis for axis in torch.eye(3)]
+    return part.features * torch.stack([*rows, black], 1)
 
 
 def region_maps(

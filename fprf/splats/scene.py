@@ -35,9 +35,9 @@ from ..types import View
 from .config import LookConfig
 from .gaussians import Gaussians
 from .levels import Levels, StyledLevels, seen_by
-from .photographs import cover, distorted
+from .photographs import camera_of, cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
-from .views import SeenMeans, camera_of, draw, find_views, seen_means
+from .views import SeenMeans, draw, find_views, seen_means
 
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
@@ -125,7 +125,7 @@ class SplatScene(Scene):
 
     def part(self, rows: slice) -> Gaussians:
         """Some of the Gaussians in the scene's look."""
-        gaussians = self.gaussians if rows == slice(0, len(self.gaussians)) else self.gaussians.part(rows)
+        gaussians = self.gaussians if rows == slice(0, len(self.gaussians)) else self.gaussians.select(rows)
         if self.look is None:
             return gaussians
         features = self.found().features[rows]

@@ -2,8 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -19,7 +19,7 @@ from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, find_sightings, sparser
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Encoder
-from ..rendering.cameras import Cameras, project
+from ..rendering.cameras import Cameras
 from ..style.references import Encoders
 from ..training import checkpoint
 from ..training.camera_optimizers import Poses, Tones, moved_cameras
@@ -34,7 +34,7 @@ from ..training.trainer import REPORT_SECONDS, Report
 from ..training.unfinished import UnfinishedRun
 from .config import GaussiansConfig
 from .gaussians import Gaussians
-from .initial import Points, initial_points, surroundings
+from .initial import Points, initial_points, projected, surroundings
 from .learner import MOVES, Learner, Narrow, Step
 from .levels import Levels, make_levels_of_detail, open_levels, write_levels
 from .photographs import Floats, make_levels
@@ -214,8 +214,12 @@ def lit(facts: Facts, config: GaussiansConfig, scene: Scene, image: Callable[[in
     if config.poses:
         centres = tuple((float(x), float(y), float(z)) for x, y, z in scene.cameras.pose[:, :, 3])
         facts = replace(facts, centres=centres, reach=sight_distance(scene, facts.space))
-    held = set(range(len(scene.paths))) - set(scene.train.tolist()) if exposure or config.poses else ()
-    return replace(facts, exposure=exposure, held=tuple(sorted(held)))
+    return replace(facts, exposure=exposure, held=other_views(scene, scene.train.tolist()) if exposure or config.poses else ())
+
+
+def other_views(scene: Scene, views: Iterable[int]) -> tuple[int, ...]:
+    """Numbers of the views that are not among some."""
+    return tuple(sorted(set(range(len(scene.paths))) - set(views)))
 
 
 def poses_of(facts: Facts) -> Poses | None:
@@ -295,7 +299,7 @@ class _Meter:
 
     def __init__(self, before: float) -> None:
         self.before, self.begun = before, time.perf_counter()
-        self.steps = self.skipped = self.failed = self.pixels = 0
+        self.skipped = self.failed = self.pixels = 0
         self.means: dict[str, float] = {}
 
     def clock(self, now: float) -> float:
@@ -304,15 +308,14 @@ class _Meter:
 
     def add(self, step: Step | None) -> None:
         """Count a step."""
-        self.steps += 1
         if step is None:
             self.skipped, self.failed = self.skipped + 1, self.failed + 1
             return
         self.failed = 0
         self.pixels += step.pixels
-        for name, value in (("rgb", step.squared), ("l1", step.l1), ("ssim", step.ssim), ("gaussians", float(step.gaussians))):
-            keep = 0.0 if name == "gaussians" else _SMOOTHING
-            self.means[name] = keep * self.means.get(name, value) + (1 - keep) * value
+        for name, value in (("rgb", step.squared), ("l1", step.l1), ("ssim", step.ssim)):
+            self.means[name] = _SMOOTHING * self.means.get(name, value) + (1 - _SMOOTHING) * value
+        self.means["gaussians"] = float(step.gaussians)
 
     def report(self, step: int, share: float, seconds: float) -> Report:
         """Return the progress."""
@@ -321,20 +324,21 @@ class _Meter:
         return Report(step, share, seconds, -10 * math.log10(rgb), speed, 1.0, dict(self.means), self.skipped)
 
 
-_PARTS = ("means", "quaternions", "log_scales", "logits", "harmonics")
-
-
 def state_of(gaussians: Gaussians, near: float) -> dict[str, Tensor]:
     """The tensors of a checkpoint; nothing nearer to a camera than `near` is drawn."""
-    return {name: getattr(gaussians, name) for name in _PARTS} | {"near": torch.tensor(near, dtype=torch.float64)}
+    return vars(gaussians) | {"near": torch.tensor(near, dtype=torch.float64)}
 
 
 def gaussians_of(saved: checkpoint.Saved) -> Gaussians:
     """The Gaussians of a checkpoint. Raises CheckpointError where it holds none."""
     try:
-        return Gaussians(*(saved.model[name] for name in _PARTS))
+        return _gaussians(saved.model)
     except KeyError as error:
         raise CheckpointError(f"checkpoint of step {saved.step}: holds no {error}, so it is not of Gaussians") from error
+
+
+def _gaussians(tensors: Mapping[str, Tensor]) -> Gaussians:
+    return Gaussians(**{field.name: tensors[field.name] for field in fields(Gaussians)})
 
 
 def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) -> LoadedRun[SplatScene]:
@@ -385,7 +389,7 @@ class UnfinishedGaussians(UnfinishedRun):
         self._scene: SplatScene | None = None
 
     def scene(self, tensors: Mapping[str, Tensor]) -> SplatScene:
-        gaussians, near = Gaussians(*(tensors[name] for name in _PARTS)), float(tensors["near"])
+        gaussians, near = _gaussians(tensors), float(tensors["near"])
         views = _some_views(self.known, _VIEWS // 4, _SEEN // 2)
 
         def found() -> Semantics:
@@ -438,8 +442,9 @@ def fit_poses(
     cameras, facts, shown = opened.known.cameras, opened.known.facts, opened.scene
     scene = replace(scene, cameras=cameras, train=torch.tensor(views))
     images, masks = load_photographs(config, scene, views)
-    others = tuple(sorted(set(range(len(cameras))) - set(views)))
-    poses = Poses(cameras.pose[:, :, 3], others, reach=sight_distance(scene, facts.space), pace=1.0, still=True)
+    poses = Poses(
+        cameras.pose[:, :, 3], other_views(scene, views), reach=sight_distance(scene, facts.space), pace=1.0, still=True
+    )
     levels, tones = make_levels(scene, images, masks, shown.near), load_tones(opened.run)
     config = replace(config, poses=_FIT_RATE, degree=shown.gaussians.degree)
     learner = Learner(config, levels, 1.0, len(shown.gaussians), tones=tones, poses=poses, only="poses")
@@ -485,11 +490,6 @@ def _semantics(
 
 def find_near(scene: Scene, points: Points) -> float:
     """Distance from cameras, along z, from which on things are drawn."""
-    some = -(-len(points.position) // _SOME)
-    positions, depths = torch.from_numpy(points.position[::some]), []
-    for view in scene.train.tolist():
-        pixel, depth = project(scene.cameras, torch.full((len(positions),), view), positions)
-        size = scene.cameras.size[view]
-        depths.append(depth[(depth > 0) & (pixel >= 0).all(-1) & (pixel < size).all(-1)])
-    seen = torch.cat(depths)
+    some = torch.from_numpy(points.position[:: -(-len(points.position) // _SOME)])
+    seen = torch.cat([depth[inside] for _, _, depth, inside in projected(scene, some)])
     return _NEAR * float(seen.quantile(0.01)) if 0 < len(seen) < 10_000_000 else 0.01

@@ -25,7 +25,7 @@ from ..ops.rasterise_reference import project_reference
 from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
 from .gaussians import Gaussians
-from .photographs import cover
+from .photographs import camera_of, cover
 
 _LIFTS = (-8.0, 12.0, 32.0, 55.0)
 """Heights of the rings, in degrees above the middle."""
@@ -66,17 +66,6 @@ _NEAR = 3.0
 _MEAN_VIEWS, _UNSEEN, _CLIP = 32, 1e-4, 0.01
 """Views that means are taken from, at most; weight, in pixels, of those that do not show a Gaussian; distance from
 which on they do."""
-
-
-def camera_of(cameras: Cameras, view: int, near: float = 0.01) -> Pinhole:
-    """A view without its lens as the rasteriser takes it: OpenCV's axes, world to camera."""
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3] = cameras.pose[view]
-    pose[:3, 1:3] *= -1
-    (fx, fy), (cx, cy) = cameras.focal[view].tolist(), cameras.centre[view].tolist()
-    intrinsics = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    width, height = (int(v) for v in cameras.size[view])
-    return Pinhole(intrinsics, torch.linalg.inv(pose), width, height, near)
 
 
 def draw(
@@ -198,9 +187,7 @@ def _around_place(
     picked = [int((ahead @ mean).argmax())]
     for _ in range(_TARGETS - 1):
         picked.append(int((ahead @ ahead[picked].T).amax(1).argmin()))
-    side, front = _level(up)
-    turn = torch.arange(4, dtype=torch.float64) * (math.pi / 2)
-    ring = turn.cos()[:, None] * side + turn.sin()[:, None] * front
+    ring = _around(up, 4)
     back = torch.tensor(_BACK, dtype=torch.float64)[:, None] * -mean
     offsets = middle * torch.cat([back, *(far * ring for far in _AROUND)])
     eye = (place + offsets).repeat_interleave(_TARGETS, 0)
@@ -251,11 +238,9 @@ def _rings(
     reach = float(_quantiles(away.float(), gaussians.opacities, (0.95,))[0]) / math.sin(math.radians(_FOV / 2))
     rings = [(lift, far) for far in _DISTANCES for lift in _LIFTS]
     each = max(4, round(1.6 * count / len(rings)))
-    side, front = _level(up)
     eyes = []
     for ring, (lifted, far) in enumerate(rings):
-        turn = (torch.arange(each, dtype=torch.float64) + 0.38 * ring) * (2 * math.pi / each)
-        flat = turn.cos()[:, None] * side + turn.sin()[:, None] * front
+        flat = _around(up, each, 0.38 * ring)
         eyes.append(centre + (math.cos(math.radians(lifted)) * flat + math.sin(math.radians(lifted)) * up) * far * reach)
     eye = torch.cat(eyes)
     cameras = pinhole(look_at(eye, centre.expand_as(eye), up), width=size[0], height=size[1], fov=_FOV)
@@ -311,9 +296,7 @@ def _inside(
     antialiased: bool,
 ) -> tuple[Cameras, Annotated[Tensor, "V"]]:
     """Views in all directions from those places that are enclosed, with their worth; none where few are."""
-    side, front = _level(up)
-    turn = torch.arange(_TURNS, dtype=torch.float64) * (2 * math.pi / _TURNS)
-    ahead = turn.cos()[:, None] * side + turn.sin()[:, None] * front - 0.1 * up
+    ahead = _around(up, _TURNS) - 0.1 * up
     eye = places.repeat_interleave(_TURNS, 0)
     cameras = pinhole(look_at(eye, eye + ahead.repeat(len(places), 1), up), width=size[0], height=size[1], fov=_WIDE)
     every = torch.arange(0, len(cameras), 2)  # half of them overlap enough to tell
@@ -339,10 +322,12 @@ def _probed(
     return worth, filled
 
 
-def _level(up: Tensor) -> tuple[Tensor, Tensor]:
-    """Two directions across `up`, and across each other."""
+def _around(up: Annotated[Tensor, "3"], count: int, begin: float = 0.0) -> Annotated[Tensor, "count 3"]:
+    """Directions across `up`, spread evenly, turned by `begin` of the angle between them."""
     basis = torch.linalg.qr(torch.cat([up[:, None], torch.eye(3, dtype=up.dtype)[:, up.abs().argsort()[:2]]], 1))[0]
-    return basis[:, 1], basis[:, 2]
+    turn = (torch.arange(count, dtype=torch.float64) + begin) * (2 * math.pi / count)
+    ring: Tensor = turn.cos()[:, None] * basis[:, 1] + turn.sin()[:, None] * basis[:, 2]
+    return ring
 
 
 def _quantiles(values: Tensor, weights: Tensor, shares: tuple[float, ...]) -> Tensor:

@@ -12,7 +12,8 @@ from fprf.datamanagers.parsers.config import parse_scene
 from fprf.evaluation.metrics import psnr
 from fprf.export.depth_maps import render_depth_maps
 from fprf.splats.files import read_capture
-from fprf.splats.views import camera_of, draw
+from fprf.splats.photographs import camera_of
+from fprf.splats.views import draw
 
 LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0"]
 """The tiny model has barely begun to agree with itself."""

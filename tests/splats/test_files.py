@@ -1,9 +1,10 @@
 """Files of Gaussians: byte for byte back where nothing changed, within each format's steps where it is written anew."""
 
+import contextlib
 import gzip
 import json
 import struct
-import zipfile
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,20 +15,23 @@ import torch
 from splat_ball import ball
 
 from fprf.errors import DataError
+from fprf.rendering.cameras import Cameras
 from fprf.rendering.paths import look_at, pinhole
 from fprf.splats.files import ENDINGS, Capture, read_capture, write_capture, write_gaussians, write_ply_parts
 from fprf.splats.files.base import spatial_order
+from fprf.splats.files.sog import bundle, unbundle
 from fprf.splats.gaussians import Gaussians
-from fprf.splats.views import camera_of, draw
+from fprf.splats.photographs import camera_of
+from fprf.splats.views import draw
 
 SHAPE = ("means", "quaternions", "log_scales", "logits")
 COUNT = 600
-STEP = {  # half a step of positions (of their range), ln-scales (of theirs), opacities, mean colours and harmonics
+STEP = {  # most that positions in [-2, 2], ln-scales, opacities, mean colours and harmonics change by: half a step
     ".ply": (0.0, 0.0, 1e-7, 0.0, 0.0),
-    ".compressed.ply": (0.5 / 1023, 0.5 / 1023, 0.5 / 255, 0.5 / 255, 0.5 * 8 / 256),
-    ".splat": (0.0, 1e-7, 0.5 / 255, 0.5 / 255, None),
-    ".spz": (2**-22, 0.5 / 16, 0.5 / 255, 0.5 / 255 * 0.282 / 0.15, 0.5 / 128),
-    ".sog": (4e-5, None, 0.5 / 255, None, None),
+    ".compressed.ply": (2 / 1023, 2 / 1023, 0.5 / 255, 0.65 / 255, 4 / 256),
+    ".splat": (0.0, 4e-7, 0.5 / 255, 0.5 / 255, 0.0),
+    ".spz": (2**-20, 0.5 / 16, 0.5 / 255, 0.5 / 255 * 0.282 / 0.15, 0.5 / 128),
+    ".sog": (1.6e-4, 0.5 / 16, 0.5 / 255, 0.02, 0.01),
 }
 
 
@@ -43,32 +47,40 @@ def cloud(degree: int, count: int = COUNT, seed: int = 0) -> Gaussians:
     return Gaussians(4 * random(count, 3) - 2, turns, -6 + 4 * random(count, 3), 8 * random(count) - 4, harmonics)
 
 
-def names(ending: str) -> str:
-    return ending if ending == "meta.json" else f"x{ending}"
+def written(path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None) -> Capture:
+    """A file of Gaussians, as it is read."""
+    write_gaussians(path, gaussians, antialiased=antialiased, views=views)
+    return read_capture(path)
+
+
+def restyled(path: Path, capture: Capture, harmonics: torch.Tensor) -> Capture:
+    """A capture with new harmonics, as it is read from another file."""
+    write_capture(path, capture, harmonics)
+    return read_capture(path)
+
+
+def from_the_front(side: int, fov: float) -> Cameras:
+    """A view of the origin along -z."""
+    pose = look_at(torch.tensor([[0.0, 0, 2]]), torch.zeros(1, 3), torch.tensor([0.0, 1, 0]))
+    return pinhole(pose, width=side, height=side, fov=fov)
 
 
 @pytest.fixture(params=[(e, d) for e in ENDINGS for d in (0, 2) if e != ".splat" or d == 0], ids=lambda p: f"{p[0]}-{p[1]}")
 def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Capture:
     ending, degree = request.param
-    write_gaussians(tmp_path / names(ending), cloud(degree), antialiased=ending != ".splat")
-    return read_capture(tmp_path / names(ending))
+    name = ending if ending == "meta.json" else f"x{ending}"
+    return written(tmp_path / name, cloud(degree), antialiased=ending != ".splat")
 
 
-def test_unchanged_colours_give_the_file_back(capture: Capture, tmp_path: Path) -> None:
-    there = tmp_path / "there" / capture.path.name
-    write_capture(there, capture, capture.gaussians.harmonics.clone())
+def test_new_colours_change_nothing_else_and_unchanged_ones_nothing(capture: Capture, tmp_path: Path) -> None:
+    there, before = tmp_path / "there" / capture.path.name, capture.gaussians
+    write_capture(there, capture, before.harmonics.clone())
     for path in [capture.path] if there.name != "meta.json" else capture.path.parent.glob("*.*"):
         assert (there.parent / path.name).read_bytes() == path.read_bytes()
     assert capture.antialiased == (there.suffix != ".splat")
-
-
-def test_new_colours_change_nothing_else(capture: Capture, tmp_path: Path) -> None:
-    before = capture.gaussians
     new = before.harmonics.clone()
     new[::2] = 0.7 * new[::2] + 0.1
-    there = tmp_path / "there" / capture.path.name
-    write_capture(there, capture, new)
-    after = read_capture(there).gaussians
+    after = restyled(there, capture, new).gaussians
     assert all(torch.equal(getattr(after, name), getattr(before, name)) for name in SHAPE)
     tolerance = 0.03 if capture.path.suffix != ".ply" or ".compressed" in capture.path.name else 0.0
     assert (after.harmonics - new).abs().max() <= tolerance
@@ -79,47 +91,32 @@ def test_new_colours_change_nothing_else(capture: Capture, tmp_path: Path) -> No
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_written_gaussians_come_back_within_a_step(ending: str, degree: int, tmp_path: Path) -> None:
     made = cloud(degree)
-    write_gaussians(tmp_path / f"x{ending}", made)
-    found = read_capture(tmp_path / f"x{ending}").gaussians
+    found = written(tmp_path / f"x{ending}", made).gaussians
     if ending in (".compressed.ply", ".sog"):
         made = made.select(torch.from_numpy(spatial_order(made.means.numpy())))
     assert found.degree == (0 if ending == ".splat" else degree)
-    at, scale, opacity, tint, rest = STEP[ending]
-
-    def off(name: str) -> float:
-        return float((getattr(found, name) - getattr(made, name)).abs().max())
-
     slack = 1e-6
-    assert off("means") <= at * 4 + slack
-    assert off("log_scales") <= (0.5 / 16 if scale is None else scale * (1 if ending == ".spz" else 4)) + slack
-    assert off("opacities") <= opacity + slack
-    assert off("colours") <= (0.02 if tint is None else tint * (1.3 if ending == ".compressed.ply" else 1)) + slack
-    if degree and ending != ".splat":
-        error = (found.harmonics[:, 1:] - made.harmonics[:, 1:]).abs().max()
-        assert error <= (0.01 if rest is None else rest) + slack
+    for name, most in zip(("means", "log_scales", "opacities", "colours"), STEP[ending], strict=False):
+        assert (getattr(found, name) - getattr(made, name)).abs().max() <= most + slack
+    rest = found.harmonics[:, 1:] - made.harmonics[:, 1 : found.harmonics.shape[1]]
+    assert (rest.abs() <= STEP[ending][-1] + slack).all()
     turned = (torch.nn.functional.normalize(found.quaternions, dim=1) * made.quaternions).sum(1).abs()
     # Half a step of 8 bits in each of four components, at most.
     assert turned.min() >= 1 - 0.5 * 4 * (0.5 / 127) ** 2 - slack
 
 
 def test_captures_change_their_format_with_the_ending(tmp_path: Path) -> None:
-    write_gaussians(tmp_path / "x.ply", cloud(1), antialiased=True)
-    capture = read_capture(tmp_path / "x.ply")
-    new = capture.gaussians.harmonics * 0.5
+    capture = written(tmp_path / "x.ply", cloud(1), antialiased=True)
+    wanted = 0.25 + 0.5 * float(capture.gaussians.colours.mean())
     for ending in (".spz", ".compressed.ply", ".sog", ".ply"):
-        write_capture(tmp_path / f"y{ending}", capture, new)
-        found = read_capture(tmp_path / f"y{ending}")
-        assert found.antialiased
-        assert float(found.gaussians.colours.mean()) == pytest.approx(
-            0.25 + 0.5 * float(capture.gaussians.colours.mean()), abs=0.01
-        )
+        found = restyled(tmp_path / f"y{ending}", capture, capture.gaussians.harmonics * 0.5)
+        assert found.antialiased and float(found.gaussians.colours.mean()) == pytest.approx(wanted, abs=0.01)
     packed = read_capture(tmp_path / "y.compressed.ply")
     (tmp_path / "z.ply").write_bytes(packed.data)
-    renamed = read_capture(tmp_path / "z.ply")
-    write_capture(tmp_path / "w.ply", renamed, renamed.gaussians.harmonics)
-    assert (tmp_path / "w.ply").read_bytes() == packed.data, "a compressed file under the plain ending stays one"
-    write_capture(tmp_path / "v.ply", packed, packed.gaussians.harmonics)
-    assert torch.equal(read_capture(tmp_path / "v.ply").gaussians.means, packed.gaussians.means)
+    again = restyled(tmp_path / "w.ply", read_capture(tmp_path / "z.ply"), packed.gaussians.harmonics)
+    assert again.data == packed.data, "a compressed file under the plain ending stays one"
+    unpacked = restyled(tmp_path / "v.ply", packed, packed.gaussians.harmonics)
+    assert unpacked.data != packed.data and torch.equal(unpacked.gaussians.means, packed.gaussians.means)
 
 
 def test_without_view_dependence_a_file_holds_the_colours_that_views_show(tmp_path: Path) -> None:
@@ -128,15 +125,11 @@ def test_without_view_dependence_a_file_holds_the_colours_that_views_show(tmp_pa
     harmonics[:, 2] = torch.tensor([0.6, -0.3, 0.0])  # Y = 0.4886 z
     means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
     there = Gaussians(means, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.full((2, 3), -2.0), torch.full((2,), 3.0), harmonics)
-    views = pinhole(
-        look_at(torch.tensor([[0.0, 0, 2]]), torch.zeros(1, 3), torch.tensor([0.0, 1, 0])), width=32, height=32, fov=40
-    )
-    write_gaussians(tmp_path / "seen.splat", there, views=views)
-    write_gaussians(tmp_path / "all.splat", there)
-    seen, every = (read_capture(tmp_path / name).gaussians.colours for name in ("seen.splat", "all.splat"))
+    seen = written(tmp_path / "seen.splat", there, views=from_the_front(32, 40)).gaussians.colours
     direction = torch.nn.functional.normalize(means - torch.tensor([0.0, 0, 2]), dim=1)
     wanted = 0.5 + 0.48860251 * direction[:, 2:] * harmonics[:, 2]
     assert torch.allclose(seen, wanted, atol=0.5 / 255 + 1e-6)
+    every = written(tmp_path / "all.splat", there).gaussians.colours
     assert torch.allclose(every, torch.full((2, 3), 0.5), atol=0.5 / 255 + 1e-6)
 
 
@@ -147,8 +140,7 @@ def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path
     scales = torch.log(torch.tensor([0.1, 1e-3, 1e-3])) + torch.linspace(0, 2, 9)[:, None]
     turns = torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 9)
     there = Gaussians(means, turns, scales, torch.full((9,), 2.0), torch.full((9, 1, 3), 1.0))
-    eye, up = torch.tensor([[0.0, 0, 2]]), torch.tensor([0.0, 1, 0])
-    views = pinhole(look_at(eye, torch.zeros(1, 3), up), width=64, height=64, fov=45)
+    views = from_the_front(64, 45)
     write_gaussians(tmp_path / f"x{ending}", there, antialiased=True, views=views, plain=ending == ".ply")
     plain = read_capture(tmp_path / f"x{ending}")
     assert not plain.antialiased
@@ -158,8 +150,7 @@ def test_plain_opacities_show_thin_gaussians_as_compensation_does(tmp_path: Path
     )
     assert (shown - wanted).abs().max() < (1e-4 if ending == ".ply" else 0.03)
     assert (heavy - wanted).abs().max() > 0.4
-    write_gaussians(tmp_path / "exact.ply", there, antialiased=True, views=views)
-    exact = read_capture(tmp_path / "exact.ply")
+    exact = written(tmp_path / "exact.ply", there, antialiased=True, views=views)
     assert exact.antialiased and torch.equal(exact.gaussians.logits, there.logits)
 
 
@@ -167,34 +158,30 @@ def test_a_ply_in_parts_is_the_same_file_and_goes_on_where_it_was_cut_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fprf.splats.files._ROWS", 64)
-    gaussians, path, asked = ball(300), tmp_path / "parts.ply", []
-    write_gaussians(tmp_path / "whole.ply", gaussians, antialiased=True)
+    gaussians, path = ball(300), tmp_path / "parts.ply"
+    whole = written(tmp_path / "whole.ply", gaussians, antialiased=True).data
 
-    def part(rows: slice) -> Gaussians:
-        if rows.start == stop:
-            raise KeyboardInterrupt
-        asked.append(rows.start)
-        return gaussians.part(rows)
+    def rows_written(key: str, stop: int | None = None, antialiased: bool = True) -> list[int]:
+        """First rows of the parts that were asked for until writing was cut off; the first part says what rows are like."""
+        asked: list[int] = []
 
-    for stop, begun in ((64, 0), (256, 0), (256, 192), (-1, 192)):
-        asked.clear()
-        if stop < 0:
-            write_ply_parts(path, part, len(gaussians), "a" * 64, antialiased=True)
-        else:
-            with pytest.raises(KeyboardInterrupt):
-                write_ply_parts(path, part, len(gaussians), "a" * 64, antialiased=True)
-            assert not path.exists()
-        assert asked[1:] == list(range(begun, stop if stop > 0 else 300, 64))  # the first says what rows are like
-    assert path.read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    stop = 256
-    with pytest.raises(KeyboardInterrupt):
-        write_ply_parts(path, part, len(gaussians), "b" * 64, antialiased=True)
-    assert path.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+        def part(rows: slice) -> Gaussians:
+            if rows.start == stop:
+                raise KeyboardInterrupt
+            asked.append(rows.start)
+            return gaussians.select(rows)
+
+        with contextlib.nullcontext() if stop is None else pytest.raises(KeyboardInterrupt):
+            write_ply_parts(path, part, len(gaussians), key * 64, antialiased=antialiased)
+        return asked[1:]
+
+    assert rows_written("a", 64) == [0]
+    assert rows_written("a", 256) == [0, 64, 128, 192]
+    assert rows_written("a", 256) == [192] and not path.exists()
+    assert rows_written("a") == [192, 256] and path.read_bytes() == whole
+    assert rows_written("b", 256) == [0, 64, 128, 192] and path.read_bytes() == whole
     # Another key begins anew, and removes what the first one left.
-    stop = -1
-    asked.clear()
-    write_ply_parts(path, part, len(gaussians), "c" * 64)
-    assert asked[1:] == list(range(0, 300, 64)) and not read_capture(path).antialiased
+    assert rows_written("c", antialiased=False) == list(range(0, 300, 64)) and not read_capture(path).antialiased
     assert sorted(each.name for each in tmp_path.iterdir()) == ["parts.ply", "whole.ply"]
 
 
@@ -206,15 +193,8 @@ def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> N
     table = np.zeros(5, [(name, codes[kind]) for name, kind in kinds])
     for k, (name, _) in enumerate(kinds):
         table[name] = np.arange(5) + 0.1 * k + 1
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment by hand",
-        "element sensor 1",
-        "property double t",
-        "element vertex 5",
-    ]
-    lines += [f"property {kind} {name}" for name, kind in kinds]
+    lines = ["ply", "format binary_little_endian 1.0", "comment by hand", "element sensor 1", "property double t"]
+    lines += ["element vertex 5", *(f"property {kind} {name}" for name, kind in kinds)]
     lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
     data = "\r\n".join(lines).encode() + struct.pack("<d", 3.5) + table.tobytes() + b"\3" + struct.pack("<3i", 0, 1, 2)
     path = tmp_path / "x.ply"
@@ -223,11 +203,10 @@ def test_a_ply_keeps_header_order_and_what_it_does_not_know(tmp_path: Path) -> N
     assert torch.equal(capture.gaussians.means[:, 0], torch.from_numpy(table["x"].copy()))
     new = capture.gaussians.harmonics.clone()
     new[3] = 0.25
-    write_capture(tmp_path / "y.ply", capture, new)
     expected = table.copy()
     for name in ("f_dc_0", "f_dc_1", "f_dc_2"):
         expected[name][3] = 0.25
-    assert (tmp_path / "y.ply").read_bytes() == data.replace(table.tobytes(), expected.tobytes())
+    assert restyled(tmp_path / "y.ply", capture, new).data == data.replace(table.tobytes(), expected.tobytes())
 
 
 def older_spz(version: int) -> bytes:
@@ -263,17 +242,15 @@ def test_every_version_of_spz(version: int, tmp_path: Path) -> None:
     assert torch.equal(found.harmonics[0, 1:, 0] * 128, torch.tensor([8.0, 5.0, -2.0]))
     new = found.harmonics.clone()
     new[1] = 0.25
-    write_capture(tmp_path / "y.spz", capture, new)
-    again = read_capture(tmp_path / "y.spz")
+    again = restyled(tmp_path / "y.spz", capture, new)
     assert torch.equal(again.gaussians.harmonics[0], found.harmonics[0])
     assert (again.gaussians.harmonics - new).abs().max() < 0.5 / 255 / 0.15
     assert (b"extended" in again.data) if version == 4 else gzip.decompress(again.data).endswith(b"more")
 
 
 def test_sog_of_version_1(tmp_path: Path) -> None:
-    write_gaussians(tmp_path / "x.sog", cloud(1, 40))
-    with zipfile.ZipFile(tmp_path / "x.sog") as archive:
-        parts = {name: archive.read(name) for name in archive.namelist()}
+    path = tmp_path / "x.sog"
+    parts = unbundle(path, written(path, cloud(1, 40)).data)
     meta = json.loads(parts["meta.json"])
     old = {"means": meta["means"] | {"shape": [40, 3]}, "quats": meta["quats"]}
     old["scales"] = {"mins": [-6, -6, -6], "maxs": [0, 0, 0], "files": ["scales.webp"]}
@@ -286,62 +263,54 @@ def test_sog_of_version_1(tmp_path: Path) -> None:
     assert np.allclose(capture.gaussians.harmonics[:, 0], pixels[:, :3] / 255 * 2 - 1, atol=1e-6)
     assert np.allclose(capture.gaussians.logits, pixels[:, 3] / 255 * 10 - 5, atol=1e-6)
     new = capture.gaussians.harmonics * 0.5
-    write_capture(tmp_path / "there" / "meta.json", capture, new)
-    again = read_capture(tmp_path / "there").gaussians
+    again = restyled(tmp_path / "there" / "meta.json", capture, new).gaussians
     assert (again.harmonics - new).abs().max() < 2 / 255 and torch.equal(again.logits, capture.gaussians.logits)
 
 
 def test_gaussians_that_are_not_finite_are_read_and_told(tmp_path: Path) -> None:
     made = cloud(0, 6)
     made.means[1, 0], made.logits[2], made.logits[3] = torch.nan, torch.inf, torch.nan
-    write_gaussians(tmp_path / "x.ply", made)
-    capture = read_capture(tmp_path / "x.ply")
-    assert capture.gaussians.finite.tolist() == [True, False, True, False, True, True]
+    assert written(tmp_path / "x.ply", made).gaussians.finite.tolist() == [True, False, True, False, True, True]
     for ending in (".compressed.ply", ".splat", ".spz", ".sog"):
-        write_gaussians(tmp_path / f"x{ending}", made)
-        assert len(read_capture(tmp_path / f"x{ending}").gaussians) == 6
+        assert len(written(tmp_path / f"x{ending}", made).gaussians) == 6
 
 
 def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:
-    write_gaussians(tmp_path / "x.ply", cloud(1, 4))
-    data = (tmp_path / "x.ply").read_bytes()
-    for what, changed in {
-        "2D Gaussians": data.replace(b"scale_2", b"scale_9"),
-        "2dgs": data.replace(b"format", b"comment SplatRenderMode: 2dgs\nformat", 1),
-        "little-endian": data.replace(b"binary_little_endian", b"ascii"),
-        "cut off": data[:-1],
-        "no property opacity": data.replace(b"opacity", b"opaque_"),
-        "f_rest": data.replace(b"f_rest_8", b"g_rest_8"),
-    }.items():
-        (tmp_path / "y.ply").write_bytes(changed)
-        with pytest.raises(DataError, match=what) as told:
-            read_capture(tmp_path / "y.ply")
-        assert "\n" not in str(told.value)
-    for name in ("x.obj", "none.ply", "x.splat"):
-        (tmp_path / "x.splat").write_bytes(b"abc")
-        with pytest.raises(DataError):
+    data, spz, sog = (written(tmp_path / f"x{ending}", cloud(1, 4)).data for ending in (".ply", ".spz", ".sog"))
+    for name, content in (
+        ("2d.ply", data.replace(b"scale_2", b"scale_9")),
+        ("2dgs.ply", data.replace(b"format", b"comment SplatRenderMode: 2dgs\nformat", 1)),
+        ("text.ply", data.replace(b"binary_little_endian", b"ascii")),
+        ("short.ply", data[:-1]),
+        ("transparent.ply", data.replace(b"opacity", b"opaque_")),
+        ("degree.ply", data.replace(b"f_rest_8", b"g_rest_8")),
+        ("x.obj", data),
+        ("x.splat", b"abc"),
+        ("short.spz", spz[:-9]),
+        ("other.spz", data),
+        ("short.sog", sog[:-9]),
+        ("meta.json", b"{}"),
+        ("none/x.ply", None),
+    ):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError) as told:
             read_capture(tmp_path / name)
-    with pytest.raises(DataError, match="degrees"):
+        assert "\n" not in str(told.value) and name in str(told.value)
+    with pytest.raises(DataError):
         replace(cloud(0, 3), harmonics=torch.zeros(3, 2, 3))
 
 
 @pytest.mark.parametrize("ending", [".spz", ".sog"])
 def test_a_small_file_that_claims_much_takes_no_memory(ending: str, tmp_path: Path) -> None:
-    import tracemalloc
-
     path = tmp_path / f"x{ending}"
     if ending == ".spz":
         path.write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 2**30, 3, 12, 0, 0) + bytes(1 << 20)))
     else:
-        write_gaussians(path, cloud(0, 40))
+        parts = unbundle(path, written(path, cloud(0, 40)).data)
         wide = cv2.imencode(".webp", np.zeros((4000, 4000, 4), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
-        with zipfile.ZipFile(path) as archive:
-            parts = {name: archive.read(name) for name in archive.namelist()}
-        parts["means_l.webp"] = wide
-        parts["meta.json"] = parts["meta.json"].replace(b'"count":40', b'"count":16000000')
-        with zipfile.ZipFile(path, "w") as archive:
-            for name, content in parts.items():
-                archive.writestr(name, content)
+        meta = parts["meta.json"].replace(b'"count":40', b'"count":16000000')
+        path.write_bytes(bundle(parts | {"means_l.webp": wide, "meta.json": meta}))
     tracemalloc.start()
     with pytest.raises(DataError):
         read_capture(path)

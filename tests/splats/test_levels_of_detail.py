@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from splat_ball import ball
+from splat_ball import ball, equal
 
 from fprf.ops.rasterise import Pinhole
 from fprf.splats.gaussians import Gaussians
@@ -26,23 +26,22 @@ def _camera(distance: float, focal: float) -> Pinhole:
     return Pinhole(intrinsics, pose, 96, 64, 0.01)
 
 
-def _squared(gaussians: Gaussians, camera: Pinhole, pixels: float) -> tuple[float, int]:
+@pytest.mark.parametrize(
+    ("distance", "focal", "pixels", "error", "left"),
+    [
+        (0.0, 100.0, 0.0, 1e-5, 1.0),
+        (5.0, 300.0, 0.0, 1e-5, 1.0),
+        (-5.0, 100.0, 0.0, 1e-5, 1.0),
+        (300.0, 300.0, 1.0, 2 / 255, 0.75),
+    ],
+)
+def test_culling_and_merging_within_a_pixel_do_not_show_and_save(
+    distance: float, focal: float, pixels: float, error: float, left: float
+) -> None:
+    gaussians, camera = _scattered(20_000), _camera(distance, focal)
     shown = make_levels_of_detail(gaussians).select(camera, pixels)
     apart = draw(gaussians, camera, antialiased=True).image - draw(shown, camera, antialiased=True).image
-    return float(apart.square().mean()), len(shown)
-
-
-def test_culling_changes_nothing() -> None:
-    gaussians = _scattered(20_000)
-    for distance, focal in ((0.0, 100.0), (5.0, 300.0), (-5.0, 100.0)):
-        error, count = _squared(gaussians, _camera(distance, focal), 0.0)
-        assert error < 1e-10 and count < len(gaussians)
-
-
-def test_merging_within_a_pixel_does_not_show_and_saves() -> None:
-    gaussians = _scattered(20_000)
-    error, count = _squared(gaussians, _camera(300.0, 300.0), 1.0)
-    assert error**0.5 < 2 / 255 and count < 0.75 * len(gaussians)
+    assert float(apart.square().mean()) ** 0.5 < error and len(shown) < left * len(gaussians)
 
 
 def test_equal_gaussians_merge_into_one_of_them() -> None:
@@ -60,9 +59,8 @@ def test_levels_in_files_show_the_same(tmp_path: Path) -> None:
     stored = open_levels(tmp_path, "key")
     assert stored is not None and open_levels(tmp_path, "other") is None
     for pixels in (0.0, 1.0, 0.0):  # pages that were given back are read again
-        made = make_levels_of_detail(gaussians).select(_camera(100.0, 300.0), pixels)
-        found = stored.select(_camera(100.0, 300.0), pixels)
-        assert all(map(torch.equal, vars(made).values(), vars(found).values()))
+        camera = _camera(100.0, 300.0)
+        assert equal(make_levels_of_detail(gaussians).select(camera, pixels), stored.select(camera, pixels))
     file = tmp_path / "rows.bin"
     whole = file.read_bytes()
     for damaged in (b"", whole[:-1], whole[: len(whole) // 2], bytes(len(whole))):
@@ -93,9 +91,8 @@ def test_a_look_shows_the_levels_of_recoloured_gaussians(room: int, tmp_path: Pa
 
     styled = StyledLevels(stored, recolour)
     for distance, pixels in ((100.0, 0.0), (100.0, 1.0), (300.0, 1.0), (5.0, 1.0), (100.0, 1.0)):
-        made = wanted.select(_camera(distance, 300.0), pixels)
-        shown = styled.select(_camera(distance, 300.0), pixels)
-        assert all(map(torch.equal, vars(made).values(), vars(shown).values()))
+        camera = _camera(distance, 300.0)
+        assert equal(wanted.select(camera, pixels), styled.select(camera, pixels))
     before = len(asked)
     styled.select(_camera(100.0, 300.0), 1.0)
     assert len(styled.select(_camera(-1e4, 300.0), 1.0)) == 0
@@ -104,12 +101,12 @@ def test_a_look_shows_the_levels_of_recoloured_gaussians(room: int, tmp_path: Pa
 
 def test_levels_stay_those_of_before_where_writing_ends_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_levels(tmp_path, _scattered(2000), "before")
-    monkeypatch.setattr("fprf.splats.levels.np.savez", _interrupted)
+
+    def interrupted(*args: object, **named: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fprf.splats.levels.np.savez", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_levels(tmp_path, _scattered(2000).select(torch.arange(1999, -1, -1)), "after")
     assert open_levels(tmp_path, "before") is not None and open_levels(tmp_path, "after") is None
     assert [path.name for path in tmp_path.iterdir()] == ["rows.bin"]
-
-
-def _interrupted(*args: object, **named: object) -> None:
-    raise KeyboardInterrupt

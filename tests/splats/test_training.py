@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from splat_ball import equal
 from stand_in_viewers import GREEDY, viewer
 from torch import Tensor
 
@@ -23,7 +23,7 @@ from fprf.datamanagers.scene import Scene
 from fprf.errors import CheckpointError
 from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
-from fprf.ops.rasterise import lift, rasterise
+from fprf.ops.rasterise import lift
 from fprf.ops.rasterise_training import learn
 from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.rendering.cameras import Cameras, project
@@ -33,7 +33,9 @@ from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
 from fprf.splats.gaussians import Gaussians
 from fprf.splats.learner import Learner
+from fprf.splats.photographs import camera_of
 from fprf.splats.training import prepare, reach_of
+from fprf.splats.views import draw
 from fprf.town.write import write_town
 from fprf.training import checkpoint
 from fprf.training.camera_optimizers import Tones, moved_cameras
@@ -48,13 +50,13 @@ def learnt(config: GaussiansConfig, scene: Scene, begin: int = 0, end: int = STE
     learner = prepare(config, scene).learner
     if before is not None:
         learner.restore(before.gaussians(), before.moments())
-    for step in range(begin, end):
-        assert learner.step(step, step / STEPS) is not None
+    stepped(learner, end, begin)
     return learner
 
 
-def equal(a: Gaussians, b: Gaussians) -> bool:
-    return all(x.shape == y.shape and torch.equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
+def stepped(learner: Learner, end: int, begin: int = 0) -> None:
+    for step in range(begin, end):
+        assert learner.step(step, step / STEPS) is not None
 
 
 @pytest.fixture(scope="module")
@@ -79,12 +81,9 @@ def test_it_learns_views_that_it_has_not_seen(config: GaussiansConfig, scene: Sc
     images = load_images(scene)
 
     def quality(found: Gaussians) -> float:
-        rows = []
-        for view in scene.test.tolist():
-            camera = photographs.pinhole(scene.cameras, view, 0.01)
-            seen = rasterise(*vars(found).values(), camera, antialiased=True).image.clamp(0, 1)
-            rows.append(psnr(seen, torch.from_numpy(images[view]).float() / 255))
-        return float(np.mean(rows))
+        drawn = {view: draw(found, camera_of(scene.cameras, view), antialiased=True).image for view in scene.test.tolist()}
+        truth = {view: torch.from_numpy(images[view]).float() / 255 for view in drawn}
+        return float(np.mean([psnr(image.clamp(0, 1), truth[view]) for view, image in drawn.items()]))
 
     before = quality(prepare(config, scene).learner.gaussians())
     assert quality(trained.gaussians()) > before + 2
@@ -129,10 +128,10 @@ def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig
     back = pose * torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=pose.dtype)
     cameras = replace(scene.cameras.select(torch.zeros(2, dtype=torch.int64)), pose=torch.stack([pose, back]))
     both = replace(scene, cameras=cameras, train=torch.arange(2))
-    draw = np.random.default_rng(0)
-    images = {view: draw.integers(0, 255, (24, 32, 3), np.uint8) for view in range(2)}
+    draws = np.random.default_rng(0)
+    images = {view: draws.integers(0, 255, (24, 32, 3), np.uint8) for view in range(2)}
     levels = photographs.make_levels(both, images, {}, 0.01)
-    spread, quaternions = (torch.from_numpy(draw.normal(size=(32, k))) for k in (3, 4))
+    spread, quaternions = (torch.from_numpy(draws.normal(size=(32, k))) for k in (3, 4))
     means = pose[:, 3] - torch.where(torch.arange(32) < 16, 4.0, -4.0)[:, None] * pose[:, 2] + 0.5 * spread
     harmonics = torch.zeros(32, (config.degree + 1) ** 2, 3)
     start = Gaussians(means.float(), quaternions.float(), torch.full((32, 3), -1.5), torch.zeros(32), harmonics)
@@ -188,8 +187,7 @@ def test_tones_are_told_from_the_scene(config: GaussiansConfig, scene: Scene) ->
             planes = target.planes[: len(target.planes) // 3 * 3]
             area = -(-target.width // 16) * 16 * -(-target.height // 16) * 16
             planes[: 3 * area].reshape(3, area)[:] *= wanted[view].exp().numpy()[:, None]
-    for step in range(STEPS):
-        assert learner.step(step, step / STEPS) is not None
+    stepped(learner, STEPS)
     train = scene.train
     assert learner.tones is not None
     found = learner.tones(train).log().detach()
@@ -230,19 +228,23 @@ def test_nothing_floats_before_a_sky_that_is_masked(config: GaussiansConfig, sce
         found = learnt(replace(config, masks=masks), masked).gaussians()
         sky, seen = torch.from_numpy(above[..., :1] / 255).float(), torch.zeros(len(found), 1)
         for view in scene.train.tolist():
-            camera = photographs.pinhole(scene.cameras, view, 0.01)
-            seen += lift(*list(vars(found).values())[:4], camera, sky, antialiased=True).features
+            seen += lift(*list(vars(found).values())[:4], camera_of(scene.cameras, view), sky, antialiased=True).features
         distance = (found.means - centre).norm(dim=1)
         return float(seen[distance < 0.4 * distance.max()].sum())
 
     assert before_the_sky(True) < 0.5 * before_the_sky(False)
 
 
+def command(config: GaussiansConfig, run: Path) -> list[str]:
+    """Words that train the town."""
+    small = ["--initial", "300", "--cap", "400", "--steps", "40"]
+    return ["train", "fprf-splats", "--data", str(config.data), *small, "--output", str(run)]
+
+
 @pytest.fixture(scope="module")
-def run(config: GaussiansConfig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def run(config: GaussiansConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("splats") / "run"
-    flags = ["--initial", "300", "--cap", "400", "--steps", "40", "--output", str(root)]
-    assert main(["train", "fprf-splats", "--data", str(config.data), *flags]) == 0
+    assert main(command(config, root)) == 0
     return root
 
 
@@ -285,25 +287,23 @@ def test_training_is_looked_at_and_changes_no_bit(
     """What the viewer is handed makes the scene of the moment, which takes a style."""
     monkeypatch.setattr(cli_train, "open_view", lambda place: LiveViewer(place, viewer(GREEDY, str(tmp_path / "log"))))
     monkeypatch.setattr(training, "REPORT_SECONDS", 0.0)
-    flags = ["--initial", "300", "--cap", "400", "--steps", "40", "--output", str(tmp_path / "run"), "--view"]
-    assert main(["train", "fprf-splats", "--data", str(config.data), *flags]) == 0
-    saved = [checkpoint.load_latest(each / "checkpoints")[0] for each in (run, tmp_path / "run")]
-    assert saved[0] is not None and saved[1] is not None
-    assert all(torch.equal(saved[0].model[name], saved[1].model[name]) for name in saved[0].model)
+    assert main([*command(config, tmp_path / "run"), "--view"]) == 0
+    alone, seen = (checkpoint.load_latest(each / "checkpoints")[0] for each in (run, tmp_path / "run"))
+    assert alone is not None and seen is not None
+    assert all(torch.equal(tensor, seen.model[name]) for name, tensor in alone.model.items())
     heard = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
     names = [line["names"] for line in heard if "names" in line]
-    assert names and all(each == sorted(saved[0].model) for each in names)
+    assert names and all(each == sorted(alone.model) for each in names)
     unfinished = Run(tmp_path / "run").load_config()[0].load_unfinished(tmp_path / "run", "cpu", None)
-    with pytest.raises(CheckpointError, match="no parameters"):
+    with pytest.raises(CheckpointError):
         unfinished.encoders(None)
-    scene = unfinished.scene(saved[0].model)
+    scene = unfinished.scene(alone.model)
     view = open_run(run, "cpu").scene.render(scene.cameras, 0)
     assert torch.equal(scene.render(scene.cameras, 0).rgb, view.rgb)
     encoders = unfinished.encoders(None)
     assert encoders.semantic is not None and len(encoders.scene.share) > 3
     assert unfinished.encoders(encoders).semantic is encoders.semantic
-    cells = ["train", "fprf-splats", "--data", str(config.data), "--cells", "2", "--output", str(tmp_path / "no"), "--view"]
-    assert main(cells) == 2
+    assert main([*command(config, tmp_path / "no"), "--cells", "2", "--view"]) == 2
 
 
 def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -311,50 +311,53 @@ def test_styles_on_a_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
         noise = np.random.default_rng(0).integers(-20, 20, (96, 128, 3))
         write_image(tmp_path / f"{name}.png", (np.array(colour) + noise).clip(0, 255).astype(np.uint8))
     dusk, snow = (str(tmp_path / f"{name}.png") for name in ("dusk", "snow"))
-    words = ["stylize", str(run), "--references", dusk, snow, "--split", "test"]
-    assert main([*words, "--output", str(tmp_path / "both")]) == 0
+    known = json.loads((run / "scene.json").read_text())
+    view, both = known["names"][known["test"][0]], ["--references", dusk, snow]
+
+    def made(verb: str, name: str, *flags: str) -> Path:
+        """What a verb writes of the run."""
+        assert main([verb, str(run), *flags, "--output", str(tmp_path / name)]) == 0
+        return tmp_path / name
+
+    def stylized(name: str, *flags: str) -> np.ndarray[Any, Any]:
+        return load_image(made("stylize", name, *flags, "--split", "test") / f"{view}.png")
+
+    image = stylized("both", *both)
     names = {path.name for path in (tmp_path / "both").iterdir()}
-    view = json.loads((run / "scene.json").read_text())["names"][json.loads((run / "scene.json").read_text())["test"][0]]
     assert {f"{view}.png", f"{view}-match.png", "style.json", "dictionary.safetensors"} <= names
     kept = (run / "style.safetensors").read_bytes()
-    # A style file on the same scene is the same style, pins and all; strength 0 is the scene itself.
-    assert main([*words, "--pin", "0=snow.png", "--output", str(tmp_path / "pinned")]) == 0
-    again = ["--style", str(tmp_path / "pinned" / "style.json"), "--split", "test", "--output", str(tmp_path / "again")]
-    assert main(["stylize", str(run), *again]) == 0
+    # A style file on the same scene is the same style, pins and all.
+    pinned = stylized("pinned", *both, "--pin", "0=snow.png")
+    again = stylized("again", "--style", str(tmp_path / "pinned" / "style.json"))
+    assert np.array_equal(pinned, again) and not np.array_equal(image, pinned)
     assert (run / "style.safetensors").read_bytes() == kept
-    images = {name: load_image(tmp_path / name / f"{view}.png") for name in ("both", "pinned", "again")}
-    assert np.array_equal(images["pinned"], images["again"]) and not np.array_equal(images["both"], images["pinned"])
-    film = ["render", str(run), "--path", "dataset", "--split", "test", "--show", "colour", "match", "--output"]
-    assert main([*film, str(tmp_path / "film"), "--references", dusk, snow, "--styles", "plain"]) == 0
-    assert np.array_equal(load_image(tmp_path / "film" / f"{view}.png")[:, : images["both"].shape[1]], images["both"])
-    assert main([*words, "--explain", "true", "--output", str(tmp_path / "explained")]) == 0
-    assert "seen best at" in capsys.readouterr().out and (tmp_path / "explained" / "explain.png").is_file()
-    assert main(["gallery", str(run), "--references", dusk, snow, "--output", str(tmp_path / "page.html")]) == 0
+    dataset = ["--path", "dataset", "--split", "test", "--show", "colour"]
+    film = made("render", "film", *dataset, "match", *both, "--styles", "plain")
+    assert np.array_equal(load_image(film / f"{view}.png")[:, : image.shape[1]], image)
+    explained = made("stylize", "explained", *both, "--split", "test", "--explain", "true")
+    assert "seen best at" in capsys.readouterr().out and (explained / "explain.png").is_file()
+    made("gallery", "page.html", *both)
     keys = [{"frame": 0, "style": None}, {"frame": 3, "style": str(tmp_path / "both" / "style.json")}]
     (tmp_path / "keys.json").write_text(json.dumps({"format": 1, "keyframes": keys}))
-    assert main([*film[:-3], "colour", "--keyframes", str(tmp_path / "keys.json"), "--output", str(tmp_path / "keyed")]) == 0
-    assert main(["export", str(run), "ply", "--references", snow, "--output", str(tmp_path / "files")]) == 0
-    plain, styled = (read_capture(tmp_path / "files" / f"splats{name}.ply").gaussians for name in ("", ".snow"))
+    made("render", "keyed", *dataset, "--keyframes", str(tmp_path / "keys.json"))
+    files = made("export", "files", "ply", "--references", snow)
+    plain, styled = (read_capture(files / f"splats{name}.ply").gaussians for name in ("", ".snow"))
     assert torch.equal(plain.means, styled.means) and styled.colours.mean() > plain.colours.mean() + 0.05
-    scene = fprf.load(run)
-    shot = scene.stylize([dusk, snow]).render(view)
-    assert np.array_equal(shot.pixels, images["both"])
+    assert np.array_equal(fprf.load(run).stylize([dusk, snow]).render(view).pixels, image)
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "export RUN glb",
-        "export RUN splat --fit 1",
-        "export RUN cameras --output x.ply",
-        "render RUN --tone 1",
-        "render RUN --lens panorama",
-        "stylize RUN --references a.png --samples 2",
-        "train fprf-splats --plan",
-        "bench speed RUN",
-        "train fprf-splats --degree 4",
-    ],
-)
+UNKNOWN = """export RUN glb
+export RUN splat --fit 1
+export RUN cameras --output x.ply
+render RUN --tone 1
+render RUN --lens panorama
+stylize RUN --references a.png --samples 2
+train fprf-splats --plan
+bench speed RUN
+train fprf-splats --degree 4"""
+
+
+@pytest.mark.parametrize("line", UNKNOWN.splitlines())
 def test_what_gaussians_do_not_know_is_refused_in_one_line(
     run: Path, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -376,10 +379,11 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
     pixel, _ = project(cameras, torch.tensor([0]), place[None])
     straight, _ = project(replace(cameras, lens=torch.zeros_like(cameras.lens)), torch.tensor([0]), place[None])
     assert (pixel - straight).norm() > 1
-    shape = (torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), -4.0), torch.full((1,), 4.0), torch.ones(1, 1, 3))
+    turn, size = torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), -4.0)
+    dot = Gaussians(place[None].float(), turn, size, torch.full((1,), 4.0), torch.ones(1, 1, 3))
     camera, where = photographs.cover(cameras, 0, 0.01)
     assert where is not None
-    drawn = photographs.distorted(rasterise(place[None].float(), *shape, camera).image, where)
+    drawn = photographs.distorted(draw(dot, camera).image, where)
     x, y = torch.meshgrid(torch.arange(160) + 0.5, torch.arange(120) + 0.5, indexing="xy")
 
     def middle(image: torch.Tensor) -> torch.Tensor:
@@ -388,28 +392,25 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
 
     assert (middle(drawn) - pixel[0]).norm() < 0.1
     bytes_ = (drawn.clamp(0, 1) * 255).byte().numpy()
-    back, inside = photographs.undistorted(cameras, 0, bytes_, photographs.pinhole(cameras, 0, 0.01))
+    back, inside = photographs.undistorted(cameras, 0, bytes_, camera_of(cameras, 0))
     assert inside is not None and 0.8 < inside.mean() < 1.01
     assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
 
 
 def test_matches_between_views_give_points_on_the_surface() -> None:
     """Views of a textured plane z = 0: what is triangulated lies in it."""
-    draw = np.random.default_rng(1)
-    texture = np.kron(draw.integers(0, 256, (60, 60, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+    draws = np.random.default_rng(1)
+    texture = np.kron(draws.integers(0, 256, (60, 60, 3)), np.ones((8, 8, 1))).astype(np.uint8)
     count, width, height, focal = 4, 200, 160, 180.0
     pose = torch.eye(4, dtype=torch.float64)[:3].repeat(count, 1, 1)
     pose[:, 0, 3], pose[:, 2, 3] = torch.linspace(-0.3, 0.3, count, dtype=torch.float64), 3.0
     cameras = pinhole(pose, width=width, height=height, fov=math.degrees(2 * math.atan(height / 2 / focal)))
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    images = []
-    for view in range(count):
-        u = (x * 3 / focal + float(pose[view, 0, 3])) * 100 + 240
-        v = y * 3 / focal * 100 + 240
-        images.append(texture[v.astype(int), u.astype(int)])
+    u, v = ((along * 3 / focal) * 100 + 240 for along in (x, y))
+    images = {view: texture[v.astype(int), (u + 100 * float(pose[view, 0, 3])).astype(int)] for view in range(count)}
     train = torch.arange(count)
     scene = Scene(name="plane", paths=(Path("a"),) * count, cameras=cameras, train=train, test=train[:0])
-    found, origin = initial.initial_points(scene, images, 1000, draw)
+    found, origin = initial.initial_points(scene, images, 1000, draws)
     assert origin == "points matched between views" and len(found.position) > 100
     assert np.median(np.abs(found.position[:, 2])) < 0.03
 
@@ -425,43 +426,40 @@ def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
     assert (np.linalg.norm(far.position - centre, axis=1) > 5 * np.linalg.norm(centre)).all()
 
 
+def after_a_step_of_wide_ones(config: GaussiansConfig, scene: Scene, restored: bool = False) -> tuple[Tensor, Tensor]:
+    """Means of the first Gaussians, and their widths after a step that begins with 3000 times as wide ones."""
+    learner = prepare(config, scene).learner
+    before = learner.gaussians()
+    for each in (learner, prepare(config, scene).learner if restored else learner):
+        learner, moments = each, learner.moments()
+        learner.restore(replace(before, log_scales=before.log_scales + 8.0), moments)
+    assert learner.step(0, 0.0) is not None
+    return before.means, learner.gaussians().log_scales.exp()
+
+
 @pytest.mark.parametrize("restored", [False, True])
 def test_surroundings_do_not_reach_the_cameras(config: GaussiansConfig, scene: Scene, restored: bool) -> None:
     """However wide one becomes, it is cut to a fifth of its distance: from beside, it would be drawn before the scene."""
-    learner = prepare(config, scene).learner
-    before = learner.gaussians()
-    far = before.means.norm(dim=1) > 0.5 * before.means.norm(dim=1).max()
-    wide = replace(before, log_scales=before.log_scales + 8.0)
-    learner.restore(wide, learner.moments())
-    if restored:
-        other = prepare(config, scene).learner
-        other.restore(learner.gaussians(), learner.moments())
-        learner = other
-    assert learner.step(0, 0.0) is not None
-    after, distance = learner.gaussians(), before.means[far].norm(dim=1, keepdim=True)
-    assert far.sum() == config.surroundings
-    assert (after.log_scales[far].exp() <= 0.22 * distance).all()
+    before, widths = after_a_step_of_wide_ones(config, scene, restored)
+    distance = before.norm(dim=1, keepdim=True)
+    far = distance[:, 0] > 0.5 * distance.max()
+    assert far.sum() == config.surroundings and (widths[far] <= 0.22 * distance[far]).all()
 
 
 @pytest.mark.parametrize(("cells", "share"), [(1, 0.5), (2, 0.25)])
 def test_nothing_covers_a_camera(config: GaussiansConfig, scene: Scene, cells: int, share: float) -> None:
-    learner = prepare(replace(config, cells=cells, surroundings=0), scene).learner
-    before = learner.gaussians()
-    learner.restore(replace(before, log_scales=before.log_scales + 8.0), learner.moments())
-    assert learner.step(0, 0.0) is not None
-    centres = scene.cameras.pose[scene.train][:, :, 3].float()
-    near = torch.stack([(before.means - centre).norm(dim=1) for centre in centres]).amin(0)[:, None]
-    after = learner.gaussians().log_scales.exp()
-    assert (after <= 1.04 * share * near).all() and (after > 0.8 * share * near).any()
+    before, widths = after_a_step_of_wide_ones(replace(config, cells=cells, surroundings=0), scene)
+    near = torch.cdist(before, scene.cameras.pose[scene.train][:, :, 3].float()).amin(1)[:, None]
+    assert (widths <= 1.04 * share * near).all() and (widths > 0.8 * share * near).any()
 
 
 @pytest.mark.parametrize("spread", [0.1, 3.0, 100.0])
 def test_the_nearest_of_many_cameras_is_found(scene: Scene, spread: float) -> None:
-    draw = torch.Generator().manual_seed(0)
+    draws = torch.Generator().manual_seed(0)
     cameras = scene.cameras.select(torch.zeros(400, dtype=torch.int64))
-    centre = 10 * torch.randn(400, 3, generator=draw, dtype=torch.float64)
+    centre = 10 * torch.randn(400, 3, generator=draws, dtype=torch.float64)
     cameras = replace(cameras, pose=torch.cat([cameras.pose[:, :, :3], centre[:, :, None]], 2))
-    means = 10 * torch.randn(60, 3, 1, generator=draw) + spread * torch.randn(60, 3, 16, generator=draw)
+    means = 10 * torch.randn(60, 3, 1, generator=draws) + spread * torch.randn(60, 3, 16, generator=draws)
     rows = np.concatenate([means.numpy(), np.full((60, 8, 16), 20, np.float32)], 1)
     training.limit_widths(replace(scene, cameras=cameras, train=torch.arange(0, 400, 2)), 1e-3, cells=True)(rows, 0)
     widest = rows[:, 3:4]

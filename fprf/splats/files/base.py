@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...ops.harmonics import HARMONIC
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, morton_order
 
 Floats: TypeAlias = NDArray[Any]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -36,12 +35,6 @@ class Capture:
     """The file. Of a folder, its files as one archive."""
     recolour: Callable[[Floats, Bools], bytes]
     """The file with the harmonics [N K 3] of some Gaussians (bool [N]) replaced and everything else as it was."""
-
-
-def assembled(means: Floats, quaternions: Floats, log_scales: Floats, logits: Floats, harmonics: Floats) -> Gaussians:
-    """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
-    parts = (means, quaternions, log_scales, logits, harmonics)
-    return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:
@@ -103,11 +96,7 @@ def spatial_order(means: Floats) -> NDArray[np.int64]:
     sound = np.nan_to_num(means.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
     low, high = sound.min(0), sound.max(0)
     cells = ((sound - low) / np.maximum(high - low, np.finfo(np.float32).tiny) * 1023).astype(np.int64)
-    code = np.zeros(len(means), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
-    return np.argsort(code, kind="stable")
+    return morton_order(cells)
 
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

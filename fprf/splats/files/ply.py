@@ -17,12 +17,11 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..gaussians import COUNTS, Gaussians
+from ..gaussians import COUNTS, Gaussians, from_arrays
 from .base import (
     Bools,
     Capture,
     Floats,
-    assembled,
     colours_of,
     constants_of,
     logit,
@@ -53,7 +52,6 @@ _SPAN = 8.0
 
 
 class _Element(NamedTuple):
-    name: str
     table: NDArray[np.void]
     offset: int
     """Of its first byte in the file."""
@@ -90,7 +88,7 @@ def read_ply(path: Path, data: bytes) -> Capture:
     harmonics = columns(*colours[:3])[:, None]
     if rest:
         harmonics = np.concatenate([harmonics, columns(*colours[3:]).reshape(-1, 3, count - 1).transpose(0, 2, 1)], 1)
-    gaussians = assembled(
+    gaussians = from_arrays(
         columns("x", "y", "z"),
         columns("rot_0", "rot_1", "rot_2", "rot_3"),
         columns("scale_0", "scale_1", "scale_2"),
@@ -192,7 +190,7 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
         share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
         harmonics = np.concatenate([harmonics, ((share - 0.5) * _SPAN).reshape(count, 3, -1).transpose(0, 2, 1)], 1)
     turned = words["packed_rotation"]
-    gaussians = assembled(
+    gaussians = from_arrays(
         unpacked(_unpack(words["packed_position"], (11, 10, 11)), _POSITION),
         three_to_four((turned >> 30).astype(np.int64), 2 * _unpack(turned, (10, 10, 10)) - 1),
         unpacked(_unpack(words["packed_scale"], (11, 10, 11)), _SCALE),
@@ -245,7 +243,7 @@ def _parse(path: Path, data: bytes) -> tuple[list[str], dict[str, _Element]]:
         kind, count = np.dtype([(each[2], _TYPES[each[1]]) for each in properties]), int(words[2])
         if offset + count * kind.itemsize > len(data):
             raise short(path, len(data), offset + count * kind.itemsize, f"element {words[1]} of {count} rows")
-        elements[words[1]] = _Element(words[1], np.frombuffer(data, kind, count, offset), offset)
+        elements[words[1]] = _Element(np.frombuffer(data, kind, count, offset), offset)
         offset += count * kind.itemsize
     return comments, elements
 

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from ...datamanagers.images import header_of
 from ...errors import DataError
-from ..gaussians import COUNTS, Gaussians
-from .base import Bools, Capture, Floats, assembled, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
+from ..gaussians import COUNTS, Gaussians, from_arrays
+from .base import Bools, Capture, Floats, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
@@ -62,7 +62,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
     labels, rest = pictures.palette()
     alpha = base[:, 3:] if version == 2 else pictures.decoded("sh0", base, 4)[:, 3:]
     constants = pictures.decoded("sh0", base[:, :3] if version == 2 else base, 3 if version == 2 else 4)[:, :3]
-    gaussians = assembled(
+    gaussians = from_arrays(
         np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)),
         quaternions,
         pictures.decoded("scales", scale[:, :3], 3),
@@ -83,7 +83,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
             entries = np.where(seen[:, None, None], mixed, rest)
             name = said["shN"]["files"][0]
             index, said["shN"] = _quantized(entries, said["shN"])
-            new[name] = _webp(_palette_picture(index, pictures.picture(name, _PALETTE * max(COUNTS))))
+            new[name] = _webp(_palette_picture(index))
         new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
         return bundle(new, like=data)
 
@@ -129,8 +129,7 @@ def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
             entries,
             {"count": used, "bands": gaussians.degree, "codebook": [], "files": ["shN_centroids.webp", "shN_labels.webp"]},
         )
-        rows = np.zeros((-(-used // _ROW), _ROW * entries.shape[1], 4), np.uint8)
-        pictures["shN_centroids.webp"] = _palette_picture(index, rows)
+        pictures["shN_centroids.webp"] = _palette_picture(index)
         pictures["shN_labels.webp"] = _picture(np.stack([labels & 255, labels >> 8, 0 * labels], 1), shape)
     files = {name: _webp(picture) for name, picture in pictures.items()}
     return bundle({**files, "meta.json": json.dumps(meta, separators=(",", ":")).encode()})
@@ -177,13 +176,11 @@ class _Pictures:
     def numbers(self, group: str, name: str, length: int) -> Floats:
         """A list of so many finite numbers."""
         value = self.meta[group].get(name) if isinstance(self.meta.get(group), dict) else None
-        if not isinstance(value, list) or len(value) != length:
-            raise self._wrong(f"{group}.{name} is no list of {length} numbers")
         # Exporters write null in the place of the first number of a codebook that is not finite.
-        if name == "codebook" and value and value[0] is None:
-            value = [value[1], *value[1:]]
+        if name == "codebook" and isinstance(value, list) and value[:1] == [None]:
+            value = value[1:2] + value[1:]
         try:
-            values = np.array(value, dtype=np.float64)
+            values = np.array(value if isinstance(value, list) else None, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             values = np.array([np.nan])
         if values.shape != (length,) or not np.isfinite(values).all():
@@ -299,12 +296,10 @@ def _picture(rows: NDArray[np.integer[Any]], shape: tuple[int, int]) -> _Bytes:
     return pixels.reshape(*shape, 4)
 
 
-def _palette_picture(index: NDArray[np.integer[Any]], like: _Bytes) -> _Bytes:
+def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
     """Entries [E K-1 3] in rows of 64."""
-    out = np.full_like(like, 255)
-    flat = out.reshape(-1, 4)
-    flat[: index.shape[0] * index.shape[1], :3] = index.reshape(-1, 3)
-    return out
+    entries, coefficients, _ = index.shape
+    return _picture(index.reshape(-1, 3), (-(-entries // _ROW), _ROW * coefficients))
 
 
 def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
-from ..gaussians import Gaussians
-from .base import Bools, Capture, Floats, assembled, colours_of, constants_of, logit, sigmoid, steps
+from ..gaussians import Gaussians, from_arrays
+from .base import Bools, Capture, Floats, colours_of, constants_of, logit, sigmoid, steps
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
 _LEAST = 1e-12
@@ -22,7 +22,7 @@ def read_splat(path: Path, data: bytes) -> Capture:
         raise DataError(f"{path}: {len(data)} bytes; a .splat file has {_RECORD.itemsize} for each Gaussian")
     table = np.frombuffer(data, _RECORD)
     share = table["rgba"] / 255
-    gaussians = assembled(
+    gaussians = from_arrays(
         table["mean"],
         (table["turn"].astype(np.float32) - 128) / 128,
         np.log(np.maximum(table["deviation"], _LEAST)),

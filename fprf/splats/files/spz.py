@@ -10,16 +10,16 @@ Version 4: a plain header of 32 bytes, a table of (compressed, raw) sizes, one z
 import itertools
 import struct
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..gaussians import COUNTS, Gaussians
-from .base import Bools, Capture, Floats, assembled, logit, short, sigmoid, smallest_three, steps, three_to_four
+from ..gaussians import COUNTS, Gaussians, from_arrays
+from .base import Bools, Capture, Floats, logit, short, sigmoid, smallest_three, steps, three_to_four
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
@@ -79,7 +79,7 @@ def read_spz(path: Path, data: bytes) -> Capture:
         quaternions[:, _TURN] = found
     bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
     harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
-    gaussians = assembled(
+    gaussians = from_arrays(
         points * _AXES,
         quaternions * np.concatenate([[1.0], _AXES]),
         scales.reshape(count, 3) / 16 - 10,
@@ -88,13 +88,14 @@ def read_spz(path: Path, data: bytes) -> Capture:
     )
 
     def recolour(harmonics: Floats, changed: Bools) -> bytes:
-        new = {2: tint.reshape(count, 3).copy(), 5: rest.reshape(count, bands - 1, 3).copy()}
-        for stream, bytes_ in zip((2, 5), _colour_bytes(harmonics[changed]), strict=True):
-            new[stream][changed] = bytes_
-        changed_streams = [new[i].tobytes() if i in new else each for i, each in enumerate(streams)]
-        if packed:
-            return _zipped(b"".join([unpacked[: _HEADER.size], *changed_streams, unpacked[ends[-1] :]]))
-        return _framed(data, changed_streams, keep=(0, 1, 3, 4))
+        colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
+        for stream, bytes_ in zip(colours, _colour_bytes(harmonics[changed]), strict=True):
+            stream[changed] = bytes_
+        new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
+        if not packed:
+            return _framed(path, data, header, new)
+        parts = [new.get(i, each) for i, each in enumerate(streams)]
+        return _zipped(b"".join([unpacked[: _HEADER.size], *parts, unpacked[ends[-1] :]]))
 
     return Capture(path, gaussians, bool(header.flags & 1), data, recolour)
 
@@ -173,7 +174,12 @@ def _zipped(data: bytes) -> bytes:
 def _frames(path: Path, data: bytes, header: _Header) -> list[bytes]:
     """The streams of version 4; harmonics of degree 0 have none."""
     from_, sizes = _toc(path, data, header)
-    zstd = _zstd(path)
+    try:
+        import zstandard as zstd
+    except ImportError:
+        raise DataError(
+            f"{path}: .spz of version 4 is read with zstandard; pip install zstandard, or save as version 3"
+        ) from None
     streams = []
     for (size, raw), wanted in zip(sizes, header.sizes, strict=False):
         if raw != wanted:
@@ -208,25 +214,14 @@ def _toc(path: Path, data: bytes, header: _Header) -> tuple[int, list[tuple[int,
     return end, sizes
 
 
-def _framed(data: bytes, streams: list[bytes], keep: tuple[int, ...]) -> bytes:
-    """A file of version 4 with new streams; those to `keep` stay as they are packed."""
+def _framed(path: Path, data: bytes, header: _Header, new: Mapping[int, bytes]) -> bytes:
+    """A file of version 4 with new streams; the others stay as they are packed."""
     import zstandard
 
-    *_, count, at = _WIDE_HEADER.unpack_from(data)
-    sizes = [_ENTRY.unpack_from(data, at + k * _ENTRY.size) for k in range(count)]
-    start, frames = at + count * _ENTRY.size, []
+    start, sizes = _toc(path, data, header)
+    head, frames = data[: start - len(sizes) * _ENTRY.size], []
     for k, (size, _) in enumerate(sizes):
-        frames.append(data[start : start + size] if k in keep else zstandard.ZstdCompressor().compress(streams[k]))
+        frames.append(zstandard.ZstdCompressor().compress(new[k]) if k in new else data[start : start + size])
         start += size
     table = b"".join(_ENTRY.pack(len(frame), raw) for frame, (_, raw) in zip(frames, sizes, strict=True))
-    return b"".join([data[:at], table, *frames, data[start:]])
-
-
-def _zstd(path: Path) -> ModuleType:
-    try:
-        import zstandard
-    except ImportError:
-        raise DataError(
-            f"{path}: .spz of version 4 is read with zstandard; pip install zstandard, or save as version 3"
-        ) from None
-    return zstandard
+    return b"".join([head, table, *frames, data[start:]])
