@@ -95,7 +95,7 @@ def _packed(
     inputs: int, weights: Sequence[Tensor], biases: Sequence[Tensor | None], shared: Tensor | None, row: Tensor | None
 ) -> tuple[Any, ...]:
     """Layers as the kernel takes them: outputs padded to whole vectors, which the next layer meets with zeros."""
-    from .lanes import WIDE
+    from .simd import WIDE
 
     packed, shifts, widths, side = [], [], [], weights[0].new_empty(0)
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):

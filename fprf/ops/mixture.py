@@ -138,6 +138,6 @@ def _flat(x: Tensor) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
 
 def _whole(x: Tensor) -> Tensor:
     """The last axis padded with zeros to whole vectors."""
-    from .lanes import WIDE
+    from .simd import WIDE
 
     return torch.nn.functional.pad(x, (0, -x.shape[-1] % WIDE))

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from fprf.ops import dense
 from fprf.ops.dense import Last, network, network_reference, runs
-from fprf.ops.lanes import WIDE, exp_lanes, opaque_lanes
+from fprf.ops.lanes import exp_lanes, opaque_lanes
+from fprf.ops.simd import WIDE
 
 QUICK = settings(max_examples=25, deadline=None)
 U = 2.0**-24
