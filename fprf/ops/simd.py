@@ -286,6 +286,19 @@ def load(array, at, lanes=LANES):
     return Vector(build, build.load(build.bitcast(array.at(at), _floats(lanes).as_pointer()), align=4))
 
 
+def load_halves(address, lanes):
+    """2^-112 of the float16 numbers whose bits lie at an address.
+
+    A half's exponent and mantissa, moved to a float's place, are 2^112 too small; subnormals come out right as well.
+    """
+    build, mask = address.build, lambda value: _same_int(value, lanes)
+    halves = build.inttoptr(address.value, ir.VectorType(ir.IntType(16), lanes).as_pointer())
+    half = build.zext(build.load(halves, align=2), _ints(lanes))
+    sign = build.shl(build.and_(half, mask(0x8000)), mask(16))
+    rest = build.shl(build.and_(half, mask(0x7FFF)), mask(13))
+    return Vector(build, build.bitcast(build.or_(sign, rest), _floats(lanes)))
+
+
 @traced
 def store(array, at, value):
     """array[at :] = value, a vector or the constant of LANES lanes."""
