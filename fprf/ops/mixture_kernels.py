@@ -28,7 +28,7 @@ def _away(x, first, rows, centre, least, away, factor):
             scaled_lanes(centre, c, np.float32(-1), x, at + c, away, to + c)
         for c in range(whole, depth):
             away[to + c] = x[at + c] - centre[c]
-        square = dot(away, to, away, to, whole) if whole > 0 else _0
+        square = dot(away, to, away, to, whole)
         for c in range(whole, depth):
             square += away[to + c] * away[to + c]
         norm = np.sqrt(square)
