@@ -25,13 +25,19 @@ Last = Literal["linear", "relu"]
 Floats = np.ndarray[tuple[int], np.dtype[np.float32]]
 
 
-def usable(x: Tensor) -> bool:
-    """Return whether kernels without gradients apply: float32 on the CPU, gradients disabled, numba installed."""
-    return _fit(x) and not torch.is_grad_enabled()
+def usable(*tensors: Tensor) -> bool:
+    """Return whether kernels without gradients apply: float32 on the CPU, not empty, gradients disabled, numba installed."""
+    return all(_fit(x) for x in tensors) and not torch.is_grad_enabled()
 
 
 def _fit(x: Tensor) -> bool:
-    return compiled() and x.device.type == "cpu" and x.dtype == torch.float32
+    return compiled() and x.device.type == "cpu" and x.dtype == torch.float32 and x.numel() > 0
+
+
+def array(x: Tensor) -> Floats:
+    """A tensor on the CPU as kernels take it: flat and contiguous."""
+    numbers: Floats = x.detach().contiguous().view(-1).numpy()
+    return numbers
 
 
 def network_reference(
@@ -67,13 +73,13 @@ def network(
 
     Each layer of the kernel errs by at most (I + 3) u (|x| |W|^T + |b|), u = 2^-24.
     """
-    if not all(usable(part) for part in (x, *weights, *(bias for bias in biases if bias is not None))) or len(x) == 0:
+    if not usable(x, *weights, *(bias for bias in biases if bias is not None)):
         return network_reference(x, weights, biases, shared=shared, row=row, last=last)
     from . import dense_kernels as kernels
 
     out = torch.empty(len(x), len(weights[-1]))
     layers = _packed(x.shape[1], weights, biases, shared, row)
-    kernels.network(_flat(x), x.shape[1], *layers, int(last == "relu"), out.view(-1).numpy(), out.shape[1])
+    kernels.network(array(x), x.shape[1], *layers, int(last == "relu"), out.view(-1).numpy(), out.shape[1])
     return out
 
 
@@ -82,7 +88,7 @@ def runs(x: Annotated[Tensor, "N C"]) -> tuple[Annotated[Tensor, "P"], Annotated
 
     Only on the CPU in float32; elsewhere each row stands for itself.
     """
-    if _fit(x) and len(x) > 0:
+    if _fit(x):
         from . import dense_kernels as kernels
 
         first, run = torch.empty(len(x), dtype=torch.int64), torch.empty(len(x), dtype=torch.int64)
@@ -95,7 +101,7 @@ def _packed(
     inputs: int, weights: Sequence[Tensor], biases: Sequence[Tensor | None], shared: Tensor | None, row: Tensor | None
 ) -> tuple[Any, ...]:
     """Layers as the kernel takes them: outputs padded to whole vectors, which the next layer meets with zeros."""
-    from .lanes import WIDE
+    from .simd import WIDE
 
     packed, shifts, widths, side = [], [], [], weights[0].new_empty(0)
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
@@ -107,13 +113,8 @@ def _packed(
         widths.append(width)
         inputs = width
     rows = torch.empty(0, dtype=torch.int64) if row is None else row.contiguous()
-    return _flat(torch.cat(packed)), _flat(torch.cat(shifts)), np.asarray(widths), _flat(side), rows.numpy()
+    return array(torch.cat(packed)), array(torch.cat(shifts)), np.asarray(widths), array(side), rows.numpy()
 
 
 def _fitted(x: Tensor, rows: int, columns: int) -> Tensor:
     return torch.nn.functional.pad(x, (0, columns - x.shape[1], 0, rows - len(x)))
-
-
-def _flat(x: Tensor) -> Floats:
-    flat: Floats = x.detach().contiguous().view(-1).numpy()
-    return flat

@@ -9,8 +9,8 @@ vectors (padded with zeros), and the padding of one layer's outputs meets zero w
 import numba
 import numpy as np
 
-from .lanes import BLOCK, WIDE, add_lanes, copy_lanes
-from .tile import ROWS_1, ROWS_2, ROWS_3, ROWS_4, multiply_1, multiply_2, multiply_3, multiply_4
+from .lanes import BLOCK, ROWS, add_lanes, copy_lanes, multiply
+from .simd import WIDE
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 _LEAST = np.float32(-np.inf)
@@ -19,34 +19,19 @@ _LEAST = np.float32(-np.inf)
 @numba.njit(inline="always", cache=True)
 def product(x, x_at, x_row, x_step, rows, w, w_at, width, start, s_at, s_row, out, o_at, o_row, depth, floor):
     """out[r] = max(start[r] + x[r] w, floor) for `rows` rows (whole tiles: a divisor or multiple of BLOCK) of `width`."""
-    c = 0
-    while c < width:
-        left = (width - c) // WIDE
-        if left >= 4:
-            for r in range(0, rows, ROWS_4):
-                multiply_4(
-                    x, x_at + r * x_row, x_row, x_step, w, w_at + c, width, start, s_at + r * s_row + c, s_row,
-                    out, o_at + r * o_row + c, o_row, depth, floor,
-                )  # fmt: skip
-        elif left == 3:
-            for r in range(0, rows, ROWS_3):
-                multiply_3(
-                    x, x_at + r * x_row, x_row, x_step, w, w_at + c, width, start, s_at + r * s_row + c, s_row,
-                    out, o_at + r * o_row + c, o_row, depth, floor,
-                )  # fmt: skip
-        elif left == 2:
-            for r in range(0, rows, ROWS_2):
-                multiply_2(
-                    x, x_at + r * x_row, x_row, x_step, w, w_at + c, width, start, s_at + r * s_row + c, s_row,
-                    out, o_at + r * o_row + c, o_row, depth, floor,
-                )  # fmt: skip
-        else:
-            for r in range(0, rows, ROWS_1):
-                multiply_1(
-                    x, x_at + r * x_row, x_row, x_step, w, w_at + c, width, start, s_at + r * s_row + c, s_row,
-                    out, o_at + r * o_row + c, o_row, depth, floor,
-                )  # fmt: skip
-        c += min(4, left) * WIDE
+    for c in range(0, width, 4 * WIDE):
+        columns = min(4, (width - c) // WIDE)
+        for r in range(0, rows, ROWS[columns]):
+            i, s, o = x_at + r * x_row, s_at + r * s_row + c, o_at + r * o_row + c
+            # The shape of a tile is a constant of the compiled code.
+            if columns == 4:
+                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 4)
+            elif columns == 3:
+                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 3)
+            elif columns == 2:
+                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 2)
+            else:
+                multiply(x, i, x_row, x_step, w, w_at + c, width, start, s, s_row, out, o, o_row, depth, floor, 1)
 
 
 @numba.njit(inline="always", cache=True)

@@ -16,7 +16,7 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from .dense import usable
+from .dense import array, usable
 
 HARMONIC = 0.28209479177387814
 """The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
@@ -81,12 +81,11 @@ def recoloured(
     directions: Directions,
 ) -> Annotated[Tensor, "N K 3"]:
     """`recoloured_reference`, within 60 u of the largest harmonic and change, u = 2^-24; without gradients."""
-    if not usable(harmonics) or len(harmonics) == 0:
+    if not usable(harmonics):
         return recoloured_reference(harmonics, change, weight, directions)
     from . import harmonics_kernels as kernels
 
     out = torch.empty_like(harmonics, memory_format=torch.contiguous_format)
     parts = (harmonics, change, weight, directions.values, directions.fit)
-    flat = (part.float().contiguous().view(-1).numpy() for part in parts)
-    kernels.recolour(*flat, len(directions.values), out.view(-1).numpy())
+    kernels.recolour(*(array(part.float()) for part in parts), len(directions.values), out.view(-1).numpy())
     return out

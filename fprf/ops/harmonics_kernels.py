@@ -7,7 +7,8 @@ import math
 import numba
 import numpy as np
 
-from .lanes import LANES, dot, scaled
+from .lanes import dot, scaled
+from .simd import NARROW
 
 _C0, _HALF, _TINY = np.float32(0.28209479177387814), np.float32(0.5), np.float32(1e-5)
 _0, _1 = np.float32(0), np.float32(1)
@@ -41,7 +42,7 @@ def _cut(rows, at, count, values, fit, size, colour, drawn):
             colour[c * size + d] = _HALF
         for k in range(count):
             factor = rows[at + 3 * k + c]
-            for d in range(0, size, LANES):
+            for d in range(0, size, NARROW):
                 scaled(values, k * size + d, factor, colour, c * size + d, colour, c * size + d)
         for d in range(size):
             least = min(least, colour[c * size + d])

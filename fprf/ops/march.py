@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from ..types import Rays
-from .backend import compiled
+from .dense import array
+from .dense import usable as usable
 
 Warp = Annotated[Tensor, "7"]
 """Map of a space to the unit cube, as the kernels take it."""
@@ -43,12 +44,6 @@ class Gathered(NamedTuple):
     view: Annotated[Tensor, "M 3"]
 
 
-def usable(*tensors: Tensor) -> bool:
-    """Return whether the kernels apply: float32 on the CPU, not empty, gradients disabled, numba installed."""
-    fit = all(x.device.type == "cpu" and x.dtype == torch.float32 and x.numel() > 0 for x in tensors)
-    return fit and compiled() and not torch.is_grad_enabled()
-
-
 def warp_of(kind: Literal["contraction", "box", "open"], low: tuple[float, ...], high: tuple[float, ...]) -> Warp:
     """The contraction, the box that becomes the unit cube, or distances of the one and points as they are."""
     corner = torch.tensor(low)
@@ -62,7 +57,7 @@ def distances(s: Annotated[Tensor, "R E"], near: Annotated[Tensor, "R"], far: An
 
     t = torch.empty(s.shape)
     if t.numel() > 0:
-        kernels.distances(_flat(s), _flat(near), _flat(far), _flat(warp), t.view(-1).numpy())
+        kernels.distances(array(s), array(near), array(far), array(warp), t.view(-1).numpy())
     return t
 
 
@@ -87,8 +82,8 @@ def propose(
 
     out = torch.empty(len(s), count + 1)
     kernels.propose(
-        _flat(rays.origin), _flat(rays.direction), _flat(rays.near), _flat(rays.far), _flat(s), _flat(warp), _flat(table),
-        resolution, table.shape[1], _flat(weight), np.float32(limit), np.float32(padding), _flat(shift),
+        array(rays.origin), array(rays.direction), array(rays.near), array(rays.far), array(s), array(warp), array(table),
+        resolution, table.shape[1], array(weight), np.float32(limit), np.float32(padding), array(shift),
         out.view(-1).numpy(),
     )  # fmt: skip
     return out
@@ -100,7 +95,7 @@ def place(rays: Rays, t: Annotated[Tensor, "R E"], warp: Warp) -> Annotated[Tens
 
     point = torch.empty(len(t), t.shape[1] - 1, 3)
     if point.numel() > 0:
-        kernels.place(_flat(rays.origin), _flat(rays.direction), _flat(t), _flat(warp), point.view(-1).numpy())
+        kernels.place(array(rays.origin), array(rays.direction), array(t), array(warp), point.view(-1).numpy())
     return point
 
 
@@ -114,7 +109,7 @@ def weigh(density: Annotated[Tensor, "R S"], t: Annotated[Tensor, "R E"], budget
     keep, kept = torch.empty(density.shape, dtype=torch.bool), torch.zeros(rays + 1, dtype=torch.int64)
     if density.numel() > 0:
         kernels.weigh(
-            _flat(density), _flat(t), np.float32(max(budget, 0.0)), weights.view(-1).numpy(), depth.numpy(),
+            array(density), array(t), np.float32(max(budget, 0.0)), weights.view(-1).numpy(), depth.numpy(),
             opacity.numpy(), transmittance.numpy(), keep.view(-1).numpy(), kept[1:].numpy(),
         )  # fmt: skip
     return Weighed(weights, depth, opacity, transmittance, keep, kept.cumsum(0))
@@ -136,8 +131,8 @@ def gather(
     )
     if total > 0:
         kernels.gather(
-            weighed.keep.view(-1).numpy(), weighed.start[:-1].numpy(), _flat(weighed.weights), _flat(point), _flat(latent),
-            _flat(view), out.ray.numpy(), *(_flat(x) for x in out[1:]),
+            weighed.keep.view(-1).numpy(), weighed.start[:-1].numpy(), array(weighed.weights), array(point), array(latent),
+            array(view), out.ray.numpy(), *(array(x) for x in out[1:]),
         )  # fmt: skip
     return out
 
@@ -150,10 +145,5 @@ def composite(
 
     out = torch.empty(len(start) - 1, values.shape[1])
     if out.numel() > 0:
-        kernels.composite(_flat(weight), _flat(values), start.numpy(), out.view(-1).numpy())
+        kernels.composite(array(weight), array(values), start.numpy(), out.view(-1).numpy())
     return out
-
-
-def _flat(x: Tensor) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    flat: np.ndarray[tuple[int], np.dtype[np.float32]] = x.detach().contiguous().view(-1).numpy()
-    return flat

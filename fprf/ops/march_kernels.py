@@ -9,8 +9,9 @@ distances of a contraction with points as they are, then what a box subtracts an
 import numba
 import numpy as np
 
-from .lanes import BLOCK, LANES, WIDE, copy_lanes, dot, exp_lanes, opaque_lanes, product_forward
-from .triplane_kernels import cells
+from .lanes import BLOCK, copy_lanes, dot, exp_lanes, opaque_lanes
+from .simd import NARROW, WIDE
+from .triplane_kernels import cells, product_forward
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 
@@ -131,8 +132,8 @@ def propose(origin, direction, near, far, s, warp, table, size, channels, weight
                 for k in range(some):
                     a, b, c = corner[k], corner[BLOCK + k], corner[2 * BLOCK + k]
                     u, v, x = part[k], part[BLOCK + k], part[2 * BLOCK + k]
-                    for g in range(0, channels, LANES):
-                        product_forward(table, feature, a + g, b + g, c + g, g, channels, size * channels, u, v, x)
+                    for g in range(0, channels, NARROW):
+                        product_forward(table, feature, a + g, b + g, c + g, g, channels, size * channels, u, v, x, NARROW)
                     tau[first + k] = min(dot(feature, 0, weight, 0, channels) - _1, limit)
                 for k in range(first, min(room, first + STRETCH), WIDE):
                     exp_lanes(tau, k, tau, k)

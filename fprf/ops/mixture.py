@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .dense import usable
+from .dense import array, usable
 from .precision import full_precision
 
 
@@ -45,16 +45,14 @@ def affine(
     centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
     """`affine_reference`, within (C + K + 3) u sum_k share_k (|x - centre| |matrix_k| + |bias_k|), u = 2^-24."""
-    if not usable(x) or len(x) == 0:
+    if not usable(x):
         return affine_reference(x, share, matrix, bias, centre=centre)
     from . import mixture_kernels as kernels
 
     channels = x.shape[1]
     out = torch.empty(len(x), channels)
-    padded = [_whole(part).contiguous().view(-1).numpy() for part in (matrix, bias)]
-    kernels.affine(
-        *(_flat(part) for part in (x, centre, share)), *padded, channels, len(padded[1]) // len(bias), out.view(-1).numpy()
-    )
+    padded = [_whole(part) for part in (matrix, bias)]
+    kernels.affine(*(array(part) for part in (x, centre, share, *padded)), channels, padded[1].shape[1], out.view(-1).numpy())
     return out
 
 
@@ -80,7 +78,7 @@ def scaled(
     centre: Annotated[Tensor, "C"],
 ) -> Annotated[Tensor, "N C"]:
     """`scaled_reference`, within (K + 2) u (|x - centre| share |gain| + share |bias|)."""
-    if not usable(x) or len(x) == 0:
+    if not usable(x):
         return scaled_reference(x, share, gain, bias, centre=centre)
     from . import mixture_kernels as kernels
 
@@ -89,7 +87,7 @@ def scaled(
     padded = [_whole(part) for part in (gain, bias)]
     width = padded[0].shape[1]
     kernels.scaled(
-        *(_flat(part) for part in (x, centre, share, *padded)),
+        *(array(part) for part in (x, centre, share, *padded)),
         channels,
         width,
         np.zeros(width, np.float32),
@@ -117,13 +115,13 @@ def attention(
     out, columns = torch.empty(len(x), len(keys)), _whole(keys.T)
     odds = torch.zeros(len(keys)) if prior is None else prior.log()
     kernels.attention(
-        _flat(x),
-        _flat(torch.zeros(x.shape[1]) if centre is None else centre),
+        array(x),
+        array(torch.zeros(x.shape[1]) if centre is None else centre),
         np.float32(-1.0 if centre is None else flat),
-        _flat(columns),
+        array(columns),
         columns.shape[1],
         np.float32(1 / max(temperature, torch.finfo(torch.float32).tiny)),
-        _flat(odds),
+        array(odds),
         np.float32(faint),
         np.zeros(columns.shape[1], np.float32),
         out.view(-1).numpy(),
@@ -131,13 +129,8 @@ def attention(
     return out
 
 
-def _flat(x: Tensor) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    flat: np.ndarray[tuple[int], np.dtype[np.float32]] = x.detach().contiguous().view(-1).numpy()
-    return flat
-
-
 def _whole(x: Tensor) -> Tensor:
     """The last axis padded with zeros to whole vectors."""
-    from .lanes import WIDE
+    from .simd import WIDE
 
     return torch.nn.functional.pad(x, (0, -x.shape[-1] % WIDE))

@@ -9,18 +9,9 @@ import numba
 import numpy as np
 
 from .dense_kernels import product
-from .lanes import BLOCK, LANES, WIDE, copy_lanes, dot, exp_lanes
+from .lanes import BLOCK, ROWS, accumulate, copy_lanes, dot, exp_lanes
 from .lanes import scaled as scaled_lanes
-from .tile import (
-    ROWS_1,
-    ROWS_2,
-    ROWS_3,
-    ROWS_4,
-    accumulate_1,
-    accumulate_2,
-    accumulate_3,
-    accumulate_4,
-)
+from .simd import NARROW, WIDE
 
 _jit = numba.njit(parallel=True, cache=True, nogil=True)
 _0, _1, _LEAST = np.float32(0), np.float32(1), np.float32(-np.inf)
@@ -30,14 +21,14 @@ _0, _1, _LEAST = np.float32(0), np.float32(1), np.float32(-np.inf)
 def _away(x, first, rows, centre, least, away, factor):
     """away[r] = x[first + r] - centre, and one by its length, 0 within `least`; NaN stays."""
     depth = len(centre)
-    whole = depth - depth % LANES
+    whole = depth - depth % NARROW
     for r in range(rows):
         at, to = (first + r) * depth, r * depth
-        for c in range(0, whole, LANES):
+        for c in range(0, whole, NARROW):
             scaled_lanes(centre, c, np.float32(-1), x, at + c, away, to + c)
         for c in range(whole, depth):
             away[to + c] = x[at + c] - centre[c]
-        square = dot(away, to, away, to, whole) if whole > 0 else _0
+        square = dot(away, to, away, to, whole)
         for c in range(whole, depth):
             square += away[to + c] * away[to + c]
         norm = np.sqrt(square)
@@ -123,34 +114,21 @@ def _any(share, at, step, rows):
 @numba.njit(inline="always", cache=True)
 def _add_scaled(x, x_at, channels, rows, w, w_at, width, bias, b_at, out, share, s_at, count):
     """out[r] += share[r] (bias + x[r] w), tile by tile; tiles without a share are passed over."""
-    c = 0
-    while c < width:
-        left = (width - c) // WIDE
-        step = ROWS_4 if left >= 4 else ROWS_3 if left == 3 else ROWS_2 if left == 2 else ROWS_1
-        for r in range(0, rows, step):
-            if not _any(share, s_at + r * count, count, step):
+    for c in range(0, width, 4 * WIDE):
+        columns = min(4, (width - c) // WIDE)
+        for r in range(0, rows, ROWS[columns]):
+            if not _any(share, s_at + r * count, count, ROWS[columns]):
                 continue
-            if left >= 4:
-                accumulate_4(
-                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
-                    out, r * width + c, width, channels, share, s_at + r * count, count,
-                )  # fmt: skip
-            elif left == 3:
-                accumulate_3(
-                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
-                    out, r * width + c, width, channels, share, s_at + r * count, count,
-                )  # fmt: skip
-            elif left == 2:
-                accumulate_2(
-                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
-                    out, r * width + c, width, channels, share, s_at + r * count, count,
-                )  # fmt: skip
+            i, b, o, s = x_at + r * channels, b_at + c, r * width + c, s_at + r * count
+            # The shape of a tile is a constant of the compiled code.
+            if columns == 4:
+                accumulate(x, i, channels, 1, w, w_at + c, width, bias, b, 0, out, o, width, channels, share, s, count, 4)
+            elif columns == 3:
+                accumulate(x, i, channels, 1, w, w_at + c, width, bias, b, 0, out, o, width, channels, share, s, count, 3)
+            elif columns == 2:
+                accumulate(x, i, channels, 1, w, w_at + c, width, bias, b, 0, out, o, width, channels, share, s, count, 2)
             else:
-                accumulate_1(
-                    x, x_at + r * channels, channels, 1, w, w_at + c, width, bias, b_at + c, 0,
-                    out, r * width + c, width, channels, share, s_at + r * count, count,
-                )  # fmt: skip
-        c += min(4, left) * WIDE
+                accumulate(x, i, channels, 1, w, w_at + c, width, bias, b, 0, out, o, width, channels, share, s, count, 1)
 
 
 @_jit

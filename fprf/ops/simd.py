@@ -1,60 +1,83 @@
-"""Vectors of sixteen float32 in compiled kernels.
+"""Vectors of float32 in compiled kernels: of LANES, where nothing else is asked for.
 
 A function under `@traced` runs while a kernel that calls it is compiled: once, on placeholders whose operators emit LLVM code.
 Inside it loops and conditions on Python numbers unroll, and other traced functions are plain calls. A kernel passes it arrays
 (or `stack` memory), indices, constants, float32 numbers, vectors and tuples of vectors, and gets vectors or numbers back; numba
-infers no types within, which is most of what compilation costs.
+infers no types within, which is most of what compilation costs. Left to itself the compiler keeps most of our inner loops
+scalar: it cannot prove that their arrays do not overlap.
 
 The instructions are plain LLVM code for any processor; narrower ones split a vector. Multiply and add may fuse and a division
 may become a product with the reciprocal, nothing else: NaN and infinity keep their meaning. Only `sums` and `total` add lanes,
-in pairs. A number among vectors counts in every lane.
+in pairs: no other result depends on the width of vectors, but for that fusion. A number among vectors counts in every lane.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc, untyped-decorator, import-untyped, call-arg"
 
+import math
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
+
+def _widest() -> int:
+    try:
+        return 16 if binding.get_host_cpu_features().get("avx512f") else 8
+    except RuntimeError:  # the features of some machines cannot be read
+        return 8
+
+
 LANES = 16
 """Numbers of a vector."""
+NARROW = 8
+"""Numbers of one AVX register: channels of planes come in groups of so many."""
+WIDE = _widest()
+"""Numbers of the machine's widest register, at least 8."""
 
 _LINE = 64
 _FLOAT, _INT, _LONG = ir.FloatType(), ir.IntType(32), ir.IntType(64)
-_VECTOR, _INTS = ir.VectorType(_FLOAT, LANES), ir.VectorType(_INT, LANES)
 _FUSE = ("contract", "arcp", "nsz")
 _ADD_ANYHOW = ("contract", "arcp", "nsz", "reassoc")
 
 
 class _VectorType(types.Type):
-    def __init__(self):
-        super().__init__(name=f"float32x{LANES}")
+    def __init__(self, lanes):
+        super().__init__(name=f"float32x{lanes}")
+        self.lanes = lanes
 
 
-_vector = _VectorType()
+def _floats(lanes):
+    return ir.VectorType(_FLOAT, lanes)
+
+
+def _ints(lanes):
+    return ir.VectorType(_INT, lanes)
 
 
 @register_model(_VectorType)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _VECTOR)
+        super().__init__(manager, kind, _floats(kind.lanes))
 
 
-def _same(value):
-    return ir.Constant(_VECTOR, [float(np.float32(value))] * LANES)
+def _same(value, lanes=LANES):
+    return ir.Constant(_floats(lanes), [float(np.float32(value))] * lanes)
 
 
-def _same_int(value):
-    return ir.Constant(_INTS, [int(value)] * LANES)
+def _same_int(value, lanes):
+    return ir.Constant(_ints(lanes), [int(value)] * lanes)
 
 
-def _undefined():
-    return ir.Constant(_VECTOR, ir.Undefined)
+def _undefined(lanes):
+    return ir.Constant(_floats(lanes), ir.Undefined)
+
+
+def _long(index):
+    return index.value if isinstance(index, _Index) else ir.Constant(_LONG, index)
 
 
 class _Placeholder:
@@ -70,8 +93,7 @@ class _Index(_Placeholder):
     """An integer: a place in an array."""
 
     def _with(self, instruction, other):
-        value = other.value if isinstance(other, _Index) else ir.Constant(_LONG, other)
-        return _Index(self.build, getattr(self.build, instruction)(self.value, value))
+        return _Index(self.build, getattr(self.build, instruction)(self.value, _long(other)))
 
     def __add__(self, other):
         return self._with("add", other)
@@ -89,7 +111,7 @@ class _Array(_Placeholder):
     """A contiguous array of float32. Indexed, it gives a number in every lane."""
 
     def at(self, index):
-        return self.build.gep(self.value, [index.value if isinstance(index, _Index) else ir.Constant(_LONG, index)])
+        return self.build.gep(self.value, [_long(index)])
 
     def __getitem__(self, index):
         return _broadcast(self.build, self.build.load(self.at(index)))
@@ -100,10 +122,18 @@ class _Float(_Placeholder):
 
 
 class Vector(_Placeholder):
-    """LANES float32."""
+    """Float32 side by side."""
+
+    @property
+    def lanes(self):
+        return self.value.type.count
+
+    def same(self, other):
+        """The LLVM value of a vector, or of a constant in every lane."""
+        return other.value if isinstance(other, Vector) else _same(other, self.lanes)
 
     def _with(self, instruction, x, y):
-        x, y = (each.value if isinstance(each, Vector) else _same(each) for each in (x, y))
+        x, y = self.same(x), self.same(y)
         return Vector(self.build, getattr(self.build, instruction)(x, y, flags=_FUSE))
 
     def __add__(self, other):
@@ -135,8 +165,8 @@ class Vector(_Placeholder):
 
 
 def _broadcast(build, value):
-    vector = build.insert_element(_undefined(), value, ir.Constant(_INT, 0))
-    return Vector(build, build.shuffle_vector(vector, _undefined(), ir.Constant(_INTS, [0] * LANES)))
+    vector = build.insert_element(_undefined(LANES), value, ir.Constant(_INT, 0))
+    return Vector(build, build.shuffle_vector(vector, _undefined(LANES), _same_int(0, LANES)))
 
 
 def _wrapped(context, build, kind, value):
@@ -162,8 +192,8 @@ def _kind_of(result):
     if isinstance(result, _Index):
         return types.int64
     if isinstance(result, tuple | list):
-        return types.UniTuple(_vector, len(result))
-    return _vector if isinstance(result, Vector) else types.float32
+        return types.UniTuple(_VectorType(result[0].lanes), len(result))
+    return _VectorType(result.lanes) if isinstance(result, Vector) else types.float32
 
 
 def _dry(kind):
@@ -174,7 +204,7 @@ def _dry(kind):
         return _FLOAT.as_pointer()
     if isinstance(kind, types.Integer):
         return _LONG
-    return _FLOAT if isinstance(kind, types.Float) else _VECTOR
+    return _FLOAT if isinstance(kind, types.Float) else _floats(kind.lanes)
 
 
 def traced(function):
@@ -207,10 +237,13 @@ def traced(function):
     return function
 
 
-def _call(vector, name, args, result=_VECTOR, flags=_FUSE):
-    build = vector.build
-    function = cgutils.get_or_insert_function(build.module, ir.FunctionType(result, [a.type for a in args]), name)
-    return (Vector if result is _VECTOR else _Float)(build, build.call(function, args, fastmath=flags))
+def _call(name, *args, flags=_FUSE):
+    """The LLVM value that an intrinsic makes of a vector, or of numbers and one: a vector, or a number by reduction."""
+    *numbers, vector = args
+    build, given = vector.build, [*numbers, vector.value]
+    kind = ir.FunctionType(_FLOAT if ".reduce." in name else vector.value.type, [each.type for each in given])
+    function = cgutils.get_or_insert_function(build.module, kind, f"{name}.v{vector.lanes}f32")
+    return build.call(function, given, fastmath=flags)
 
 
 def aligned(count: int) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -247,26 +280,59 @@ def take(typing, counters, k):
 
 
 @traced
-def load(array, at):
-    """array[at : at + LANES]."""
-    return Vector(array.build, array.build.load(array.build.bitcast(array.at(at), _VECTOR.as_pointer()), align=4))
+def load(array, at, lanes=LANES):
+    """array[at : at + lanes]."""
+    build = array.build
+    return Vector(build, build.load(build.bitcast(array.at(at), _floats(lanes).as_pointer()), align=4))
+
+
+def load_halves(address, lanes):
+    """2^-112 of the float16 numbers whose bits lie at an address.
+
+    A half's exponent and mantissa, moved to a float's place, are 2^112 too small; subnormals come out right as well.
+    """
+    build, mask = address.build, lambda value: _same_int(value, lanes)
+    halves = build.inttoptr(address.value, ir.VectorType(ir.IntType(16), lanes).as_pointer())
+    half = build.zext(build.load(halves, align=2), _ints(lanes))
+    sign = build.shl(build.and_(half, mask(0x8000)), mask(16))
+    rest = build.shl(build.and_(half, mask(0x7FFF)), mask(13))
+    return Vector(build, build.bitcast(build.or_(sign, rest), _floats(lanes)))
 
 
 @traced
 def store(array, at, value):
-    """array[at : at + LANES] = value."""
+    """array[at :] = value, a vector or the constant of LANES lanes."""
     value = value.value if isinstance(value, Vector) else _same(value)
-    array.build.store(value, array.build.bitcast(array.at(at), _VECTOR.as_pointer()), align=4)
+    array.build.store(value, array.build.bitcast(array.at(at), value.type.as_pointer()), align=4)
 
 
-def splat(like, value):
+def repeat(count, start, step, by=1):
+    """A loop of the compiled code: vectors = step(k, vectors) from `start` on, for k = 0, by, 2 by, ... below `count`."""
+    build, count = start[0].build, _long(count)
+    before, loop, after = build.block, build.append_basic_block("loop"), build.append_basic_block("after")
+    build.cbranch(build.icmp_signed(">", count, _long(0)), loop, after)
+    build.position_at_end(loop)
+    k, held = build.phi(_LONG), [build.phi(each.value.type) for each in start]
+    found = step(_Index(build, k), [Vector(build, each) for each in held])
+    following, end = build.add(k, _long(by)), build.block
+    build.cbranch(build.icmp_signed("<", following, count), loop, after)
+    build.position_at_end(after)
+    results = [build.phi(each.value.type) for each in start]
+    firsts, lasts = ([each.value for each in vectors] for vectors in (start, found))
+    for phi, first, last in zip([k, *held, *results], [_long(0), *firsts * 2], [following, *lasts * 2], strict=True):
+        phi.add_incoming(first, before)
+        phi.add_incoming(last, end)
+    return [Vector(build, each) for each in results]
+
+
+def splat(like, value, lanes=LANES):
     """A constant in every lane."""
-    return Vector(like.build, _same(value))
+    return Vector(like.build, _same(value, lanes))
 
 
 def lanes(like, values=range(LANES)):
     """0, 1, 2 ..., or a number for each lane."""
-    return Vector(like.build, ir.Constant(_VECTOR, [float(k) for k in values]))
+    return Vector(like.build, ir.Constant(_floats(LANES), [float(k) for k in values]))
 
 
 def as_float(index):
@@ -276,7 +342,7 @@ def as_float(index):
 
 def _choose(comparison, x, y):
     like = x if isinstance(x, Vector) else y
-    x, y = (each.value if isinstance(each, Vector) else _same(each) for each in (x, y))
+    x, y = like.same(x), like.same(y)
     return Vector(like.build, like.build.select(like.build.fcmp_ordered(comparison, x, y), x, y))
 
 
@@ -292,42 +358,42 @@ def maximum(x, y):
 
 def where_greater(p, q, x, y):
     """x where p > q, else y: also where p or q is NaN."""
-    build = (p if isinstance(p, Vector) else q).build
-    p, q, x, y = (each.value if isinstance(each, Vector) else _same(each) for each in (p, q, x, y))
-    return Vector(build, build.select(build.fcmp_ordered(">", p, q), x, y))
+    like = p if isinstance(p, Vector) else q
+    p, q, x, y = (like.same(each) for each in (p, q, x, y))
+    return Vector(like.build, like.build.select(like.build.fcmp_ordered(">", p, q), x, y))
 
 
 def square_root(x):
     """Square root."""
-    return _call(x, f"llvm.sqrt.v{LANES}f32", [x.value])
+    return Vector(x.build, _call("llvm.sqrt", x))
 
 
 def absolute(x):
     """|x|."""
-    return _call(x, f"llvm.fabs.v{LANES}f32", [x.value])
+    return Vector(x.build, _call("llvm.fabs", x))
 
 
 def floor(x):
     """The largest whole number that is not above x."""
-    return _call(x, f"llvm.floor.v{LANES}f32", [x.value])
+    return Vector(x.build, _call("llvm.floor", x))
 
 
 @traced
 def least(x):
     """The smallest of the lanes."""
-    return _call(x, f"llvm.vector.reduce.fmin.v{LANES}f32", [x.value], _FLOAT)
+    return _Float(x.build, _call("llvm.vector.reduce.fmin", x))
 
 
 @traced
 def largest(x):
     """The largest of the lanes."""
-    return _call(x, f"llvm.vector.reduce.fmax.v{LANES}f32", [x.value], _FLOAT)
+    return _Float(x.build, _call("llvm.vector.reduce.fmax", x))
 
 
 @traced
 def total(x):
     """The sum of the lanes."""
-    return _call(x, f"llvm.vector.reduce.fadd.v{LANES}f32", [ir.Constant(_FLOAT, 0.0), x.value], _FLOAT, _ADD_ANYHOW)
+    return _Float(x.build, _call("llvm.vector.reduce.fadd", ir.Constant(_FLOAT, 0.0), x, flags=_ADD_ANYHOW))
 
 
 @traced
@@ -338,13 +404,18 @@ def lowest_bit(bits):
 
 def greater_bits(x, y):
     """An integer: 1 << lane for each lane where x > y."""
-    bits = x.build.fcmp_ordered(">", x.value, y.value if isinstance(y, Vector) else _same(y))
+    bits = x.build.fcmp_ordered(">", x.value, x.same(y))
     return _Index(x.build, x.build.zext(x.build.bitcast(bits, ir.IntType(LANES)), _LONG))
 
 
 def _picked(x, y, mask):
-    y = _undefined() if y is None else y.value
-    return Vector(x.build, x.build.shuffle_vector(x.value, y, ir.Constant(_INTS, mask)))
+    y = _undefined(x.lanes) if y is None else y.value
+    return Vector(x.build, x.build.shuffle_vector(x.value, y, ir.Constant(_ints(len(mask)), mask)))
+
+
+def narrow(x, lanes):
+    """The first lanes of a vector."""
+    return x if lanes == x.lanes else _picked(x, None, list(range(lanes)))
 
 
 def transposed(rows):
@@ -411,7 +482,7 @@ def _fit(function, degree, low, high):
 
 
 def _polynomial(coefficients, x):
-    value = splat(x, coefficients[-1])
+    value = coefficients[-1]
     for each in coefficients[-2::-1]:
         value = value * x + each
     return value
@@ -422,13 +493,19 @@ _ROUND = 1.5 * 2**23
 _EXP2 = {degree: _fit(np.exp2, degree, -0.5, 0.5) for degree in (3, 5)}
 
 
-def _exp2(x, degree):
-    build, large = x.build, _same(_ROUND)
+def _rounded(x):
+    """The whole numbers next to x, and integers whose low bits they are."""
+    build, large = x.build, _same(_ROUND, x.lanes)
     rounded = build.fadd(x.value, large)  # these must not be simplified
-    part = Vector(build, build.fsub(x.value, build.fsub(rounded, large)))
-    exponent = build.shl(build.bitcast(rounded, _INTS), _same_int(23))
-    value = build.bitcast(_polynomial(_EXP2[degree], part).value, _INTS)
-    return Vector(build, build.bitcast(build.add(exponent, value), _VECTOR))
+    return Vector(build, build.fsub(rounded, large)), build.bitcast(rounded, _ints(x.lanes))
+
+
+def _exp2(x, degree):
+    build, lanes = x.build, x.lanes
+    whole, bits = _rounded(x)
+    part = Vector(build, build.fsub(x.value, whole.value))
+    value = build.bitcast(_polynomial(_EXP2[degree], part).value, _ints(lanes))
+    return Vector(build, build.bitcast(build.add(build.shl(bits, _same_int(23, lanes)), value), _floats(lanes)))
 
 
 def exp2_rough(x):
@@ -439,6 +516,37 @@ def exp2_rough(x):
 def exp2(x):
     """2^x for |x| < 126; relative error 3e-7."""
     return _exp2(x, 5)
+
+
+# exp and 1 - exp(-x):  x = n ln 2 + r,  |r| <= ln 2 / 2,  e^x - 1 = 2^n p + (2^n - 1)  with  p = e^r - 1 by its series to r^7.
+# The remainder is below 5e-9 |p|, so p errs by about one unit round-off and so do the functions (at most 3u, u = 2^-24).
+_LOWEST, _HIGHEST = -87.33, 88.3
+"""Between them 2^n is a normal float32."""
+# ln 2 in two parts: n times the first is exact for |n| <= 128.
+_LN2_HIGH = 355 / 512
+_LN2_LOW = math.log(2) - _LN2_HIGH
+_SERIES = [1 / math.factorial(k) for k in range(2, 8)]
+
+
+def _exp_parts(x):
+    """e^r - 1 and 2^n of x between the limits."""
+    build, lanes = x.build, x.lanes
+    n, bits = _rounded(x * (1 / math.log(2)))
+    r = x - n * _LN2_HIGH - n * _LN2_LOW
+    exponent = build.shl(build.add(bits, _same_int(127, lanes)), _same_int(23, lanes))
+    return r * r * _polynomial(_SERIES, r) + r, Vector(build, build.bitcast(exponent, _floats(lanes)))
+
+
+def exp(x):
+    """e^x within 3u; 0 below -87.33 and infinite above 88.3, where 2^n would leave float32's normal range. NaN stays NaN."""
+    p, power = _exp_parts(minimum(_HIGHEST, maximum(_LOWEST, x)))
+    return where_greater(x, _HIGHEST, math.inf, where_greater(_LOWEST, x, 0, power * p + power))
+
+
+def opaque(x):
+    """1 - exp(-x) for x >= 0, within 3u; NaN stays NaN."""
+    p, power = _exp_parts(minimum(0, maximum(-18, -x)))  # below 2^-25 of 1 nothing is left of exp(-x)
+    return -(power * p + (power - 1))
 
 
 _LOG2 = (
@@ -452,9 +560,9 @@ _LOG2 = (
 
 def log2(x):
     """log2 of a positive normal number; error 3e-7 of the larger of 1 and itself."""
-    build = x.build
-    bits = build.bitcast(x.value, _INTS)
+    build, lanes = x.build, x.lanes
+    bits, places = build.bitcast(x.value, _ints(lanes)), _same_int(23, lanes)
     # From 2^-0.5 on: 0x3f3504f3 are the bits of the square root of one half.
-    exponent = build.ashr(build.sub(bits, _same_int(0x3F3504F3)), _same_int(23))
-    part = Vector(build, build.bitcast(build.sub(bits, build.shl(exponent, _same_int(23))), _VECTOR)) - 1.0
-    return _polynomial(_LOG2, part) * part + Vector(build, build.sitofp(exponent, _VECTOR))
+    exponent = build.ashr(build.sub(bits, _same_int(0x3F3504F3, lanes)), places)
+    part = Vector(build, build.bitcast(build.sub(bits, build.shl(exponent, places)), _floats(lanes))) - 1.0
+    return _polynomial(_LOG2, part) * part + Vector(build, build.sitofp(exponent, _floats(lanes)))

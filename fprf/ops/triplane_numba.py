@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from .backend import compiled
+from .dense import array
 
 _LANES = 8
 _SLICES = 4
@@ -79,5 +80,5 @@ def _flat(points: Tensor, table: Tensor, resolutions: Sequence[int], *more: Tens
     """Points, table, its channels, nodes a side and first row of every scale, and further arrays, as kernels take them."""
     sizes = np.asarray(resolutions, dtype=np.int64)
     starts = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(3 * sizes * sizes)[:-1]])
-    arrays = [x.detach().contiguous().view(-1).numpy() for x in (points, table, *more)]
+    arrays = [array(x) for x in (points, table, *more)]
     return *arrays[:2], table.shape[1], sizes, starts, *arrays[2:]

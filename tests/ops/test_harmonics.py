@@ -26,6 +26,7 @@ def double(directions: Directions) -> Directions:
     return Directions(*(part.double() for part in directions))
 
 
+@torch.no_grad()
 @pytest.mark.parametrize("bands", [1, 4, 9, 16, 25])
 @pytest.mark.parametrize("count", [1, 5, 1300])
 def test_the_compiled_form_stays_within_the_bound(bands: int, count: int) -> None:
@@ -48,6 +49,7 @@ def test_other_types_and_nothing_take_the_plain_form() -> None:
     assert recoloured(harmonics[:0].float(), change[:0].float(), weight[:0].float(), all_around(4)).shape == (0, 4, 3)
 
 
+@torch.no_grad()
 def test_mean_colours_stay_in_range_unless_they_were_outside() -> None:
     harmonics, change, weight = inputs(2000, 4)
     directions = all_around(4)
@@ -58,6 +60,7 @@ def test_mean_colours_stay_in_range_unless_they_were_outside() -> None:
     assert (after[inside] < 1e-6).any() and (after[inside] > 1 - 1e-6).any()
 
 
+@torch.no_grad()
 def test_harmonics_become_those_of_colours_as_they_are_drawn() -> None:
     made = torch.zeros(3, 4, 3)
     made[0, 0], made[0, 2] = 1.0, 0.2  # nowhere below 0

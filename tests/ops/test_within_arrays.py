@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-KERNELS = ("dense", "guided", "march", "mixture", "rasterise", "triplane")
+KERNELS = ("dense", "guided", "harmonics", "march", "mixture", "rasterise", "triplane")
 
 
 @pytest.mark.slow
