@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -30,7 +30,6 @@ def test_what_is_wrong_with_the_file_is_told(tmp_path: Path, rows: object) -> No
         assert str(caught.value).startswith(f"{file}: ")
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=5, unique=True).map(sorted), st.integers(0, 70))
 def test_a_fade_lies_between_its_neighbours(frames: list[int], at: int) -> None:
     before, after, way = fade(frames, at)

@@ -159,7 +159,7 @@ def test_cameras_in_one_place_are_refused(offset: float, alpha: bool) -> None:
         find_space(scene)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 12), st.integers(0, 9999), st.booleans(), st.floats(-3, 6))
 def test_any_rig_has_a_space(count: int, seed: int, alpha: bool, exponent: float) -> None:
     """Or a DataError; whatever is found maps rays into the cube."""

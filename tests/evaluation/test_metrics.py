@@ -148,7 +148,7 @@ def picture(height: int = 24, width: int = 30, seed: int = 0) -> torch.Tensor:
     return noise(height, width, seed) * torch.where(torch.arange(width) < width // 2, 1.0, 0.3)[:, None]
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 1000), st.integers(11, 20), st.integers(11, 20))
 def test_structure_is_the_written_out_one(seed: int, height: int, width: int) -> None:
     """SSIM's second factor of luminances with one mean and deviation."""
@@ -159,7 +159,6 @@ def test_structure_is_the_written_out_one(seed: int, height: int, width: int) ->
     assert structure(a, b) == pytest.approx(ssim_oracle(*alike, means=False), abs=1e-6)
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.floats(0.05, 0.9), st.floats(0.0, 0.1), st.floats(0.1, 1.0))
 def test_brightness_contrast_and_tint_cost_nothing(contrast: float, brightness: float, red: float) -> None:
     grey = picture()[..., :1].expand(-1, -1, 3)
@@ -199,7 +198,6 @@ def draws(seed: int, mean: float = 0.5, spread: float = 0.1) -> Tensor:
 HALVES = (torch.arange(16) >= 8).long().expand(12, 16)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.integers(1, 6))
 def test_the_full_distance_is_frechets(seed: int, channels: int) -> None:
     a, b = statistics(seed, channels), statistics(seed + 1, channels)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from kornia.color import rgb_to_lab
 from torch import Tensor
@@ -85,7 +85,6 @@ def lab(x: Tensor) -> Tensor:
     return rgb_to_lab(x.T.reshape(1, 3, -1, 1))[0, :, :, 0].T
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000), st.integers(20, 200), st.integers(20, 200))
 def test_reinhard_takes_mean_and_deviation(seed: int, n: int, m: int) -> None:
     content, style = colours(n, seed), colours(m, seed + 1, 0.4, 0.6)
@@ -94,7 +93,6 @@ def test_reinhard_takes_mean_and_deviation(seed: int, n: int, m: int) -> None:
     assert torch.allclose(found.std(0, correction=0), there.std(0, correction=0), atol=0.05)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 1000), st.integers(1, 40), st.integers(1, 40))
 def test_ranks_are_those_of_numpys_quantiles(seed: int, n: int, m: int) -> None:
     content, style = colours(n, seed, 0, 1).double(), colours(m, seed + 1, 0, 1).double()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -64,7 +64,6 @@ def test_counts_are_those_of_the_march(world: World) -> None:
     }
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(2, 9), min_size=1, max_size=3), st.integers(1, 9), st.integers(0, 99))
 def test_grid_sample_is_the_same_lookup(resolutions: list[int], channels: int, seed: int) -> None:
     """In float64 both round by 1e-16; what is left is a step over a node's edge, which both take continuously."""

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 from block_world import BlockWorld, digests, done_of, small, steps_of, tensors_of, unfinish
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.blocks.fields import Member
@@ -142,7 +142,6 @@ def weights_in(root: Path) -> dict[str, str]:
     return {folder.name: (folder / "weights").read_text() for folder in (root / "blocks").glob("*") if folder.is_dir()}
 
 
-@settings(deadline=None)
 @given(tasks, tasks)
 def test_each_block_finds_what_was_trained_for_it(before: list[str], now: list[str]) -> None:
     with tempfile.TemporaryDirectory() as name:
@@ -156,7 +155,6 @@ def test_each_block_finds_what_was_trained_for_it(before: list[str], now: list[s
         assert not [name for name in found if not name.isdigit()]
 
 
-@settings(deadline=None)
 @given(tasks, st.permutations(range(6)), st.integers(0, 12))
 def test_cut_off_anywhere_the_next_call_finishes_it(before: list[str], order: list[int], until: int) -> None:
     now = {number: before[at] for number, at in enumerate([k for k in order if k < len(before)])}

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -87,7 +87,7 @@ def test_a_damaged_one_is_named_and_the_one_before_serves(root: Path, name: str,
     assert len(damaged) == 1 and "step-0000009" in damaged[0]
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40)
 @given(st.data())
 def test_no_harm_to_a_manifest_is_more_than_damage(root: Path, data: st.DataObject) -> None:
     path = root / "step-0000009" / "manifest.json"

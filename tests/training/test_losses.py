@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, rays_of, trained_for
@@ -167,7 +167,6 @@ def test_a_ray_that_ends_at_its_point_costs_nothing_before_it_two_behind_it_one(
         assert found is not None and float(found) == cost
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(0.5, 9.5) | st.just(float("nan")), min_size=1, max_size=6), st.integers(0, 1000))
 def test_only_known_rays_count_and_the_mean_is_theirs(distances: list[float], seed: int) -> None:
     count = len(distances)

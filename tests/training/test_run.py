@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -80,7 +80,6 @@ def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> Non
     assert (tmp_path / "events.jsonl").read_text() == f'{torn}\n{{"step": 3}}\n{{"step": 4}}\n'
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(st.lists(st.sampled_from(["a", "b", "ab"]), min_size=1, max_size=3), min_size=1, max_size=6))
 def test_names_are_never_alike(paths: list[list[str]]) -> None:
     names = view_names([Path("/scene", *parts).with_suffix(".png") for parts in paths])

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -28,7 +28,6 @@ def cameras_of(sizes: list[tuple[int, int]]) -> Cameras:
     )
 
 
-@settings(max_examples=60, deadline=None)
 @given(SIZES, st.integers(1, 400), st.data())
 def test_the_lattice_covers_every_view_by_its_share(sizes: list[tuple[int, int]], rays: int, data: st.DataObject) -> None:
     cameras = cameras_of(sizes)
