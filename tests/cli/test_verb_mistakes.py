@@ -15,6 +15,10 @@ MISTAKES = f"""
     bench sped | no such benchmark
     bench speed nowhere | nowhere: no config.json
     bench profile run | python -m benchmarks profiling
+    bench restyle run --device cpu --seeds 0 1 2 | is the town of the run itself
+    bench restyle run --device cpu --palettes noon | noon
+    bench restyle nowhere | nowhere
+    bench restyle --frames 7 | --frames
     doctor run --device x | --device
     doctor run --clean | --clean
     doctor --clean --device cpu | --clean

@@ -207,16 +207,3 @@ def test_every_method_is_in_the_table(world: World, tmp_path: Path, capsys: pyte
     assert "](sheets/all.png)" in text and all(name in text for name in METHODS)
     assert cv2.imread(str(sheet)) is not None
     assert "region-tone" in capsys.readouterr().out
-
-
-def test_mistakes_are_one_line(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words, told in (
-        ([str(world.run), "--seeds", "0", "1", "2"], "is the town of the run itself"),
-        ([str(world.run), "--palettes", "noon"], "noon"),
-        ([str(tmp_path / "nothing")], str(tmp_path)),
-    ):
-        assert cli.main(["bench", "restyle", *words[:1], *SMALL, *words[1:]]) == 2
-        error = capsys.readouterr().err
-        assert told in error and error.count("\n") == 1
-    assert cli.main(["bench", "restyle", "--frames", "7"]) == 2
-    assert "--frames" in capsys.readouterr().err

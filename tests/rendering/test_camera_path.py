@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fprf.errors import DataError
@@ -22,6 +22,7 @@ def file(path: Path, **changes: Any) -> Path:
     return path
 
 
+@settings(max_examples=15)
 @given(st.integers(1, 6), st.floats(20, 4000), st.floats(1, 120), st.integers(0, 99))
 def test_what_is_written_reads_back(
     tmp_path_factory: pytest.TempPathFactory, count: int, focal: float, fps: float, seed: int

@@ -17,6 +17,7 @@ import torch
 from block_world import BlockWorld, digests, done_of, small, steps_of, tensors_of, unfinish
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_world import same
 
 from fprf.blocks.fields import Member
 from fprf.blocks.plan import pixel_mask
@@ -223,9 +224,8 @@ def copy_of(world: BlockWorld, folder: Path) -> Path:
     return folder / "run"
 
 
-def same(root: Path, other: Path, name: str) -> bool:
-    mine, theirs = tensors_of(root, name), tensors_of(other, name)
-    return mine.keys() == theirs.keys() and all(torch.equal(mine[k], theirs[k]) for k in mine)
+def same_block(root: Path, other: Path, name: str) -> bool:
+    return same(tensors_of(root, name), tensors_of(other, name))
 
 
 def stamps(root: Path, name: str) -> list[int]:
@@ -267,7 +267,7 @@ def test_an_interrupted_block_goes_on_to_the_same_bits(
         load_run(root, "cpu")
     assert train_block(task(block_world, root, block), lambda event: seen.append(event.step))
     assert seen[:4] == [1, 2, 3, 4], "it must not start over"
-    assert same(root, block_world.root, folder.name)
+    assert same_block(root, block_world.root, folder.name)
 
 
 def test_two_workers_on_a_block_the_second_is_told_and_changes_nothing(block_world: BlockWorld, tmp_path: Path) -> None:
@@ -283,7 +283,7 @@ def test_two_workers_on_a_block_the_second_is_told_and_changes_nothing(block_wor
         met.append("refused")
 
     assert train_block(task(block_world, root, 1), meanwhile)
-    assert met and same(root, block_world.root, "01")
+    assert met and same_block(root, block_world.root, "01")
     assert not train_block(task(block_world, root, 1), lambda event: None)
     assert not (root / "blocks/01/.lock").exists()
 
@@ -299,7 +299,7 @@ def test_another_task_in_the_folder_starts_anew(block_world: BlockWorld, tmp_pat
         shutil.copy(town / "images/0004.png", town / "images/0003.png")
     (root / "blocks/00/events.jsonl").write_text('{"step": 99}\n')
     assert train_block(replace(task(block_world, root, 0), data=str(town)), lambda event: None)
-    assert not same(root, block_world.root, "00")
+    assert not same_block(root, block_world.root, "00")
     assert done_of(root, "00")["step"] == 6 and not (root / "blocks/00/events.jsonl").exists()
 
 
@@ -372,4 +372,4 @@ def test_a_killed_block_is_resumed_to_the_same_bits(block_world: BlockWorld, tmp
     subprocess.run(command, check=True, capture_output=True, timeout=300)
     for name in NAMES:
         assert done_of(root, name)["step"] == steps
-        assert same(root, calm, name), name
+        assert same_block(root, calm, name), name

@@ -5,34 +5,24 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_world import World
+from tiny_world import World, after_one_step
 
 from fprf.errors import CheckpointError
 from fprf.training import checkpoint
-from fprf.training.model import Model, build_model
-
-
-def fresh(world: World) -> tuple[Model, torch.optim.Optimizer]:
-    """A model after one step of Adam on made-up gradients."""
-    model = build_model(world.config, world.prepared.facts)
-    optimizer = torch.optim.Adam(model.learned(), lr=1e-3, fused=True)
-    for parameter in model.learned():
-        parameter.grad = torch.randn_like(parameter)
-    optimizer.step()
-    return model, optimizer
+from fprf.training.model import build_model
 
 
 @pytest.fixture
 def root(world: World, tmp_path: Path) -> Path:
     """Checkpoints of steps 5 and 9."""
-    model, optimizer = fresh(world)
+    model, optimizer = after_one_step(world)
     for step in (5, 9):
         checkpoint.save(tmp_path / "c", model, optimizer, step=step, seconds=step / 2)
     return tmp_path / "c"
 
 
 def test_everything_comes_back(world: World, tmp_path: Path) -> None:
-    model, optimizer = fresh(world)
+    model, optimizer = after_one_step(world)
     assert checkpoint.reached(tmp_path) == (0, 0.0) and not checkpoint.digest(tmp_path)
     checkpoint.save(tmp_path, model, optimizer, step=3, seconds=1.5)
     saved, damaged = checkpoint.load_latest(tmp_path)
@@ -47,7 +37,7 @@ def test_everything_comes_back(world: World, tmp_path: Path) -> None:
 
 def test_a_past_that_was_gone_back_from_is_dropped(world: World, root: Path) -> None:
     """Else a damaged newest one would keep its place, and only one intact would be left."""
-    model, optimizer = fresh(world)
+    model, optimizer = after_one_step(world)
     checkpoint.save(root, model, optimizer, step=7, seconds=0.0)
     assert checkpoint.steps(root) == [5, 7]
 
@@ -103,7 +93,7 @@ def test_no_harm_to_a_manifest_is_more_than_damage(root: Path, data: st.DataObje
 
 
 def test_parameters_that_are_not_finite_are_not_resumed_from(world: World, root: Path) -> None:
-    model, optimizer = fresh(world)
+    model, optimizer = after_one_step(world)
     model.learned()[0].detach().view(-1)[0] = float("nan")
     checkpoint.save(root, model, optimizer, step=12, seconds=0.0)
     saved, damaged = checkpoint.load_latest(root)
@@ -113,7 +103,7 @@ def test_parameters_that_are_not_finite_are_not_resumed_from(world: World, root:
 def test_a_checkpoint_of_another_config_is_refused(world: World, root: Path) -> None:
     saved, _ = checkpoint.load_latest(root)
     assert saved is not None
-    model, _ = fresh(world)
+    model, _ = after_one_step(world)
     name, *others = saved.model
     for tensors in (
         {other: saved.model[other] for other in others},

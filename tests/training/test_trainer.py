@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_world import Altered, Change, World, events, parameters, spoilt, stopping, trained_for
+from tiny_world import Altered, Change, World, events, parameters, same, spoilt, stopping, trained_for
 from torch import nn
 
 from fprf.config import TrainConfig
@@ -23,10 +23,6 @@ from fprf.training.trainer import Report, train
 from fprf.types import Batch
 
 NAN, INF = float("nan"), float("inf")
-
-
-def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 def stopped(world: World, folder: Path, config: TrainConfig, change: Change) -> Run:

@@ -1,6 +1,6 @@
 """Small renderers of points and of triangles in NumPy, as viewers draw them: judges of exported files.
 
-Views are pinholes with OpenGL axes and their centre in the middle, as in `splatter`. What is behind is black.
+Views are pinholes with OpenGL axes and their centre in the middle, as in tests/export/splatter.py. What is behind is black.
 """
 
 import numpy as np
