@@ -17,7 +17,6 @@ from fprf.evaluation.subject import (
     attempt,
     batch_rays,
     colour_gradient,
-    count,
     difference,
     exact,
     find,
@@ -27,7 +26,6 @@ from fprf.evaluation.subject import (
 )
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
-from fprf.rendering.renderer import march
 from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
@@ -50,18 +48,6 @@ def test_exact_is_double_and_every_way_comes_near_it(world: World) -> None:
         for name, found in ways.items():
             assert difference(found, truth).largest < 1e-4, name
     assert all(p.dtype == torch.float32 for p in model.parameters()), "the run's own model stays as it is"
-
-
-def test_counts_are_those_of_the_march(world: World) -> None:
-    trained = world.load()
-    rays = view_rays(trained.model, trained.known.cameras, 0)
-    with torch.inference_mode():
-        kept = march(rays, trained.model.parts, budget=0.3).kept
-    assert count(trained.model.parts, rays, 0.3) == {
-        "kept_samples_share": len(kept.ray) / (768 * 8),
-        "empty_rays_share": 1 - len(set(kept.ray.tolist())) / 768,
-        "kept_samples_per_ray": len(kept.ray) / 768,
-    }
 
 
 @given(st.lists(st.integers(2, 9), min_size=1, max_size=3), st.integers(1, 9), st.integers(0, 99))

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from splatter import read_gaussians, read_splat, table
+from splatter import read_gaussians, read_splat
 from tiny_world import World
 
 from fprf.cli import main as cli
-from fprf.io.images import srgb_to_linear
 
 LOOSE = ["--tolerance", "0.3", "--agree", "1", "--presence", "0", "--no-sky"]
 LOOKS = {"": "plain", ".dusk": "dusk", ".snow": "snow"}
@@ -41,24 +40,9 @@ def test_all_files_of_one_geometry_agree(folder: Path) -> None:
         assert len(points.vertices) == len(ply.at) == len(splat.at) == made["points"] == made["splats"] > 100
         assert np.array_equal(points.vertices, first), "a style moves nothing"
         assert np.array_equal(np.float32(ply.at), np.float32(points.vertices))
-        for at in (ply.at, splat.at):
-            assert np.allclose([at.min(0), at.max(0)], points.bounds, atol=1e-6)
         assert np.abs(ply.colour - points.colors[:, :3] / 255).max() <= 0.5 / 255 + 1e-6
-        order = np.lexsort(np.float32(splat.at).T), np.lexsort(np.float32(ply.at).T)
-        assert np.abs(splat.colour[order[0]] - ply.colour[order[1]]).max() <= 0.5 / 255 + 1e-6
-        raw = table((folder / f"points{look}.ply").read_bytes())
-        assert np.array_equal(np.stack([raw[c] for c in ("red", "green", "blue")], 1), points.colors[:, :3])
+        [glb] = trimesh.load_scene(folder / f"mesh{look}.glb", process=False).geometry.values()
+        for mesh in (glb, trimesh.load(folder / f"mesh{look}.ply", process=False)):
+            assert (len(mesh.vertices), len(mesh.faces)) == (made["vertices"], made["triangles"])
         seen.append(points.colors[:, :3].astype(float))
     assert all(np.abs(seen[a] - seen[b]).mean() > 2 for a, b in ((0, 1), (0, 2), (1, 2)))
-
-
-def test_both_meshes_agree_in_every_look(folder: Path) -> None:
-    made = json.loads((folder / "export.json").read_text())
-    for look in LOOKS:
-        ply = trimesh.load(folder / f"mesh{look}.ply", process=False)
-        [glb] = trimesh.load_scene(folder / f"mesh{look}.glb", process=False).geometry.values()
-        for mesh in (ply, glb):
-            assert (len(mesh.vertices), len(mesh.faces)) == (made["vertices"], made["triangles"])
-        assert np.array_equal(ply.vertices, glb.vertices) and np.array_equal(ply.faces, glb.faces)
-        shade = np.asarray(glb.visual.vertex_attributes["color"])[:, :3] / 65535
-        assert np.abs(shade - srgb_to_linear(ply.visual.vertex_colors[:, :3] / 255)).max() < 2.3 / 255

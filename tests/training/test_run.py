@@ -43,10 +43,6 @@ def test_scene_json_gives_the_scene_back(world: World) -> None:
     assert known.split("all") == tuple(sorted(known.train + known.test)) == tuple(range(10))
 
 
-def test_the_config_comes_back_without_its_folder(world: World) -> None:
-    assert Run(world.run).load_config() == (replace(world.config, output=None), "fprf-lite")
-
-
 def _without(key: str) -> Any:
     return lambda d: {k: v for k, v in d.items() if k != key}
 
@@ -216,15 +212,6 @@ def test_the_history_of_a_training_that_was_resumed(tmp_path: Path) -> None:
     }
     assert history.parts == {"preparing": 3.0, "training": 7.0}
     assert history.notes == ["damaged: step-9: model", "step: 7, skipped: rgb"]
-
-
-def test_blocks_have_histories_of_their_own(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError):
-        read_history(tmp_path)
-    write(tmp_path / "blocks" / "01", step(3, 1))
-    write(tmp_path / "blocks" / "00", step(2, 1))
-    write(tmp_path / "blocks" / "surroundings", "")
-    assert [(history.name, history.step) for history in read_history(tmp_path)] == [("00", [2]), ("01", [3])]
 
 
 def test_what_is_absent_or_damaged_is_refused(world: World, run: Run) -> None:

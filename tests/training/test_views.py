@@ -17,7 +17,6 @@ from fprf.plugins.stylizers.config import (
 )
 from fprf.rendering.cameras import pixel_grid
 from fprf.style.look import Restyle
-from fprf.style.match_maps import match_map
 from fprf.style.restyle import restyle
 from fprf.style.scene import own_style
 from fprf.training.loading import Trained, load_style
@@ -39,15 +38,6 @@ def test_a_view_does_not_depend_on_the_chunk(world: World) -> None:
         assert torch.allclose(views[0].depth, other.depth, rtol=1e-4)
 
 
-@pytest.mark.parametrize("stylizer", STYLIZERS[2:], ids=lambda s: type(s).__name__)
-def test_strength_0_is_the_plain_render_bit_for_bit(world: World, stylizer: StylizerConfig) -> None:
-    trained = world.load()
-    styled = restyle(trained, world.references, stylizer, strength=0.0)
-    for v in trained.known.test:
-        plain, same = trained.render(trained.cameras, v), trained.restyled(styled.restyle).render(trained.cameras, v)
-        assert torch.equal(plain.rgb, same.rgb) and torch.equal(plain.depth, same.depth)
-
-
 @pytest.mark.parametrize("stylizer", [AdainConfig(), RegionAdainConfig(), RegionOtConfig()], ids=lambda s: type(s).__name__)
 def test_the_scenes_own_style_returns_the_render(world: World, stylizer: StylizerConfig) -> None:
     """Identity: 40 dB is promised; on this model 99 dB (differences of one rounding) were measured for all three."""
@@ -56,18 +46,6 @@ def test_the_scenes_own_style_returns_the_render(world: World, stylizer: Stylize
     own = trained.restyled(Restyle(stylizer.build(dictionary=own_style(scene), scene=scene)))
     for v in trained.known.split("all"):
         assert psnr(trained.render(trained.cameras, v).rgb, own.render(trained.cameras, v).rgb) >= 40
-
-
-@pytest.mark.parametrize("stylizer", STYLIZERS, ids=lambda s: type(s).__name__)
-def test_matches_are_shares_of_the_codes(world: World, stylizer: StylizerConfig) -> None:
-    trained = world.load()
-    styled = restyle(trained, world.references, stylizer, clusters=3)
-    match = match_map(trained, styled, 0).taken
-    assert match.shape == (24, 32, len(styled.dictionary.keys)) and float(match.min()) >= 0
-    assert torch.allclose(match.sum(-1), torch.ones(24, 32), atol=1e-4)
-    with torch.no_grad():
-        trained.model.get_parameter("field.to_density.weight").fill_(-1e6)
-    assert not match_map(trained, styled, 0).taken.any(), "empty space matches nothing"
 
 
 @pytest.mark.parametrize(
@@ -82,6 +60,9 @@ def test_a_restyle_is_the_restyled_render(world: World, stylizer: StylizerConfig
     for style in (None, look, None):
         found, wanted = cached.restyled(style), trained.restyled(style).render(trained.cameras, 2)
         torch.testing.assert_close(found, wanted, atol=0, rtol=0)
+        assert strength > 0 or torch.equal(found.rgb, cached.restyled().rgb), (
+            "at strength 0 it is the plain render, bit for bit"
+        )
 
 
 @pytest.mark.parametrize("budget", [0.0, 0.2])
