@@ -28,8 +28,8 @@ def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_pa
     assert all(np.array_equal(frames[name], plain[name]) for name in frames)
 
 
-def test_a_gif_is_a_file(run: Path, tmp_path: Path) -> None:
-    render(run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2")
+def test_a_gif_is_a_file(run: Path, world: World, tmp_path: Path) -> None:
+    render(run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2", "--references", str(world.references[0]))
     assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
 
 

@@ -20,11 +20,15 @@ MISTAKES = f"""
     bench restyle nowhere | nowhere
     bench restyle --frames 7 | --frames
     doctor run --device x | --device
+    doctor absent | absent
+    doctor empty | empty
+    doctor a b | 'b'
     doctor run --clean | --clean
     doctor --clean --device cpu | --clean
     eval | RUN is missing
     eval absent | no run folder
     eval run --split half | --split half
+    eval run --quality great | --quality great: it takes draft or standard or best
     eval moved | gone: no such folder
     eval other | its images are not those of the run
     eval untested | --split test

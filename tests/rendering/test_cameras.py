@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from analytic import plane_depth
 from hypothesis import given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
@@ -223,19 +224,11 @@ def camera(around: bool) -> Cameras:
     return panoramas(plain, 48, UP) if around else plain
 
 
-def plane_depth(cameras: Cameras, normal: torch.Tensor, offset: float) -> torch.Tensor:
-    """Distance along each ray to the plane normal . x = offset; infinite where it is missed."""
-    origin, direction = view_rays(cameras)
-    depth = (offset - origin @ normal) / (direction @ normal)
-    width, height = cameras.size[0].tolist()
-    return torch.where(depth > 0, depth, torch.inf).view(height, width)
-
-
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (-1.0, 0.2, 0.1), (-0.6, 0.0, 0.8)])
 def test_a_plane_has_its_normal_everywhere(normal: tuple[float, float, float]) -> None:
     unit = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
     for cameras in (camera(False), camera(True)):
-        depth = plane_depth(cameras, unit, float(unit @ torch.tensor([5.0, 0, 0], dtype=torch.float64)))
+        depth = plane_depth(cameras, 0, unit, float(unit @ torch.tensor([5.0, 0, 0], dtype=torch.float64)))
         found = normals(cameras, 0, depth)
         seen = found.norm(dim=-1) > 0
         assert int(seen.sum()) >= 0.9 * int(torch.isfinite(depth).sum())

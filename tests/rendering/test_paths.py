@@ -162,9 +162,10 @@ def test_a_file_is_a_path_too(tmp_path: Path) -> None:
     write_camera_path(tmp_path / "path.json", frames, 24)
     read = make_path(around(), [], str(tmp_path / "path.json"), 99)
     assert len(read) == 3 and torch.allclose(read.pose, frames.pose, atol=1e-9)
-    (tmp_path / "other.json").write_text("[]")
-    with pytest.raises(DataError, match=r"other\.json"):
-        make_path(around(), [], str(tmp_path / "other.json"), 99)
+    for text in ("[]", "{"):
+        (tmp_path / "other.json").write_text(text)
+        with pytest.raises(DataError, match=r"other\.json"):
+            make_path(around(), [], str(tmp_path / "other.json"), 99)
     with pytest.raises(UsageError, match="--path spirale: neither a file nor one of spiral, orbit"):
         make_path(around(), [], "spirale", 3)
 

@@ -61,17 +61,17 @@ def test_what_was_cut_short_does_not_count_and_tidying_removes_nothing_else(root
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "optimizer.safetensors", "manifest.json"])
-@pytest.mark.parametrize("harm", ["cut", "empty", "gone", "flip"])
+@pytest.mark.parametrize("harm", ["cut", "empty", "gone", "flip", "older"])
 def test_a_damaged_one_is_named_and_the_one_before_serves(root: Path, name: str, harm: str) -> None:
     path = root / "step-0000009" / name
     raw = bytearray(path.read_bytes())
-    if harm == "gone":
-        if name == "manifest.json":
-            pytest.skip("then it does not count")
-        path.unlink()
-    else:
+    if (harm == "gone" and name == "manifest.json") or (harm == "older" and name != "manifest.json"):
+        pytest.skip("then it does not count, or is the same")
+    path.unlink()
+    if harm != "gone":
         raw[-40] ^= 1
-        path.write_bytes({"cut": raw[: len(raw) // 2], "empty": b"", "flip": raw}[harm])
+        older = (root / "step-0000005" / name).read_bytes()
+        path.write_bytes({"cut": raw[: len(raw) // 2], "empty": b"", "flip": raw, "older": older}[harm])
     saved, damaged = checkpoint.load_latest(root)
     assert saved is not None and saved.step == 5
     assert len(damaged) == 1 and "step-0000009" in damaged[0]

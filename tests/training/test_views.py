@@ -60,9 +60,7 @@ def test_a_restyle_is_the_restyled_render(world: World, stylizer: StylizerConfig
     for style in (None, look, None):
         found, wanted = cached.restyled(style), trained.restyled(style).render(trained.cameras, 2)
         torch.testing.assert_close(found, wanted, atol=0, rtol=0)
-        assert strength > 0 or torch.equal(found.rgb, cached.restyled().rgb), (
-            "at strength 0 it is the plain render, bit for bit"
-        )
+        assert strength > 0 or torch.equal(found.rgb, cached.restyled().rgb), "strength 0 is the plain render"
 
 
 @pytest.mark.parametrize("budget", [0.0, 0.2])
