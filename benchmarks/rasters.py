@@ -89,7 +89,10 @@ def _barycentric(at: np.ndarray, corner: np.ndarray) -> np.ndarray:
     a, b, c = (corner[:, None, k] for k in range(3))
 
     def area(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return (v[..., 0] - u[..., 0]) * (w[..., 1] - u[..., 1]) - (v[..., 1] - u[..., 1]) * (w[..., 0] - u[..., 0])
+        twice: np.ndarray = (v[..., 0] - u[..., 0]) * (w[..., 1] - u[..., 1]) - (v[..., 1] - u[..., 1]) * (
+            w[..., 0] - u[..., 0]
+        )
+        return twice
 
     whole = area(a, b, c)
     parts = np.stack([area(b, c, at), area(c, a, at), area(a, b, at)], -1)
