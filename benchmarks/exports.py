@@ -31,10 +31,10 @@ from fprf.splats.photographs import camera_of
 from fprf.splats.views import draw as draw_capture
 
 from .common import ROOT, report
+from .rasters import draw_points, draw_triangles, psnr
 
 sys.path.insert(0, str(ROOT / "tests" / "export"))  # the tests' own readers and renderers are the judges
 
-from rasters import draw_points, draw_triangles, psnr
 from splatter import draw, read_gaussians, read_splat
 
 

@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING
 import numba
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
     from tiny_world import World
+
+# Times vary on a busy machine, and no test minds that its examples share fixtures.
+UNCHECKED = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
+settings.register_profile("tests", deadline=None, suppress_health_check=UNCHECKED)
+settings.load_profile("tests")
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.cameras import PixelRays
 from fprf.town.write import write_town
 from fprf.training.loading import Trained, load_run
+from fprf.training.model import Model, build_model
 from fprf.training.prepare import Prepared, prepare
 from fprf.training.run import Run
 from fprf.training.trainer import Report, train
@@ -152,6 +153,20 @@ def parameters(run: Run, step: int) -> dict[str, torch.Tensor]:
     saved = load(run.checkpoints, step)
     named = {**{f"model.{k}": v for k, v in saved.model.items()}, **{f"adam.{k}": v for k, v in saved.optimizer.items()}}
     return {name: tensor.clone() for name, tensor in named.items()}  # else they are maps of files that tests spoil
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def after_one_step(world: World) -> tuple[Model, torch.optim.Optimizer]:
+    """A new model after a step of Adam on made-up gradients."""
+    model = build_model(world.config, world.prepared.facts)
+    optimizer = torch.optim.Adam(model.learned(), lr=1e-3, fused=True)
+    for parameter in model.learned():
+        parameter.grad = torch.randn_like(parameter)
+    optimizer.step()
+    return model, optimizer
 
 
 def events(run: Run, key: str) -> list[dict[str, Any]]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -30,7 +30,6 @@ def test_what_is_wrong_with_the_file_is_told(tmp_path: Path, rows: object) -> No
         assert str(caught.value).startswith(f"{file}: ")
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=5, unique=True).map(sorted), st.integers(0, 70))
 def test_a_fade_lies_between_its_neighbours(frames: list[int], at: int) -> None:
     before, after, way = fade(frames, at)
@@ -50,16 +49,11 @@ def test_a_fade_is_even_about_its_middle_and_starts_and_ends_without_a_jerk() ->
     assert steps[0] < 0.05 * steps.max() and np.abs(np.diff(steps)).max() < 0.05 * steps.max()
 
 
-@pytest.fixture
-def styles(world: World, tmp_path: Path) -> tuple[Path, Path]:
-    paths = (tmp_path / "dusk.json", tmp_path / "snow.json")
-    for path, reference, strength in zip(paths, world.references, (1.0, 0.8), strict=True):
+def test_each_frame_has_its_look(world: World, tmp_path: Path) -> None:
+    styles = (tmp_path / "dusk.json", tmp_path / "snow.json")
+    for path, reference, strength in zip(styles, world.references, (1.0, 0.8), strict=True):
         style = StyleConfig(references=(reference,), clusters=2, stylizer=AdainConfig(), strength=strength, luminance=0.5)
         write_style(path, StyleFile(style))
-    return paths
-
-
-def test_each_frame_has_its_look(world: World, styles: tuple[Path, Path]) -> None:
     looks = keyed_looks(world.load(), [Key(2, None), Key(6, styles[0]), Key(10, styles[1]), Key(14, None), Key(20, None)])
     assert looks(0) is looks(2) is looks(14) is looks(17) is looks(30) is None
     first, second = looks(6), looks(10)

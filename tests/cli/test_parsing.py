@@ -170,7 +170,7 @@ def test_a_config_with_a_missing_plugin_needs_another_choice(tmp_path: Path) -> 
     assert chosen == fprf_lite()
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.lists(st.text(max_size=8), max_size=5))
 def test_no_arguments_whatever_break_the_parser(args: list[str]) -> None:
     try:

@@ -1,4 +1,5 @@
 from pathlib import Path
+from unittest.mock import DEFAULT, Mock
 
 import cv2
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from tiny_world import World
 
 from fprf.cli import main as cli
+from fprf.io import images
 
 CAPTURED = ["--path", "dataset", "--split", "test"]
 ORBIT = ["--path", "orbit", "--frames"]
@@ -28,8 +30,8 @@ def test_captured_views_keep_their_names_and_are_those_of_eval(run: Path, tmp_pa
     assert all(np.array_equal(frames[name], plain[name]) for name in frames)
 
 
-def test_a_gif_is_a_file(run: Path, tmp_path: Path) -> None:
-    render(run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2")
+def test_a_gif_is_a_file(run: Path, world: World, tmp_path: Path) -> None:
+    render(run, tmp_path / "a.gif", "--path", "spiral", "--frames", "2", "--references", str(world.references[0]))
     assert (tmp_path / "a.gif").read_bytes().startswith(b"GIF89a") and len(list(tmp_path.iterdir())) == 2
 
 
@@ -64,23 +66,15 @@ def test_frames_that_are_there_are_not_made_again(run: Path, tmp_path: Path, cap
 
 
 def test_an_interrupted_film_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import fprf.io.images as images
-
-    written, write = [], images.write_image
-
-    def interrupted(path: Path, picture: np.ndarray) -> None:
-        if len(written) == 2:
-            raise KeyboardInterrupt
-        written.append(path.name)
-        write(path, picture)
-
     film = tmp_path / "x.mp4"
     args = ["render", str(run), *ORBIT, "4", "--output", str(film)]
-    monkeypatch.setattr(images, "write_image", interrupted)
+    write = Mock(wraps=images.write_image, side_effect=[DEFAULT, DEFAULT, KeyboardInterrupt])
+    monkeypatch.setattr(images, "write_image", write)
     assert cli.main(args) == 130 and not film.exists()
-    monkeypatch.setattr(images, "write_image", lambda path, picture: (written.append(path.name), write(path, picture)))
+    write.side_effect = None
     assert cli.main(args) == 0 and film.is_file()
-    assert written == ["00000.png", "00001.png", "00002.png", "00003.png"] and not (tmp_path / "x.frames").exists()
+    assert [call.args[0].name for call in write.call_args_list] == [f"0000{k}.png" for k in (0, 1, 2, 2, 3)]
+    assert not (tmp_path / "x.frames").exists()
 
 
 def test_exr_holds_everything_as_numbers(run: Path, world: World, tmp_path: Path) -> None:

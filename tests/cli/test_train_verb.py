@@ -3,7 +3,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
-from tiny_world import World, flags, parameters
+from tiny_world import World, flags, parameters, same
 
 from fprf.cli import main as cli
 from fprf.cli.train import train_scene
@@ -16,14 +16,6 @@ from fprf.plugins.decoders.config import MlpDecoderConfig
 from fprf.plugins.encoders.config import EncoderConfig
 from fprf.training import checkpoint
 from fprf.training.run import Run
-
-
-def test_the_flags_make_the_config_and_the_run_is_the_same(world: World, tmp_path: Path) -> None:
-    assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run")]) == 0
-    run = Run(tmp_path / "run")
-    assert run.load_config() == (replace(world.config, output=None), "fprf-lite")
-    here, there = parameters(run, 15), parameters(Run(world.run), 15)
-    assert here.keys() == there.keys() and all(here[name].equal(there[name]) for name in here)
 
 
 def test_a_config_json_goes_on_with_its_run_wherever_that_lies(world: World, tmp_path: Path) -> None:
@@ -63,8 +55,7 @@ def test_an_interrupt_is_130_and_the_run_goes_on(
     assert checkpoint.steps(tmp_path / "run" / "checkpoints") == [3]
     monkeypatch.setattr(RayBatches, "batch", whole)
     assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run")]) == 0
-    here, there = parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15)
-    assert here.keys() == there.keys() and all(here[name].equal(there[name]) for name in here)
+    assert same(parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15))
 
 
 def test_everything_that_is_missing_is_listed_at_once(

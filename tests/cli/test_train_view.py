@@ -1,9 +1,10 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from stand_in_viewers import DEAD, GREEDY, viewer
-from tiny_world import World, flags, parameters
+from tiny_world import World, flags, parameters, same
 
 from fprf.cli import main as cli
 from fprf.cli import train
@@ -46,8 +47,9 @@ def test_what_is_trained_is_the_same_to_the_bit_whoever_looks(
     monkeypatch.setattr(train, "open_view", lambda place: LiveViewer(place, viewer(script, str(log))))
     monkeypatch.setattr(trainer, "REPORT_SECONDS", 0.0)  # look after every step
     assert cli.main(["train", "fprf-lite", *flags(world, tmp_path / "run"), "--view"]) == 0
-    here, there = parameters(Run(tmp_path / "run"), 15), parameters(Run(world.run), 15)
-    assert here.keys() == there.keys() and all(here[name].equal(there[name]) for name in here)
+    run = Run(tmp_path / "run")
+    assert run.load_config() == (replace(world.config, output=None), "fprf-lite")
+    assert same(parameters(run, 15), parameters(Run(world.run), 15))
     assert (tmp_path / "run" / "style.safetensors").read_bytes() == (world.run / "style.safetensors").read_bytes()
     assert "live at http://here/" in capsys.readouterr().err
     if script is GREEDY:

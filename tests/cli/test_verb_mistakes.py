@@ -15,12 +15,20 @@ MISTAKES = f"""
     bench sped | no such benchmark
     bench speed nowhere | nowhere: no config.json
     bench profile run | python -m benchmarks profiling
+    bench restyle run --device cpu --seeds 0 1 2 | is the town of the run itself
+    bench restyle run --device cpu --palettes noon | noon
+    bench restyle nowhere | nowhere
+    bench restyle --frames 7 | --frames
     doctor run --device x | --device
+    doctor absent | absent
+    doctor empty | empty
+    doctor a b | 'b'
     doctor run --clean | --clean
     doctor --clean --device cpu | --clean
     eval | RUN is missing
     eval absent | no run folder
     eval run --split half | --split half
+    eval run --quality great | --quality great: it takes draft or standard or best
     eval moved | gone: no such folder
     eval other | its images are not those of the run
     eval untested | --split test

@@ -56,15 +56,6 @@ def same(here: Path, there: Path) -> None:
         assert content(here / name) == content(there / name), name
 
 
-def keyed(world: World, folder: Path) -> list[str]:
-    """A film that fades from the scene as it is into a style."""
-    style = {"format": 1, "style": {"references": [str(world.references[0])], "clusters": 3, "luminance": 0.5}}
-    (folder / "style.json").write_text(json.dumps(style))
-    keys = {"format": 1, "keyframes": [{"frame": 0, "style": None}, {"frame": 2, "style": "style.json"}]}
-    (folder / "keys.json").write_text(json.dumps(keys))
-    return ["--keyframes", str(folder / "keys.json"), "--path", "orbit", "--frames", "3", "--output", "OUT/film.mp4"]
-
-
 def between(world: World, folder: Path) -> list[str]:
     """A style on the way to another, with regions that are kept and pinned, and numbers for every pixel."""
     style = {"format": 1, "style": {"references": [str(world.references[1])], "clusters": 3}}
@@ -81,8 +72,7 @@ SPIRAL = "--path spiral --frames 2 --resolution 0.5 --show colour depth normals 
 EVERYTHING = "ply splat glb cameras lut --images --output OUT"
 VERBS: dict[str, Callable[[World, Path], list[str]]] = {
     "stylize": lambda world, folder: [*VIEW, *between(world, folder)],
-    "render": keyed,
-    "render --path": lambda *_: SPIRAL.split(),
+    "render": lambda *_: SPIRAL.split(),
     "export": lambda world, _: [*EVERYTHING.split(), *LOOSE, *references(world)],
 }
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.datamanagers.basis import Basis, fit_basis
@@ -11,7 +11,6 @@ from fprf.errors import ConfigError, DataError, NumericsError
 UNIT = 2.0**-24
 
 
-@settings(max_examples=20, deadline=None)
 @given(samples=st.integers(1, 40), channels=st.integers(1, 12), dim=st.integers(1, 15), seed=st.integers(0, 99))
 def test_columns_are_orthonormal_and_energy_is_a_share(samples: int, channels: int, dim: int, seed: int) -> None:
     x = torch.randn(samples, channels, generator=torch.Generator().manual_seed(seed))

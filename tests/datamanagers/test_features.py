@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor
@@ -20,7 +20,6 @@ from fprf.interfaces import Encoder
 from fprf.ops import guided
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     channels=st.integers(1, 19),
     offset=st.sampled_from([0.0, 1.0, -1e3, 1e6]),

@@ -35,7 +35,6 @@ values = st.one_of(
 )
 
 
-@settings(deadline=None)
 @given(st.lists(st.dictionaries(names, values, max_size=4), max_size=3), st.booleans())
 def test_what_was_written_is_read(tmp_path_factory, written, packed: bool) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path_factory.mktemp("records") / "a.tfrecord"
@@ -53,7 +52,6 @@ def test_what_was_written_is_read(tmp_path_factory, written, packed: bool) -> No
                 assert one.numbers(name, len(value)).tobytes() == value.tobytes()
 
 
-@settings(deadline=None)
 @given(st.data())
 def test_a_flipped_bit_and_a_lost_end_are_found_wherever_they_are(tmp_path_factory, data: st.DataObject) -> None:  # type: ignore[no-untyped-def]
     whole = bytearray(record(b"some bytes") + record(b"more"))
@@ -76,7 +74,7 @@ def rays_of(camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
     return (x.float().numpy().reshape(height, width, 3) for x in (origin, direction))  # type: ignore[return-value]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(number, number, number, number, number)
 def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p1: float) -> None:
     pose = np.concatenate([cv2.Rodrigues(3 * np.array([x, y, z]))[0], [[100.0], [-20.0], [3.0]]], 1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_files import rotations
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.datamanagers.parsers.files import as_record, path_inside, read_json, read_npy, read_npz
@@ -88,7 +88,6 @@ def test_records_fall_back_and_name_the_place() -> None:
             as_record("f", empty).records("frames")
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 999), st.floats(0, 4e-4))
 def test_rounded_rotations_are_repaired(seed: int, amount: float) -> None:
     draw = np.random.default_rng(seed)

@@ -13,7 +13,6 @@ from pretend_cuda import CUDA, pretend_cuda
 from tiny_world import World, stage_of
 from torch import Tensor
 
-from benchmarks.paper_styles import Case, PaperConfig, _by_view, cell_dictionary, set_up
 from fprf.cli import main as cli
 from fprf.datamanagers.images import load_image
 from fprf.errors import DataError, UsageError
@@ -150,32 +149,26 @@ def test_every_goal_is_judged_on_its_own() -> None:
     assert found["met"] == dict(zip(GOALS, (True, True, False, True, True), strict=True))
 
 
-def measured(world: World, device: str, folder: Path) -> list[Any]:
-    """Pictures and matches of every way to restyle, and whose class codes are."""
+def measured(world: World, device: str) -> list[Any]:
+    """Pictures and matches in the scene and one by one, and whose class codes are."""
     trained = load_run(world.run, device)
-    encoders = trained.encoders()
-    bench = set_up(trained, encoders, PaperConfig(table="time", views=1), folder)
-    paths, tone = world.references[:1], RegionToneConfig()
+    encoders, paths = trained.encoders(), world.references[:1]
+    views = stage_of(trained, views=1, frames=8, longest=32).shown
     dictionary = dictionary_of(paths, encoders, clusters=3, blend=0.1)[0]
     image = torch.from_numpy(load_image(paths[0])).float() / 255
     shown = Reference(paths[0].name, image, torch.arange(image[..., 0].numel()).view(image.shape[:2]) % 3)
-    plain = nothing(bench.stage.shown).pictures
-    case = Case("night", [shown], list(paths), dictionary, 0.0)
-    found = [
-        in_scene(trained, bench.stage.shown, LocalAdainConfig(), dictionary, encoders, paths),
-        one_by_one(trained, plain, tone, dictionary, encoders),
-        _by_view(bench, tone)(case),
-    ]
-    cells = cell_dictionary({shown.name: image}, trained, encoders)
+    plain = nothing(views).pictures
+    there = in_scene(trained, views, LocalAdainConfig(), dictionary, encoders, paths)
+    alone = one_by_one(trained, plain, RegionToneConfig(), dictionary, encoders)
     classes = code_classes(dictionary, {shown.name: shown}, encoders, trained.config.datamanager.guided)
-    return [*plain, *(x for each in found for x in (*each.pictures, *(each.taken or []))), *cells[:6], *cells[8:10], classes]
+    return [*plain, *(x for each in (there, alone) for x in (*each.pictures, *(each.taken or []))), classes]
 
 
-def test_ways_to_restyle(world: World, tmp_path: Path) -> None:
+def test_ways_to_restyle(world: World) -> None:
     with backend.plain():
-        expected = measured(world, "cpu", tmp_path)
+        expected = measured(world, "cpu")
     with pretend_cuda() as seen:
-        found = measured(world, str(CUDA), tmp_path)
+        found = measured(world, str(CUDA))
     assert seen.uploads and len(found) == len(expected)
     assert all(a.device.type == "cpu" and torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
@@ -207,16 +200,3 @@ def test_every_method_is_in_the_table(world: World, tmp_path: Path, capsys: pyte
     assert "](sheets/all.png)" in text and all(name in text for name in METHODS)
     assert cv2.imread(str(sheet)) is not None
     assert "region-tone" in capsys.readouterr().out
-
-
-def test_mistakes_are_one_line(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words, told in (
-        ([str(world.run), "--seeds", "0", "1", "2"], "is the town of the run itself"),
-        ([str(world.run), "--palettes", "noon"], "noon"),
-        ([str(tmp_path / "nothing")], str(tmp_path)),
-    ):
-        assert cli.main(["bench", "restyle", *words[:1], *SMALL, *words[1:]]) == 2
-        error = capsys.readouterr().err
-        assert told in error and error.count("\n") == 1
-    assert cli.main(["bench", "restyle", "--frames", "7"]) == 2
-    assert "--frames" in capsys.readouterr().err

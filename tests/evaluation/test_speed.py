@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -17,7 +17,6 @@ from fprf.evaluation.subject import (
     attempt,
     batch_rays,
     colour_gradient,
-    count,
     difference,
     exact,
     find,
@@ -27,7 +26,6 @@ from fprf.evaluation.subject import (
 )
 from fprf.ops import triplane
 from fprf.plugins.stylizers.config import LocalAdainConfig, RegionOtConfig
-from fprf.rendering.renderer import march
 from fprf.style.restyle import restyle
 from fprf.training.views import render_view
 
@@ -52,19 +50,6 @@ def test_exact_is_double_and_every_way_comes_near_it(world: World) -> None:
     assert all(p.dtype == torch.float32 for p in model.parameters()), "the run's own model stays as it is"
 
 
-def test_counts_are_those_of_the_march(world: World) -> None:
-    trained = world.load()
-    rays = view_rays(trained.model, trained.known.cameras, 0)
-    with torch.inference_mode():
-        kept = march(rays, trained.model.parts, budget=0.3).kept
-    assert count(trained.model.parts, rays, 0.3) == {
-        "kept_samples_share": len(kept.ray) / (768 * 8),
-        "empty_rays_share": 1 - len(set(kept.ray.tolist())) / 768,
-        "kept_samples_per_ray": len(kept.ray) / 768,
-    }
-
-
-@settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(2, 9), min_size=1, max_size=3), st.integers(1, 9), st.integers(0, 99))
 def test_grid_sample_is_the_same_lookup(resolutions: list[int], channels: int, seed: int) -> None:
     """In float64 both round by 1e-16; what is left is a step over a node's edge, which both take continuously."""

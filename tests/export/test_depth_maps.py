@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from analytic import plane_depth, ring
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -20,7 +20,6 @@ from fprf.training.views import render_view
 angle = st.floats(-1.0, 1.0)
 
 
-@settings(deadline=None)
 @given(tilt=angle, turn=angle)
 def test_normals_of_a_plane_are_exact(tilt: float, turn: float) -> None:
     """Points of a plane stay on it, so that steps between them lie in it whatever the perspective."""
@@ -38,7 +37,6 @@ def test_normals_of_a_plane_are_exact(tilt: float, turn: float) -> None:
     assert torch.allclose(seen.facing.double(), way @ normal, atol=1e-5)
 
 
-@settings(deadline=None)
 @given(offset=st.floats(-0.5, 0.5))
 def test_the_gap_is_how_far_in_front_of_the_surface_a_point_is(offset: float) -> None:
     cameras = ring(1, size=(20, 16))
@@ -54,7 +52,6 @@ def test_the_gap_is_how_far_in_front_of_the_surface_a_point_is(offset: float) ->
     assert torch.allclose(distance, there - offset, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**31), share=st.floats(0.05, 0.95))
 def test_half_way_is_where_that_much_weight_has_been_met(seed: int, share: float) -> None:
     """Against weight spread finely over each step, in float64."""

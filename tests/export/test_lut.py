@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -15,7 +15,6 @@ from fprf.style.restyle import restyle
 from fprf.training.loading import load_style
 from fprf.training.views import render_view
 
-FEW = settings(deadline=None, max_examples=15)
 seeds = st.integers(0, 2**31)
 
 
@@ -23,7 +22,6 @@ def drawn(seed: int, *shape: int) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@FEW
 @given(seed=seeds, size=st.integers(2, 9))
 def test_a_table_is_applied_trilinearly(seed: int, size: int) -> None:
     """Exact for what is linear in each colour, and at the nodes for anything."""

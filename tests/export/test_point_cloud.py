@@ -9,7 +9,7 @@ import pytest
 import torch
 import trimesh
 from analytic import RADIUS, globe
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.errors import DataError
@@ -82,7 +82,6 @@ def drawn(seed: int, *shape: int) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds)
 def test_keys_tell_voxels_and_levels_apart(seed: int) -> None:
     draw = torch.Generator().manual_seed(seed)
@@ -94,7 +93,6 @@ def test_keys_tell_voxels_and_levels_apart(seed: int) -> None:
     assert torch.equal(key[:, None] == key, same)
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds, edge=st.sampled_from([0.5, 1.0, 3.0]))
 def test_spacing_is_the_mean_distance_to_the_nearest(seed: int, edge: float) -> None:
     """Against all pairs; one point a voxel, as it is used."""
@@ -142,7 +140,6 @@ def test_far_from_its_origin_a_capture_is_moved_and_the_file_says_so(tmp_path: P
     assert all(f"{value:.0f}" in origin_comment(origin)[0] for value in origin.tolist())
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=seeds)
 def test_coarse_points_give_way_to_finer_ones_in_their_voxel(seed: int) -> None:
     points = drawn(seed, 60, 3) * 8

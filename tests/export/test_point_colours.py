@@ -17,7 +17,7 @@ def sphere(count: int, seed: int) -> torch.Tensor:
     return RADIUS * torch.nn.functional.normalize(drawn, dim=1)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 5))
 def test_witnesses_are_the_best_of_those_that_see_a_point(seed: int, count: int) -> None:
     """Against looking at each point and view alone."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from analytic import globe
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from splatter import draw, matrices, read_gaussians, read_splat, table
 
@@ -23,7 +23,6 @@ def cloud() -> Cloud:
     return fuse(globe(8), edge=0.2, most=10**6, tolerance=0.02, agree=2)
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 2**31))
 def test_turns_bring_the_z_axis_to_the_normal(seed: int) -> None:
     drawn = torch.randn(20, 3, generator=torch.Generator().manual_seed(seed)).double()

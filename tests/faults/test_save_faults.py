@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
-from tiny_world import World
+from tiny_world import World, after_one_step
 
 from fprf.errors import CheckpointError, DataError
 from fprf.training import checkpoint
-from fprf.training.model import Model, build_model
+from fprf.training.model import Model
 from fprf.training.run import held
 
 Trainer = tuple[Model, torch.optim.Optimizer]
@@ -50,13 +50,7 @@ def deadly(function: Callable[..., object], calls: Iterator[int], at: int) -> Ca
 
 @pytest.fixture
 def trainer(world: World) -> Trainer:
-    """A model after one step of Adam on made-up gradients."""
-    model = build_model(world.config, world.prepared.facts)
-    optimizer = torch.optim.Adam(model.learned(), lr=1e-3, fused=True)
-    for parameter in model.learned():
-        parameter.grad = torch.randn_like(parameter)
-    optimizer.step()
-    return model, optimizer
+    return after_one_step(world)
 
 
 @pytest.fixture

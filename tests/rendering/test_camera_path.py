@@ -22,7 +22,7 @@ def file(path: Path, **changes: Any) -> Path:
     return path
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(1, 6), st.floats(20, 4000), st.floats(1, 120), st.integers(0, 99))
 def test_what_is_written_reads_back(
     tmp_path_factory: pytest.TempPathFactory, count: int, focal: float, fps: float, seed: int
@@ -61,29 +61,17 @@ def test_a_rounded_rotation_is_made_exact(tmp_path: Path) -> None:
 FRAME = {"camera_to_world": IDENTITY, "fov": 60}
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("camera_type", "equirectangular"), ("render_width", 0), ("render_width", 10**400), ("render_height", float("inf")),
-     ("fps", 0), ("camera_path", [])],
-)  # fmt: skip
-def test_what_is_wrong_is_named(tmp_path: Path, name: str, value: object) -> None:
-    with pytest.raises(DataError, match=f"{name} is "):
-        read_camera_path(file(tmp_path / "p.json", **{name: value}))
+WRONG = [("camera_type", "equirectangular"), ("render_width", 0), ("render_width", 10**400), ("render_height", math.inf)]
+WRONG_FRAMES = [{"fov": 60}, {**FRAME, "fov": 180}]
+# letters, what is not finite, a scale, a mirroring
+WRONG_FRAMES += [{**FRAME, "camera_to_world": [first, *IDENTITY[1:]]} for first in ("x", math.nan, 10**400, 2, -1)]
 
 
 @pytest.mark.parametrize(
-    "frame",
-    [{"fov": 60}, {**FRAME, "fov": 180}]
-    # letters, what is not finite, a scale, a mirroring
-    + [{**FRAME, "camera_to_world": [first, *IDENTITY[1:]]} for first in ("x", float("nan"), 10**400, 2, -1)],
+    ("name", "value", "told"),
+    [(name, value, f"{name} is ") for name, value in (*WRONG, ("fps", 0), ("camera_path", []))]
+    + [("camera_path", [FRAME, frame], r"camera_path\[1\]") for frame in WRONG_FRAMES],
 )
-def test_a_frame_that_is_wrong_is_named(tmp_path: Path, frame: dict[str, Any]) -> None:
-    with pytest.raises(DataError, match=r"camera_path\[1\]"):
-        read_camera_path(file(tmp_path / "p.json", camera_path=[FRAME, frame]))
-
-
-@pytest.mark.parametrize("text", ["", "{", "[1, 2]", "\x00", "[" * 100_000])
-def test_what_is_no_camera_path_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "p.json").write_text(text)
-    with pytest.raises(DataError, match="export the camera path again"):
-        read_camera_path(tmp_path / "p.json")
+def test_what_is_wrong_is_named(tmp_path: Path, name: str, value: object, told: str) -> None:
+    with pytest.raises(DataError, match=told):
+        read_camera_path(file(tmp_path / "p.json", **{name: value}))

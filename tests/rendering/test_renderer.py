@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from torch import Tensor, nn
@@ -19,9 +19,6 @@ from fprf.rendering.space import Kind
 from fprf.rendering.stepfun import midpoints
 from fprf.style.look import Restyle
 from fprf.types import Rays, Rendered, Want
-
-QUICK = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-"""The form that is rendered by stays the same throughout a test."""
 
 
 @pytest.fixture(params=["compiled", "plain"], autouse=True)
@@ -81,7 +78,7 @@ def test_a_render_is_the_loop_over_rays_and_samples(kind: Kind, proposal: bool, 
         assert float(found.depth[r]) == pytest.approx(wanted["depth"], rel=1e-4)
 
 
-@QUICK
+@settings(max_examples=15)
 @given(st.integers(0, 9999), st.sampled_from([1e-4, 1 / 512, 0.02, 0.3]), st.floats(0.3, 6.0))
 def test_the_budget_bounds_the_colour_error(seed: int, budget: float, thickness: float) -> None:
     parts, rays = parts_of(seed=seed, thickness=thickness), rays_of("contraction", 24, seed)

@@ -5,13 +5,12 @@ from fractions import Fraction
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
 from fprf.rendering.space import Kind, Space, contract
 
-QUICK = settings(max_examples=40, deadline=None)
 U = 2.0**-24
 """Unit round-off of float32."""
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -37,7 +36,6 @@ def contract_oracle(x: list[float]) -> list[float]:
     return [v / 2 if m <= 1 else (2 - 1 / m) * (v / m) / 2 for v in x]
 
 
-@QUICK
 @given(st.tuples(coordinate, coordinate, coordinate))
 def test_contraction_is_the_formula(x: tuple[float, ...]) -> None:
     found = contract(torch.tensor([x]))[0]
@@ -155,7 +153,6 @@ def slab_oracle(o: list[float], d: list[float], least: float) -> tuple[float, fl
     return (near, far) if near < far else None
 
 
-@QUICK
 @given(st.integers(0, 9999), st.booleans())
 def test_box_rays_enter_and_leave_where_slabs_say(seed: int, axis_aligned: bool) -> None:
     draw = torch.Generator().manual_seed(seed)

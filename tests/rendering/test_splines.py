@@ -1,7 +1,7 @@
 import math
 
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.rendering.splines import catmull_rom, quaternions, rotations, slerp
@@ -18,7 +18,6 @@ def axis(seed: int) -> torch.Tensor:
     return torch.randn(3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.floats(-math.pi, math.pi) | st.sampled_from([0.0, 1e-9, math.pi, math.pi - 1e-9]))
 def test_quaternions_round_trip(seed: int, angle: float) -> None:
     rotation = turn(axis(seed), angle)[None]
@@ -28,7 +27,6 @@ def test_quaternions_round_trip(seed: int, angle: float) -> None:
     torch.testing.assert_close(rotations(-3 * quaternion), rotation, atol=1e-13, rtol=0)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.floats(1e-12, math.pi - 1e-6) | st.just(0.0), st.floats(0, 1), st.booleans())
 def test_slerp_is_the_part_of_the_turn(seed: int, angle: float, u: float, flip: bool) -> None:
     start = turn(axis(seed + 1), 1.3)
@@ -38,7 +36,6 @@ def test_slerp_is_the_part_of_the_turn(seed: int, angle: float, u: float, flip: 
     torch.testing.assert_close(rotations(found)[0], start @ turn(axis(seed), u * angle), atol=1e-9, rtol=0)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(2, 6), st.integers(0, 1000))
 def test_catmull_rom_passes_through_keys_with_one_velocity(count: int, seed: int) -> None:
     keys = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
@@ -52,7 +49,6 @@ def test_catmull_rom_passes_through_keys_with_one_velocity(count: int, seed: int
     torch.testing.assert_close(before / step, after / step, atol=1e-4, rtol=0)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(0, 10) | st.just(0.0), min_size=2, max_size=6))
 def test_catmull_rom_never_turns_back_on_a_line(distances: list[float]) -> None:
     along = torch.tensor([0.0, *distances], dtype=torch.float64).cumsum(0)

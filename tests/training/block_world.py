@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -61,19 +60,9 @@ def tensors_of(root: Path, name: str) -> dict[str, torch.Tensor]:
     return {k: t.clone() for k, t in tensorfiles.read(root / "blocks" / name / "block.safetensors").items()}
 
 
-def digests(root: Path, names: Sequence[str]) -> list[str]:
-    """What each block was trained as."""
-    return [done_of(root, name)["asked"]["task"] for name in names]
-
-
 def done_of(root: Path, name: str) -> dict[str, Any]:
     document: dict[str, Any] = json.loads((root / "blocks" / name / "done.json").read_text())
     return document
-
-
-def steps_of(root: Path, name: str) -> list[int]:
-    """Steps that events.jsonl of a block speaks of."""
-    return [json.loads(line)["step"] for line in (root / "blocks" / name / "events.jsonl").read_text().splitlines()]
 
 
 def unfinish(root: Path, block: int) -> Path:

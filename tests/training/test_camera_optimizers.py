@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from block_world import BlockWorld, small, tensors_of
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World, parameters, trained_for
 from torch import Tensor
@@ -32,7 +32,6 @@ def poses_with(offset: Tensor, centres: Tensor, held: tuple[int, ...] = (), reac
     return poses
 
 
-@settings(deadline=None)
 @given(SEEDS, st.floats(0, 3))
 def test_a_turn_is_the_exponential_of_its_vector(seed: int, size: float) -> None:
     turn, x = size * torch.nn.functional.normalize(draw(4, 3, seed=seed)), draw(4, 3, seed=seed + 1)
@@ -47,7 +46,6 @@ def test_no_turn_has_a_slope_too() -> None:
     assert torch.autograd.gradcheck(lambda t: rotated(x, t), (turn,))
 
 
-@settings(deadline=None, max_examples=30)
 @given(st.integers(2, 7), st.integers(0, 3), SEEDS)
 def test_what_no_image_can_tell_is_taken_out(count: int, held: int, seed: int) -> None:
     """Moves have no mean shift, and none along a common turn or a change of scale; held-out views have none at all."""
@@ -133,7 +131,6 @@ def test_blocks_start_from_what_their_surroundings_found(block_world: BlockWorld
     assert torch.equal(trained.known.cameras.pose[list(trained.known.test)], plain.pose[list(trained.known.test)])
 
 
-@settings(deadline=None)
 @given(st.integers(1, 6), st.integers(0, 5), st.integers(0, 2**31 - 1))
 def test_what_the_training_views_share_belongs_to_the_scene(count: int, held: int, seed: int) -> None:
     tones = Tones(torch.zeros(count + held), tuple(range(count, count + held)))

@@ -42,14 +42,6 @@ def test_rendering_needs_no_encoder(moved: Path) -> None:
     assert bool(trained.render(trained.cameras, 0).rgb.isfinite().all())
 
 
-def test_a_damaged_newest_checkpoint_is_stepped_over_and_named(world: World, moved: Path) -> None:
-    copy = moved / "checkpoints" / "step-0000020"
-    shutil.copytree(moved / "checkpoints" / "step-0000015", copy)
-    (copy / "model.safetensors").write_bytes(b"no")
-    trained = load_run(moved)
-    assert trained.step == 15 and len(trained.damaged) == 1 and "step-0000020" in trained.damaged[0]
-
-
 def test_what_is_missing_is_named_with_what_to_do(moved: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="so it is no run folder; `fprf train` makes one"):
         load_run(tmp_path)

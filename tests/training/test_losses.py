@@ -3,14 +3,13 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
-from tiny_world import World, rays_of, trained_for
+from tiny_world import World, rays_of
 from torch import Tensor
 
 from fprf.config import LossConfig
@@ -20,7 +19,6 @@ from fprf.plugins.losses.config import LossTermConfig
 from fprf.rendering.renderer import Parts, render_rays
 from fprf.training.losses import SHELL, check_penalties, emptiness, ending, extra_term, terms, total, wanted
 from fprf.training.model import Model, build_model
-from fprf.training.trainer import Report
 from fprf.types import Batch, Rendered, Want
 
 TERMS = ("rgb", "content", "semantic", "variation", "proposal_variation", "interlevel", "distortion")
@@ -131,20 +129,6 @@ def test_a_term_of_a_package_counts(world: World) -> None:
             terms(bad, world.prepared.facts, out, batch, model, step=0, extra=extra_term(bad))
 
 
-@pytest.mark.parametrize("name", ["semantic", "content"])
-def test_features_never_move_density(world: World, name: str) -> None:
-    """Paper: semantics are rendered with detached weights; a method may ask so for content too."""
-    model = build_model(world.config, world.prepared.facts)
-    batch, config = world.prepared.manager.batch(0), only(**{name: 1.0})
-    parts = terms(config, world.prepared.facts, rendered(world, model, batch, config), batch, model, step=0)
-    assert set(parts) == {name}
-    total(config, parts).backward()  # type: ignore[no-untyped-call]
-    moved = {n for n, p in model.named_parameters() if p.grad is not None and bool((p.grad != 0).any())}
-    assert moved and not any(n.startswith(("sampler.", "decoder.")) or "density" in n for n in moved), moved
-    if name == "semantic":
-        assert all(n.startswith("semantic.") for n in moved), moved
-
-
 NAN = float("nan")
 EDGES = torch.linspace(0.0, 10.0, 101)
 
@@ -167,7 +151,6 @@ def test_a_ray_that_ends_at_its_point_costs_nothing_before_it_two_behind_it_one(
         assert found is not None and float(found) == cost
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(0.5, 9.5) | st.just(float("nan")), min_size=1, max_size=6), st.integers(0, 1000))
 def test_only_known_rays_count_and_the_mean_is_theirs(distances: list[float], seed: int) -> None:
     count = len(distances)
@@ -238,22 +221,3 @@ def test_what_sky_rays_meet_before_the_shell(shell: float, wanted: float) -> Non
     assert found is not None and found.item() == pytest.approx(wanted)
     found.backward()
     assert weights.grad is not None and not weights.grad[1].any()
-
-
-def test_the_sky_is_cleared(world: World, tmp_path: Path) -> None:
-    """Rays of the upper third are said to be sky: they are emptied where that counts; at weight 0 nothing is computed."""
-
-    last = {}
-    for weight in (1.0, 1e-9, 0.0):
-        events: list[Report] = []
-        config = replace(world.config, steps=40, loss=replace(world.config.loss, sky=weight))
-        trained_for(
-            world,
-            tmp_path / str(weight),
-            config,
-            change=lambda step, batch: batch._replace(sky=batch.pixel[:, 1] < 8),
-            report=events.append,
-        )
-        last[weight] = events[-1].losses
-    assert last[1.0]["sky"] < 0.8 * last[1e-9]["sky"]
-    assert "sky" not in last[0.0]

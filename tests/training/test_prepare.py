@@ -15,7 +15,6 @@ from fprf.training.model import build_model
 from fprf.training.prepare import (
     Forecast,
     Outcome,
-    cache_folder,
     device_of,
     exposure_of,
     find_downscale,
@@ -25,19 +24,6 @@ from fprf.training.prepare import (
     with_downscale,
 )
 from fprf.training.trainer import Report
-
-
-def test_features_are_computed_once(world: World) -> None:
-    told: list[tuple[int, int, str]] = []
-
-    def files() -> dict[Path, int]:
-        return {p: p.stat().st_ino for p in cache_folder().rglob("*") if p.is_file() and p.suffix != ".json"}
-
-    before = files()
-    again = prepare(world.config, lambda *of: told.append(of))
-    assert again.facts == world.prepared.facts
-    assert before and files() == before, "nothing new, nothing written twice"
-    assert told[-1][:2] == (8, 8) and told[-1][2].startswith("features of bundled-semantic")
 
 
 def test_without_semantics(world: World) -> None:

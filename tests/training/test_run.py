@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -41,10 +41,6 @@ def test_scene_json_gives_the_scene_back(world: World) -> None:
     assert Run(world.folder / "none").saved_facts() is None
     assert (known.split("train"), known.split("test")) == (tuple(scene.train.tolist()), tuple(scene.test.tolist()))
     assert known.split("all") == tuple(sorted(known.train + known.test)) == tuple(range(10))
-
-
-def test_the_config_comes_back_without_its_folder(world: World) -> None:
-    assert Run(world.run).load_config() == (replace(world.config, output=None), "fprf-lite")
 
 
 def _without(key: str) -> Any:
@@ -80,7 +76,6 @@ def test_an_event_after_a_torn_line_has_a_line_of_its_own(tmp_path: Path) -> Non
     assert (tmp_path / "events.jsonl").read_text() == f'{torn}\n{{"step": 3}}\n{{"step": 4}}\n'
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(st.lists(st.sampled_from(["a", "b", "ab"]), min_size=1, max_size=3), min_size=1, max_size=6))
 def test_names_are_never_alike(paths: list[list[str]]) -> None:
     names = view_names([Path("/scene", *parts).with_suffix(".png") for parts in paths])
@@ -217,15 +212,6 @@ def test_the_history_of_a_training_that_was_resumed(tmp_path: Path) -> None:
     }
     assert history.parts == {"preparing": 3.0, "training": 7.0}
     assert history.notes == ["damaged: step-9: model", "step: 7, skipped: rgb"]
-
-
-def test_blocks_have_histories_of_their_own(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError):
-        read_history(tmp_path)
-    write(tmp_path / "blocks" / "01", step(3, 1))
-    write(tmp_path / "blocks" / "00", step(2, 1))
-    write(tmp_path / "blocks" / "surroundings", "")
-    assert [(history.name, history.step) for history in read_history(tmp_path)] == [("00", [2]), ("01", [3])]
 
 
 def test_what_is_absent_or_damaged_is_refused(world: World, run: Run) -> None:

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
@@ -10,14 +10,12 @@ from fprf.errors import CheckpointError
 from fprf.training import tensorfiles
 
 KINDS = (torch.float32, torch.float16, torch.bfloat16, torch.float64, torch.int64, torch.uint8, torch.bool)
-SHARED = settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def tensors() -> dict[str, torch.Tensor]:
     return {"a.weight": torch.randn(3, 4), "b": torch.arange(5), "scalar": torch.tensor(2.5)}
 
 
-@SHARED
 @given(kind=st.sampled_from(KINDS), shape=st.lists(st.integers(0, 4), max_size=3), seed=st.integers(0, 99))
 def test_any_tensor_comes_back_bit_for_bit(tmp_path: Path, kind: torch.dtype, shape: list[int], seed: int) -> None:
     path, made = tmp_path / "x.safetensors", (torch.randn(shape, generator=torch.Generator().manual_seed(seed)) * 9).to(kind)
@@ -29,7 +27,6 @@ def test_any_tensor_comes_back_bit_for_bit(tmp_path: Path, kind: torch.dtype, sh
         assert each.dtype == kind and each.shape == made.shape and torch.equal(each, made)
 
 
-@SHARED
 @given(st.floats(0, 1, exclude_max=True))
 def test_a_cut_file_is_found(tmp_path: Path, share: float) -> None:
     path = tmp_path / "x.safetensors"
@@ -68,7 +65,7 @@ def test_nothing_is_left_where_writing_failed(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@settings(SHARED, max_examples=200)
+@settings(max_examples=200)
 @given(st.data())
 def test_a_flipped_bit_of_a_sealed_file_is_found_or_harmless(tmp_path: Path, data: st.DataObject) -> None:
     torch.manual_seed(1)

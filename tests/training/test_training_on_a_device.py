@@ -260,13 +260,13 @@ TRITON = """
 import sys
 from collections import Counter
 from pathlib import Path
+import pytest
 from pretend_cuda import pretend_cuda
-from fprf.training import trainer
-from fprf.training.prepare import prepare
-from fprf.training.run import Run
+from test_training_on_a_device import Steps, trained
 from fprf.ops import triplane_triton
+from fprf.training.run import Run
 
-taken = Counter()
+taken, steps = Counter(), Steps(pytest.MonkeyPatch())
 
 def counting(name, function):
     def call(points, table, *args, **kwargs):
@@ -276,19 +276,10 @@ def counting(name, function):
 
 for name in ("forward", "backward"):
     setattr(triplane_triton, name, counting(name, getattr(triplane_triton, name)))
-run, trainer.REPORT_SECONDS = Run(Path(sys.argv[1])), 1e9
-config, _ = run.load_config()
-with pretend_cuda(triton=True) as seen:
-    prepared = prepare(config)
-    step = trainer.Loop.step
-    def counted(loop, *args):
-        before = seen.syncs.total()
-        result = step(loop, *args)
-        taken["waits"] += seen.syncs.total() - before
-        return result
-    trainer.Loop.step = counted
-    trainer.train(config, prepared, run, lambda event: None)
-print(*(taken[name] for name in ("forward", "backward", "waits")))
+run = Run(Path(sys.argv[1]))
+with pretend_cuda(triton=True) as steps.seen:
+    trained(run.load_config()[0], run.root)
+print(taken["forward"], taken["backward"], sum(steps.waits))
 """
 
 
@@ -304,7 +295,8 @@ def test_kernels_of_the_device_are_taken(world: World, tmp_path: Path) -> None:
     run = Run(tmp_path / "triton")
     run.root.mkdir()
     run.save_config(config, "fprf-lite")
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    here = Path(__file__).resolve().parent
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": f"{here}{os.pathsep}{here.parent}"}
     command = [sys.executable, "-c", TRITON, str(run.root)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

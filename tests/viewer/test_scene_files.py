@@ -3,7 +3,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fprf.errors import DataError, UsageError
@@ -24,7 +24,6 @@ HEADS = {
 }
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(more=st.binary(max_size=200), piece=st.integers(60, 300), name=st.sampled_from(["a.png", "images/01 é.png"]))
 def test_a_file_in_pieces_is_the_file(tmp_path_factory: pytest.TempPathFactory, more: bytes, piece: int, name: str) -> None:
     folder, data = tmp_path_factory.mktemp("x") / "files", PICTURE + more

@@ -1,5 +1,4 @@
 import threading
-from dataclasses import replace
 
 import pytest
 from session_helpers import Listener, camera_of, plan_of
@@ -24,12 +23,6 @@ def test_a_photograph_restyles_what_every_client_sees(session: Session, listener
         assert abs(frame.picture.astype(int) - plain[client].picture).mean() > 2
     again = session.upload(world.references[0].read_bytes(), "dusk.png")
     assert again.name == "dusk.png (2)" and session.state.shelf == (card, again)
-
-
-def test_an_impossible_state_is_refused_with_a_message(session: Session, listener: Listener) -> None:
-    assert not session.update(lambda state: replace(state, wipe=7.0))
-    assert session.state.wipe is None and any("wipe" in text for text in listener.said)
-    assert session.update(lambda state: replace(state, wipe=0.5)) and listener.states[-1].wipe == 0.5
 
 
 def test_a_click_picks_a_region_and_its_references_follow_the_look(session: Session, listener: Listener, world: World) -> None:

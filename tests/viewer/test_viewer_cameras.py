@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tiny_world import World
 
@@ -52,7 +52,6 @@ def test_the_page_looks_along_plus_z_with_y_down() -> None:
     assert float(depth[0]) == pytest.approx(1.0) and pixel[0].tolist() == pytest.approx([75.0, 62.5])
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=60)
 @given(
     st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.01),
     st.tuples(*[st.floats(-1e9, 1e9)] * 3),
@@ -77,7 +76,6 @@ def test_what_is_no_camera_is_refused(numbers: str) -> None:
         checked_camera((1, 0, 0), (0, 0, 0), 1.0, 640, 480)
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.floats(0.1, 10), st.integers(1, 100_000))
 def test_pictures_have_the_shape_asked_for_and_are_never_huge(aspect: float, longest: int) -> None:
     width, height = picture_size(aspect, longest)

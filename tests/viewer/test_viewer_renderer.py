@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pretend_cuda import CUDA, pretend_cuda
 from session_helpers import camera_of
@@ -160,7 +160,6 @@ def test_every_layer_is_the_same_on_another_device(world: World) -> None:
     assert torch.is_inference_mode_enabled() is False
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=60)
 @given(st.integers(1, 4096), st.integers(1, 4096))
 def test_resolutions_double_up_to_the_very_size(width: int, height: int) -> None:
     found = resolutions((width, height))

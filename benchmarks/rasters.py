@@ -1,6 +1,6 @@
 """Small renderers of points and of triangles in NumPy, as viewers draw them: judges of exported files.
 
-Views are pinholes with OpenGL axes and their centre in the middle, as in `splatter`. What is behind is black.
+Views are pinholes with OpenGL axes and their centre in the middle, as in tests/export/splatter.py. What is behind is black.
 """
 
 import numpy as np
@@ -89,7 +89,10 @@ def _barycentric(at: np.ndarray, corner: np.ndarray) -> np.ndarray:
     a, b, c = (corner[:, None, k] for k in range(3))
 
     def area(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return (v[..., 0] - u[..., 0]) * (w[..., 1] - u[..., 1]) - (v[..., 1] - u[..., 1]) * (w[..., 0] - u[..., 0])
+        twice: np.ndarray = (v[..., 0] - u[..., 0]) * (w[..., 1] - u[..., 1]) - (v[..., 1] - u[..., 1]) * (
+            w[..., 0] - u[..., 0]
+        )
+        return twice
 
     whole = area(a, b, c)
     parts = np.stack([area(b, c, at), area(c, a, at), area(a, b, at)], -1)
