@@ -273,6 +273,10 @@ def test_gaussians_that_are_not_finite_are_read_and_told(tmp_path: Path) -> None
     assert written(tmp_path / "x.ply", made).gaussians.finite.tolist() == [True, False, True, False, True, True]
     for ending in (".compressed.ply", ".splat", ".spz", ".sog"):
         assert len(written(tmp_path / f"x{ending}", made).gaussians) == 6
+    bright = cloud(1, 6)
+    bright.means[0, 1], bright.harmonics[1, 1, 0], bright.log_scales[2, 0] = torch.inf, -torch.inf, torch.inf
+    for ending in (".ply", ".compressed.ply", ".splat", ".spz", ".sog"):
+        assert len(written(tmp_path / f"bright{ending}", bright).gaussians) == 6
 
 
 def test_what_is_refused_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -47,6 +47,12 @@ def steps(values: Floats, most: int) -> NDArray[np.int64]:
     return np.rint(np.clip(np.nan_to_num(values.astype(np.float64), nan=0.0), 0, 1) * most).astype(np.int64)
 
 
+def finite(values: Floats) -> NDArray[np.float64]:
+    """Numbers in float64 whose differences are finite in float32, too: 0 for NaN, the largest such for infinite ones."""
+    largest = 0.25 * float(np.finfo(np.float32).max)
+    return np.clip(np.nan_to_num(values.astype(np.float64)), -largest, largest)
+
+
 def sigmoid(x: Floats) -> Floats:
     """In [0, 1], without overflow."""
     return 0.5 * (1 + np.tanh(0.5 * x))

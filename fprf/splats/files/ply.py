@@ -24,6 +24,7 @@ from .base import (
     Floats,
     colours_of,
     constants_of,
+    finite,
     logit,
     short,
     sigmoid,
@@ -280,12 +281,12 @@ def _flat(harmonics: Floats) -> Floats:
 
 
 def _rest_bytes(rest: Floats) -> NDArray[np.uint8]:
-    return np.asarray(np.clip(np.floor((rest / _SPAN + 0.5) * 256), 0, 255), np.uint8)
+    return np.asarray(np.clip(np.floor((finite(rest) / _SPAN + 0.5) * 256), 0, 255), np.uint8)
 
 
 def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
     """Values [N C] as shares of the bounds of their chunks, and these bounds [chunks C]."""
-    starts = np.arange(0, len(values), _CHUNK)
+    starts, values = np.arange(0, len(values), _CHUNK), finite(values)
     low, high = (what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum))
     at = np.arange(len(values)) // _CHUNK
     span = (high - low).astype(np.float64)[at]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ...datamanagers.images import header_of
 from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians, from_arrays
-from .base import Bools, Capture, Floats, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
+from .base import Bools, Capture, Floats, finite, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
@@ -96,14 +96,14 @@ def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     count = len(gaussians)
     width = -(-int(np.ceil(count**0.5)) // 4) * 4
     shape = (-(-count // max(width, 1)), width)
-    means = np.nan_to_num(gaussians.means.numpy().astype(np.float64))
+    means = finite(gaussians.means.numpy())
     bent = np.sign(means) * np.log1p(np.abs(means))
     least, most = bent.min(0), bent.max(0)
     at = steps((bent - least) / np.where(most > least, most - least, 1.0), 65535)
     largest, three = smallest_three(gaussians.quaternions.numpy())
     harmonics = gaussians.harmonics.numpy()
     opacity = steps(sigmoid(gaussians.logits.numpy()), 255)
-    scale, scales = _quantized(np.nan_to_num(gaussians.log_scales.numpy()), {"files": ["scales.webp"], "codebook": []})
+    scale, scales = _quantized(gaussians.log_scales.numpy(), {"files": ["scales.webp"], "codebook": []})
     base, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
     pictures = {
         "means_l.webp": _picture(at & 255, shape),
@@ -304,7 +304,7 @@ def _palette_picture(index: NDArray[np.integer[Any]]) -> _Bytes:
 
 def _quantized(values: Floats, about: Mapping[str, Any]) -> tuple[NDArray[np.int64], dict[str, Any]]:
     """Values [... 3] as bytes, and what meta.json says of them: a new codebook, or new ranges (version 1)."""
-    said, values = dict(about), np.nan_to_num(values.astype(np.float64))
+    said, values = dict(about), finite(values)
     if "codebook" in said:
         book = _codebook(values.ravel())
         said["codebook"] = book.tolist()

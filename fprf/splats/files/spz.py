@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians, from_arrays
-from .base import Bools, Capture, Floats, logit, short, sigmoid, smallest_three, steps, three_to_four
+from .base import Bools, Capture, Floats, finite, logit, short, sigmoid, smallest_three, steps, three_to_four
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
@@ -102,7 +102,7 @@ def read_spz(path: Path, data: bytes) -> Capture:
 
 def spz_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     """A file of version 3, with as many fractional bits as the largest coordinate leaves."""
-    means = np.nan_to_num(gaussians.means.numpy().astype(np.float64) * _AXES)
+    means = finite(gaussians.means.numpy()) * _AXES
     largest = float(np.abs(means).max(initial=0.0))
     fraction = int(np.clip(np.floor(np.log2((2**23 - 1) / max(largest, 2.0**-10))), 0, 23))
     at = np.clip(np.rint(means * 2.0**fraction), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
@@ -118,7 +118,7 @@ def spz_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
         np.stack([at & 255, at >> 8 & 255, at >> 16], -1).astype(np.uint8).tobytes(),
         steps(sigmoid(gaussians.logits.numpy()), 255).astype(np.uint8).tobytes(),
         tint.tobytes(),
-        np.clip(np.rint((np.nan_to_num(gaussians.log_scales.numpy()) + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
+        np.clip(np.rint((finite(gaussians.log_scales.numpy()) + 10) * 16), 0, 255).astype(np.uint8).tobytes(),
         word.astype("<u4").tobytes(),
         rest.tobytes(),
     ]
@@ -133,7 +133,7 @@ def _whole(turn: Floats) -> Floats:
 
 def _colour_bytes(harmonics: Floats) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Constants [N 3] and the other harmonics [N K-1 3] as a file has them."""
-    turned = np.nan_to_num(harmonics.astype(np.float64) * _SIGNS[: harmonics.shape[1], None])
+    turned = finite(harmonics) * _SIGNS[: harmonics.shape[1], None]
     tint = steps(turned[:, 0] * _TINT + 0.5, 255).astype(np.uint8)
     return tint, np.clip(np.rint(turned[:, 1:] * 128) + 128, 0, 255).astype(np.uint8)
 
