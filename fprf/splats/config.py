@@ -55,7 +55,7 @@ class LookConfig:
 class GaussiansConfig(RunConfig):
     """3D Gaussians, trained from photographs on the CPU."""
 
-    untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "executor")
+    untrained: ClassVar[tuple[str, ...]] = ("semantic", "regions", "semantic_size", "executor")
     former: ClassVar[tuple[str, ...]] = ("rounds",)
 
     steps: int = 10_000
@@ -105,6 +105,9 @@ class GaussiansConfig(RunConfig):
     """Semantics; another encoder needs no training anew."""
     regions: int = 24
     """Semantic regions of the scene (with 16, 24, 32 of them 89, 91, 91 % of the town's pixels take from the right class)."""
+    semantic_size: int = 240
+    """Longest side in pixels, at most, of the views that semantics are found in and of references as they are encoded: at 240
+    the bundled encoder tells things apart best (docs/train-gaussians.md); encoders with large patches may want more."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind everything, also where images have transparency."""
 
@@ -113,6 +116,7 @@ class GaussiansConfig(RunConfig):
         for name in ("initial", "passes", "cap", "pixels_per_gaussian", "cells", "regions", "relocate_every"):
             at_least(name, getattr(self, name), 1)
         at_least("surroundings", self.surroundings, 0)
+        at_least("semantic_size", self.semantic_size, 32)
         if self.degree not in range(4):
             raise ConfigError(f"degree: {self.degree}; 0, 1, 2 or 3 are possible")
         for name in ("grow", "overview", "rate"):

@@ -43,8 +43,8 @@ from .scene import Semantics, SplatScene, find_semantics, load_semantics, semant
 _PATIENCE = 3
 """Steps in a row without a finite loss after which training gives up."""
 _SMOOTHING = 0.95
-_VIEWS, _SEEN = 32, 240
-"""Training views that semantics are found in, at most; their longest side in pixels."""
+_VIEWS = 32
+"""Training views that semantics are found in, at most."""
 _PIXELS = 640 * 360
 """Of an image, where nobody says how far to reduce them."""
 _SURROUNDINGS = 10
@@ -367,9 +367,9 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         True,
         known.cameras,
         known.names,
-        cache(lambda: _semantics(run, saved.step, known, gaussians, near, encoder(), config.regions)),
+        cache(lambda: _semantics(run, saved.step, known, gaussians, near, encoder(), config)),
         encoder,
-        min(_SEEN, int(known.cameras.size.amax())),
+        min(config.semantic_size, int(known.cameras.size.amax())),
         near,
         config.background,
         resolution if quality.resolution is None else quality.resolution,
@@ -390,7 +390,7 @@ class UnfinishedGaussians(UnfinishedRun):
 
     def scene(self, tensors: Mapping[str, Tensor]) -> SplatScene:
         gaussians, near = _gaussians(tensors), float(tensors["near"])
-        views = _some_views(self.known, _VIEWS // 4, _SEEN // 2)
+        views = _some_views(self.known, _VIEWS // 4, self.config.semantic_size // 2)
 
         def found() -> Semantics:
             return find_semantics(gaussians, True, self._encoder(), views, self.config.regions, near=near)
@@ -472,19 +472,19 @@ def _tones(saved: checkpoint.Saved, facts: Facts) -> Tones | None:
 
 
 def _semantics(
-    run: Run, step: int, known: Known, gaussians: Gaussians, near: float, encoder: Encoder, regions: int
+    run: Run, step: int, known: Known, gaussians: Gaussians, near: float, encoder: Encoder, config: GaussiansConfig
 ) -> Semantics:
-    """Return the semantics, from the run folder; found anew and kept where those are of another step, encoder or number."""
+    """Return the semantics, from the run folder; found anew and kept where those are of another step, encoder or setting."""
+    wanted = {"step": step, "regions": config.regions, "semantic_size": config.semantic_size}
     if (run.root / "style.safetensors").is_file():
         tensors = run.load_tensors("style")
-        of = int(tensors.pop("step", torch.tensor(-1))), int(tensors.pop("regions", torch.tensor(-1)))
-        if of == (step, regions):
+        if {name: int(tensors.pop(name, torch.tensor(-1))) for name in wanted} == wanted:
             kept = load_semantics(tensors, len(gaussians))
             if kept.encoder == encoder.identity:
                 return kept
-    semantics = find_semantics(gaussians, True, encoder, _some_views(known, _VIEWS, _SEEN), regions, near=near)
-    known_of = {"step": torch.tensor(step), "regions": torch.tensor(regions)}
-    run.save_tensors("style", {**semantics_tensors(semantics), **known_of})
+    views = _some_views(known, _VIEWS, config.semantic_size)
+    semantics = find_semantics(gaussians, True, encoder, views, config.regions, near=near)
+    run.save_tensors("style", {**semantics_tensors(semantics), **{name: torch.tensor(of) for name, of in wanted.items()}})
     return semantics
 
 

@@ -270,7 +270,7 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     before = (run / "checkpoints" / "step-0000040" / "manifest.json").read_bytes()
     assert main(["train", str(run / "config.json")]) == 0
     shutil.copytree(run, tmp_path / "other")
-    words = ["--semantic.encoder", "random", "--semantic.encoder.channels", "6", "--regions", "3"]
+    words = ["--semantic.encoder", "random", "--semantic.encoder.channels", "6", "--regions", "3", "--semantic-size", "32"]
     assert main(["train", str(tmp_path / "other" / "config.json"), *words]) == 0
     for folder in (run, tmp_path / "other"):
         assert (folder / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
