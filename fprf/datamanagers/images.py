@@ -214,7 +214,7 @@ MAX_PIXELS = 100_000_000
 
 Image: TypeAlias = NDArray[np.uint8]
 WHITE = (1.0, 1.0, 1.0)
-"""What transparent pixels show by default."""
+"""Default colour behind transparent pixels."""
 
 
 def load_image(

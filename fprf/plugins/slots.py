@@ -29,7 +29,7 @@ class Slot(NamedTuple):
 
     @property
     def choices(self) -> list[str]:
-        """What `--path` takes: the names of its kind, and `none` where that is allowed."""
+        """Choices of `--path`: the names of its kind, and `none` where that is allowed."""
         names = registry.choices(self.kind.group, self.kind)
         return [*names, "none"] if self.optional else names
 

@@ -26,7 +26,7 @@ Progress = Callable[[int, int, str], None]
 
 
 class SceneFolder:
-    """Where the parts of a scene folder lie."""
+    """Paths of the parts of a scene folder."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -38,7 +38,7 @@ class SceneFolder:
         self.log = self.work / "log.txt"
         """Everything that COLMAP said."""
         self.progress = self.work / "progress.jsonl"
-        """What a running step said of how far it is."""
+        """Progress of a running step, as it reports it."""
         self.model = root / "sparse" / "0"
         """The finished model."""
 

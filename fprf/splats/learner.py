@@ -90,7 +90,7 @@ class Learner:
             for kind, module in (("tones", tones), ("poses", poses))
             for name, each in (module.named_parameters() if module is not None else ())
         }
-        """What is learnt of each view: the parameter, its moments and the steps of each view."""
+        """Corrections of views by name: the parameter, its moments and the steps of each view."""
 
     @property
     def rows(self) -> int:
