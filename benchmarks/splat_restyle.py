@@ -3,7 +3,8 @@
     python -m benchmarks splat_restyle --captures plant.splat --references autumn.jpg night.jpg --output splat_restyle.json
 
 Each capture, and made-up ones of --synthetic Gaussians, is looked at in a process of its own with one thread. `rims` is how
-much the brightness that stands out at depth edges is amplified, relative to that inside of surfaces: above 1 edges glow.
+much the brightness that stands out at depth edges is amplified, relative to that inside of surfaces: of restyled Gaussians, and
+of the picture whose pixels are mapped as their Gaussians are. Where the former is above the latter, edges glow.
 """
 
 import argparse
@@ -118,15 +119,17 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     scene = look_at_capture(capture.gaussians, capture.antialiased, encoder, LookConfig())
     scene.found()
     looked = time.process_time() - start
-    seconds, rims = [], []
+    seconds: list[float] = []
+    rims: dict[str, list[float]] = {}
     for reference in references:
         start = time.process_time()
         style = StyleConfig(references=(reference,), stylizer=RegionToneConfig(centred=False))
-        new = scene.restyled(apply_style(scene, StyleFile(style)).restyle).shown.harmonics
+        look = apply_style(scene, StyleFile(style)).restyle
+        new = scene.restyled(look).shown.harmonics
         with tempfile.TemporaryDirectory() as folder:
             write_capture(Path(folder) / path.name, capture, new)
         seconds.append(time.process_time() - start)
-        rims.append(rim_ratio(scene, new))
+        rims[reference.stem] = rim_ratios(scene, look)
     return {
         "capture": f"{path.parent.name} (SOG folder)" if path.name == "meta.json" else path.name,
         "gaussians": len(capture.gaussians),
@@ -134,29 +137,45 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
         "look_seconds": round(looked, 2),
         "style_seconds": round(sorted(seconds)[len(seconds) // 2], 2),
         "peak_mib": round((peak() or 0) / 2**20),
-        "rims": {reference.stem: round(ratio, 2) for reference, ratio in zip(references, rims, strict=True)},
+        "rims": rims,
     }
 
 
-def rim_ratio(scene: Any, new: Any) -> float:
-    """Amplification of what stands out at depth edges, over that inside of surfaces."""
-    found = np.array([[standing_out(scene, each, view) for view in range(0, len(scene.names), 4)] for each in (None, new)])
-    before, after = found.mean(1)
-    return float(after[0] / before[0] / (after[1] / before[1]))
+def rim_ratios(scene: Any, look: Any) -> list[float]:
+    """Amplification of what stands out at depth edges, over that inside of surfaces: of the Gaussians, and of mapped pixels."""
+    found = np.array([standing_out(scene, look, view) for view in range(0, len(scene.names), 4)])
+    before, *after = found.mean(0)
+    return [round(float(each[0] / before[0] / (each[1] / before[1])), 2) for each in after]
 
 
-def standing_out(scene: Any, harmonics: Any, view: int) -> tuple[float, float]:
-    """How much brighter than their surroundings pixels are, at depth edges and elsewhere."""
+def standing_out(scene: Any, look: Any, view: int) -> list[tuple[float, float]]:
+    """How much brighter than their surroundings pixels are, at depth edges and elsewhere: as captured, restyled, mapped."""
+    import torch
+
+    from fprf.rendering.cameras import pixel_grid
     from fprf.splats.photographs import camera_of
     from fprf.splats.views import draw
     from fprf.style.controls import luma
 
-    gaussians = scene.gaussians if harmonics is None else scene.gaussians.recoloured(harmonics)
-    drawn = draw(gaussians, camera_of(scene.cameras, view), background=(0.5, 0.5, 0.5))
-    level = luma(drawn.image.flatten(0, 1)).view(drawn.opacity.shape).numpy()
-    above = np.maximum(level - cv2.GaussianBlur(level, (0, 0), 3), 0)
+    camera = camera_of(scene.cameras, view)
+    drawn, restyled = (draw(each.shown, camera, antialiased=scene.antialiased) for each in (scene, scene.restyled(look)))
+    opacity = drawn.opacity[..., None]
+    maps = look.parts[0].colours
+    rows = torch.cat([maps.matrix, maps.bias[:, None]], 1).flatten(1)
+    mean, _ = scene.paint(
+        scene.cameras, view, pixel_grid(scene.cameras, view), lambda features, points: maps.membership(features) @ rows
+    )
+    mean = mean.view(*drawn.opacity.shape, 4, 3)
+    front = drawn.image / opacity.clamp_min(1e-3)
+    mapped = (front + torch.einsum("hwc,hwcd->hwd", front, mean[:, :, :3]) + mean[:, :, 3]).clamp(0, 1) * opacity
     solid = drawn.opacity.numpy() > 0.9
     depth = np.where(drawn.opacity > 0.5, drawn.depth, 1.5 * drawn.depth.max()).astype(np.float32)
     steep = cv2.morphologyEx(depth, cv2.MORPH_GRADIENT, np.ones((5, 5))) > 0.15 * float(scene.gaussians.means.std())
     away = cv2.dilate(steep.astype(np.uint8), np.ones((3, 3))) == 0
-    return float(above[solid & steep].mean()), float(above[solid & away].mean())
+    out = []
+    for image in (drawn.image, restyled.image, mapped):
+        behind = (image + 0.5 * (1 - opacity)).clamp(0, 1)
+        level = luma(behind.flatten(0, 1)).view(drawn.opacity.shape).numpy()
+        above = np.maximum(level - cv2.GaussianBlur(level, (0, 0), 3), 0)
+        out.append((float(above[solid & steep].mean()), float(above[solid & away].mean())))
+    return out

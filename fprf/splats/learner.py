@@ -35,6 +35,9 @@ _JUDGES = 8
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
+_CALM, _CALM_EVERY = 3e-3, 20
+"""Share of its view-dependent colour that a Gaussian loses a step, falling as the rates do, and the steps between losses: from
+where no photograph looks it would become any colour, which a style that refits cut colours brings into view as specks."""
 _GAIN, _EXPONENT = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
 
@@ -129,8 +132,11 @@ class Learner:
         )  # fmt: skip
         if not math.isfinite(measured.l1 + measured.ssim):
             return None
+        used = self.blocks.reshape(-1, self.rows, LANES)[: -(-self.count // LANES)]
+        if step % _CALM_EVERY == 0 and self.only is None:
+            used[:, FIXED + 3 :] *= np.float32(1 - _CALM_EVERY * _CALM * 0.2**share)
         if self.narrow is not None:
-            self.narrow(self.blocks.reshape(-1, self.rows, LANES)[: -(-self.count // LANES)], step)
+            self.narrow(used, step)
         self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)
         self._learn_pose(view, target, torch.from_numpy(measured.of_camera), self.config.poses * 0.1**share)
         moved = (step + 1) % self.config.relocate_every == 0 and self.only is None

@@ -7,6 +7,7 @@ themselves have less contrast (deviation 0.13 against 0.17 on a plant), since wh
 """
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
@@ -389,18 +390,21 @@ def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"5 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
+    digest.update(f"6 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 
 def _pixel_features(
     basis: Basis, maps: Annotated[Tensor, "C h w"], image: Annotated[Tensor, "H W 3"], opacity: Annotated[Tensor, "H W"]
 ) -> Annotated[Tensor, "H W D"]:
-    """Features at pixels, by the guided filter that photographs pass."""
+    """Features at pixels, by the guided filter that photographs pass; its window is a share of the root of the area, for that of
+    the shorter side of an upright view hardly covers two of the encoder's cells: a fir before the sky was half sky.
+    """
     guided = GuidedConfig()
     low = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
     filled = (image + (1 - opacity)[..., None]).clamp(0, 1)
-    return upsample(low, filled, radius=round(guided.radius * min(opacity.shape)), eps=guided.eps, stride=guided.stride)
+    radius = round(guided.radius * math.sqrt(opacity.numel()))
+    return upsample(low, filled, radius=radius, eps=guided.eps, stride=guided.stride)
 
 
 def _reduced(pixels: Annotated[Tensor, "H W C"], cameras: Cameras) -> Annotated[Tensor, "h w C"]:

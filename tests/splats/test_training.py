@@ -122,6 +122,18 @@ def test_a_view_without_numbers_changes_nothing(config: GaussiansConfig, scene: 
     assert learner.step(0, 0.0) is None and equal(learner.gaussians(), before)
 
 
+def test_colours_that_no_view_shows_fall_back_to_their_mean(config: GaussiansConfig, scene: Scene) -> None:
+    """Else a Gaussian could have any colour from where it was not photographed, and a style would bring that into view."""
+    learner = prepare(config, scene).learner
+    start = learner.gaussians()
+    faint = replace(start, logits=torch.full_like(start.logits, -20), harmonics=torch.ones_like(start.harmonics))
+    learner.start_from(faint)
+    stepped(learner, 100)
+    after = learner.gaussians().harmonics
+    assert torch.equal(after[:, 0], faint.harmonics[:, 0])
+    assert float(after[:, 1:].min()) == float(after[:, 1:].max()) == pytest.approx(math.exp(-0.06 * 3.96), abs=0.01)
+
+
 def test_a_gaussian_learns_alike_however_late_it_is_seen(config: GaussiansConfig, scene: Scene) -> None:
     """Two views in opposite directions: what the second one shows moves as if nothing had been learnt before."""
     pose = scene.cameras.pose[0].clone()
