@@ -123,8 +123,8 @@ def write_cells(root: Path, scene: Scene, data: Path, count: int) -> list[Cell]:
                 shutil.rmtree(root / "cells", ignore_errors=True)
     write_json(file, document)
     (root / _VIEWS).unlink(missing_ok=True)
-    if all(path is None or path.is_relative_to(data) for path in (*scene.paths, *scene.masks)):
-        files = {"paths": scene.paths, "masks": scene.masks}
+    if all(path is None or path.is_relative_to(data) for path in (*scene.paths, *scene.masks, *scene.sky_masks)):
+        files = {"paths": scene.paths, "masks": scene.masks, "sky_masks": scene.sky_masks}
         write_json(
             root / _VIEWS,
             {name: [path and path.relative_to(data).as_posix() for path in paths] for name, paths in files.items()},
@@ -143,9 +143,11 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
     known = Run(root).load_known()
     with open_json(file, _WRITTEN) as document:
         paths = from_json(document["paths"], tuple[str, ...], path="paths")
-        masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
-        if len(paths) != len(known.cameras) or len(masks) not in (0, len(paths)):
-            raise ValueError(f"{len(paths)} images and {len(masks)} masks for {len(known.cameras)} cameras")
+        masks, skies = (  # runs of before name none of the sky
+            from_json(document.get(name, []), tuple[str | None, ...], path=name) for name in ("masks", "sky_masks")
+        )
+        if len(paths) != len(known.cameras) or not {len(masks), len(skies)} <= {0, len(paths)}:
+            raise ValueError(f"{len(paths)} images, {len(masks)} and {len(skies)} masks for {len(known.cameras)} cameras")
     train, test = torch.tensor(known.train), torch.tensor(known.test, dtype=torch.int64)
     return Scene(
         name=known.name,
@@ -154,6 +156,7 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
         train=train,
         test=test,
         masks=tuple(None if name is None else data / name for name in masks),
+        sky_masks=tuple(None if name is None else data / name for name in skies),
     )
 
 
@@ -254,9 +257,9 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
 def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved) -> Prepared:
     """A cell's windows, and the Gaussians of the whole scene that they show."""
     scene = replace(scene, cameras=refined(scene.cameras, start))
-    images, masks = load_photographs(config, scene, list(cell.windows))
+    images, *both = load_photographs(config, scene, list(cell.windows))
     images = {view: cell.cut(view, image) for view, image in images.items()}
-    masks = {view: cell.cut(view, mask) for view, mask in masks.items()}
+    masks, skies = ({view: cell.cut(view, mask) for view, mask in each.items()} for each in both)
     near, whole = float(start.model["near"]), gaussians_of(start)
     shown = cell.shown(scene, whole, near)
     gaussians = whole.select(shown)
@@ -266,7 +269,7 @@ def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, s
     cap = len(gaussians) + round(max(config.cap - len(whole), 0) * around / len(whole))
     tones = _tones_of(facts, start)
     tones = tones and tones.going_on(other_views(scene, cell.windows))
-    levels = make_levels(own, images, masks, near)
+    levels = make_levels(own, images, masks, near, skies)
     narrow = limit_widths(scene, near, cells=True)  # of all cameras: what lies before those of other cells is part of the union
     learner = Learner(replace(config, cap=cap), levels, reach_of(own), cap, cell.around, narrow, tones=tones)
     # As if the number had grown from the beginning of the schedule.

@@ -5,12 +5,14 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from fprf.cli.main import main
 from fprf.datamanagers.parsers.config import parse_scene
 from fprf.datamanagers.scene import Scene, find_sightings
+from fprf.io.images import write_image
 from fprf.plugins.codec import load_config, save_config
 from fprf.splats import cell_training
 from fprf.splats.cell_training import CellTask, read_cells, train_cell
@@ -171,3 +173,23 @@ def test_cells_see_from_where_the_whole_scene_found_its_views(town: Path, tmp_pa
     seen = cell_training._prepared(config, parse_scene(town, 1, None), given.facts, cell, start).scene.cameras
     shown = open_run(run, "cpu").known.cameras
     assert torch.equal(seen.pose, shown.pose) and not torch.equal(shown.pose, given.cameras.pose)
+
+
+def test_cells_know_where_the_sky_is(town: Path, scene: Scene, tmp_path: Path) -> None:
+    data, run = tmp_path / "town", tmp_path / "run"
+    shutil.copytree(town, data)
+    above = np.zeros((72, 96, 3), np.uint8)
+    above[:30] = 255
+    for path in scene.paths:
+        write_image(data / "sky_masks" / f"{path.name}.png", above)
+    assert main(command(data, run)) == 0
+    config = Run(run).load_config()[0]
+    assert isinstance(config, GaussiansConfig)
+    views, start, cell = cell_training._read_views(run, config, data), cell_training._load_overview(run), read_cells(run)[0]
+    facts = Run(run).load_known().facts
+    seen = cell_training._prepared(config, views, facts, cell, start).learner.levels[0]
+    for view, (_, top, width, height) in cell.windows.items():
+        sky = seen[view].sky
+        assert sky is not None and float(sky.sum()) == width * min(max(30 - top, 0), height)
+    bare = replace(config, surroundings=0)
+    assert all(each.sky is None for each in cell_training._prepared(bare, views, facts, cell, start).learner.levels[0].values())
