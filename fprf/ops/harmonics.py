@@ -22,8 +22,8 @@ HARMONIC = 0.28209479177387814
 """The zeroth spherical harmonic, 1 / (2 sqrt(pi))."""
 _TINY = 1e-5
 """Colours below this may be rounded to less than 0."""
-BRIGHT = 1.5
-"""Mean colours are mapped no higher. With 1 pictures lose contrast, without a limit single Gaussians show."""
+MAX_COLOUR = 1.5
+"""Mean colours are mapped no higher; with 1 pictures lose contrast (docs/train-gaussians.md)."""
 
 
 class Directions(NamedTuple):
@@ -64,13 +64,13 @@ def recoloured_reference(
 ) -> Annotated[Tensor, "N K 3"]:
     """Harmonics as drawn, mapped by A = 1 + change[:, :3] and b = change[:, 3]; those of no weight stay, bit for bit.
 
-    Mean colours stay below `BRIGHT`, but for those that were above it.
+    Mean colours stay below `MAX_COLOUR`, but for those that were above it.
     """
     drawn = as_drawn(harmonics, directions)
     matrix = torch.eye(3).to(change) + change[:, :3]
     colour = 0.5 + HARMONIC * drawn[:, 0]
     moved = torch.einsum("nc,ncd->nd", colour, matrix) + change[:, 3]
-    moved = moved.minimum(colour.clamp_min(BRIGHT))
+    moved = moved.minimum(colour.clamp_min(MAX_COLOUR))
     new = torch.einsum("nkc,ncd->nkd", drawn, matrix)
     new[:, 0] = (moved - 0.5) / HARMONIC
     return torch.where((weight > 0)[:, None, None], new, harmonics)

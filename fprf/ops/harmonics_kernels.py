@@ -7,12 +7,12 @@ import math
 import numba
 import numpy as np
 
-from .harmonics import BRIGHT
+from .harmonics import MAX_COLOUR
 from .lanes import dot, scaled
 from .simd import NARROW
 
 _C0, _HALF, _TINY = np.float32(0.28209479177387814), np.float32(0.5), np.float32(1e-5)
-_0, _BRIGHT = np.float32(0), np.float32(BRIGHT)
+_0, _MAX_COLOUR = np.float32(0), np.float32(MAX_COLOUR)
 _REACH = tuple(np.float32(math.sqrt((2 * degree + 1) / (4 * math.pi))) for degree in range(4))
 _BLOCK = 512
 
@@ -80,5 +80,5 @@ def recolour(rows, change, weight, values, fit, count, out):
             for c in range(3):
                 mine = _HALF + _C0 * drawn[c]
                 moved = mine + (x * change[to + c] + y * change[to + 3 + c] + z * change[to + 6 + c]) + change[to + 9 + c]
-                moved = min(moved, max(mine, _BRIGHT))
+                moved = min(moved, max(mine, _MAX_COLOUR))
                 out[at + c] = (moved - _HALF) / _C0

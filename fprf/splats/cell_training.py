@@ -45,6 +45,7 @@ from .training import (
     gaussians_of,
     limit_widths,
     load_photographs,
+    load_skies,
     other_views,
     prepare,
     reach_of,
@@ -143,9 +144,8 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
     known = Run(root).load_known()
     with open_json(file, _WRITTEN) as document:
         paths = from_json(document["paths"], tuple[str, ...], path="paths")
-        masks, skies = (  # runs of before name none of the sky
-            from_json(document.get(name, []), tuple[str | None, ...], path=name) for name in ("masks", "sky_masks")
-        )
+        masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
+        skies = from_json(document.get("sky_masks", []), tuple[str | None, ...], path="sky_masks")  # older runs name none
         if len(paths) != len(known.cameras) or not {len(masks), len(skies)} <= {0, len(paths)}:
             raise ValueError(f"{len(paths)} images, {len(masks)} and {len(skies)} masks for {len(known.cameras)} cameras")
     train, test = torch.tensor(known.train), torch.tensor(known.test, dtype=torch.int64)
@@ -257,9 +257,10 @@ def train_cell(task: CellTask, report: Callable[[Report], None]) -> bool:
 def _prepared(config: GaussiansConfig, scene: Scene, facts: Facts, cell: Cell, start: checkpoint.Saved) -> Prepared:
     """A cell's windows, and the Gaussians of the whole scene that they show."""
     scene = replace(scene, cameras=refined(scene.cameras, start))
-    images, *both = load_photographs(config, scene, list(cell.windows))
+    images, masks = load_photographs(config, scene, list(cell.windows))
+    skies = load_skies(config, scene, images)
     images = {view: cell.cut(view, image) for view, image in images.items()}
-    masks, skies = ({view: cell.cut(view, mask) for view, mask in each.items()} for each in both)
+    masks, skies = ({view: cell.cut(view, mask) for view, mask in each.items()} for each in (masks, skies))
     near, whole = float(start.model["near"]), gaussians_of(start)
     shown = cell.shown(scene, whole, near)
     gaussians = whole.select(shown)

@@ -35,9 +35,9 @@ _JUDGES = 8
 _SPLIT_SIZE, _SPLIT_DISTANCE, _SPLIT_OPACITY = 0.6, 0.5, 0.85
 """Of both halves: size and distance from the middle along the longest axis, as shares of its size, and share of the opacity."""
 _START_OPACITY, _START_SCALE, _FAR_OPACITY = 0.3, 0.7, 0.9
-_CALM, _CALM_EVERY = 3e-3, 20
-"""Share of its view-dependent colour that a Gaussian loses a step, falling as the rates do, and the steps between losses: from
-where no photograph looks it would become any colour, which a style that refits cut colours brings into view as specks."""
+_DECAY, _DECAY_EVERY = 3e-3, 20
+"""Weight decay of the harmonics above degree 0, a step, and the steps between its uses; it falls as the rates do. From where no
+photograph looks they would become any colour, which a style that refits cut colours brings into view as specks."""
 _GAIN, _EXPONENT = 0.005, 2e-3
 """Learning rates of the logarithms of a view's factors, whenever it is seen, and of the exponent. They fall to a tenth."""
 
@@ -133,8 +133,8 @@ class Learner:
         if not math.isfinite(measured.l1 + measured.ssim):
             return None
         used = self.blocks.reshape(-1, self.rows, LANES)[: -(-self.count // LANES)]
-        if step % _CALM_EVERY == 0 and self.only is None:
-            used[:, FIXED + 3 :] *= np.float32(1 - _CALM_EVERY * _CALM * 0.2**share)
+        if step % _DECAY_EVERY == 0 and self.only is None:
+            used[:, FIXED + 3 :] *= np.float32(1 - _DECAY_EVERY * _DECAY * 0.2**share)
         if self.narrow is not None:
             self.narrow(used, step)
         self._learn_tones(view, torch.from_numpy(measured.pull), self.config.rate * 0.1**share)

@@ -397,8 +397,10 @@ def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
 def _pixel_features(
     basis: Basis, maps: Annotated[Tensor, "C h w"], image: Annotated[Tensor, "H W 3"], opacity: Annotated[Tensor, "H W"]
 ) -> Annotated[Tensor, "H W D"]:
-    """Features at pixels, by the guided filter that photographs pass. Its window is a share of the root of the area: one of the
-    shorter side of an upright view hardly covers two of the encoder's cells, and a fir before the sky was half sky.
+    """Features at pixels, by the guided filter that photographs pass.
+
+    Its window is a share of the root of the area: one of the shorter side of an upright view hardly covers two of the encoder's
+    cells, and a fir before the sky was half sky.
     """
     guided = GuidedConfig()
     low = basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])

@@ -110,7 +110,7 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     `saved` are the facts of a run that goes on: its exposures are not measured again.
     """
     config = _bounded(config, scene)
-    images, masks, skies = load_photographs(config, scene, scene.train.tolist())
+    images, masks = load_photographs(config, scene, scene.train.tolist())
     facts = saved or lit(facts_of(config, scene), config, scene, lambda view: images[view])
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
@@ -118,7 +118,7 @@ def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -
     far = surroundings(scene, images, points, config.surroundings) if config.surroundings else None
     room = max(config.cap, len(points.position) + config.surroundings)
     sphere = _Sphere.around(far) if far is not None else None
-    levels = make_levels(scene, images, masks, near, skies)
+    levels = make_levels(scene, images, masks, near, load_skies(config, scene, images))
     inside = None if sphere is None else sphere.encloses
     narrow = limit_widths(scene, near, cells=config.cells > 1, sphere=sphere)
     learner = Learner(config, levels, reach_of(scene), room, inside, narrow, tones=tones_of(facts), poses=poses_of(facts))
@@ -182,14 +182,15 @@ def limit_widths(scene: Scene, near: float, *, cells: bool, sphere: _Sphere | No
 
 def load_photographs(
     config: GaussiansConfig, scene: Scene, views: list[int]
-) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]], dict[int, NDArray[np.bool_]]]:
-    """Images of views, and the masks and the masks of the sky of those that have one.
-
-    Without surroundings there are none of the sky: nothing else could show it.
-    """
+) -> tuple[dict[int, Image], dict[int, NDArray[np.bool_]]]:
+    """Images of views, and the masks of those that have one."""
     images = dict(zip(views, load_images(scene, config.background, views), strict=True))
-    masks = _load_masks(scene.masks if config.masks else (), images)
-    return images, masks, _load_masks(scene.sky_masks if config.masks and config.surroundings else (), images)
+    return images, _load_masks(scene.masks if config.masks else (), images)
+
+
+def load_skies(config: GaussiansConfig, scene: Scene, images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
+    """The masks of the sky of the views that have one; none without surroundings: nothing else could show the sky."""
+    return _load_masks(scene.sky_masks if config.masks and config.surroundings else (), images)
 
 
 def _load_masks(paths: tuple[Path | None, ...], images: Mapping[int, Image]) -> dict[int, NDArray[np.bool_]]:
@@ -443,7 +444,7 @@ def fit_poses(
     """
     cameras, facts, shown = opened.known.cameras, opened.known.facts, opened.scene
     scene = replace(scene, cameras=cameras, train=torch.tensor(views))
-    images, masks, _ = load_photographs(config, scene, views)
+    images, masks = load_photographs(config, scene, views)
     poses = Poses(
         cameras.pose[:, :, 3], other_views(scene, views), reach=sight_distance(scene, facts.space), pace=1.0, still=True
     )

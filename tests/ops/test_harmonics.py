@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from fprf.fields.planes import harmonics as functions
-from fprf.ops.harmonics import BRIGHT, HARMONIC, Directions, as_drawn, recoloured, recoloured_reference
+from fprf.ops.harmonics import HARMONIC, MAX_COLOUR, Directions, as_drawn, recoloured, recoloured_reference
 from fprf.splats.restyle import all_around
 
 U = 2.0**-24
@@ -56,8 +56,8 @@ def test_mean_colours_are_not_mapped_above_the_limit() -> None:
     before = 0.5 + HARMONIC * as_drawn(harmonics, directions)[:, 0]
     after = 0.5 + HARMONIC * recoloured(harmonics, 9 * change, weight, directions)[:, 0]
     some = (weight > 0)[:, None].expand_as(before)
-    assert (after[some] <= before[some].clamp_min(BRIGHT) + 1e-5).all() and int(some.sum()) > 2000
-    assert (after[some] > BRIGHT - 1e-5).any() and (after[some] < 0).any()
+    assert (after[some] <= before[some].clamp_min(MAX_COLOUR) + 1e-5).all() and int(some.sum()) > 2000
+    assert (after[some] > MAX_COLOUR - 1e-5).any() and (after[some] < 0).any()
 
 
 @torch.no_grad()

@@ -27,7 +27,6 @@ from fprf.ops.rasterise import lift
 from fprf.ops.rasterise_training import learn
 from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
 from fprf.rendering.cameras import Cameras, project
-from fprf.rendering.paths import pinhole
 from fprf.splats import initial, photographs, training
 from fprf.splats.config import GaussiansConfig
 from fprf.splats.files import read_capture
@@ -409,24 +408,6 @@ def test_a_lens_moves_pixels_where_projection_says(scene: Scene) -> None:
     assert (middle(torch.from_numpy(back).float()) - straight[0]).norm() < 0.15
 
 
-def test_matches_between_views_give_points_on_the_surface() -> None:
-    """Views of a textured plane z = 0: what is triangulated lies in it."""
-    draws = np.random.default_rng(1)
-    texture = np.kron(draws.integers(0, 256, (60, 60, 3)), np.ones((8, 8, 1))).astype(np.uint8)
-    count, width, height, focal = 4, 200, 160, 180.0
-    pose = torch.eye(4, dtype=torch.float64)[:3].repeat(count, 1, 1)
-    pose[:, 0, 3], pose[:, 2, 3] = torch.linspace(-0.3, 0.3, count, dtype=torch.float64), 3.0
-    cameras = pinhole(pose, width=width, height=height, fov=math.degrees(2 * math.atan(height / 2 / focal)))
-    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    u, v = ((along * 3 / focal) * 100 + 240 for along in (x, y))
-    images = {view: texture[v.astype(int), (u + 100 * float(pose[view, 0, 3])).astype(int)] for view in range(count)}
-    train = torch.arange(count)
-    scene = Scene(name="plane", paths=(Path("a"),) * count, cameras=cameras, train=train, test=train[:0])
-    found, origin = initial.initial_points(scene, images, 1000, draws)
-    assert origin == "points matched between views" and len(found.position) > 100
-    assert np.median(np.abs(found.position[:, 2])) < 0.03
-
-
 def test_surroundings_fill_what_no_photograph_shows(scene: Scene) -> None:
     """All directions have a Gaussian far away: grey photographs give grey surroundings, in and out of view."""
     images = {view: np.full((24, 32, 3), 102, np.uint8) for view in scene.train.tolist()}
@@ -493,10 +474,3 @@ def test_means_move_by_what_views_see_not_by_how_far_apart_they_are(scene: Scene
     twice = replace(scene, cameras=both, train=train, points=torch.cat([scene.points, scene.points + apart]), seen=None)
     assert reach_of(twice) < 1.5 * reach_of(replace(scene, seen=None))
     assert reach_of(replace(twice, points=None)) > 500
-
-
-def test_points_begin_where_there_are_none(scene: Scene) -> None:
-    bare = replace(scene, points=None, seen=None)
-    found, origin = initial.initial_points(bare, dict(enumerate(load_images(bare))), 500, np.random.default_rng(0))
-    assert origin == "random points" and len(found.position) == 500 and np.isfinite(found.position).all()
-    assert found.colour.min() >= 0 and found.colour.max() <= 1
