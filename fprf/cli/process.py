@@ -92,6 +92,8 @@ def _check(root: Path) -> None:
 
     config = GaussiansConfig(data=root, minutes=MINUTES)
     delivered = parse_scene(root, 1, None)
+    for note in delivered.notes:
+        print(f"note: {note}")
     size = with_downscale(config).downscale or 1
     width, height = delivered.cameras.scaled(size).size[0].tolist()
     run = default_output(config, DEFAULT_METHOD)

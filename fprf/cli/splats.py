@@ -155,6 +155,8 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
         check_same(folder, config)
         remove_unfinished(output)
         scene = scene_of(config)
+        for note in scene.notes:
+            display.say(f"note: {note}")
         marks = image_hashes(scene)
         if folder.exists and not others:
             check_images(output, scene, marks)

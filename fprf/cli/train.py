@@ -158,6 +158,8 @@ def train_scene(
         marks: dict[str, str] = {}
 
         def look(scene: "Scene") -> None:
+            for note in scene.notes:
+                display.say(f"note: {note}")
             marks.update(image_hashes(scene))
             if folder.exists and not others:
                 check_images(output, scene, marks)

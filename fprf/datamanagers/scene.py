@@ -45,6 +45,8 @@ class Scene:
     """The same of sky, which is white."""
     alpha: bool = False
     """Images carry transparency."""
+    notes: tuple[str, ...] = ()
+    """What was decided while the capture was read, a line each, for the user."""
 
 
 TILES = 16

@@ -19,18 +19,18 @@ WRONG = {
         camera_model="OPENCV_FISHEYE"&p1=0.1 camera_model="PINHOLE"&k1=0.1 test_filenames=["images/0009.png"]
         test_filenames=["images/0000.png"]&train_filenames=["images/0000.png"] test_filenames="x"
         fl_x=null&fl_y=null&camera_angle_x=4.0 fl_x=null&fl_y=null""",
-    "frame": f"""file_path="images/none.png" file_path="/etc/passwd" file_path="../0001.png" file_path=null
+    "frame": f"""file_path="/etc/passwd" file_path="../0001.png" file_path=null
         file_path="images/0000.png" transform_matrix=[[1,0,0,0],[0,1,0,0]] transform_matrix={EYE[:-2]}2]]
         transform_matrix={BENT} transform_matrix=[["a"]] transform_matrix=null""",
     "polycam": 't_00=null fx="20" fx=-1.0 t_11=7.0 width=0 width=1e9 width=48',
-    "record3d": """poses=[[0,0,0,1,0,0,0],[0,0,0,1,0,0,0]] poses=[[0,0,0,1,0,0,0]] poses=[[0,0,0,2,0,0,0],[0,0,0,2,1,0,0]]
-        poses=[[1,2,3]] poses=null K=[1,2] perFrameIntrinsicCoeffs=[[1,2,3,"4"]] w=null h=1e9 h=17""",
+    "record3d": """poses=[[0,0,0,1,0,0,0],[0,0,0,1,0,0,0]] poses=[] poses=[[0,0,0,2,0,0,0],[0,0,0,2,1,0,0]]
+        poses=[[1,2,3]] poses=null K=[1,2] perFrameIntrinsicCoeffs=[[1,2,3,"4"]] w=0 h=1e9 h=17""",
     "odm": """projection_type="spherical" focal_x=null&focal_y=null focal_x=-0.5 width=24&height=24 k1="x" """,
     "shot": 'rotation=[1,2] rotation=[1e9,0,0] translation=null camera="none"',
     "reconstruction": '=[] ={} =[{}] =[{"shots":{}}] =[3] =[{"shots":3}]',
     "colmap": """cameras.0="8" cameras.1="FOO" cameras.1="RADIAL" cameras.2="0" cameras.4="-1" cameras.4="x" images.1="9"
-        images.4="x" images.9="../x.png" images.9="0001.png" images.9="a\\u202eb.png" points3D.0="x" points3D.1="x" """,
-    "llff": "0=NaN 15=Infinity 1=3.0 4=0.0 9=1e30 14=-5.0 15=10.0 9=16.0",
+        images.4="x" images.9="../x.png" images.9="0001.png" images.9="a\\u001bb.png" points3D.0="x" points3D.1="x" """,
+    "llff": "1=3.0 4=0.0 9=1e30 14=-5.0 15=10.0 9=16.0",
     "rows": "=[] =[[1,2,3]] =[1,2,3]",
 }
 """Changes `key=value` by what they are made to, several at once joined by &; of COLMAP's files the words of the first line."""

@@ -7,11 +7,11 @@ COLMAP's lenses become ours; its world-to-camera poses in OpenCV axes become cam
 is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that it observes (LLFF's rule).
 """
 
+import shlex
 import struct
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
@@ -21,27 +21,33 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ...rendering.splines import rotations
 from ..scene import Scene
 from .config import ColmapConfig
-from .files import path_inside, read_bytes, read_npz
-from .views import View, assemble_scene, pixel_size, quaternion_rotation, rigid_pose
+from .files import NamedFiles, path_inside, read_bytes, read_float, read_npz, read_ply_points
+from .views import View, assemble_scene, lens_of, pixel_size, quaternion_rotation, read_views, rigid_pose
 
 MODELS = (
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
+    ("SIMPLE_PINHOLE", "f cx cy"),
+    ("PINHOLE", "fx fy cx cy"),
+    ("SIMPLE_RADIAL", "f cx cy k1"),
+    ("RADIAL", "f cx cy k1 k2"),
+    ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+    ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+    ("FOV", "fx fy cx cy omega"),
+    ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
+    ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s2"),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4"),
+    ("SIMPLE_DIVISION", "f cx cy division"),
+    ("DIVISION", "fx fy cx cy division"),
+    ("SIMPLE_FISHEYE", "f cx cy"),
+    ("FISHEYE", "fx fy cx cy"),
+    ("EUCM", "fx fy cx cy alpha beta"),
+    ("EQUIRECTANGULAR", "w h"),
 )
-"""Name and number of parameters, in the order of COLMAP's model ids."""
+"""Name and parameters, in the order of COLMAP's model ids (4.2); k1 to k4 are the polynomial's, d1 to d3 a denominator's."""
 
 
 @dataclass(frozen=True)
@@ -139,11 +145,11 @@ def _cameras_bin(path: Path) -> dict[int, ColmapCamera]:
     for _ in range(file.count(_CAMERA.size, "cameras")):
         id_, model, width, height = file.take(_CAMERA, "a camera")
         if not 0 <= model < len(MODELS):
-            raise file.error(f"camera model {model} is unknown, 0 to {len(MODELS) - 1} are known")
+            raise file.error(f"camera model {model} is unknown, 0 to {len(MODELS) - 1} are known; {_undistort(path.parent)}")
         if id_ in cameras:
             raise file.error(f"camera {id_} occurs twice")
         name, params = MODELS[int(model)]
-        numbers = file.take(struct.Struct(f"<{params}d"), "its parameters")
+        numbers = file.take(struct.Struct(f"<{len(params.split())}d"), "its parameters")
         cameras[int(id_)] = ColmapCamera(name, int(width), int(height), numbers)
     file.end()
     return cameras
@@ -185,19 +191,19 @@ def _points_bin(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
-    """The place and text of each line that is no comment; empty ones too."""
+    """The place and text of each line that is no comment; empty ones too. Blanks at its end may belong to a name."""
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise _bad(path, f"byte {error.start}", "not UTF-8 text") from error
     for number, line in enumerate(text.split("\n"), start=1):
         if not line.lstrip().startswith("#"):
-            yield f"line {number}", line.strip()
+            yield f"line {number}", line.rstrip("\r")
 
 
 def _floats(path: Path, place: str, words: list[str]) -> tuple[float, ...]:
     try:
-        return tuple(float(word) for word in words)
+        return tuple(read_float(word) for word in words)
     except ValueError as error:
         raise _bad(path, place, f"not numbers ({error})") from error
 
@@ -219,8 +225,10 @@ def _cameras_txt(path: Path) -> dict[int, ColmapCamera]:
         words = line.split()
         if not words:
             continue
-        if len(words) < 4 or words[1] not in known or len(words) != 4 + known[words[1]]:
-            raise _bad(path, place, "not `ID MODEL WIDTH HEIGHT` and as many parameters as a known model has")
+        if len(words) >= 4 and words[1].isidentifier() and words[1] not in known:
+            raise DataError(f"{path}: {place}: the camera model {words[1]} is unknown; {_undistort(path.parent)}")
+        if len(words) < 4 or words[1] not in known or len(words) != 4 + len(known[words[1]].split()):
+            raise _bad(path, place, "not `ID MODEL WIDTH HEIGHT` and as many parameters as the model has")
         id_, width, height = _ints(path, place, [words[0], *words[2:4]])
         if id_ in cameras:
             raise _bad(path, place, f"camera {id_} occurs twice")
@@ -232,7 +240,8 @@ def _images_txt(path: Path) -> list[ColmapImage]:
     images = []
     lines = _lines(path)
     for place, line in lines:
-        words = line.split(maxsplit=9)
+        # The name is the rest of the line; as bytes only ASCII's blanks part words, of which a name may begin with others.
+        words = [word.decode() for word in line.encode().split(maxsplit=9)]
         if not words:
             continue
         if len(words) != 10:
@@ -265,6 +274,7 @@ def _points_txt(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 _APART = 1e-3
 """Share of the cameras' extent by which the two sets of camera centres may differ."""
 
+_Lens: TypeAlias = tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float, float, float], int]
 Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 """Finite points [P 3], and pairs [O 2] where known."""
 
@@ -326,15 +336,49 @@ def read_cloud(path: Path, views: int) -> Cloud:
     return _finite(xyz, seen.astype(np.int64))
 
 
-_Lens: TypeAlias = tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float, float, float], int]
+def _undistort(folder: Path, images: str = "IMAGES") -> str:
+    """The remedy for lenses that cannot be represented."""
+    paths = f"--image_path {shlex.quote(images)} --input_path {shlex.quote(str(folder))} --output_path UNDISTORTED"
+    return f"undistort the images with `colmap image_undistorter {paths}` and give the folder UNDISTORTED"
 
 
-def model_folder(data: Path) -> Path | None:
-    """Folder of the sparse model, or None."""
-    for folder in (data / "sparse" / "0", data / "sparse", data):
-        if (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file():
-            return folder
-    return None
+def model_folders(data: Path) -> list[Path]:
+    """Folders of sparse models in a scene folder: sparse/0, sparse/1, ... sparse, the folder itself, colmap/sparse/0, ..."""
+    numbered = [sorted(path for path in (data / place).glob("*")) for place in ("sparse", "colmap/sparse")]
+    folders = [*numbered[0], data / "sparse", data, *numbered[1]]
+    return [each for each in folders if (each / "cameras.bin").is_file() or (each / "cameras.txt").is_file()]
+
+
+def largest_model(data: Path) -> tuple[Path | None, list[str]]:
+    """Folder of the sparse model with the most images, the first of equals, and a note where there are several."""
+    folders = model_folders(data)
+    if len(folders) < 2:
+        return next(iter(folders), None), []
+    counts = {folder: _image_count(folder) for folder in folders}
+    largest = max(folders, key=lambda folder: counts[folder])
+    told = ", ".join(f"{folder.relative_to(data)} ({count})" for folder, count in counts.items())
+    return largest, [f"of the models {told} that of the most images is read: {largest.relative_to(data)}"]
+
+
+def _image_count(folder: Path) -> int:
+    """Images that a model claims to have; 0 where its file cannot be read."""
+    try:
+        if (folder / "cameras.bin").is_file():
+            with (folder / "images.bin").open("rb") as file:
+                return int.from_bytes(file.read(_COUNT.size), "little")
+        return sum(1 for _ in _lines(folder / "images.txt")) // 2
+    except (OSError, DataError):
+        return 0
+
+
+def read_points_file(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
+    """The finite points of a PLY file that a capture names, and a note where there are none."""
+    try:
+        points = read_ply_points(path)
+    except DataError as fault:
+        return None, [f"points are not read: {fault}"]
+    points = points[np.asarray(np.isfinite(points).all(1))]
+    return (points, []) if len(points) else (None, [f"{path}: holds no points"])
 
 
 class ColmapParser(DataParser):
@@ -345,78 +389,71 @@ class ColmapParser(DataParser):
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the size of the images in the chosen folder."""
-        folder = model_folder(data)
+        folder, notes = largest_model(data)
         if folder is None:
             raise DataError(f"{data}: no cameras.bin or cameras.txt in sparse/0, sparse or here; run COLMAP's mapper")
         model = read_model(folder)
         if not model.images:
             raise DataError(f"{folder}: the model has no images; run COLMAP's mapper again")
         name, root = path_inside(data, "parser.images", self.config.images)
-        lenses = {id_: _lens(f"{folder}: camera {id_}", camera) for id_, camera in model.cameras.items()}
-        named = [(*path_inside(root, f"{folder}: image {image.name!r}", image.name), image) for image in model.images]
-        named.sort(key=lambda each: each[0])
-        observed = observed_points(model, [image for _, _, image in named])
-        views = []
-        for (inner, path, image), rows in zip(named, observed, strict=True):
+        files = NamedFiles(root)
+        named = [
+            (*files.find(f"{folder}: image {image.name!r}", image.name), image, rows)
+            for image, rows in zip(model.images, observed_points(model, model.images), strict=True)
+        ]
+
+        def view(each: tuple[str, Path, ColmapImage, NDArray[np.int64]]) -> View:
+            inner, path, image, rows = each
             where = f"{folder}: image {image.name!r}"
-            if image.camera not in lenses:
+            camera = model.cameras.get(image.camera)
+            if camera is None:
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
-            camera = model.cameras[image.camera]
-            focal, centre, distortion, lens = lenses[image.camera]
             pose = _pose(where, image)
-            views.append(
-                View(
-                    name=inner,
-                    path=path,
-                    pose=pose,
-                    size=(camera.width, camera.height),
-                    focal=focal,
-                    centre=centre,
-                    distortion=distortion,
-                    lens=lens,
-                    depths=_depths(model.points[rows], pose),
-                )
+            focal, centre, distortion, lens = _lens(f"{folder}: camera {image.camera}", camera, _undistort(folder, str(root)))
+            return View(
+                name=inner,
+                path=path,
+                pose=pose,
+                size=(camera.width, camera.height),
+                focal=focal,
+                centre=centre,
+                distortion=distortion,
+                lens=lens,
+                depths=_depths(model.points[rows], pose),
             )
-        twice = [a.name for a, b in pairwise(views) if a.name == b.name]
-        if twice:
-            raise DataError(f"{folder}: the image {twice[0]!r} is registered twice; export the model again")
-        points, seen = cloud_of_images(model, observed)
-        return assemble_scene(data, views, downscale=downscale, points=points, seen=seen, reduced=name != "images")
+
+        kept, lost = read_views(data, sorted(named, key=lambda each: each[0]), view)
+        points, seen = cloud_of_images(model, [rows for (_, _, _, rows), _ in kept])
+        notes += lost
+        if not len(points):
+            # 3DGS keeps the points of a model, or those that it was begun with, beside it.
+            beside = (folder / "points3D.ply", folder / "input.ply", data / "input.ply")
+            file = next((path for path in beside if path.is_file()), None)
+            extra, said = (None, []) if file is None else read_points_file(file)
+            points, notes = points if extra is None else extra, notes + said
+        views = [one for _, one in kept]
+        reduced = name != "images"
+        return assemble_scene(data, views, downscale=downscale, points=points, seen=seen, reduced=reduced, notes=notes)
 
 
 def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
     back = quaternion_rotation(where, image.quaternion).T
-    # A damaged translation may overflow; `rigid_pose` refuses what is not finite.
+    # A damaged translation may overflow; `rigid_pose` leaves out what is not finite.
     with np.errstate(over="ignore", invalid="ignore"):
         centre = -back @ np.array(image.translation)
     return rigid_pose(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
 
 
-def _lens(where: str, camera: ColmapCamera) -> _Lens:
+def _lens(where: str, camera: ColmapCamera, remedy: str) -> _Lens:
     """Focal lengths, principal point, k1 k2 k3 k4 p1 p2 and lens of a COLMAP camera."""
-    p = camera.params
     pixel_size(where, camera.width, camera.height)
-    shared = camera.model.startswith("SIMPLE") or camera.model in ("RADIAL", "RADIAL_FISHEYE")
-    focal, centre, k = ((p[0], p[0]), (p[1], p[2]), p[3:]) if shared else ((p[0], p[1]), (p[2], p[3]), p[4:])
-    match camera.model:
-        case "SIMPLE_PINHOLE" | "PINHOLE":
-            return focal, centre, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), PINHOLE
-        case "SIMPLE_RADIAL" | "SIMPLE_RADIAL_FISHEYE":
-            bent = (k[0], 0.0, 0.0, 0.0, 0.0, 0.0)
-        case "RADIAL" | "RADIAL_FISHEYE":
-            bent = (k[0], k[1], 0.0, 0.0, 0.0, 0.0)
-        case "OPENCV":
-            bent = (k[0], k[1], 0.0, 0.0, k[2], k[3])
-        case "OPENCV_FISHEYE":
-            bent = (k[0], k[1], k[2], k[3], 0.0, 0.0)
-        case "FULL_OPENCV" if not any(k[5:]):
-            bent = (k[0], k[1], k[4], 0.0, k[2], k[3])
-        case _:
-            raise DataError(
-                f"{where}: the lens {camera.model} with parameters {list(k)} cannot be represented; "
-                "run `colmap image_undistorter` and use its output"
-            )
-    return focal, centre, bent, FISHEYE if camera.model.endswith("FISHEYE") else OPENCV if any(bent) else PINHOLE
+    given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
+    fx, fy = (given.pop(key, given.get("f", 0.0)) for key in ("fx", "fy"))
+    given.pop("f", None)
+    centre = given.pop("cx", 0.0), given.pop("cy", 0.0)
+    k = [given.pop(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    distortion, lens = lens_of(where, camera.model, k, list(given.values()), remedy)
+    return (fx, fy), centre, distortion, lens
 
 
 def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float] | None:

@@ -88,15 +88,15 @@ class TransformsConfig(DataParserConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ColmapConfig(DataParserConfig):
-    """A COLMAP sparse model, binary or text, in `sparse/0`, `sparse` or the folder itself."""
+    """A COLMAP sparse model, binary or text: of those in `sparse/*`, `sparse` and the folder itself that of the most images."""
 
     images: str = "images"
     """Image folder. `images_N` holds images reduced by N: the model's cameras are then scaled to their size."""
 
     def recognises(self, data: Path) -> Recognised | None:
-        from .colmap import model_folder
+        from .colmap import model_folders
 
-        folder = model_folder(data)
+        folder = next(iter(model_folders(data)), None)
         return Recognised(0.5, f"a model in {folder}") if folder is not None else None
 
     def build(self) -> DataParser:
@@ -189,11 +189,11 @@ class PhotoTourismConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By the only *.tsv beside a model, or beside `dense` with a model."""
-        from .colmap import model_folder
+        from .colmap import model_folders
 
         tables = [path.name for path in data.glob("*.tsv")]
-        model = model_folder(data) or model_folder(data / "dense")
-        return Recognised(0.6, tables[0]) if len(tables) == 1 and model is not None else None
+        modelled = model_folders(data) or model_folders(data / "dense")
+        return Recognised(0.6, tables[0]) if len(tables) == 1 and modelled else None
 
     def build(self) -> DataParser:
         from .phototourism import PhotoTourismParser
@@ -208,8 +208,8 @@ class PolycamConfig(DataParserConfig):
     def recognises(self, data: Path) -> Recognised | None:
         from .polycam import keyframes
 
-        record = keyframes(data)
-        return Recognised(0.3, f"{record[1]}") if record is not None else None
+        folders = keyframes(data)
+        return Recognised(0.3, str(folders[0][1])) if folders else None
 
     def build(self) -> DataParser:
         from .polycam import PolycamParser

@@ -1,15 +1,18 @@
-"""Untrusted files of a scene folder: strict JSON and its records, paths that stay inside, NumPy arrays without pickle.
+"""Untrusted files of a scene folder: JSON and its records, paths that stay inside, NumPy arrays without pickle, PLY points.
 
 Whatever the bytes, the outcome is a value or a DataError of one line; nothing is allocated on a file's word alone.
 Links inside the folder are followed: only what a file *says* must stay inside.
 """
 
+import io
 import math
+import os
 import re
+import unicodedata
 import zipfile
 import zlib
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from typing import TypeAlias
 
 import numpy as np
@@ -39,27 +42,99 @@ def read_bytes(path: Path) -> bytes:
         raise DataError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
 
 
+_NOT_FINITE = re.compile(r'"(?:[^"\\]|\\.)*"|[+-]?\b(nan(?:\(\w*\))?|inf(?:inity)?|1\.#\w+)', re.IGNORECASE)
+"""Strings of JSON, which are left alone, and what C++ writes of numbers that are not finite: -nan(ind), inf, 1.#QNAN."""
+
+
 def read_json(path: Path) -> Json:
-    """The strict JSON value of a file (see `parse_json`)."""
+    """The JSON value of a file (see `parse_json`), numbers that are not finite included, however they are written."""
     data = read_bytes(path)
     try:
-        value: Json = parse_json(data.decode("utf-8-sig"))
+        text = data.decode("utf-8-sig")
+        try:
+            value: Json = parse_json(text, nan=True)
+        except ValueError:
+            value = parse_json(_NOT_FINITE.sub(lambda found: "NaN" if found[1] else found[0], text), nan=True)
     except ValueError as error:
         raise DataError(f"{path}: no valid JSON ({error}); write it again with the tool it came from") from error
     return value
 
 
-def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
-    """A path that a file gives relative to `root`: its normal form with slashes, and the whole path.
+def read_float(text: str) -> float:
+    """A number as text; NaN for what C++ writes of those that are not finite. Raises ValueError for anything else."""
+    return math.nan if _NOT_FINITE.fullmatch(text) else float(text)
 
-    Raises DataError for absolute paths, drive letters, `..`, empty and unprintable ones. `where` opens the message.
+
+_CONTROL = re.compile("[\0-\x08\n-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+"""Ends of lines, terminals' commands, and what UTF-8 cannot hold."""
+
+
+def path_inside(root: Path, where: str, text: str) -> tuple[str, Path]:
+    """A path that a file gives, relative to `root` or absolute: its normal form with slashes, and the whole path.
+
+    Raises DataError, opened by `where`, for paths that leave `root`, for none, and for control characters.
     """
-    name = text.replace("\\", "/")
-    parts = PurePosixPath(name).parts
-    outside = PurePosixPath(name).is_absolute() or PureWindowsPath(text).drive or ".." in parts
-    if outside or not parts or not name.isprintable():
-        raise DataError(f"{where}: the path {text!r} leaves {root} or is none; give paths inside, like images/0001.png")
-    return "/".join(parts), root.joinpath(*parts)
+    if control := _CONTROL.search(text):
+        raise DataError(f"{where}: the path {text!r} has the control character {control[0]!r} in it; rename the file")
+    # A backslash is Windows' slash, except where a file is called so.
+    name = text if "\\" in text and os.path.lexists(os.path.join(root, text)) else text.replace("\\", "/")
+    foreign = os.name != "nt" and PureWindowsPath(text).is_absolute()
+    for top in (os.path.abspath(root), os.path.realpath(root)):
+        whole = Path(os.path.normpath(os.path.join(top, name)))
+        if whole.is_relative_to(top) and not foreign:
+            parts = whole.relative_to(top).parts
+            if not parts:
+                raise DataError(f"{where}: the path {text!r} names no file; give one inside of {root}, like images/0001.png")
+            return "/".join(parts), root.joinpath(*parts)
+    raise DataError(f"{where}: the path {text!r} leaves {root}; give paths inside, like images/0001.png")
+
+
+class NamedFiles:
+    """Files inside a folder by the names that a capture gives them, which other systems may have spelt another way."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._listed: dict[Path, dict[str, str]] = {}
+
+    def find(self, where: str, text: str, suffixes: frozenset[str] = frozenset()) -> tuple[str, Path]:
+        """The path as `path_inside` gives it, and where no such file is, that of the one file whose name differs in case,
+        outer blanks or Unicode's normal form (macOS), or by one of `suffixes`, in lower case, that the path lacks.
+        """
+        name, path = path_inside(self.root, where, text)
+        if os.path.lexists(path):
+            return name, path
+        if path.parent not in self._listed:
+            listed: dict[str, str] = {}
+            names = os.listdir(path.parent) if path.parent.is_dir() else []
+            for entry in sorted(names, key=lambda entry: (not entry.lower().endswith(".png"), entry)):  # PNG before JPEG
+                whole, suffix = _spelling(entry), os.path.splitext(entry)[1]
+                # Two files of one spelling are told apart by nothing: neither is found.
+                listed[whole] = "" if whole in listed else entry
+                if suffix.lower() in suffixes:
+                    listed.setdefault(_spelling(entry[: -len(suffix)]), entry)
+            self._listed[path.parent] = listed
+        found = self._listed[path.parent].get(_spelling(path.name))
+        if not found:
+            return name, path
+        missing = os.path.splitext(found)[1] if _spelling(found) != _spelling(path.name) else ""
+        return name + missing, path.with_name(found)
+
+
+def _spelling(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold().strip()
+
+
+def read_ply_points(path: Path) -> NDArray[np.float64]:
+    """Positions [P 3] of the vertices of a PLY file, text or binary. Raises DataError."""
+    import trimesh
+
+    data = read_bytes(path)
+    try:
+        mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+        points = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+    except Exception as error:  # whatever trimesh makes of the bytes
+        raise DataError(f"{path}: no PLY file with points ({' '.join(str(error).split())[:100]}); write it again") from error
+    return points
 
 
 def name_of(data: Path) -> str:
@@ -74,7 +149,7 @@ def read_npy(where: str, data: bytes) -> NDArray[np.float64]:
         raise DataError(f"{where}: no NumPy array; write it again with numpy.save")
     start = 8 + length + int.from_bytes(data[8 : 8 + length], "little")
     header = _NPY_HEADER.fullmatch(data[8 + length : min(start, 8 + length + 4096)].decode("latin-1"))
-    if header is None or header[2] == "True":
+    if header is None:
         raise DataError(f"{where}: the array's header is not that of a plain numeric array; write it with numpy.save")
     dtype = np.dtype(header[1])
     plain = re.fullmatch(r"\((\d{1,18},|(\d{1,18}, ?)+(\d{1,18})?)?\)", header[3])
@@ -85,7 +160,8 @@ def read_npy(where: str, data: bytes) -> NDArray[np.float64]:
             f"{where}: the header says {header[3]} of {header[1]}, but {max(len(data) - start, 0)} bytes follow; "
             "copy the file again, it is damaged"
         )
-    return np.frombuffer(data, dtype=dtype, offset=start, count=count).reshape(shape).astype(np.float64)
+    numbers = np.frombuffer(data, dtype=dtype, offset=start, count=count)
+    return np.array(numbers.reshape(shape, order="F" if header[2] == "True" else "C"), dtype=np.float64, order="C")
 
 
 def read_npz(path: Path, key: str) -> NDArray[np.float64]:
@@ -125,13 +201,20 @@ class Record:
         return self.common.get(key) if value is None else value
 
     def number(self, key: str) -> float | None:
-        """A number, or None where it is absent."""
+        """A number, finite or not, or None where it is absent."""
         value = self.get(key)
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e300:
+        if (number := _number(value)) is None:
             raise DataError(f"{self.where}: {key} is {_short(value)}, not a number; correct it")
-        return float(value)
+        return number
+
+    def needed(self, key: str) -> float:
+        """A number that must be there."""
+        value = self.number(key)
+        if value is None:
+            raise DataError(f"{self.where}: {key} is missing; export the capture again")
+        return value
 
     def text(self, key: str) -> str | None:
         """A string, or None where it is absent."""
@@ -168,10 +251,17 @@ class Record:
         return [as_record(f"{self.where}: {key}[{k}]", item, self.own) for k, item in enumerate(value)]
 
 
+def _number(value: Json) -> float | None:
+    """A number of JSON as float64, finite or not; None for anything else, and beyond 1e300, where products overflow."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or 1e300 < abs(value) < math.inf:
+        return None
+    return float(value)
+
+
 def numbers_of(value: Json, count: int) -> list[float] | None:
-    """The numbers of a list of `count`; None for anything else."""
+    """The numbers, finite or not, of a list of `count`; None for anything else."""
     cells = value if isinstance(value, list) else []
-    numbers = [float(c) for c in cells if isinstance(c, int | float) and not isinstance(c, bool) and abs(c) < 1e300]
+    numbers = [number for number in map(_number, cells) if number is not None]
     return numbers if len(numbers) == len(cells) == count else None
 
 

@@ -15,7 +15,7 @@ from ..images import image_names
 from ..scene import Scene
 from .config import LlffConfig
 from .files import path_inside, read_bytes, read_npy
-from .views import View, assemble_scene, pixel_size, rigid_pose
+from .views import View, assemble_scene, pixel_size, read_views, rigid_pose
 
 
 class LlffParser(DataParser):
@@ -30,32 +30,36 @@ class LlffParser(DataParser):
         rows = read_npy(str(file), read_bytes(file))
         if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
             raise DataError(f"{file}: an array of shape {rows.shape}; LLFF has one row of 17 numbers an image")
-        if not np.isfinite(rows).all():
-            bad = int(np.flatnonzero(~np.isfinite(rows).all(1))[0])
-            raise DataError(f"{file}: row {bad} is not finite; run the reconstruction again")
         folder = _folder(data, self.config.images)
         names = image_names(folder)
         if len(names) != len(rows):
-            raise DataError(f"{folder}: {len(names)} images but {len(rows)} poses; remove the extra or re-run COLMAP")
-        views = []
-        for number, (name, row) in enumerate(zip(names, rows, strict=True)):
+            raise DataError(
+                f"{folder}: {len(names)} images, but poses_bounds.npy has {len(rows)} rows, one for each in the order of "
+                "names; restore the images that it was made of, or run LLFF's imgs2poses again"
+            )
+
+        def view(each: tuple[int, str]) -> View:
+            number, name = each
+            row = rows[number]
             height, width, focal = row[:15].reshape(3, 5)[:, 4]
             matrix = row[:15].reshape(3, 5)[:, :4]
             turned = np.stack([matrix[:, 1], -matrix[:, 0], matrix[:, 2], matrix[:, 3]], 1)
             where = f"{file}: row {number} ({name})"
             size = pixel_size(where, width, height)
-            views.append(
-                View(
-                    name=name,
-                    path=folder / name,
-                    pose=rigid_pose(where, turned),
-                    size=size,
-                    focal=(float(focal), float(focal)),
-                    centre=(size[0] / 2, size[1] / 2),
-                    depths=(float(row[15]), float(row[16])),
-                )
+            return View(
+                name=name,
+                path=folder / name,
+                pose=rigid_pose(where, turned),
+                size=size,
+                focal=(float(focal), float(focal)),
+                centre=(size[0] / 2, size[1] / 2),
+                depths=(float(row[15]), float(row[16])),
             )
-        return assemble_scene(data, views, downscale=downscale, reduced=True)
+
+        kept, notes = read_views(data, enumerate(names), view)
+        if names != sorted(names, key=lambda name: (len(name), name)) and all(Path(name).stem.isdecimal() for name in names):
+            notes.append(f"rows of poses_bounds.npy are taken in LLFF's order of names: {', '.join(names[:3])}, ...")
+        return assemble_scene(data, [each for _, each in kept], downscale=downscale, reduced=True, notes=notes)
 
 
 def _folder(data: Path, wanted: str) -> Path:

@@ -4,7 +4,6 @@ Metadata are tensors written by torch.save: `H W c2w intrinsics`. They are read 
 are OpenGL's, in world axes down, right, back; `coordinates.pt` tells how many metres their unit is.
 """
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,7 @@ from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
 from .config import MegaNerfConfig
-from .files import name_of
-from .views import View, assemble_scene, pixel_size, rigid_pose, split_by
+from .views import View, assemble_scene, image_size, pixel_size, read_views, rigid_pose, split_by
 
 _LARGEST = 1 << 24
 """Bytes of a file of metadata."""
@@ -32,22 +30,20 @@ class MegaNerfParser(DataParser):
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the delivered size; `val` is held out. Lengths are metres where the capture says."""
         unit = _unit(data)
-        views, held = [], []
+        files: list[tuple[Path, str]] = []
         for split in ("train", "val"):
             folder = data / split / "metadata"
-            files = sorted(folder.glob("*.pt"))
-            if split == "train" and not files:
+            files += [(file, split) for file in folder.glob("*.pt")]
+            if not files:
                 raise DataError(
                     f"{folder}: no *.pt files; name the folder of a scene, with train/metadata and train/rgbs in it"
                 )
-            views += [_view(file, data / split / "rgbs", unit) for file in files]
-            held += [split == "val"] * len(files)
-        order = sorted(range(len(views)), key=lambda k: views[k].name)
-        twice = [a for a, b in pairwise(order) if views[a].name == views[b].name]
-        if twice:
-            raise DataError(f"{name_of(data)}: {views[twice[0]].name} is in train and in val; remove it from one")
-        parts = split_by([held[k] for k in order])
-        return assemble_scene(data, [views[k] for k in order], downscale=downscale, split=parts, reduced=True)
+        kept, notes = read_views(
+            data, sorted(files, key=lambda each: each[0].stem), lambda each: _view(each[0], data / each[1] / "rgbs", unit)
+        )
+        parts = split_by([split == "val" for (_, split), _ in kept])
+        views = [view for _, view in kept]
+        return assemble_scene(data, views, downscale=downscale, split=parts, reduced=True, notes=notes)
 
 
 def _unit(data: Path) -> float:
@@ -86,18 +82,17 @@ def _first_line(error: Exception) -> str:
 
 def _view(file: Path, images: Path, unit: float) -> View:
     metadata = _load(file)
+    path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
+    width, height = image_size(images / f"{file.stem}.jpg" if path is None else path)
     try:
-        size = pixel_size(str(file), int(metadata["W"]), int(metadata["H"]))
-        pose = np.asarray(torch.as_tensor(metadata["c2w"]).double().numpy())
+        size = pixel_size(str(file), float(metadata.get("W", width)), float(metadata.get("H", height)))
+        pose = np.array(torch.as_tensor(metadata["c2w"]).double().numpy())
         fx, fy, cx, cy = (float(v) for v in torch.as_tensor(metadata["intrinsics"]).reshape(-1).tolist())
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        told = f"{file}: W, H, c2w [3 4] and intrinsics [4] are needed ({_first_line(error)}); copy the file again"
+        told = f"{file}: c2w [3 4] and intrinsics [4] are needed ({_first_line(error)}); copy the file again"
         raise DataError(told) from error
     if pose.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{file}: c2w is {pose.shape}, not 3x4 or 4x4; copy the file again")
-    pose = pose.copy()
     pose[:3, 3] *= unit
-    path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
-    if path is None:
-        raise DataError(f"{file}: no image {images / file.stem}.jpg beside it; copy the images there")
+    assert path is not None
     return View(name=file.stem, path=path, pose=rigid_pose(str(file), pose), size=size, focal=(fx, fy), centre=(cx, cy))

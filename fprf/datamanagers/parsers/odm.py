@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
-from ..images import read_header
 from ..scene import Scene
 from .config import OdmConfig
-from .files import Record, as_record, numbers_of, path_inside, read_json
-from .views import View, assemble_scene, check_images_exist, rigid_pose
+from .files import NamedFiles, Record, as_record, numbers_of, path_inside, read_json
+from .views import View, assemble_scene, image_size, lens_of, read_views, rigid_pose
 
 _RECONSTRUCTION, _SHOTS = "opensfm/reconstruction.json", "odm_report/shots.geojson"
-_RADIAL = {"perspective": OPENCV, "simple_radial": OPENCV, "radial": OPENCV, "brown": OPENCV}
-_LENSES = _RADIAL | {"fisheye": FISHEYE, "fisheye_opencv": FISHEYE}
+_LENSES = dict.fromkeys(("perspective", "simple_radial", "radial", "brown"), "OPENCV")
+_LENSES |= {"fisheye": "FISHEYE", "fisheye_opencv": "OPENCV_FISHEYE", "spherical": "EQUIRECTANGULAR"}
+"""COLMAP's names of OpenSfM's."""
 _FLIP = np.array([1.0, -1.0, -1.0])
 _TURN = 1e3
 """Largest angle of a rotation in radians that is taken for one."""
@@ -60,10 +59,10 @@ class OdmParser(DataParser):
             raise DataError(f"{data}: neither {_RECONSTRUCTION} nor {_SHOTS}; give the folder of an ODM project")
         shots, points = _reconstruction(file) if file.name == "reconstruction.json" else (_shots(data, file), None)
         folder = path_inside(data, "parser.images", self.config.images)[1]
-        named = sorted((*path_inside(folder, str(file), shot.name), shot) for shot in shots)
-        check_images_exist(folder, [path for _, path, _ in named])
-        views = [_view(str(file), name, path, shot) for name, path, shot in named]
-        return assemble_scene(data, views, downscale=downscale, points=points)
+        files = NamedFiles(folder)
+        named = sorted(((*files.find(str(file), shot.name), shot) for shot in shots), key=lambda each: each[0])
+        kept, notes = read_views(data, named, lambda each: _view(str(file), *each))
+        return assemble_scene(data, [view for _, view in kept], downscale=downscale, points=points, notes=notes)
 
 
 def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
@@ -101,39 +100,37 @@ def _shots(data: Path, file: Path) -> list[_Shot]:
             raise DataError(f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {_RECONSTRUCTION}")
         place = _vector(record, "translation")
         shots.append(_Shot(name, cameras[key], _turn(record), place))
-    if len({shot.name for shot in shots}) < len(shots):
-        raise DataError(f"{file}: an image occurs twice; remove one of its shots")
     return shots
 
 
 def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
-    header = read_header(path)
-    camera, longest = shot.camera, max(header.width, header.height)
+    width, height = image_size(path)
+    camera, longest = shot.camera, max(width, height)
     own = camera.number("width"), camera.number("height")
-    if None not in own and abs((own[0] or 0) * header.height - (own[1] or 0) * header.width) > 2 * longest:
-        raise DataError(f"{path}: {header.width}x{header.height} pixels is not the shape of its camera; restore the image")
+    if None not in own and abs((own[0] or 0) * height - (own[1] or 0) * width) > 2 * longest:
+        raise DataError(f"{path}: {width}x{height} pixels is not the shape of its camera; restore the image")
     kind = camera.text("projection_type") or "perspective"
     if kind not in _LENSES:
         raise DataError(f"{camera.where}: projection_type {kind!r} is not read; known are {', '.join(_LENSES)}")
-    k1, k2, k3, k4, p1, p2 = (camera.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k = [camera.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    distortion, lens = lens_of(camera.where, _LENSES[kind], k)
     fx, fy = (camera.number(key) or camera.number("focal") for key in ("focal_x", "focal_y"))
     if fx is None:
         raise DataError(f"{camera.where}: neither focal nor focal_x; run ODM again")
-    straight = kind in _RADIAL and not any((k1, k2, k3, k4, p1, p2))
     turned = np.concatenate([shot.turn.T * _FLIP, shot.place[:, None]], 1)
     return View(
         name=name,
         path=path,
         pose=rigid_pose(f"{where} ({name})", turned),
-        size=(header.width, header.height),
+        size=(width, height),
         focal=(fx * longest, (fx if fy is None else fy) * longest),
         # OpenSfM counts pixels from the middle of the first one, we from its corner: the half cancels.
         centre=(
-            header.width / 2 + (camera.number("c_x") or 0.0) * longest,
-            header.height / 2 + (camera.number("c_y") or 0.0) * longest,
+            width / 2 + (camera.number("c_x") or 0.0) * longest,
+            height / 2 + (camera.number("c_y") or 0.0) * longest,
         ),
-        distortion=(k1, k2, k3, k4, p1, p2),
-        lens=PINHOLE if straight else _LENSES[kind],
+        distortion=distortion,
+        lens=lens,
     )
 
 

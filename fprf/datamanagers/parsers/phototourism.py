@@ -13,7 +13,7 @@ import torch
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
-from .colmap import ColmapParser, model_folder
+from .colmap import ColmapParser, model_folders
 from .config import ColmapConfig, PhotoTourismConfig
 from .files import name_of
 from .views import index_tensor
@@ -28,7 +28,7 @@ class PhotoTourismParser(DataParser):
     def parse(self, data: Path, downscale: int) -> Scene:
         """The listed photographs. Raises DataError where the table names none of the model's."""
         table = self._table(data)
-        inner = data / "dense" if model_folder(data) is None and (data / "dense").is_dir() else data
+        inner = data / "dense" if not model_folders(data) and (data / "dense").is_dir() else data
         scene = ColmapParser(ColmapConfig()).parse(inner, downscale)
         roles = read_list(table)
         named = [roles.get(path.name) for path in scene.paths]

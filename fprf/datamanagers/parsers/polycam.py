@@ -1,8 +1,9 @@
 """Polycam's raw data (LiDAR captures, developer mode): `keyframes/` with images and a JSON file for each camera.
 
-`corrected_images` and `corrected_cameras`, which Polycam writes after its global optimisation, are used where they are; else
-`images` and `cameras`. `t_00` ... `t_23` are camera to world, three rows of four, in OpenGL axes (ARKit's: y is up in the
-world); `fx fy cx cy width height` are in pixels. The world frame is kept, in metres. An image without a camera is left out.
+`corrected_images` and `corrected_cameras`, which Polycam writes after its global optimisation, are used for each frame that
+both have; else `images` and `cameras`. `t_00` ... `t_23` are camera to world, three rows of four, in OpenGL axes (ARKit's: y is
+up in the world); `fx fy cx cy width height` are in pixels, and files without the last two belong to images as they are. The
+world frame is kept, in metres. An image without a camera is left out.
 """
 
 from pathlib import Path
@@ -11,22 +12,23 @@ import numpy as np
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ..images import image_names
+from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
 from .config import PolycamConfig
-from .files import Record, as_record, read_json
-from .views import View, assemble_scene, pixel_size, rigid_pose
+from .files import as_record, read_json
+from .views import View, assemble_scene, image_size, pixel_size, read_views, rigid_pose
 
 _PAIRS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 
 
-def keyframes(data: Path) -> tuple[Path, Path] | None:
-    """Folders of images and cameras in a scene folder, or None: either may be `keyframes` or hold it."""
+def keyframes(data: Path) -> list[tuple[Path, Path]]:
+    """Folders of images and cameras in a scene folder, corrected ones first: either may be `keyframes` or hold it."""
     for root in (data / "keyframes", data):
-        for images, cameras in _PAIRS:
-            if (root / images).is_dir() and (root / cameras).is_dir() and next((root / cameras).glob("*.json"), None):
-                return root / images, root / cameras
-    return None
+        pairs = [(root / images, root / cameras) for images, cameras in _PAIRS]
+        there = [(images, cameras) for images, cameras in pairs if images.is_dir() and next(cameras.glob("*.json"), None)]
+        if there:
+            return there
+    return []
 
 
 class PolycamParser(DataParser):
@@ -38,32 +40,35 @@ class PolycamParser(DataParser):
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of its images."""
         folders = keyframes(data)
-        if folders is None:
+        if not folders:
             raise DataError(f"{data}: no keyframes/images with keyframes/cameras/*.json; export raw data from Polycam")
-        images, cameras = folders
-        named = [(images / name, cameras / f"{Path(name).stem}.json") for name in image_names(images)]
-        views = [_view(image, file) for image, file in named if file.is_file()]
-        if not views:
+        frames: dict[str, tuple[Path, Path]] = {}
+        for images, cameras in folders:
+            known = {path.stem for path in cameras.glob("*.json")}
+            stems = [(path.stem, path) for path in images.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+            pairs = {stem: (path, cameras / f"{stem}.json") for stem, path in stems if stem in known}
+            frames = pairs | frames
+        if not frames:
+            images, cameras = folders[0]
             raise DataError(f"{cameras}: no file has the name of an image in {images}; export the raw data again")
-        return assemble_scene(data, views, downscale=downscale)
+        kept, notes = read_views(data, [frames[stem] for stem in sorted(frames)], _view)
+        corrected = sum(image.parent == folders[0][0] for (image, _), _ in kept)
+        if corrected < len(kept):
+            notes.append(f"{corrected} of {len(kept)} frames are in {folders[0][0].name}; the others are taken as recorded")
+        return assemble_scene(data, [view for _, view in kept], downscale=downscale, notes=notes)
 
 
-def _view(image: Path, file: Path) -> View:
-    record = as_record(file, read_json(file))
-    rows = [[_number(record, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-    width, height, fx, fy, cx, cy = (_number(record, key) for key in ("width", "height", "fx", "fy", "cx", "cy"))
+def _view(frame: tuple[Path, Path]) -> View:
+    image, file = frame
+    record, own = as_record(file, read_json(file)), image_size(image)
+    rows = [[record.needed(f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    fx, fy, cx, cy = (record.needed(key) for key in ("fx", "fy", "cx", "cy"))
+    width, height = record.number("width"), record.number("height")
     return View(
         name=image.name,
         path=image,
         pose=rigid_pose(str(file), np.array(rows)),
-        size=pixel_size(str(file), width, height),
+        size=pixel_size(str(file), own[0] if width is None else width, own[1] if height is None else height),
         focal=(fx, fy),
         centre=(cx, cy),
     )
-
-
-def _number(record: Record, key: str) -> float:
-    value = record.number(key)
-    if value is None:
-        raise DataError(f"{record.where}: {key} is missing; export the raw data again")
-    return value

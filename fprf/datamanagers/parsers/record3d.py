@@ -2,7 +2,7 @@
 
 Images are numbered. `poses` has a row for each: a quaternion x y z w and the position, camera to world in OpenGL axes, metres.
 `perFrameIntrinsicCoeffs` has fx fy cx cy for each image; without it `K` holds for all, its 3x3 matrix column after column.
-Both are in pixels of the images, which are `w` by `h`.
+Both are in pixels of the images, which are `w` by `h`, or as they are where the file says nothing.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from ..images import image_names
 from ..scene import Scene
 from .config import Record3DConfig
 from .files import Record, as_record, numbers_of, read_json, table_of
-from .views import View, assemble_scene, pixel_size, quaternion_rotation, rigid_pose
+from .views import View, assemble_scene, image_size, pixel_size, quaternion_rotation, read_views, rigid_pose
 
 _Rows: TypeAlias = NDArray[np.float64]
 _PAIRS = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata", "rgb"), ("metadata.json", "rgbd"))
@@ -44,30 +44,34 @@ class Record3DParser(DataParser):
         record = as_record(file, read_json(file))
         poses = _table(record, "poses", 7)
         numbered = sorted((int(Path(name).stem), name) for name in image_names(folder) if _numbered(name))
-        if not numbered or numbered[-1][0] >= len(poses):
+        posed = [each for each in numbered if each[0] < len(poses)]
+        if not posed:
             last = numbered[-1][1] if numbered else "nothing numbered"
             raise DataError(f"{folder}: {last}, but {file.name} has {len(poses)} poses, from 0 on; export the recording again")
-        if len(poses) > 1 and not np.ptp(poses, axis=0).any():
+        if len(poses) > 1 and not np.nan_to_num(np.ptp(poses, axis=0), nan=1.0).any():
             raise DataError(f"{file}: all poses are one (front cameras have none); find poses with `fprf process {folder}`")
-        size = pixel_size(str(file), record.number("w") or 0.0, record.number("h") or 0.0)
+        width, height = record.number("w"), record.number("h")
         lenses = _lenses(record, len(poses))
-        even = np.linspace(0, len(numbered) - 1, min(len(numbered), self.config.frames)).round().astype(int)
-        views = []
-        for number, name in (numbered[k] for k in even):
+        even = np.linspace(0, len(posed) - 1, min(len(posed), self.config.frames)).round().astype(int)
+
+        def view(each: tuple[int, str]) -> View:
+            number, name = each
             fx, fy, cx, cy = lenses[number].tolist()
-            where, row = f"{file}: poses[{number}]", poses[number]
+            where, row, own = f"{file}: poses[{number}]", poses[number], image_size(folder / name)
             turn = quaternion_rotation(where, row[[3, 0, 1, 2]])
-            views.append(
-                View(
-                    name=name,
-                    path=folder / name,
-                    pose=rigid_pose(where, np.concatenate([turn, row[4:, None]], 1)),
-                    size=size,
-                    focal=(fx, fy),
-                    centre=(cx, cy),
-                )
+            return View(
+                name=name,
+                path=folder / name,
+                pose=rigid_pose(where, np.concatenate([turn, row[4:, None]], 1)),
+                size=pixel_size(str(file), own[0] if width is None else width, own[1] if height is None else height),
+                focal=(fx, fy),
+                centre=(cx, cy),
             )
-        return assemble_scene(data, views, downscale=downscale)
+
+        kept, notes = read_views(data, [posed[k] for k in even], view)
+        if len(posed) < len(numbered):
+            notes.append(f"{len(numbered) - len(posed)} of {len(numbered)} images have no pose and are left out")
+        return assemble_scene(data, [each for _, each in kept], downscale=downscale, notes=notes)
 
 
 def _numbered(name: str) -> bool:
@@ -79,7 +83,7 @@ def _lenses(record: Record, count: int) -> _Rows:
     """fx fy cx cy of each image."""
     if record.get("perFrameIntrinsicCoeffs") is not None:
         rows = _table(record, "perFrameIntrinsicCoeffs", 4)
-        if len(rows) == count:
+        if len(rows) >= count:
             return rows
     numbers = numbers_of(record.get("K"), 9)
     if numbers is None:

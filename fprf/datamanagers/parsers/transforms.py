@@ -3,11 +3,11 @@
 Poses are camera-to-world in OpenGL axes and are kept as they are (an `applied_transform` is not undone). Intrinsics
 (`fl_x fl_y cx cy w h`, else `camera_angle_x`; `k1 k2 k3 k4 p1 p2`; `camera_model`; `near`, `far`) stand once or by frame.
 `mask_path` names an image's mask (black pixels are left out), `sky_mask_path` one of its sky (white).
-`points.npz` beside the file holds sparse points in the same frame; so does a COLMAP model in `sparse/0` that it was made of.
+`points.npz` beside the file or the PLY file that `ply_file_path` names hold sparse points in the same frame; so does the
+COLMAP model, in `sparse/0` or elsewhere, that it was made of.
 """
 
 import math
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,24 +17,17 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...interfaces import DataParser
-from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
-from ..images import read_header
+from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
-from .colmap import cloud_of_model, read_cloud
+from .colmap import cloud_of_model, largest_model, read_cloud, read_points_file
 from .config import TransformsConfig
-from .files import Record, as_record, path_inside, read_json
-from .views import View, assemble_scene, check_images_exist, index_tensor, pixel_size, rigid_pose
+from .files import NamedFiles, Record, as_record, path_inside, read_json
+from .views import View, assemble_scene, image_size, index_tensor, lens_of, pixel_size, read_views, rigid_pose
 
-_LENSES = {
-    "PINHOLE": PINHOLE,
-    "SIMPLE_PINHOLE": PINHOLE,
-    "OPENCV": OPENCV,
-    "SIMPLE_RADIAL": OPENCV,
-    "RADIAL": OPENCV,
-    "OPENCV_FISHEYE": FISHEYE,
-}
-_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Tried in this order for Blender's paths, which have none."""
+_LENSES = frozenset(
+    {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "EQUIRECTANGULAR"}
+    | {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+)
 
 
 class _Entry(NamedTuple):
@@ -45,8 +38,6 @@ class _Entry(NamedTuple):
     path: Path
     role: str
     """train, test, or nothing: then the file's lists or the rule decide."""
-    data: Path
-    """Folder that paths are relative to."""
 
 
 class TransformsParser(DataParser):
@@ -59,17 +50,20 @@ class TransformsParser(DataParser):
         """The scene at 1/downscale of the size that the file's intrinsics belong to."""
         files = self._files(data)
         tops = [as_record(file, read_json(file)) for file, _ in files]
-        entries = []
+        entries, inside = [], NamedFiles(data)
         for top, (_, role) in zip(tops, files, strict=True):
-            entries += [_entry(data, record, role) for record in top.records("frames")]
+            entries += [_entry(inside, record, role) for record in top.records("frames")]
         entries.sort(key=lambda entry: entry.name)
-        for first, second in pairwise(entries):
-            if first.name == second.name:
-                raise DataError(f"{second.record.where}: the image {second.name} occurs twice; remove one of the frames")
-        check_images_exist(data, [entry.path for entry in entries])
-        views = [_view(entry) for entry in entries]
-        points, seen = _cloud(data, views)
-        return assemble_scene(data, views, downscale=downscale, split=_split(data, tops, entries), points=points, seen=seen)
+        # A frame that is written twice over says nothing new; where the two differ `read_views` refuses them.
+        same = [k > 0 and entries[k - 1].record.own == entry.record.own for k, entry in enumerate(entries)]
+        once = [entry for entry, again in zip(entries, same, strict=True) if not again]
+        kept, notes = read_views(data, once, lambda entry: _view(entry, inside))
+        if any(same):
+            notes.append(f"frames that are written twice are read once: {sum(same)}")
+        points, seen, said = _cloud(inside, tops[0], once, [view for _, view in kept])
+        left, views = [entry for entry, _ in kept], [view for _, view in kept]
+        split = _split(inside, tops, once, left)
+        return assemble_scene(data, views, downscale=downscale, split=split, points=points, seen=seen, notes=notes + said)
 
     def _files(self, data: Path) -> list[tuple[Path, str]]:
         if self.config.file:
@@ -86,33 +80,43 @@ class TransformsParser(DataParser):
         raise DataError(f"{data}: neither transforms.json nor transforms_train.json; name the file with parser.file")
 
 
-def _cloud(data: Path, views: list[View]) -> tuple[NDArray[np.float64] | None, NDArray[np.int64] | None]:
-    """Sparse points, and which views see them: of points.npz, or of the COLMAP model that the transforms came from."""
-    cloud, model = data / "points.npz", data / "sparse" / "0"
-    points, seen = read_cloud(cloud, len(views)) if cloud.is_file() else (None, None)
-    if seen is None and ((model / "cameras.bin").is_file() or (model / "cameras.txt").is_file()):
+def _cloud(
+    inside: NamedFiles, top: Record, entries: list[_Entry], views: list[View]
+) -> tuple[NDArray[np.float64] | None, NDArray[np.int64] | None, list[str]]:
+    """Sparse points, which views see them, and notes.
+
+    The points are those of points.npz, of `ply_file_path`, or of the COLMAP model that the transforms came from.
+    """
+    cloud, ply = inside.root / "points.npz", top.text("ply_file_path")
+    points, seen = read_cloud(cloud, len(entries)) if cloud.is_file() else (None, None)
+    notes: list[str] = []
+    if seen is not None and len(views) < len(entries):
+        # Pairs count the frames, some of which may be left out.
+        place = {view.name: k for k, view in enumerate(views)}
+        row = np.array([place.get(entry.name, -1) for entry in entries])
+        seen = np.stack([row[seen[:, 0]], seen[:, 1]], 1)
+        seen = seen[seen[:, 0] >= 0]
+    if points is None and ply:
+        points, notes = read_points_file(inside.find(f"{top.where}: ply_file_path", ply)[1])
+    model = largest_model(inside.root)[0]
+    if seen is None and model is not None:
         sparse = cloud_of_model(model, [view.name for view in views], [view.pose for view in views])
-        return (points, None) if sparse is None else sparse
-    return points, seen
+        return (points, None, notes) if sparse is None else (*sparse, [])
+    return points, seen, notes
 
 
-def _entry(data: Path, record: Record, role: str) -> _Entry:
+def _entry(inside: NamedFiles, record: Record, role: str) -> _Entry:
     text = record.text("file_path")
     if text is None:
         raise DataError(f"{record.where}: file_path is missing; each frame names its image")
-    name, path = path_inside(data, record.where, text)
-    if not path.is_file():
-        for suffix in _SUFFIXES:
-            if path.with_name(path.name + suffix).is_file():
-                return _Entry(record, name + suffix, path.with_name(path.name + suffix), role, data)
-    return _Entry(record, name, path, role, data)
+    return _Entry(record, *inside.find(record.where, text, IMAGE_SUFFIXES), role)
 
 
-def _view(entry: _Entry) -> View:
+def _view(entry: _Entry, inside: NamedFiles) -> View:
     record = entry.record
-    header = read_header(entry.path)
+    own = image_size(entry.path)
     width, height = record.number("w"), record.number("h")
-    size = pixel_size(record.where, header.width if width is None else width, header.height if height is None else height)
+    size = pixel_size(record.where, own[0] if width is None else width, own[1] if height is None else height)
     near, far = record.number("near"), record.number("far")
     cx, cy = record.number("cx"), record.number("cy")
     distortion, lens = _lens(record)
@@ -126,16 +130,15 @@ def _view(entry: _Entry) -> View:
         distortion=distortion,
         lens=lens,
         depths=None if near is None or far is None else (near, far),
-        mask=_named(entry, "mask_path"),
-        sky_mask=_named(entry, "sky_mask_path"),
+        mask=_named(entry, inside, "mask_path"),
+        sky_mask=_named(entry, inside, "sky_mask_path"),
     )
 
 
-def _named(entry: _Entry, key: str) -> Path | None:
-    text = entry.record.own.get(key)
-    if text is None:
+def _named(entry: _Entry, inside: NamedFiles, key: str) -> Path | None:
+    if entry.record.own.get(key) is None:
         return None
-    return path_inside(entry.data, entry.record.where, entry.record.text(key) or "")[1]
+    return inside.find(entry.record.where, entry.record.text(key) or "")[1]
 
 
 def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
@@ -143,6 +146,8 @@ def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
         focal, angle = record.number(key), record.number(angle_key)
         if focal is not None or angle is None:
             return focal
+        if math.isnan(angle):
+            return angle
         if not 0 < angle < math.pi:
             raise DataError(f"{record.where}: {angle_key} is {angle}; it must lie between 0 and pi")
         return pixels / 2 / math.tan(angle / 2)
@@ -155,25 +160,22 @@ def _focal(record: Record, size: tuple[int, int]) -> tuple[float, float]:
 
 
 def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, float], int]:
-    k1, k2, k3, k4, p1, p2 = (record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k = [record.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    others = [record.number(key) or 0.0 for key in ("k5", "k6")]
     model = record.text("camera_model")
     if model is None:
         model = "OPENCV_FISHEYE" if record.get("is_fisheye") is True else "OPENCV"
     if model not in _LENSES:
-        raise DataError(f"{record.where}: camera_model {model!r} is not supported; undistort to one of {list(_LENSES)}")
-    lens = _LENSES[model]
-    if lens == FISHEYE and (p1 or p2):
-        raise DataError(f"{record.where}: a fisheye with tangential p1, p2 is not supported; undistort the images")
-    distorted = any((k1, k2, k3, k4, p1, p2))
-    if lens == PINHOLE and distorted:
-        raise DataError(f"{record.where}: camera_model {model} with distortion k or p; use OPENCV or remove them")
-    return (k1, k2, k3, k4, p1, p2), OPENCV if lens == OPENCV and distorted else FISHEYE if lens == FISHEYE else PINHOLE
+        raise DataError(f"{record.where}: camera_model {model!r} is not supported; undistort to one of {sorted(_LENSES)}")
+    if model == "FULL_OPENCV":  # whose k4 is a denominator's; nerfstudio's OPENCV has a polynomial of four
+        k[3], others = 0.0, [k[3], *others]
+    return lens_of(record.where, model, k, others)
 
 
-def _split(data: Path, tops: list[Record], entries: list[_Entry]) -> tuple[Tensor, Tensor] | None:
-    """Blender's two files, or the lists of file names of the one; None: the rule decides."""
+def _split(inside: NamedFiles, tops: list[Record], entries: list[_Entry], kept: list[_Entry]) -> tuple[Tensor, Tensor] | None:
+    """Blender's two files, or the lists of file names of the one, among those kept; None: the rule decides."""
     if len(tops) > 1:
-        return index_tensor([e.role == "train" for e in entries]), index_tensor([e.role == "test" for e in entries])
+        return index_tensor([e.role == "train" for e in kept]), index_tensor([e.role == "test" for e in kept])
     top = tops[0]
     train, test = top.texts("train_filenames"), top.texts("test_filenames")
     if train is None and test is None:
@@ -181,7 +183,7 @@ def _split(data: Path, tops: list[Record], entries: list[_Entry]) -> tuple[Tenso
     names = {entry.name for entry in entries}
     listed = []
     for key, texts in (("train_filenames", train), ("test_filenames", test)):
-        members = {path_inside(data, f"{top.where}: {key}", text)[0] for text in texts or ()}
+        members = {inside.find(f"{top.where}: {key}", text, IMAGE_SUFFIXES)[0] for text in texts or ()}
         if not members <= names:
             raise DataError(f"{top.where}: {key} has {min(members - names)!r}, which no frame is; remove it there")
         listed.append(members)
@@ -190,4 +192,4 @@ def _split(data: Path, tops: list[Record], entries: list[_Entry]) -> tuple[Tenso
         raise DataError(f"{top.where}: {min(both)!r} is in train_filenames and in test_filenames; remove it from one")
     learned = names - listed[1] if train is None else listed[0]
     held = names - listed[0] - set(top.texts("val_filenames") or ()) if test is None else listed[1]
-    return index_tensor([e.name in learned for e in entries]), index_tensor([e.name in held for e in entries])
+    return index_tensor([e.name in learned for e in kept]), index_tensor([e.name in held for e in kept])

@@ -7,9 +7,10 @@ used whole; a folder in which no mask carries an image's name is none.
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from ...errors import DataError
 from ...rendering.cameras import Cameras
+from ...rendering.lens import FISHEYE, OPENCV, PINHOLE
 from ...rendering.splines import rotations
 from ..images import read_header
 from ..scene import Scene
@@ -93,18 +95,83 @@ class View:
     sky_mask: Path | None = None
 
 
-def check_images_exist(root: Path, paths: Sequence[Path]) -> None:
-    """Raise DataError unless every image is there, naming the first and how many are missing."""
-    missing = [path for path in paths if not os.path.isfile(path)]
-    if missing:
+class UnusableView(DataError):
+    """A view that is left out, because its image is missing or its numbers are not finite; the others are read."""
+
+    def __init__(self, where: str, reason: str) -> None:
+        self.where, self.reason = where, reason
+        super().__init__(f"{where}: {reason}; restore it or run the reconstruction again")
+
+
+Entry = TypeVar("Entry")
+
+
+def read_views(
+    data: Path, entries: Iterable[Entry], view: Callable[[Entry], View]
+) -> tuple[list[tuple[Entry, View]], list[str]]:
+    """What a capture says of each image with its view, and notes on what is left out (see `UnusableView`).
+
+    Raises DataError where nothing is left and where an image occurs twice.
+    """
+    views: dict[str, tuple[Entry, View]] = {}
+    lost: dict[str, list[str]] = {}
+    for entry in entries:
+        try:
+            one = view(entry)
+            if not one.path.is_file():
+                raise UnusableView(str(one.path), _MISSING)
+            _check_camera(one)
+        except UnusableView as fault:
+            lost.setdefault(fault.reason, []).append(fault.where)
+            continue
+        if one.name in views:
+            raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
+        views[one.name] = (entry, one)
+    count = len(views) + sum(map(len, lost.values()))
+    notes = [f"{len(each)} of {count} images are left out: {each[0]}: {reason}" for reason, each in lost.items()]
+    if not views:
+        raise DataError(f"{data}: no view is left: {'; '.join(notes)}; restore them or run the reconstruction again")
+    return list(views.values()), notes
+
+
+_MISSING = "the image is missing"
+_NOT_FINITE = "numbers of its camera are not finite"
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image. Raises UnusableView where there is none, DataError where it cannot be read."""
+    if not path.is_file():
+        raise UnusableView(str(path), _MISSING)
+    header = read_header(path)
+    return header.width, header.height
+
+
+def lens_of(
+    where: str, model: str, distortion: Sequence[float], others: Sequence[float] = (), remedy: str = "undistort the images"
+) -> tuple[tuple[float, float, float, float, float, float], int]:
+    """Distortion k1 k2 k3 k4 p1 p2 and lens of a camera model by COLMAP's name, whose `others` are its remaining parameters.
+
+    A polynomial without terms is a pinhole. Raises DataError, opened by `where`, for what the lenses cannot represent.
+    """
+    if not np.isfinite([*distortion, *others]).all():
+        raise UnusableView(where, _NOT_FINITE)
+    k1, k2, k3, k4, p1, p2 = distortion
+    if model == "EQUIRECTANGULAR":
         raise DataError(
-            f"{root}: {len(missing)} of {len(paths)} images are missing, the first is {missing[0]}; "
-            "copy them there or remove their entries"
+            f"{where}: a panorama ({model}), which `colmap image_undistorter` cannot undistort either; cut the images "
+            "into pinhole views, for example with COLMAP's panorama_sfm.py or `ns-process-data images --camera-type equirectangular`"
         )
+    fisheye = "FISHEYE" in model
+    if any(others) or (fisheye and (p1 or p2)) or (model.endswith("PINHOLE") and any(distortion)):
+        known = "no terms" if model.endswith("PINHOLE") else "k1 k2 k3 k4" if fisheye else "k1 k2 k3 k4 p1 p2 in a polynomial"
+        raise DataError(f"{where}: the lens {model} has more terms than are represented ({known}); {remedy}")
+    return (k1, k2, k3, k4, p1, p2), FISHEYE if fisheye else OPENCV if any(distortion) else PINHOLE
 
 
 def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
     """Width and height as whole numbers. Raises DataError, opened by `where`, unless both lie in 1 to 1e6."""
+    if not math.isfinite(width + height):
+        raise UnusableView(where, _NOT_FINITE)
     size = round(float(width)), round(float(height))
     if min(size) < 1 or max(size) > 10**6:
         raise DataError(f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again")
@@ -114,6 +181,8 @@ def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
 def quaternion_rotation(where: str, quaternion: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
     """The rotation [3 3] of a quaternion w x y z. Raises DataError, opened by `where`, unless its length is about 1."""
     length = math.hypot(*quaternion)
+    if not math.isfinite(length):
+        raise UnusableView(where, _NOT_FINITE)
     if not 0.9 < length < 1.1:
         raise DataError(f"{where}: a quaternion of length {length:.3g} is no rotation; export the capture again")
     return rotations(torch.tensor(quaternion, dtype=torch.float64)[None])[0].numpy()
@@ -124,10 +193,12 @@ def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Raises DataError, opened by `where`, for anything that is not a rotation and a finite position within 1e-3.
     """
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise DataError(f"{where}: the pose is no finite 3x4 or 4x4 matrix; run the reconstruction again")
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise DataError(f"{where}: the pose has the shape {matrix.shape}, not 3x4 or 4x4; run the reconstruction again")
+    if not np.isfinite(matrix).all():
+        raise UnusableView(where, _NOT_FINITE)
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
-        raise DataError(f"{where}: the pose's last row is {matrix[3].tolist()}, not 0 0 0 1; run the reconstruction again")
+        raise DataError(f"{where}: the pose's last row is {matrix[3].tolist()}; write 0 0 0 1, or leave that row out")
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
@@ -149,18 +220,17 @@ def assemble_scene(
     points: NDArray[np.float64] | None = None,
     seen: NDArray[np.int64] | None = None,
     reduced: bool = False,
+    notes: Sequence[str] = (),
 ) -> Scene:
     """The scene of at least one view, in the given order; without a split every 8th view is held out.
 
     The files' headers are read: their size must be the camera's, unless `reduced` says that the image folder holds
     smaller copies of the same shape, which the cameras are then scaled to.
     """
-    check_images_exist(data, [view.path for view in views])
     alpha = False
     sizes = []
     for view in views:
         header = read_header(view.path)
-        _check_lens(view)
         _check_size(view, (header.width, header.height), reduced)
         alpha |= header.alpha
         sizes.append((header.width, header.height))
@@ -186,6 +256,7 @@ def assemble_scene(
         masks=_masks(data, views, [view.mask for view in views], MASKS),
         sky_masks=_masks(data, views, [view.sky_mask for view in views], SKY_MASKS),
         alpha=alpha,
+        notes=tuple(notes),
     )
 
 
@@ -193,7 +264,9 @@ def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], fold
     """Those that the capture names, or where it names none, those that lie beside the images."""
     if not any(named):
         return find_masks(data, [view.path for view in views], folder)
-    check_images_exist(data, [path for path in named if path is not None])
+    missing = [path for path in named if path is not None and not os.path.isfile(path)]
+    if missing:
+        raise DataError(f"{data}: {len(missing)} masks are missing, the first is {missing[0]}; copy them there or unname them")
     return tuple(named)
 
 
@@ -207,13 +280,15 @@ def _check_size(view: View, file: tuple[int, int], reduced: bool) -> None:
         )
 
 
-def _check_lens(view: View) -> None:
+def _check_camera(view: View) -> None:
     numbers = (*view.focal, *view.centre, *view.distortion)
-    if not np.isfinite(numbers).all() or max(map(abs, numbers)) > 1e9:
-        raise DataError(f"{view.path}: the camera's numbers {numbers} are not all finite and sane; calibrate again")
+    if not np.isfinite((*numbers, *(view.depths or ()))).all():
+        raise UnusableView(str(view.path), _NOT_FINITE)
+    if max(map(abs, numbers)) > 1e9:
+        raise DataError(f"{view.path}: the camera's numbers {numbers} go beyond 1e9; calibrate again")
     if min(view.focal) <= 0:
         raise DataError(f"{view.path}: the focal length is {min(view.focal)}, it must be above 0; calibrate again")
-    if view.depths is not None and not 0 < view.depths[0] < view.depths[1] < np.inf:
+    if view.depths is not None and not 0 < view.depths[0] < view.depths[1]:
         raise DataError(
             f"{view.path}: nearest and farthest depth are {view.depths[0]} and {view.depths[1]}, "
             "0 < near < far is needed; remove or correct them"
