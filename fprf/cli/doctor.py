@@ -206,8 +206,9 @@ def _version(package: str) -> str:
 
 
 def scene_folder(data: Path) -> Iterator[Finding]:
-    """Format, views, sizes and splits of a scene. Raises DataError where it cannot be parsed."""
+    """Format, views, sizes, splits and content of a scene. Raises DataError where it cannot be parsed."""
     from ..datamanagers.parsers.config import DataParserConfig, recognise
+    from .doctor_scene import inspect_scene
 
     parser = recognise(data)
     yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
@@ -217,11 +218,9 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})
     yield Finding("views", f"{len(scene.paths)} of {shown} pixels, {' and '.join(lenses)} lens")
     yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
-    absent = [path for path in scene.paths if not path.is_file()]
-    if absent:
-        yield Finding("images", f"{len(absent)} are absent, the first is {absent[0]}", "restore them, or remove their poses")
-    points = 0 if scene.points is None else len(scene.points)
-    yield Finding("points", f"{points} of the reconstruction" if points else "none; bounds come from the cameras")
+    for note in scene.notes:
+        yield Finding("note", note)
+    yield from inspect_scene(scene)
     yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
 
 

@@ -159,7 +159,7 @@ def lens_of(
     if model == "EQUIRECTANGULAR":
         raise DataError(
             f"{where}: a panorama ({model}), which `colmap image_undistorter` cannot undistort either; cut the images "
-            "into pinhole views, for example with COLMAP's panorama_sfm.py or `ns-process-data images --camera-type equirectangular`"
+            "into pinhole views, as COLMAP's panorama_sfm.py and `ns-process-data images --camera-type equirectangular` do"
         )
     fisheye = "FISHEYE" in model
     if any(others) or (fisheye and (p1 or p2)) or (model.endswith("PINHOLE") and any(distortion)):

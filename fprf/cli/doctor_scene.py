@@ -1,0 +1,228 @@
+"""What `fprf doctor` finds in a parsed scene that its training would not say: each finding with what is decided.
+
+At most LOOKED views, evenly through the scene, have their files opened and their pixels looked at.
+"""
+
+import hashlib
+import io
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image as Pillow
+from PIL import ImageCms
+from torch import Tensor
+
+from ..datamanagers.images import Image, load_images, load_mask
+from ..datamanagers.scene import Scene, exposures_differ, find_sightings, sparser, with_exposure
+from ..errors import DataError
+from .doctor import Finding
+
+LOOKED = 48
+"""Views whose files are opened."""
+_SIDE = 960
+"""Longest side in pixels at which images are looked at."""
+_BLURRED = 0.25
+"""Share of the sharpness of the frames around it below which a photograph counts as blurred."""
+_AROUND = 3
+"""Frames on each side that a photograph's sharpness is compared with."""
+_FEW_POINTS = 100
+"""Points below which the first Gaussians are not placed at them."""
+_ROUNDING = 1e-5
+"""Share of the cameras' extent below which steps of float32 do not matter."""
+_TAIL = 1 << 16
+"""Bytes by which files of equal size are compared first."""
+_ORIENTATION = 0x0112
+
+
+def inspect_scene(scene: Scene) -> Iterator[Finding]:
+    """Coordinates, points, masks, files, duplicates, exposure and blur of a scene, one line each where there is one to say."""
+    count = len(scene.paths)
+    looked = np.unique(np.linspace(0, count - 1, min(count, LOOKED)).round().astype(int)).tolist()
+    if len(looked) < count:
+        yield Finding("sample", f"masks, profiles, exposure and blur are looked at in {len(looked)} of {count} views")
+    yield from _coordinates(scene.cameras.pose[:, :, 3])
+    yield _points(scene)
+    for name, masks in (("masks", scene.masks), ("sky masks", scene.sky_masks)):
+        if masks:
+            yield from _masks(name, [(masks[view], scene.cameras.size[view].tolist()) for view in looked])
+    yield from _metadata([scene.paths[view] for view in looked])
+    yield from _duplicates(scene)
+    # One reading of the pixels serves both, at a size at which blur is seen and thousands of points are found.
+    scale = max(1.0, float(scene.cameras.size.max()) / _SIDE)
+    reduced = replace(scene, cameras=scene.cameras.scaled(scale)) if scale > 1 else scene
+    pixels, broken = _pixels(reduced, looked)
+    if broken:
+        more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+        yield Finding("images", f"{broken[0]}{more}", "replace them, or remove their poses")
+    yield from _exposure(reduced, pixels)
+    yield from _blurred(scene, pixels)
+
+
+def _coordinates(position: Tensor) -> Iterator[Finding]:
+    """Positions at which float32 is too coarse for the extent of the cameras."""
+    low, high = position.amin(0), position.amax(0)
+    extent, largest = float((high - low).max()), float(position.abs().max())
+    step = float(np.spacing(np.float32(largest)))
+    if extent > 0 and step > _ROUNDING * extent:
+        centre = ", ".join(f"{float(x):.9g}" for x in (low + high) / 2)
+        found = f"centre at ({centre}), where float32 has steps of {step:.2g}, cameras span {extent:.3g}"
+        yield Finding("coordinates", f"{found}: trained about a local origin")
+
+
+def _points(scene: Scene) -> Finding:
+    """How many of the reconstruction's points there are, and whether training views see them."""
+    count = 0 if scene.points is None else len(scene.points)
+    if not count:
+        return Finding("points", "none; bounds come from the cameras, first Gaussians from matches between views")
+    sightings = find_sightings(sparser(scene))
+    seeing = 0 if sightings is None else len(sightings.view.unique())
+    found = f"{count} of the reconstruction, in view of {seeing} of {len(scene.train)} training views"
+    if not seeing:
+        return Finding("points", found, "remove them, or give those of this scene: they lie elsewhere or behind", optional=True)
+    few = "; too few to begin with: first Gaussians come from matches between views" if count < _FEW_POINTS else ""
+    return Finding("points", found + few)
+
+
+def _masks(name: str, masks: Sequence[tuple[Path | None, list[int]]]) -> Iterator[Finding]:
+    """The share of the pixels that masks keep, and masks that say nothing."""
+    shares = []
+    for path, (width, height) in masks:
+        try:
+            shares += [] if path is None else [float(load_mask(path, (width, height)).mean())]
+        except DataError as fault:
+            yield Finding(name, str(fault), "restore it, or remove it")
+            return
+    if not shares:
+        return
+    sky = name != "masks"
+    found = f"white is {100 * np.mean(shares):.0f} % of the pixels of {len(shares)} views"
+    black, white = sum(share == 0 for share in shares), sum(share == 1 for share in shares)
+    if black == len(shares) and not sky:
+        yield Finding(name, f"{found}: nothing is left to learn from", "invert them: white is used, black is left out")
+    elif white == len(shares) or black == len(shares):
+        what = "all is sky" if white else "no sky" if sky else "they leave nothing out"
+        yield Finding(
+            name, f"{found}: {what}", "remove them, or write them again: do their pixels hold what was meant?", optional=True
+        )
+    else:
+        empty = f"; {black} leave nothing of their view" if black and not sky else ""
+        yield Finding(name, f"{found}, which is {'sky' if sky else 'used'}{empty}")
+
+
+def _metadata(paths: Sequence[Path]) -> Iterator[Finding]:
+    """Colour profiles other than sRGB, and orientations."""
+    profiles: Counter[str] = Counter()
+    turned = 0
+    for path in paths:
+        try:
+            with Pillow.open(path) as image:
+                icc, orientation = image.info.get("icc_profile"), image.getexif().get(_ORIENTATION, 1)
+        except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError):
+            continue  # what cannot be read is said where its pixels are
+        turned += orientation not in (0, 1)
+        if icc and "srgb" not in (profile := _profile(icc)).lower():
+            profiles[profile] += 1
+    if profiles:
+        named = ", ".join(f"{name} ({count})" for name, count in profiles.most_common())
+        yield Finding("profiles", f"{named} of {len(paths)} images: converted to sRGB")
+    if turned:
+        yield Finding(
+            "orientation", f"{turned} of {len(paths)} images are marked as turned: pixels are taken as COLMAP reads them"
+        )
+
+
+def _profile(icc: bytes) -> str:
+    """Name of a colour profile."""
+    try:
+        return ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(icc))).strip() or "unnamed"
+    except (OSError, ImageCms.PyCMSError):
+        return "unreadable"
+
+
+def _duplicates(scene: Scene) -> Iterator[Finding]:
+    """Files of the same content, and views of the same pose."""
+    views = range(len(scene.paths))
+    files = _alike([views], lambda view: scene.paths[view].stat().st_size)
+    files = _alike(files, lambda view: _digest(scene.paths[view], _TAIL))  # whole files only where much is equal already
+    files = _alike(files, lambda view: _digest(scene.paths[view], None))
+    position = scene.cameras.pose[:, :, 3]
+    extent = float((position.amax(0) - position.amin(0)).max()) or 1.0
+    pose = torch.cat([scene.cameras.pose[:, :, :3].flatten(1), (position - position.mean(0)) / extent], 1)
+    rows = (pose * 1e6).round().tolist()
+    posed = _alike([views], lambda view: tuple(rows[view]))
+    for what, groups in (("are the same file", files), ("are taken from the same pose", posed)):
+        if groups:
+            first = " and ".join(scene.paths[view].name for view in groups[0][:2])
+            found = f"{sum(len(group) - 1 for group in groups)} of {len(views)} views: {first} {what}; all are trained"
+            yield Finding("duplicates", found, "remove the copies", optional=True)
+
+
+def _alike(groups: Iterable[Sequence[int]], key: Callable[[int], Hashable]) -> list[list[int]]:
+    """Views of a group that have the same key, where they are at least two."""
+    found = []
+    for group in groups:
+        parts: dict[Hashable, list[int]] = {}
+        for view in group:
+            parts.setdefault(key(view), []).append(view)
+        found += [part for part in parts.values() if len(part) > 1]
+    return found
+
+
+def _digest(path: Path, tail: int | None) -> bytes:
+    """Digest of a file, or of its last bytes."""
+    with path.open("rb") as file:
+        if tail is not None:
+            file.seek(max(0, path.stat().st_size - tail))
+        return hashlib.sha256(file.read()).digest()
+
+
+def _pixels(scene: Scene, views: Sequence[int]) -> tuple[dict[int, Image], list[str]]:
+    """Images by view, and why others cannot be read."""
+
+    def load(view: int) -> Image | str:
+        try:
+            return load_images(scene, views=[view])[0]
+        except DataError as fault:
+            return str(fault)
+
+    with ThreadPoolExecutor() as pool:
+        loaded = dict(zip(views, pool.map(load, views), strict=True))
+    images = {view: each for view, each in loaded.items() if not isinstance(each, str)}
+    return images, [each for each in loaded.values() if isinstance(each, str)]
+
+
+def _exposure(scene: Scene, images: Mapping[int, Image]) -> Iterator[Finding]:
+    """How far the exposures of the training views that were looked at are apart."""
+    train = torch.tensor([view for view in scene.train.tolist() if view in images], dtype=torch.int64)
+    if len(train) < 2:
+        return
+    some = replace(scene, train=train, test=train[:0])
+    exposure = with_exposure(some, lambda view: torch.from_numpy(images[view]).float() / 255).exposure
+    if exposure is None:
+        return
+    spread = float(exposure[train].log2().std())
+    decided = "a factor for each view is learnt" if exposures_differ(exposure[train]) else "no factor is learnt"
+    yield Finding("exposure", f"spread by {spread:.2f} stops: {decided}")
+
+
+def _blurred(scene: Scene, images: Mapping[int, Image]) -> Iterator[Finding]:
+    """Photographs far less sharp than those around them."""
+    from ..reconstruction.images import sharpness
+
+    views = list(images)
+    with ThreadPoolExecutor() as pool:
+        scores = list(pool.map(sharpness, images.values()))
+    blurred = []
+    for k, view in enumerate(views):
+        around = scores[max(0, k - _AROUND) : k] + scores[k + 1 : k + 1 + _AROUND]
+        if around and scores[k] < _BLURRED * float(np.median(around)):
+            blurred.append(scene.paths[view].name)
+    if blurred:
+        named = ", ".join(blurred[:3]) + (", ..." if len(blurred) > 3 else "")
+        found = f"{len(blurred)} of {len(views)} images: {named}; they are trained like the others"
+        yield Finding("blur", found, "remove them, where others show the same", optional=True)
