@@ -220,7 +220,7 @@ def scene_folder(data: Path) -> Iterator[Finding]:
     yield Finding("split", f"{len(scene.train)} to train, {len(scene.test)} held out")
     for note in scene.notes:
         yield Finding("note", note)
-    yield from inspect_scene(scene)
+    yield from inspect_scene(data, scene)
     yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
 
 

@@ -39,14 +39,14 @@ _TAIL = 1 << 16
 _ORIENTATION = 0x0112
 
 
-def inspect_scene(scene: Scene) -> Iterator[Finding]:
+def inspect_scene(data: Path, scene: Scene) -> Iterator[Finding]:
     """Coordinates, points, masks, files, duplicates, exposure and blur of a scene, one line each where there is one to say."""
     count = len(scene.paths)
     looked = np.unique(np.linspace(0, count - 1, min(count, LOOKED)).round().astype(int)).tolist()
     if len(looked) < count:
         yield Finding("sample", f"masks, profiles, exposure and blur are looked at in {len(looked)} of {count} views")
     yield from _coordinates(scene.cameras.pose[:, :, 3])
-    yield _points(scene)
+    yield _points(data, scene)
     for name, masks in (("masks", scene.masks), ("sky masks", scene.sky_masks)):
         if masks:
             yield from _masks(name, [(masks[view], scene.cameras.size[view].tolist()) for view in looked])
@@ -74,13 +74,18 @@ def _coordinates(position: Tensor) -> Iterator[Finding]:
         yield Finding("coordinates", f"{found}: trained about a local origin")
 
 
-def _points(scene: Scene) -> Finding:
+def _points(data: Path, scene: Scene) -> Finding:
     """How many of the reconstruction's points there are, and whether training views see them."""
     count = 0 if scene.points is None else len(scene.points)
     if not count:
-        return Finding("points", "none; bounds come from the cameras, first Gaussians from matches between views")
+        found = "none; bounds come from the cameras, first Gaussians from matches between views"
+        unread = next((path.name for path in sorted(data.glob("*.ply"))), None)
+        if unread is None:
+            return Finding("points", found)
+        remedy = f'if its points are in the frame of the poses: "ply_file_path": "{unread}" in transforms.json'
+        return Finding("points", f"{found}; {unread} is not read", remedy, optional=True)
     sightings = find_sightings(sparser(scene))
-    seeing = 0 if sightings is None else len(sightings.view.unique())
+    seeing = 0 if sightings is None else len({*sightings.view.tolist()})
     found = f"{count} of the reconstruction, in view of {seeing} of {len(scene.train)} training views"
     if not seeing:
         return Finding("points", found, "remove them, or give those of this scene: they lie elsewhere or behind", optional=True)

@@ -222,7 +222,7 @@ def test_the_table_says_who_is_in_and_for_what(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"gone.tsv: no such table"):
         parse(tmp_path, PhotoTourismConfig(list="gone.tsv"))
     (tmp_path / "b.tsv").write_text("filename\tid\tsplit\nelsewhere.png\t1\ttrain\n")
-    with pytest.raises(DataError, match="none of its training photographs"):
+    with pytest.raises(DataError, match="none of the images"):
         parse(tmp_path, PhotoTourismConfig(list="b.tsv"))
 
 

@@ -34,7 +34,7 @@ from ...rendering.lens import OPENCV
 from ..scene import Scene
 from .config import BlockNerfConfig
 from .town import cache_folder
-from .views import View, assemble_scene, rigid_pose, split_by
+from .views import View, assemble_scene, read_views, rigid_pose, split_by
 
 _POLYNOMIAL = 0x82F63B78
 _MASK = 0xA282EAD8
@@ -392,9 +392,10 @@ class BlockNerfParser(DataParser):
                 f"{data}: the rays of {worst['name']} are {worst['error']:.2g} pixels from those of any camera, "
                 f"parser.tolerance is {self.config.tolerance:g}; raise it, or leave out its camera with parser.cameras"
             )
-        views, split = [_view(folder, entry) for entry in chosen], split_by([entry["held"] for entry in chosen])
-        scene = assemble_scene(data, views, downscale=downscale, split=split)
-        return replace(scene, exposure=torch.tensor([entry["exposure"] for entry in chosen], dtype=torch.float64))
+        kept, notes = read_views(data, chosen, lambda entry: _view(folder, entry))
+        split = split_by([entry["held"] for entry, _ in kept])
+        scene = assemble_scene(data, [view for _, view in kept], downscale=downscale, split=split, notes=notes)
+        return replace(scene, exposure=torch.tensor([entry["exposure"] for entry, _ in kept], dtype=torch.float64))
 
 
 def _key(data: Path, files: list[Path]) -> str:

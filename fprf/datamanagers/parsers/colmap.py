@@ -10,7 +10,7 @@ is kept. Each view's depths are the 0.1 and 99.9 percentile of the points that i
 import shlex
 import struct
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
@@ -25,7 +25,7 @@ from ...rendering.splines import rotations
 from ..scene import Scene
 from .config import ColmapConfig
 from .files import NamedFiles, path_inside, read_bytes, read_float, read_npz, read_ply_points
-from .views import View, assemble_scene, lens_of, pixel_size, quaternion_rotation, read_views, rigid_pose
+from .views import View, assemble_scene, index_tensor, lens_of, pixel_size, quaternion_rotation, read_views, rigid_pose
 
 MODELS = (
     ("SIMPLE_PINHOLE", "f cx cy"),
@@ -387,8 +387,11 @@ class ColmapParser(DataParser):
     def __init__(self, config: ColmapConfig) -> None:
         self.config = config
 
-    def parse(self, data: Path, downscale: int) -> Scene:
-        """The scene at 1/downscale of the size of the images in the chosen folder."""
+    def parse(self, data: Path, downscale: int, roles: Mapping[str, str] | None = None) -> Scene:
+        """The scene at 1/downscale of the size of the images in the chosen folder.
+
+        Of `roles`, train or test by file name, images without one are left out; else every 8th is for testing.
+        """
         folder, notes = largest_model(data)
         if folder is None:
             raise DataError(f"{data}: no cameras.bin or cameras.txt in sparse/0, sparse or here; run COLMAP's mapper")
@@ -400,7 +403,10 @@ class ColmapParser(DataParser):
         named = [
             (*files.find(f"{folder}: image {image.name!r}", image.name), image, rows)
             for image, rows in zip(model.images, observed_points(model, model.images), strict=True)
+            if roles is None or PurePosixPath(image.name).name in roles
         ]
+        if not named:
+            raise DataError(f"{folder}: the model has none of the images that are asked for; are they another scene's?")
 
         def view(each: tuple[str, Path, ColmapImage, NDArray[np.int64]]) -> View:
             inner, path, image, rows = each
@@ -432,8 +438,13 @@ class ColmapParser(DataParser):
             extra, said = (None, []) if file is None else read_points_file(file)
             points, notes = points if extra is None else extra, notes + said
         views = [one for _, one in kept]
-        reduced = name != "images"
-        return assemble_scene(data, views, downscale=downscale, points=points, seen=seen, reduced=reduced, notes=notes)
+        split = None
+        if roles is not None:
+            given = [roles[PurePosixPath(image.name).name] for (_, _, image, _), _ in kept]
+            split = index_tensor([role == "train" for role in given]), index_tensor([role == "test" for role in given])
+        return assemble_scene(
+            data, views, downscale=downscale, split=split, points=points, seen=seen, reduced=name != "images", notes=notes
+        )
 
 
 def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:

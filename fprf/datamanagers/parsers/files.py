@@ -16,6 +16,7 @@ from pathlib import Path, PureWindowsPath
 from typing import TypeAlias
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ...errors import DataError
@@ -23,10 +24,6 @@ from ...io.strict_json import parse_json
 
 Json: TypeAlias = "dict[str, Json] | list[Json] | str | int | float | bool | None"
 
-_NPY_HEADER = re.compile(
-    r"\s*\{\s*'descr':\s*'([<>|=](?:f[248]|[iu][1248]))',\s*'fortran_order':\s*(True|False),"
-    r"\s*'shape':\s*(\([0-9, ]*\)),?\s*\}\s*"
-)
 _MAX_ARRAY = 1 << 32
 """Bytes that an array inside an archive may unpack to."""
 _RATIO = 1032
@@ -126,12 +123,11 @@ def _spelling(name: str) -> str:
 
 def read_ply_points(path: Path) -> NDArray[np.float64]:
     """Positions [P 3] of the vertices of a PLY file, text or binary. Raises DataError."""
-    import trimesh
+    from trimesh.exchange.ply import load_ply
 
     data = read_bytes(path)
     try:
-        mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
-        points = np.array(mesh.vertices, dtype=np.float64).reshape(-1, 3)
+        points = np.array(load_ply(io.BytesIO(data))["vertices"], dtype=np.float64).reshape(-1, 3)
     except Exception as error:  # whatever trimesh makes of the bytes
         raise DataError(f"{path}: no PLY file with points ({' '.join(str(error).split())[:100]}); write it again") from error
     return points
@@ -144,24 +140,21 @@ def name_of(data: Path) -> str:
 
 def read_npy(where: str, data: bytes) -> NDArray[np.float64]:
     """The numbers of a .npy file as float64; DataError, opened by `where`, for anything but a whole numeric array."""
-    length = {1: 2, 2: 4, 3: 4}.get(data[6] if len(data) > 8 else 0, 0)
-    if not data.startswith(b"\x93NUMPY") or not length:
-        raise DataError(f"{where}: no NumPy array; write it again with numpy.save")
-    start = 8 + length + int.from_bytes(data[8 : 8 + length], "little")
-    header = _NPY_HEADER.fullmatch(data[8 + length : min(start, 8 + length + 4096)].decode("latin-1"))
-    if header is None:
-        raise DataError(f"{where}: the array's header is not that of a plain numeric array; write it with numpy.save")
-    dtype = np.dtype(header[1])
-    plain = re.fullmatch(r"\((\d{1,18},|(\d{1,18}, ?)+(\d{1,18})?)?\)", header[3])
-    shape = tuple(int(side) for side in re.findall(r"\d+", header[3])) if plain else (-1,)
-    count = math.prod(shape)
-    if count < 0 or count * dtype.itemsize != len(data) - start:
+    stream = io.BytesIO(data)
+    try:
+        version = npy.read_magic(stream)
+        read_header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        shape, fortran, dtype = read_header(stream)
+    except Exception as error:  # the header is a literal of Python, and says so in many ways
+        raise DataError(f"{where}: no NumPy array ({' '.join(str(error).split())[:80]}); write it with numpy.save") from error
+    count, held = math.prod(shape), len(data) - stream.tell()
+    if dtype.kind not in "fiu" or min(shape, default=0) < 0 or count * dtype.itemsize != held:
         raise DataError(
-            f"{where}: the header says {header[3]} of {header[1]}, but {max(len(data) - start, 0)} bytes follow; "
-            "copy the file again, it is damaged"
+            f"{where}: the header says {shape} of {dtype}, but {held} bytes follow; numbers are read: write them with "
+            "numpy.save, or copy the file again"
         )
-    numbers = np.frombuffer(data, dtype=dtype, offset=start, count=count)
-    return np.array(numbers.reshape(shape, order="F" if header[2] == "True" else "C"), dtype=np.float64, order="C")
+    numbers = np.frombuffer(data, dtype=dtype, offset=stream.tell(), count=count)
+    return np.array(numbers.reshape(shape, order="F" if fortran else "C"), dtype=np.float64, order="C")
 
 
 def read_npz(path: Path, key: str) -> NDArray[np.float64]:

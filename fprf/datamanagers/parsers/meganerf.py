@@ -15,7 +15,7 @@ from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
 from .config import MegaNerfConfig
-from .views import View, assemble_scene, image_size, pixel_size, read_views, rigid_pose, split_by
+from .views import View, assemble_scene, read_views, rigid_pose, split_by, stated_size
 
 _LARGEST = 1 << 24
 """Bytes of a file of metadata."""
@@ -83,9 +83,10 @@ def _first_line(error: Exception) -> str:
 def _view(file: Path, images: Path, unit: float) -> View:
     metadata = _load(file)
     path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
-    width, height = image_size(images / f"{file.stem}.jpg" if path is None else path)
+    path = images / f"{file.stem}.jpg" if path is None else path
     try:
-        size = pixel_size(str(file), float(metadata.get("W", width)), float(metadata.get("H", height)))
+        width, height = (None if key not in metadata else float(metadata[key]) for key in "WH")
+        size = stated_size(str(file), path, width, height)
         pose = np.array(torch.as_tensor(metadata["c2w"]).double().numpy())
         fx, fy, cx, cy = (float(v) for v in torch.as_tensor(metadata["intrinsics"]).reshape(-1).tolist())
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
@@ -94,5 +95,4 @@ def _view(file: Path, images: Path, unit: float) -> View:
     if pose.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{file}: c2w is {pose.shape}, not 3x4 or 4x4; copy the file again")
     pose[:3, 3] *= unit
-    assert path is not None
     return View(name=file.stem, path=path, pose=rigid_pose(str(file), pose), size=size, focal=(fx, fy), centre=(cx, cy))

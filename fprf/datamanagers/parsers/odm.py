@@ -81,7 +81,8 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
         turn, offset = _turn(record), _vector(record, "translation")
         shots.append(_Shot(name, cameras[key], turn, -turn.T @ offset))
     points = [_vector(point, "coordinates") for point in _objects(largest, "points").values()]
-    return shots, np.array(points).reshape(-1, 3)
+    cloud = np.array(points).reshape(-1, 3)
+    return shots, cloud[np.isfinite(cloud).all(1)]
 
 
 def _shots(data: Path, file: Path) -> list[_Shot]:

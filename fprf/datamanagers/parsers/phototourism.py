@@ -8,15 +8,12 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
 from .colmap import ColmapParser, model_folders
 from .config import ColmapConfig, PhotoTourismConfig
 from .files import name_of
-from .views import index_tensor
 
 
 class PhotoTourismParser(DataParser):
@@ -29,31 +26,10 @@ class PhotoTourismParser(DataParser):
         """The listed photographs. Raises DataError where the table names none of the model's."""
         table = self._table(data)
         inner = data / "dense" if not model_folders(data) and (data / "dense").is_dir() else data
-        scene = ColmapParser(ColmapConfig()).parse(inner, downscale)
-        roles = read_list(table)
-        named = [roles.get(path.name) for path in scene.paths]
-        kept = index_tensor([role is not None for role in named])
-        train = index_tensor([role == "train" for role in named])
-        if not len(train):
+        scene = ColmapParser(ColmapConfig()).parse(inner, downscale, read_list(table))
+        if not len(scene.train):
             raise DataError(f"{table}: none of its training photographs is in the model of {inner}; is it another scene's?")
-        place = torch.full((len(scene.paths),), -1, dtype=torch.int64)
-        place[kept] = torch.arange(len(kept))
-        seen = scene.seen
-        if seen is not None:
-            seen = torch.stack([place[seen[:, 0]], seen[:, 1]], 1)
-            seen = seen[seen[:, 0] >= 0]
-        return replace(
-            scene,
-            name=name_of(data),
-            paths=tuple(scene.paths[k] for k in kept.tolist()),
-            cameras=scene.cameras.select(kept),
-            train=place[train],
-            test=place[index_tensor([role == "test" for role in named])],
-            depths=None if scene.depths is None else scene.depths[kept],
-            seen=seen,
-            masks=tuple(scene.masks[k] for k in kept.tolist()) if scene.masks else (),
-            sky_masks=tuple(scene.sky_masks[k] for k in kept.tolist()) if scene.sky_masks else (),
-        )
+        return replace(scene, name=name_of(data))
 
     def _table(self, data: Path) -> Path:
         if self.config.list:

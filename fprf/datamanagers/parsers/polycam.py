@@ -16,7 +16,7 @@ from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
 from .config import PolycamConfig
 from .files import as_record, read_json
-from .views import View, assemble_scene, image_size, pixel_size, read_views, rigid_pose
+from .views import View, assemble_scene, read_views, rigid_pose, stated_size
 
 _PAIRS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 
@@ -60,15 +60,14 @@ class PolycamParser(DataParser):
 
 def _view(frame: tuple[Path, Path]) -> View:
     image, file = frame
-    record, own = as_record(file, read_json(file)), image_size(image)
+    record = as_record(file, read_json(file))
     rows = [[record.needed(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     fx, fy, cx, cy = (record.needed(key) for key in ("fx", "fy", "cx", "cy"))
-    width, height = record.number("width"), record.number("height")
     return View(
         name=image.name,
         path=image,
         pose=rigid_pose(str(file), np.array(rows)),
-        size=pixel_size(str(file), own[0] if width is None else width, own[1] if height is None else height),
+        size=stated_size(str(file), image, record.number("width"), record.number("height")),
         focal=(fx, fy),
         centre=(cx, cy),
     )

@@ -17,7 +17,7 @@ from ..images import image_names
 from ..scene import Scene
 from .config import Record3DConfig
 from .files import Record, as_record, numbers_of, read_json, table_of
-from .views import View, assemble_scene, image_size, pixel_size, quaternion_rotation, read_views, rigid_pose
+from .views import View, assemble_scene, quaternion_rotation, read_views, rigid_pose, stated_size
 
 _Rows: TypeAlias = NDArray[np.float64]
 _PAIRS = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata", "rgb"), ("metadata.json", "rgbd"))
@@ -50,20 +50,19 @@ class Record3DParser(DataParser):
             raise DataError(f"{folder}: {last}, but {file.name} has {len(poses)} poses, from 0 on; export the recording again")
         if len(poses) > 1 and not np.nan_to_num(np.ptp(poses, axis=0), nan=1.0).any():
             raise DataError(f"{file}: all poses are one (front cameras have none); find poses with `fprf process {folder}`")
-        width, height = record.number("w"), record.number("h")
         lenses = _lenses(record, len(poses))
         even = np.linspace(0, len(posed) - 1, min(len(posed), self.config.frames)).round().astype(int)
 
         def view(each: tuple[int, str]) -> View:
             number, name = each
             fx, fy, cx, cy = lenses[number].tolist()
-            where, row, own = f"{file}: poses[{number}]", poses[number], image_size(folder / name)
+            where, row = f"{file}: poses[{number}]", poses[number]
             turn = quaternion_rotation(where, row[[3, 0, 1, 2]])
             return View(
                 name=name,
                 path=folder / name,
                 pose=rigid_pose(where, np.concatenate([turn, row[4:, None]], 1)),
-                size=pixel_size(str(file), own[0] if width is None else width, own[1] if height is None else height),
+                size=stated_size(str(file), folder / name, record.number("w"), record.number("h")),
                 focal=(fx, fy),
                 centre=(cx, cy),
             )

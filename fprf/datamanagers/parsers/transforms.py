@@ -22,7 +22,7 @@ from ..scene import Scene
 from .colmap import cloud_of_model, largest_model, read_cloud, read_points_file
 from .config import TransformsConfig
 from .files import NamedFiles, Record, as_record, path_inside, read_json
-from .views import View, assemble_scene, image_size, index_tensor, lens_of, pixel_size, read_views, rigid_pose
+from .views import View, assemble_scene, index_tensor, lens_of, read_views, rigid_pose, stated_size
 
 _LENSES = frozenset(
     {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "EQUIRECTANGULAR"}
@@ -114,9 +114,7 @@ def _entry(inside: NamedFiles, record: Record, role: str) -> _Entry:
 
 def _view(entry: _Entry, inside: NamedFiles) -> View:
     record = entry.record
-    own = image_size(entry.path)
-    width, height = record.number("w"), record.number("h")
-    size = pixel_size(record.where, own[0] if width is None else width, own[1] if height is None else height)
+    size = stated_size(record.where, entry.path, record.number("w"), record.number("h"))
     near, far = record.number("near"), record.number("far")
     cx, cy = record.number("cx"), record.number("cy")
     distortion, lens = _lens(record)

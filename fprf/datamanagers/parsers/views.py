@@ -146,6 +146,22 @@ def image_size(path: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
+def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
+    """Width and height as whole numbers. Raises DataError, opened by `where`, unless both lie in 1 to 1e6."""
+    if not math.isfinite(width + height):
+        raise UnusableView(where, _NOT_FINITE)
+    size = round(float(width)), round(float(height))
+    if min(size) < 1 or max(size) > 10**6:
+        raise DataError(f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again")
+    return size
+
+
+def stated_size(where: str, path: Path, width: float | None, height: float | None) -> tuple[int, int]:
+    """Width and height that a capture says of an image, and the image's own where it says none. Raises as the two above."""
+    own = image_size(path)
+    return pixel_size(where, own[0] if width is None else width, own[1] if height is None else height)
+
+
 def lens_of(
     where: str, model: str, distortion: Sequence[float], others: Sequence[float] = (), remedy: str = "undistort the images"
 ) -> tuple[tuple[float, float, float, float, float, float], int]:
@@ -166,16 +182,6 @@ def lens_of(
         known = "no terms" if model.endswith("PINHOLE") else "k1 k2 k3 k4" if fisheye else "k1 k2 k3 k4 p1 p2 in a polynomial"
         raise DataError(f"{where}: the lens {model} has more terms than are represented ({known}); {remedy}")
     return (k1, k2, k3, k4, p1, p2), FISHEYE if fisheye else OPENCV if any(distortion) else PINHOLE
-
-
-def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
-    """Width and height as whole numbers. Raises DataError, opened by `where`, unless both lie in 1 to 1e6."""
-    if not math.isfinite(width + height):
-        raise UnusableView(where, _NOT_FINITE)
-    size = round(float(width)), round(float(height))
-    if min(size) < 1 or max(size) > 10**6:
-        raise DataError(f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again")
-    return size
 
 
 def quaternion_rotation(where: str, quaternion: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
