@@ -5,6 +5,7 @@ At most LOOKED views, evenly through the scene, have their files opened and thei
 
 import hashlib
 import io
+import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -125,7 +126,7 @@ def _metadata(paths: Sequence[Path]) -> Iterator[Finding]:
     turned = 0
     for path in paths:
         try:
-            with Pillow.open(path) as image:
+            with warnings.catch_warnings(action="ignore"), Pillow.open(path) as image:
                 icc, orientation = image.info.get("icc_profile"), image.getexif().get(_ORIENTATION, 1)
         except (OSError, ValueError, SyntaxError, Pillow.DecompressionBombError):
             continue  # what cannot be read is said where its pixels are

@@ -43,6 +43,16 @@ def test_a_scene_without_faults_has_none(tmp_path: Path) -> None:
     assert found["points"].found.startswith("400 ") and "10 of 10" in found["points"].found
 
 
+def test_what_was_left_out_is_told(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "s")
+    (folder / "images/03.png").unlink()
+    found = findings(folder)
+    assert "03.png" in found["note"].found and found["views"].found.startswith("11 ")
+    (folder / "points.npz").unlink()
+    (folder / "sparse_pc.ply").touch()
+    assert "sparse_pc.ply" in findings(folder)["points"].found and findings(folder)["points"].optional
+
+
 def test_coordinates_beyond_float32_are_told_with_their_centre(tmp_path: Path) -> None:
     found = findings(write_scene(tmp_path / "s", centre=(500_000, 0, 5_600_000)))
     assert "(500000.55, 0, 5600000)" in found["coordinates"].found and "steps of 0.5" in found["coordinates"].found

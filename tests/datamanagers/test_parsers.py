@@ -229,7 +229,9 @@ def test_the_table_says_who_is_in_and_for_what(tmp_path: Path) -> None:
 def test_polycam_s_images_without_a_camera_are_left_out(tmp_path: Path) -> None:
     cameras = write_polycam(tmp_path / "keyframes", Capture.make(5))
     (cameras / "0002.json").unlink()
-    assert [path.name for path in parse(tmp_path).paths] == ["0000.png", "0001.png", "0003.png", "0004.png"]
+    scene = parse(tmp_path)
+    assert [path.name for path in scene.paths] == ["0000.png", "0001.png", "0003.png", "0004.png"]
+    assert len(scene.notes) == 1 and "1 of 5" in scene.notes[0]
     for file in cameras.iterdir():
         file.rename(file.with_name(f"x{file.name}"))
     with pytest.raises(DataError, match="has the name of an image"):

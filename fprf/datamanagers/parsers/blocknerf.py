@@ -392,10 +392,10 @@ class BlockNerfParser(DataParser):
                 f"{data}: the rays of {worst['name']} are {worst['error']:.2g} pixels from those of any camera, "
                 f"parser.tolerance is {self.config.tolerance:g}; raise it, or leave out its camera with parser.cameras"
             )
-        kept, notes = read_views(data, chosen, lambda entry: _view(folder, entry))
-        split = split_by([entry["held"] for entry, _ in kept])
-        scene = assemble_scene(data, [view for _, view in kept], downscale=downscale, split=split, notes=notes)
-        return replace(scene, exposure=torch.tensor([entry["exposure"] for entry, _ in kept], dtype=torch.float64))
+        views, kept, notes = read_views(data, chosen, lambda entry: _view(folder, entry))
+        split = split_by([entry["held"] for entry in kept])
+        scene = assemble_scene(data, views, downscale=downscale, split=split, notes=notes)
+        return replace(scene, exposure=torch.tensor([entry["exposure"] for entry in kept], dtype=torch.float64))
 
 
 def _key(data: Path, files: list[Path]) -> str:

@@ -371,16 +371,6 @@ def _image_count(folder: Path) -> int:
         return 0
 
 
-def read_points_file(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
-    """The finite points of a PLY file that a capture names, and a note where there are none."""
-    try:
-        points = read_ply_points(path)
-    except DataError as fault:
-        return None, [f"points are not read: {fault}"]
-    points = points[np.asarray(np.isfinite(points).all(1))]
-    return (points, []) if len(points) else (None, [f"{path}: holds no points"])
-
-
 class ColmapParser(DataParser):
     """A sparse model and the folder of its images."""
 
@@ -428,19 +418,18 @@ class ColmapParser(DataParser):
                 depths=_depths(model.points[rows], pose),
             )
 
-        kept, lost = read_views(data, sorted(named, key=lambda each: each[0]), view)
-        points, seen = cloud_of_images(model, [rows for (_, _, _, rows), _ in kept])
+        views, kept, lost = read_views(data, sorted(named, key=lambda each: each[0]), view)
+        points, seen = cloud_of_images(model, [rows for _, _, _, rows in kept])
         notes += lost
         if not len(points):
             # 3DGS keeps the points of a model, or those that it was begun with, beside it.
             beside = (folder / "points3D.ply", folder / "input.ply", data / "input.ply")
             file = next((path for path in beside if path.is_file()), None)
-            extra, said = (None, []) if file is None else read_points_file(file)
+            extra, said = (None, []) if file is None else read_ply_points(file)
             points, notes = points if extra is None else extra, notes + said
-        views = [one for _, one in kept]
         split = None
         if roles is not None:
-            given = [roles[PurePosixPath(image.name).name] for (_, _, image, _), _ in kept]
+            given = [roles[PurePosixPath(image.name).name] for _, _, image, _ in kept]
             split = index_tensor([role == "train" for role in given]), index_tensor([role == "test" for role in given])
         return assemble_scene(
             data, views, downscale=downscale, split=split, points=points, seen=seen, reduced=name != "images", notes=notes

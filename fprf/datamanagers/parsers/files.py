@@ -121,16 +121,18 @@ def _spelling(name: str) -> str:
     return unicodedata.normalize("NFC", name).casefold().strip()
 
 
-def read_ply_points(path: Path) -> NDArray[np.float64]:
-    """Positions [P 3] of the vertices of a PLY file, text or binary. Raises DataError."""
+def read_ply_points(path: Path) -> tuple[NDArray[np.float64] | None, list[str]]:
+    """The finite positions [P 3] of a PLY file, text or binary; where there are none, None and a note that says why."""
     from trimesh.exchange.ply import load_ply
 
-    data = read_bytes(path)
     try:
-        points = np.array(load_ply(io.BytesIO(data))["vertices"], dtype=np.float64).reshape(-1, 3)
+        points = np.array(load_ply(io.BytesIO(read_bytes(path)))["vertices"], dtype=np.float64).reshape(-1, 3)
+    except DataError as fault:
+        return None, [f"points are not read: {fault}"]
     except Exception as error:  # whatever trimesh makes of the bytes
-        raise DataError(f"{path}: no PLY file with points ({' '.join(str(error).split())[:100]}); write it again") from error
-    return points
+        return None, [f"points are not read: {path}: no PLY file with points ({' '.join(str(error).split())[:80]})"]
+    points = points[np.isfinite(points).all(1)]
+    return (points, []) if len(points) else (None, [f"points are not read: {path}: holds none"])
 
 
 def name_of(data: Path) -> str:

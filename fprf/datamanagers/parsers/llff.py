@@ -56,10 +56,10 @@ class LlffParser(DataParser):
                 depths=(float(row[15]), float(row[16])),
             )
 
-        kept, notes = read_views(data, enumerate(names), view)
+        views, _, notes = read_views(data, enumerate(names), view)
         if names != sorted(names, key=lambda name: (len(name), name)) and all(Path(name).stem.isdecimal() for name in names):
             notes.append(f"rows of poses_bounds.npy are taken in LLFF's order of names: {', '.join(names[:3])}, ...")
-        return assemble_scene(data, [each for _, each in kept], downscale=downscale, reduced=True, notes=notes)
+        return assemble_scene(data, views, downscale=downscale, reduced=True, notes=notes)
 
 
 def _folder(data: Path, wanted: str) -> Path:

@@ -38,11 +38,9 @@ class MegaNerfParser(DataParser):
                 raise DataError(
                     f"{folder}: no *.pt files; name the folder of a scene, with train/metadata and train/rgbs in it"
                 )
-        kept, notes = read_views(
-            data, sorted(files, key=lambda each: each[0].stem), lambda each: _view(each[0], data / each[1] / "rgbs", unit)
-        )
-        parts = split_by([split == "val" for (_, split), _ in kept])
-        views = [view for _, view in kept]
+        files.sort(key=lambda each: each[0].stem)
+        views, kept, notes = read_views(data, files, lambda each: _view(each[0], data / each[1] / "rgbs", unit))
+        parts = split_by([split == "val" for _, split in kept])
         return assemble_scene(data, views, downscale=downscale, split=parts, reduced=True, notes=notes)
 
 

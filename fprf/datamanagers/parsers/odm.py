@@ -61,8 +61,8 @@ class OdmParser(DataParser):
         folder = path_inside(data, "parser.images", self.config.images)[1]
         files = NamedFiles(folder)
         named = sorted(((*files.find(str(file), shot.name), shot) for shot in shots), key=lambda each: each[0])
-        kept, notes = read_views(data, named, lambda each: _view(str(file), *each))
-        return assemble_scene(data, [view for _, view in kept], downscale=downscale, points=points, notes=notes)
+        views, _, notes = read_views(data, named, lambda each: _view(str(file), *each))
+        return assemble_scene(data, views, downscale=downscale, points=points, notes=notes)
 
 
 def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:

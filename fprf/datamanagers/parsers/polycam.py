@@ -43,19 +43,24 @@ class PolycamParser(DataParser):
         if not folders:
             raise DataError(f"{data}: no keyframes/images with keyframes/cameras/*.json; export raw data from Polycam")
         frames: dict[str, tuple[Path, Path]] = {}
+        alone: set[str] = set()
         for images, cameras in folders:
             known = {path.stem for path in cameras.glob("*.json")}
-            stems = [(path.stem, path) for path in images.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-            pairs = {stem: (path, cameras / f"{stem}.json") for stem, path in stems if stem in known}
-            frames = pairs | frames
+            paths = {path.stem: path for path in images.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
+            frames = {stem: (path, cameras / f"{stem}.json") for stem, path in paths.items() if stem in known} | frames
+            alone |= paths.keys()
         if not frames:
             images, cameras = folders[0]
             raise DataError(f"{cameras}: no file has the name of an image in {images}; export the raw data again")
-        kept, notes = read_views(data, [frames[stem] for stem in sorted(frames)], _view)
-        corrected = sum(image.parent == folders[0][0] for (image, _), _ in kept)
+        views, kept, notes = read_views(data, [frames[stem] for stem in sorted(frames)], _view)
+        corrected = sum(image.parent == folders[0][0] for image, _ in kept)
         if corrected < len(kept):
             notes.append(f"{corrected} of {len(kept)} frames are in {folders[0][0].name}; the others are taken as recorded")
-        return assemble_scene(data, [view for _, view in kept], downscale=downscale, notes=notes)
+        if alone := alone - frames.keys():
+            notes.append(
+                f"{len(alone)} of {len(alone) + len(frames)} images have no camera and are left out, like {min(alone)}"
+            )
+        return assemble_scene(data, views, downscale=downscale, notes=notes)
 
 
 def _view(frame: tuple[Path, Path]) -> View:

@@ -67,10 +67,10 @@ class Record3DParser(DataParser):
                 centre=(cx, cy),
             )
 
-        kept, notes = read_views(data, [posed[k] for k in even], view)
+        views, _, notes = read_views(data, [posed[k] for k in even], view)
         if len(posed) < len(numbered):
             notes.append(f"{len(numbered) - len(posed)} of {len(numbered)} images have no pose and are left out")
-        return assemble_scene(data, [each for _, each in kept], downscale=downscale, notes=notes)
+        return assemble_scene(data, views, downscale=downscale, notes=notes)
 
 
 def _numbered(name: str) -> bool:

@@ -19,9 +19,9 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..images import IMAGE_SUFFIXES
 from ..scene import Scene
-from .colmap import cloud_of_model, largest_model, read_cloud, read_points_file
+from .colmap import cloud_of_model, largest_model, read_cloud
 from .config import TransformsConfig
-from .files import NamedFiles, Record, as_record, path_inside, read_json
+from .files import NamedFiles, Record, as_record, path_inside, read_json, read_ply_points
 from .views import View, assemble_scene, index_tensor, lens_of, read_views, rigid_pose, stated_size
 
 _LENSES = frozenset(
@@ -57,12 +57,11 @@ class TransformsParser(DataParser):
         # A frame that is written twice over says nothing new; where the two differ `read_views` refuses them.
         same = [k > 0 and entries[k - 1].record.own == entry.record.own for k, entry in enumerate(entries)]
         once = [entry for entry, again in zip(entries, same, strict=True) if not again]
-        kept, notes = read_views(data, once, lambda entry: _view(entry, inside))
+        views, kept, notes = read_views(data, once, lambda entry: _view(entry, inside))
         if any(same):
             notes.append(f"frames that are written twice are read once: {sum(same)}")
-        points, seen, said = _cloud(inside, tops[0], once, [view for _, view in kept])
-        left, views = [entry for entry, _ in kept], [view for _, view in kept]
-        split = _split(inside, tops, once, left)
+        points, seen, said = _cloud(inside, tops[0], once, views)
+        split = _split(inside, tops, once, kept)
         return assemble_scene(data, views, downscale=downscale, split=split, points=points, seen=seen, notes=notes + said)
 
     def _files(self, data: Path) -> list[tuple[Path, str]]:
@@ -97,7 +96,7 @@ def _cloud(
         seen = np.stack([row[seen[:, 0]], seen[:, 1]], 1)
         seen = seen[seen[:, 0] >= 0]
     if points is None and ply:
-        points, notes = read_points_file(inside.find(f"{top.where}: ply_file_path", ply)[1])
+        points, notes = read_ply_points(inside.find(f"{top.where}: ply_file_path", ply)[1])
     model = largest_model(inside.root)[0]
     if seen is None and model is not None:
         sparse = cloud_of_model(model, [view.name for view in views], [view.pose for view in views])

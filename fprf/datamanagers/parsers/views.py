@@ -108,17 +108,18 @@ Entry = TypeVar("Entry")
 
 def read_views(
     data: Path, entries: Iterable[Entry], view: Callable[[Entry], View]
-) -> tuple[list[tuple[Entry, View]], list[str]]:
-    """What a capture says of each image with its view, and notes on what is left out (see `UnusableView`).
+) -> tuple[list[View], list[Entry], list[str]]:
+    """The views of a capture's entries, the entries that they are of, and notes on those left out (see `UnusableView`).
 
     Raises DataError where nothing is left and where an image occurs twice.
     """
-    views: dict[str, tuple[Entry, View]] = {}
+    views: dict[str, View] = {}
+    kept: list[Entry] = []
     lost: dict[str, list[str]] = {}
     for entry in entries:
         try:
             one = view(entry)
-            if not one.path.is_file():
+            if not os.path.isfile(one.path):
                 raise UnusableView(str(one.path), _MISSING)
             _check_camera(one)
         except UnusableView as fault:
@@ -126,12 +127,13 @@ def read_views(
             continue
         if one.name in views:
             raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
-        views[one.name] = (entry, one)
+        views[one.name] = one
+        kept.append(entry)
     count = len(views) + sum(map(len, lost.values()))
     notes = [f"{len(each)} of {count} images are left out: {each[0]}: {reason}" for reason, each in lost.items()]
     if not views:
         raise DataError(f"{data}: no view is left: {'; '.join(notes)}; restore them or run the reconstruction again")
-    return list(views.values()), notes
+    return list(views.values()), kept, notes
 
 
 _MISSING = "the image is missing"
@@ -140,7 +142,7 @@ _NOT_FINITE = "numbers of its camera are not finite"
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image. Raises UnusableView where there is none, DataError where it cannot be read."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UnusableView(str(path), _MISSING)
     header = read_header(path)
     return header.width, header.height
