@@ -45,9 +45,11 @@ def test_a_scene_without_faults_has_none(tmp_path: Path) -> None:
 
 def test_what_was_left_out_is_told(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "s")
-    (folder / "images/03.png").unlink()
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][3]["fl_x"] = np.nan
+    (folder / "transforms.json").write_text(json.dumps(content))
     found = findings(folder)
-    assert "03.png" in found["note"].found and found["views"].found.startswith("11 ")
+    assert "1 of 12" in found["note"].found and found["views"].found.startswith("11 ")
     (folder / "points.npz").unlink()
     (folder / "sparse_pc.ply").touch()
     assert "sparse_pc.ply" in findings(folder)["points"].found and findings(folder)["points"].optional

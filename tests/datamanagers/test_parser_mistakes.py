@@ -19,7 +19,7 @@ WRONG = {
         camera_model="OPENCV_FISHEYE"&p1=0.1 camera_model="PINHOLE"&k1=0.1 test_filenames=["images/0009.png"]
         test_filenames=["images/0000.png"]&train_filenames=["images/0000.png"] test_filenames="x"
         fl_x=null&fl_y=null&camera_angle_x=4.0 fl_x=null&fl_y=null""",
-    "frame": f"""file_path="/etc/passwd" file_path="../0001.png" file_path=null
+    "frame": f"""file_path="images/none.png" file_path="/etc/passwd" file_path="../0001.png" file_path=null
         file_path="images/0000.png" transform_matrix=[[1,0,0,0],[0,1,0,0]] transform_matrix={EYE[:-2]}2]]
         transform_matrix={BENT} transform_matrix=[["a"]] transform_matrix=null""",
     "polycam": 't_00=null fx="20" fx=-1.0 t_11=7.0 width=0 width=1e9 width=48',

@@ -253,7 +253,7 @@ def test_record3d_s_images_go_by_their_numbers_and_may_have_lenses_of_their_own(
 def test_odm_s_images_stay_inside_and_missing_ones_are_named(tmp_path: Path) -> None:
     file = write_odm(tmp_path, Capture.make(2))
     (tmp_path / "images").rename(tmp_path / "photos")
-    with pytest.raises(DataError, match="2 of 2 images are left out"):
+    with pytest.raises(DataError, match="2 of 2 images are missing"):
         parse(tmp_path)
     assert len(parse(tmp_path, OdmConfig(images="photos")).paths) == 2
     file.write_text(file.read_text().replace("0001.png", "../x.png"))

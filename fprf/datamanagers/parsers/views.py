@@ -96,11 +96,15 @@ class View:
 
 
 class UnusableView(DataError):
-    """A view that is left out, because its image is missing or its numbers are not finite; the others are read."""
+    """A view that is left out because its numbers are not finite; the others are read."""
 
-    def __init__(self, where: str, reason: str) -> None:
-        self.where, self.reason = where, reason
-        super().__init__(f"{where}: {reason}; restore it or run the reconstruction again")
+    def __init__(self, where: str) -> None:
+        self.where = where
+        super().__init__(f"{where}: numbers of its camera are not finite; run the reconstruction again")
+
+
+class _MissingImage(DataError):
+    """An image that is not there: all that are missing are told at once."""
 
 
 Entry = TypeVar("Entry")
@@ -111,39 +115,43 @@ def read_views(
 ) -> tuple[list[View], list[Entry], list[str]]:
     """The views of a capture's entries, the entries that they are of, and notes on those left out (see `UnusableView`).
 
-    Raises DataError where nothing is left and where an image occurs twice.
+    Raises DataError where images are missing, where one occurs twice, and where nothing is left.
     """
     views: dict[str, View] = {}
     kept: list[Entry] = []
-    lost: dict[str, list[str]] = {}
-    for entry in entries:
+    lost: list[str] = []
+    missing: list[str] = []
+    count = 0
+    for count, entry in enumerate(entries, 1):
         try:
             one = view(entry)
-            if not os.path.isfile(one.path):
-                raise UnusableView(str(one.path), _MISSING)
             _check_camera(one)
+            image_size(one.path)
         except UnusableView as fault:
-            lost.setdefault(fault.reason, []).append(fault.where)
+            lost.append(fault.where)
+            continue
+        except _MissingImage as fault:
+            missing.append(str(fault))
             continue
         if one.name in views:
             raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
         views[one.name] = one
         kept.append(entry)
-    count = len(views) + sum(map(len, lost.values()))
-    notes = [f"{len(each)} of {count} images are left out: {each[0]}: {reason}" for reason, each in lost.items()]
+    if missing:
+        raise DataError(
+            f"{data}: {len(missing)} of {count} images are missing, the first is {missing[0]}; "
+            "copy them there or remove their entries"
+        )
+    notes = [f"{len(lost)} of {count} images are left out, whose camera is not finite: {lost[0]}"] if lost else []
     if not views:
-        raise DataError(f"{data}: no view is left: {'; '.join(notes)}; restore them or run the reconstruction again")
+        raise DataError(f"{data}: no view is left: {'; '.join(notes)}; run the reconstruction again")
     return list(views.values()), kept, notes
 
 
-_MISSING = "the image is missing"
-_NOT_FINITE = "numbers of its camera are not finite"
-
-
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image. Raises UnusableView where there is none, DataError where it cannot be read."""
+    """Width and height of an image. Raises DataError where it is missing or cannot be read."""
     if not os.path.isfile(path):
-        raise UnusableView(str(path), _MISSING)
+        raise _MissingImage(str(path))
     header = read_header(path)
     return header.width, header.height
 
@@ -151,7 +159,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def pixel_size(where: str, width: float, height: float) -> tuple[int, int]:
     """Width and height as whole numbers. Raises DataError, opened by `where`, unless both lie in 1 to 1e6."""
     if not math.isfinite(width + height):
-        raise UnusableView(where, _NOT_FINITE)
+        raise UnusableView(where)
     size = round(float(width)), round(float(height))
     if min(size) < 1 or max(size) > 10**6:
         raise DataError(f"{where}: {width:g}x{height:g} pixels; a side has 1 to 1000000: correct it, or export it again")
@@ -172,7 +180,7 @@ def lens_of(
     A polynomial without terms is a pinhole. Raises DataError, opened by `where`, for what the lenses cannot represent.
     """
     if not np.isfinite([*distortion, *others]).all():
-        raise UnusableView(where, _NOT_FINITE)
+        raise UnusableView(where)
     k1, k2, k3, k4, p1, p2 = distortion
     if model == "EQUIRECTANGULAR":
         raise DataError(
@@ -190,7 +198,7 @@ def quaternion_rotation(where: str, quaternion: Sequence[float] | NDArray[np.flo
     """The rotation [3 3] of a quaternion w x y z. Raises DataError, opened by `where`, unless its length is about 1."""
     length = math.hypot(*quaternion)
     if not math.isfinite(length):
-        raise UnusableView(where, _NOT_FINITE)
+        raise UnusableView(where)
     if not 0.9 < length < 1.1:
         raise DataError(f"{where}: a quaternion of length {length:.3g} is no rotation; export the capture again")
     return rotations(torch.tensor(quaternion, dtype=torch.float64)[None])[0].numpy()
@@ -204,7 +212,7 @@ def rigid_pose(where: str, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{where}: the pose has the shape {matrix.shape}, not 3x4 or 4x4; run the reconstruction again")
     if not np.isfinite(matrix).all():
-        raise UnusableView(where, _NOT_FINITE)
+        raise UnusableView(where)
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise DataError(f"{where}: the pose's last row is {matrix[3].tolist()}; write 0 0 0 1, or leave that row out")
     rotation = matrix[:3, :3]
@@ -291,7 +299,7 @@ def _check_size(view: View, file: tuple[int, int], reduced: bool) -> None:
 def _check_camera(view: View) -> None:
     numbers = (*view.focal, *view.centre, *view.distortion)
     if not np.isfinite((*numbers, *(view.depths or ()))).all():
-        raise UnusableView(str(view.path), _NOT_FINITE)
+        raise UnusableView(str(view.path))
     if max(map(abs, numbers)) > 1e9:
         raise DataError(f"{view.path}: the camera's numbers {numbers} go beyond 1e9; calibrate again")
     if min(view.focal) <= 0:
