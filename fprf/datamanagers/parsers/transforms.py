@@ -22,7 +22,7 @@ from ..scene import Scene
 from .colmap import cloud_of_model, largest_model, read_cloud
 from .config import TransformsConfig
 from .files import NamedFiles, Record, as_record, path_inside, read_json, read_ply_points
-from .views import View, assemble_scene, index_tensor, lens_of, read_views, rigid_pose, stated_size
+from .views import UNDISTORT, View, assemble_scene, index_tensor, lens_of, read_views, rigid_pose, stated_size
 
 _LENSES = frozenset(
     {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "EQUIRECTANGULAR"}
@@ -163,7 +163,7 @@ def _lens(record: Record) -> tuple[tuple[float, float, float, float, float, floa
     if model is None:
         model = "OPENCV_FISHEYE" if record.get("is_fisheye") is True else "OPENCV"
     if model not in _LENSES:
-        raise DataError(f"{record.where}: camera_model {model!r} is not supported; undistort to one of {sorted(_LENSES)}")
+        raise DataError(f"{record.where}: camera_model {model!r} is none of {', '.join(sorted(_LENSES))}; {UNDISTORT}")
     if model == "FULL_OPENCV":  # whose k4 is a denominator's; nerfstudio's OPENCV has a polynomial of four
         k[3], others = 0.0, [k[3], *others]
     return lens_of(record.where, model, k, others)

@@ -121,8 +121,7 @@ def read_views(
     kept: list[Entry] = []
     lost: list[str] = []
     missing: list[str] = []
-    count = 0
-    for count, entry in enumerate(entries, 1):
+    for entry in entries:
         try:
             one = view(entry)
             _check_camera(one)
@@ -137,6 +136,7 @@ def read_views(
             raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
         views[one.name] = one
         kept.append(entry)
+    count = len(views) + len(lost) + len(missing)
     if missing:
         raise DataError(
             f"{data}: {len(missing)} of {count} images are missing, the first is {missing[0]}; "
@@ -172,8 +172,12 @@ def stated_size(where: str, path: Path, width: float | None, height: float | Non
     return pixel_size(where, own[0] if width is None else width, own[1] if height is None else height)
 
 
+UNDISTORT = "undistort the images (`colmap image_undistorter` does) and write the cameras of those"
+"""Remedy for lenses that cannot be represented."""
+
+
 def lens_of(
-    where: str, model: str, distortion: Sequence[float], others: Sequence[float] = (), remedy: str = "undistort the images"
+    where: str, model: str, distortion: Sequence[float], others: Sequence[float] = (), remedy: str = UNDISTORT
 ) -> tuple[tuple[float, float, float, float, float, float], int]:
     """Distortion k1 k2 k3 k4 p1 p2 and lens of a camera model by COLMAP's name, whose `others` are its remaining parameters.
 
