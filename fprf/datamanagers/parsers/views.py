@@ -125,7 +125,8 @@ def read_views(
         try:
             one = view(entry)
             _check_camera(one)
-            image_size(one.path)
+            if not os.path.isfile(one.path):
+                raise _MissingImage(str(one.path))
         except UnusableView as fault:
             lost.append(fault.where)
             continue
@@ -136,6 +137,7 @@ def read_views(
             raise DataError(f"{data}: the image {one.name} occurs twice; remove one of its cameras")
         views[one.name] = one
         kept.append(entry)
+    # A reconstruction may fail for single images, but a missing one is mostly a folder that was copied in part.
     count = len(views) + len(lost) + len(missing)
     if missing:
         raise DataError(
