@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import struct
 from collections.abc import Callable
 from functools import partial
@@ -170,6 +171,18 @@ def test_transforms_take_points_from_the_model_that_they_were_made_of(tmp_path: 
     scene, model = parse(tmp_path), parse(tmp_path, ColmapConfig())
     assert scene.points is not None and model.points is not None and scene.seen is not None and model.seen is not None
     assert torch.equal(scene.points, model.points) and torch.equal(scene.seen, model.seen)
+    # ns-process-data turns the poses and leaves the model as it is, in colmap/sparse/0.
+    applied = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1.0, 0.5]])
+    turned = np.concatenate([applied[:, :3] @ capture.poses[:, :, :3], capture.poses[:, :, 3:]], 2)
+    turned[:, :, 3] = capture.poses[:, :, 3] @ applied[:, :3].T + applied[:, 3]
+    moved = Capture(capture.names, turned, capture.points)
+    (tmp_path / "ns/colmap").mkdir(parents=True)
+    shutil.copytree(tmp_path / "sparse", tmp_path / "ns/colmap/sparse")
+    write_transforms(tmp_path / "ns", moved, applied_transform=applied.tolist())
+    (tmp_path / "ns/points.npz").unlink()
+    scene = parse(tmp_path / "ns")
+    assert scene.points is not None and torch.equal(scene.seen, model.seen)
+    assert np.allclose(scene.points.numpy(), capture.points @ applied[:, :3].T + applied[:, 3], atol=1e-12)
     np.savez(tmp_path / "points.npz", xyz=[[np.nan] * 3, [0, 0, 1.0], [0, 1, 1.0]], seen=[[0, 0], [0, 2], [4, 1]])
     scene = parse(tmp_path)
     assert scene.points is not None and scene.seen is not None

@@ -11,7 +11,7 @@ import shlex
 import struct
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
@@ -305,8 +305,13 @@ def _finite(points: NDArray[np.float64], seen: NDArray[np.int64]) -> tuple[NDArr
     return points[finite], np.stack([view, (np.cumsum(finite) - 1)[point]], 1)
 
 
-def cloud_of_model(folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float64]]) -> Cloud | None:
-    """The points of a model whose images are these views, by file name and place; None where it is another's."""
+def cloud_of_model(
+    folder: Path, names: Sequence[str], poses: Sequence[NDArray[np.float64]], applied: NDArray[np.float64]
+) -> Cloud | None:
+    """The points of a model whose images are these views, by file name and place; None where it is another's.
+
+    The views may stand as in the model, or moved by `applied` [3 4], which then moves the points too.
+    """
     model = read_model(folder)
     images = {PurePosixPath(image.name).name: image for image in model.images}
     files = [PurePosixPath(name).name for name in names]
@@ -316,10 +321,14 @@ def cloud_of_model(folder: Path, names: Sequence[str], poses: Sequence[NDArray[n
     here = np.stack([pose[:, 3] for pose in poses])
     turn = rotations(torch.tensor([image.quaternion for image in ordered], dtype=torch.float64)).numpy()
     offset = np.array([image.translation for image in ordered])
-    with np.errstate(over="ignore", invalid="ignore"):
-        apart = np.abs(-np.einsum("vji,vj->vi", turn, offset) - here).max()
     extent = np.ptp(here, axis=0).max() if len(here) > 1 else 1.0
-    return cloud_of_images(model, observed_points(model, ordered)) if apart <= _APART * extent else None
+    for move in (np.eye(3, 4), applied):
+        with np.errstate(over="ignore", invalid="ignore"):
+            centres = -np.einsum("vji,vj->vi", turn, offset) @ move[:, :3].T + move[:, 3]
+            points = model.points @ move[:, :3].T + move[:, 3]
+        if np.abs(centres - here).max() <= _APART * extent:
+            return cloud_of_images(replace(model, points=points), observed_points(model, ordered))
+    return None
 
 
 def read_cloud(path: Path, views: int) -> Cloud:

@@ -4,7 +4,7 @@ Poses are camera-to-world in OpenGL axes and are kept as they are (an `applied_t
 (`fl_x fl_y cx cy w h`, else `camera_angle_x`; `k1 k2 k3 k4 p1 p2`; `camera_model`; `near`, `far`) stand once or by frame.
 `mask_path` names an image's mask (black pixels are left out), `sky_mask_path` one of its sky (white).
 `points.npz` beside the file or the PLY file that `ply_file_path` names hold sparse points in the same frame; so does the
-COLMAP model, in `sparse/0` or elsewhere, that it was made of.
+COLMAP model, in `sparse/0` or elsewhere, that it was made of, whose points are moved by `applied_transform`.
 """
 
 import math
@@ -99,7 +99,8 @@ def _cloud(
         points, notes = read_ply_points(inside.find(f"{top.where}: ply_file_path", ply)[1])
     model = largest_model(inside.root)[0]
     if seen is None and model is not None:
-        sparse = cloud_of_model(model, [view.name for view in views], [view.pose for view in views])
+        applied = np.eye(3, 4) if top.get("applied_transform") is None else top.matrix("applied_transform")[:3]
+        sparse = cloud_of_model(model, [view.name for view in views], [view.pose for view in views], applied)
         return (points, None, notes) if sparse is None else (*sparse, [])
     return points, seen, notes
 
