@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,7 @@ from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
 from ..ops.guided import upsample
 from ..ops.rasterise import Pinhole, lift
+from ..ops.rasterise_reference import MIN_ALPHA
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
@@ -262,6 +264,15 @@ def look_at_capture(
     up = torch.tensor(config.up or _UP)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
+    if float(gaussians.opacities.max()) < MIN_ALPHA:
+        raise DataError(f"all {len(gaussians)} Gaussians are transparent; nothing of the capture can be seen or restyled")
+    away, side = float(gaussians.means.abs().max()), bulk_of(gaussians.means.numpy()).side
+    step = float(np.spacing(np.float32(away)))
+    if len(gaussians) > 1 and step > 0.05 * side and bool((gaussians.means != gaussians.means[0]).any()):
+        raise DataError(
+            f"the capture is {side:.2g} across and lies {away:.2g} from the origin, where float32 has steps of {step:.2g}: its "
+            "shape is lost; export it closer to the origin"
+        )
     cameras = find_views(
         gaussians,
         count=config.views,

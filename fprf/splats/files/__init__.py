@@ -20,7 +20,7 @@ from ..gaussians import Gaussians
 from ..views import seen_means
 from .base import Bools, Capture
 from .ply import compressed_bytes, compressed_keeps, is_compressed, ply_bytes, ply_head, ply_rows, read_ply
-from .sog import read_sog, sog_bytes, sog_keeps, unbundle
+from .sog import folder_of, read_sog, sog_bytes, sog_keeps, unbundle
 from .splat import read_splat, splat_bytes
 from .spz import read_spz, spz_bytes, spz_keeps, spz_notes
 
@@ -178,6 +178,9 @@ def _write(path: Path, data: bytes) -> None:
     if _ending(path) != "meta.json":
         write_bytes(path, data)
         return
-    for name, content in unbundle(path, data).items():
-        if not name.startswith("__MACOSX/") and (own := name.rpartition("/")[2]):
+    files = unbundle(path, data)
+    folder = folder_of(path, files)
+    for name, content in files.items():
+        own = name.removeprefix(folder)
+        if name.startswith(folder) and own and "/" not in own:
             write_bytes(path.with_name(own), content)

@@ -24,7 +24,7 @@ _EDGE = 1e-6
 _MOST = 64.0
 """Largest magnitude of harmonics and ln-scales that are written: far beyond what is seen, and no number spoils the others."""
 _ROOT = 2**0.5
-_APART = 2.0
+_APART = 4.0
 """Extents of the bulk from it, from which on Gaussians are ordered and bounded apart from it."""
 
 

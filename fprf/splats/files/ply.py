@@ -50,6 +50,8 @@ _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 _COLOURS = (-1.5, 2.5)
 """Mean colours of compressed files: beyond, they are white or black from everywhere, and would spoil those of their chunk."""
 _CHUNK = 256
+_FEW = 32
+"""Outliers that are left out of compressed files; more are surroundings."""
 _POSITION, _SCALE, _COLOUR = (
     (tuple(f"min_{v}" for v in of), tuple(f"max_{v}" for v in of))
     for of in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
@@ -170,22 +172,23 @@ def _is_compressed(header: _Header) -> bool:
 
 
 def compressed_keeps(gaussians: Gaussians) -> Bools:
-    """Which Gaussians a compressed file holds: of those far from the bulk, some may have to go.
-
-    A chunk of 256 that holds a part of the bulk and what is far from it would tell little apart. Where outliers begin, as many
-    as the chunk has room for are left out, those of least opacity.
-    """
-    level, kept = levels_of(gaussians.means.numpy()), np.ones(len(gaussians), bool)
-    for k in range(int(level.max(initial=0))):
-        room = -int((kept & (level <= k)).sum()) % _CHUNK
-        beyond = np.flatnonzero(kept & (level > k))
-        kept[beyond[gaussians.logits.numpy()[beyond].argsort(kind="stable")[:room]]] = False
-    return kept
+    """Which Gaussians a compressed file holds: all but a few outliers, which would need chunks of their own."""
+    level = levels_of(gaussians.means.numpy())
+    beyond = len(level) - np.cumsum(np.bincount(level, minlength=1))
+    return level <= int((beyond <= _FEW).argmax())
 
 
 def compressed_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
-    """SuperSplat's file. Gaussians are put in spatial order, so that the bounds of chunks are narrow."""
-    gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
+    """SuperSplat's file. Gaussians are put in spatial order, so that the bounds of chunks are narrow.
+
+    No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
+    """
+    order, level = spatial_order(gaussians.means.numpy()), levels_of(gaussians.means.numpy())
+    parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
+    parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
+    index = np.concatenate(parts)
+    filled = index[1:] == index[:-1]
+    gaussians = gaussians.select(torch.from_numpy(index))
     means, turns, scales, logits, harmonics = _arrays(gaussians)
     bounds: list[Floats] = []
     words = np.zeros((len(means), 4), np.uint32)
@@ -196,7 +199,9 @@ def compressed_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     largest, three = smallest_three(turns)
     words[:, 1] = largest << 30 | _pack(three / 2 + 0.5, (10, 10, 10))
     share, low, high = _in_chunks(colours_of(harmonics).clip(*_COLOURS))
-    words[:, 3] = _pack(np.concatenate([share, sigmoid(logits)[:, None]], 1), (8, 8, 8, 8))
+    opacity = sigmoid(logits)
+    opacity[1:][filled] = 0
+    words[:, 3] = _pack(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
     bounds += [low, high]
     names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
     chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
@@ -414,7 +419,7 @@ def _arrays(gaussians: Gaussians) -> tuple[Floats, ...]:
 
 def _flat(harmonics: Floats) -> Floats:
     """Columns as files have them [N 3 K]: the three constants, then channel by channel."""
-    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(harmonics), -1)
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(harmonics), 3 * harmonics.shape[1] - 3)
     return np.concatenate([harmonics[:, 0], rest], 1)
 
 

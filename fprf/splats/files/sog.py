@@ -61,10 +61,8 @@ def read_sog(path: Path, data: bytes) -> Capture:
     if not data.startswith(b"PK"):
         data = bundle(_folder(path, data))
     files = unbundle(path, data)
-    folder = _folder_of(files)
-    parts = files if folder is None else {name.removeprefix(folder): each for name, each in files.items()}
-    if "meta.json" not in parts:
-        raise DataError(f"{path}: an archive without meta.json; not a SOG file")
+    folder = folder_of(path, files)
+    parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
     meta = _json(path, parts["meta.json"])
     version = meta.get("version", 1)
     if version not in (1, 2):
@@ -106,7 +104,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
             index, said["shN"] = _quantized(entries, said["shN"])
             new[name] = _webp(_palette_picture(index))
         new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
-        new = {(folder or "") + name: content for name, content in new.items()}
+        new = {folder + name: content for name, content in new.items()}
         return bundle(files | new, like=data)
 
     antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
@@ -184,11 +182,11 @@ def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
         raise DataError(f"{path}: no readable .sog archive ({error}); copy it again") from error
 
 
-def _folder_of(files: Mapping[str, bytes]) -> str | None:
-    """The folder of an archive, with its slash, that holds the meta.json nearest to the top; None where that has one."""
-    found = [name for name in files if name.endswith("/meta.json") and not name.startswith("__MACOSX/")]
-    if "meta.json" in files or not found:
-        return None
+def folder_of(path: Path, files: Mapping[str, bytes]) -> str:
+    """The folder of an archive, with its slash, that holds the meta.json nearest to the top. Raises DataError without one."""
+    found = [name for name in files if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/")]
+    if not found:
+        raise DataError(f"{path}: an archive without meta.json; not a SOG file")
     return min(found, key=lambda name: (name.count("/"), name)).removesuffix("meta.json")
 
 

@@ -274,7 +274,7 @@ def _unzip(path: Path, data: bytes) -> tuple[bytes, bytes]:
                 content += got
                 if len(content) == most == _HEADER.size:  # the header bounds the rest
                     most += _announced(path, content, len(data)) + _TRAILER
-                if not got and not piece:
+                if not got and not piece and not packer.eof:
                     return content, b""
             if not packer.eof:
                 raise DataError(f"{path}: more than {_TRAILER} bytes behind the Gaussians; it is damaged or of another kind")
