@@ -48,7 +48,7 @@ _PALETTE = 1 << 16
 _DENSE = 8
 """Pixels a byte of the low image of positions at most: captures have far fewer, and it bounds what is decoded."""
 _SLACK = 1 << 16
-_PRECISION = 2.0**-11
+_PRECISION = 2.0**-12
 """Steps of positions in extents of the capture, to which outliers do not matter."""
 _MEMBERS = 64
 _LLOYD = 12
@@ -179,7 +179,7 @@ def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
                 raise DataError(f"{path}: {len(entries)} files that claim more than the archive holds; copy it again")
             return {entry.filename: archive.read(entry) for entry in entries}
     except (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{path}: no readable .sog archive ({error}); copy it again") from error
+        raise DataError(f"{path}: no readable .sog archive ({error}); copy it again, it is cut off or damaged") from error
 
 
 def folder_of(path: Path, files: Mapping[str, bytes]) -> str:
