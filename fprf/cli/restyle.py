@@ -110,9 +110,7 @@ def run(args: list[str]) -> int:
             _write_page(config, scene, made, pictures)
     each_seconds = sum(seconds for *_, seconds in made) / max(1, len(made))
     left = "".join(f", {each} left {'out' if written.faulty else 'as they are'}" for each in capture.gaussians.faults())
-    if written.far:
-        left += f", {written.far} far from the others left out"
-    left += "".join(f", {note}" for note in written.notes)
+    left += "".join(f", {loss}" for loss in written.losses())
     print(f"{count} Gaussians{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles")
     return 0
 

@@ -51,6 +51,10 @@ class Written(NamedTuple):
     notes: tuple[str, ...] = ()
     """What is limited, each as a phrase."""
 
+    def losses(self) -> list[str]:
+        """What was left out but Gaussians that cannot be drawn, and what is limited, each as a phrase."""
+        return [*([f"{self.far} far from the others left out"] if self.far else []), *self.notes]
+
 
 _FORMATS = {
     ".compressed.ply": _Format(read_ply, compressed_bytes, keeps=compressed_keeps),

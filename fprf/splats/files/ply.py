@@ -57,6 +57,8 @@ _POSITION, _SCALE, _COLOUR = (
     for of in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
 )
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_LONGEST = 64
+"""Values of lists, as of the corners of faces, that are passed over at once where all are as long."""
 _SPAN = 8.0
 """Harmonics of compressed files lie in [-4, 4]."""
 
@@ -285,10 +287,9 @@ def _header(data: bytes) -> _Header | None:
     end = re.compile(newline + rb"[ \t]*end_header[ \t]*" + newline).search(data, first.start(1))
     if end is None:
         return None
-    lines = re.split(newline, data[first.end() : end.start()]) if end.start() > first.end() else []
-    return _Header(
-        [words for line in lines if (words := re.split(r"[ \t]+", line.decode("latin-1").strip(" \t")))[0]], end.end()
-    )
+    lines = re.split(newline, data[first.end() : max(first.end(), end.start())])
+    words = [re.split(r"[ \t]+", line.decode("latin-1").strip(" \t")) for line in lines]
+    return _Header([each for each in words if each[0]], end.end())
 
 
 def _elements(path: Path, data: bytes, header: _Header) -> dict[str, _Element]:
@@ -308,7 +309,7 @@ def _elements(path: Path, data: bytes, header: _Header) -> dict[str, _Element]:
         what = f"element {words[1]} of {count} rows"
         if any(len(kinds) > 1 for kinds in fields):
             if (after := _after_lists(data, offset, count, fields)) is None and "vertex" not in elements:
-                raise short(path, len(data), len(data) + 1, what)
+                raise DataError(f"{path}: {what} runs beyond the end of the file; copy it again, it is cut off or damaged")
             if after is None:
                 break  # what follows the Gaussians may be cut
             offset = after
@@ -330,12 +331,12 @@ def _kinds(words: list[str]) -> list[str]:
 
 def _after_lists(data: bytes, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
     """Where rows with lists end; None where that is beyond the end of the file."""
-    if len(fields) == 1 and offset + np.dtype(fields[0][0]).itemsize <= len(data):
+    if count and len(fields) == 1 and offset + np.dtype(fields[0][0]).itemsize <= len(data):
         # Mostly all have as many values as the first.
         length = max(0, int(np.frombuffer(data, fields[0][0], 1, offset)[0]))
-        row = np.dtype([("length", fields[0][0]), ("values", fields[0][1], (length,))])
+        row = np.dtype([("length", fields[0][0]), ("values", fields[0][1], (min(length, _LONGEST),))])
         end = offset + count * row.itemsize
-        if end <= len(data) and bool((np.frombuffer(data, row, count, offset)["length"] == length).all()):
+        if length <= _LONGEST and end <= len(data) and (np.frombuffer(data, row, count, offset)["length"] == length).all():
             return end
     for _ in range(count):
         for first, *values in fields:
