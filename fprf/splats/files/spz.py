@@ -122,7 +122,7 @@ def read_spz(path: Path, data: bytes) -> Capture:
 def spz_keeps(gaussians: Gaussians) -> Bools:
     """Which Gaussians a file holds: those within the reach of 24 bits whose steps suit the bulk."""
     means = gaussians.means.numpy()
-    return precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1)
+    return np.asarray(precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1))
 
 
 def spz_notes(gaussians: Gaussians) -> list[str]:
@@ -179,7 +179,7 @@ class _Axes(NamedTuple):
         """Points [N 3] of a file, right down front."""
         if self.turned:
             points = np.stack([points[:, 0], points[:, 2], -points[:, 1]], 1)
-        return points * np.array(self.signs)
+        return np.asarray(points * np.array(self.signs))
 
     def quaternions(self, turns: Floats) -> Floats:
         """Rotations [N 4], w x y z, as `points`. Mirroring the world and the own axes of a Gaussian leaves its shape."""
@@ -187,7 +187,7 @@ class _Axes(NamedTuple):
             w, x, y, z = turns.T * 0.5**0.5
             turns = np.stack([w + x, x - w, y + z, z - y], 1)
         a, b, c = self.signs
-        return turns * np.array([1.0, b * c, a * c, a * b])
+        return np.asarray(turns * np.array([1.0, b * c, a * c, a * b]))
 
     def harmonics(self, harmonics: Floats) -> Floats:
         """Harmonics [N K 3] as `points`."""
