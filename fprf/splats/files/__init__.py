@@ -28,6 +28,8 @@ __all__ = ["ENDINGS", "Capture", "Written", "read_capture", "write_capture", "wr
 
 _ROWS = 1 << 17
 """Gaussians that are in memory at a time while a large scene is written."""
+_TESTED = 1 << 12
+"""Gaussians of which it is asked at a time whether any can be drawn."""
 
 
 class _Format(NamedTuple):
@@ -80,7 +82,8 @@ def read_capture(path: Path) -> Capture:
         capture = reader(path, data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
-    if not bool(capture.gaussians.finite.any()):
+    parts = (capture.gaussians.select(slice(start, start + _TESTED)) for start in range(0, len(capture.gaussians), _TESTED))
+    if not any(bool(part.finite.any()) for part in parts):  # mostly the first part tells
         reasons = " and ".join(capture.gaussians.faults())
         raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again")
     return capture
