@@ -70,7 +70,7 @@ def run(args: list[str]) -> int:
     config, file = read_flags(RestyleConfig(), args, prog="fprf restyle", description=_DESCRIPTION, positional=("capture",))
     _check(config)
     from ..io.images import write_image
-    from ..splats.files import read_capture, write_capture
+    from ..splats.files import Written, read_capture, write_capture
     from ..style.regions import Regions
     from ..style.restyle import apply_style
 
@@ -81,7 +81,7 @@ def run(args: list[str]) -> int:
         scene = seen_capture(capture, config, config.cache, functools.partial(display.count, what="looking"), display.say)
         scene.found()
         looked = time.perf_counter() - begun
-        named, made, encoders = _styles(config, file), [], scene.encoders()
+        named, made, written, encoders = _styles(config, file), [], Written(), scene.encoders()
         for i, (name, each) in enumerate(named):
             display.count(i, len(named), "restyling")
             start = time.perf_counter()
@@ -90,7 +90,7 @@ def run(args: list[str]) -> int:
             harmonics = shown.shown.harmonics  # computed now, so that its time counts
             if config.output is not None:
                 output = _named(config.output, name)
-                write_capture(output, capture, harmonics, scene.views)
+                written = write_capture(output, capture, harmonics, scene.views)
                 write_style(_beside(output, "style.json"), styled.controls.saved)
             made.append((name, styled, shown, time.perf_counter() - start))
         display.count(len(named), len(named), "restyling")
@@ -109,8 +109,8 @@ def run(args: list[str]) -> int:
         if config.page is not None:
             _write_page(config, scene, made, pictures)
     each_seconds = sum(seconds for *_, seconds in made) / max(1, len(made))
-    lost = count - len(scene.gaussians)
-    left = f", {lost} that are not finite left as they are" if lost else ""
+    left = "".join(f", {each} left {'out' if written.faulty else 'as they are'}" for each in capture.gaussians.faults())
+    left += "".join(f", {loss}" for loss in written.losses())
     print(f"{count} Gaussians{left}; looked at in {looked:.1f} s, {each_seconds:.2f} s for each of {len(made)} styles")
     return 0
 
@@ -150,18 +150,19 @@ def seen_capture(
     progress: Callable[[int, int], None] = lambda done, total: None,
     say: Callable[[str], None] = lambda text: None,
 ) -> "SplatScene":
-    """The finite Gaussians of a capture with views and features from the cache.
+    """The Gaussians of a capture that can be drawn, with views and features from the cache.
 
-    Where they are absent, views are found here, and features, which are then stored, when they are first asked for.
+    What points up is as the flags say, else as the file does. Where views and features are absent, views are found here, and
+    features, which are then stored, when they are first asked for.
     """
     from ..splats.scene import cache_name, load_scene, look_at_capture, scene_tensors
     from ..training.prepare import cache_folder
     from ..training.tensorfiles import load_sealed, save_sealed
 
+    look = replace(look, up=look.up or capture.up)
     folder, encoder = cache or cache_folder() / "captures", look.semantic.encoder.build()
     path = folder / cache_name(capture.data, encoder.identity, look)
-    finite = capture.gaussians.finite
-    gaussians = capture.gaussians if bool(finite.all()) else capture.gaussians.select(finite)
+    gaussians = capture.gaussians.drawable()
     if path.is_file():
         try:
             scene = load_scene(load_sealed(path), gaussians, capture.antialiased, encoder)
@@ -170,7 +171,7 @@ def seen_capture(
         else:
             path.touch()
             return scene
-    scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress)
+    scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress, capture.camera)
 
     def found() -> "Semantics":
         semantics = scene.found()

@@ -107,7 +107,7 @@ class SplatVerbs(Verbs):
         if single and len(styles) > 1:
             raise UsageError(f"--output {output}: one file holds one style, {len(styles)} are asked for; name a folder")
         opened = open_gaussians(config.run, self.config, QualityConfig())
-        scene, paths = opened.scene, []
+        scene, paths, losses = opened.scene, [], dict[str, None]()
         looks = make_looks(scene, styles)[-1 if single else 0 :]
         if table or "cameras" in kinds:
             what = Plan(("cameras",), output.parent if single else output, output if single else None)
@@ -124,9 +124,12 @@ class SplatVerbs(Verbs):
                     key = hashlib.sha256(key.encode()).hexdigest()
                     write_ply_parts(path, shown.part, len(scene.gaussians), key, antialiased=True)
                 else:
-                    write_gaussians(path, shown.shown, antialiased=True, views=scene.views, plain=config.plain)
+                    written = write_gaussians(path, shown.shown, antialiased=True, views=scene.views, plain=config.plain)
+                    losses |= {f", {path.name}: {loss}": None for loss in written.losses()}
         if paths:
-            print(f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}")
+            print(
+                f"{len(scene.gaussians)} Gaussians in {', '.join(str(path) for path in dict.fromkeys(paths))}{''.join(losses)}"
+            )
 
 
 def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewer | None", others: bool) -> Path:

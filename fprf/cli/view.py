@@ -34,8 +34,8 @@ class ViewConfig(QualityConfig):
     the browser, which takes photographs, a video, a capture or a run."""
     output: Path = Path("my_scenes")
     """Folder of what the start page makes, with a folder for each scene."""
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-    """Direction that points up in a capture's own axes."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up in a capture's own axes; none = as the file says, else 0 -1 0."""
     inside: bool | None = None
     """Look at a capture from within, as in rooms and streets, or around an object; none = found out."""
     semantic: GaussianSemanticsConfig = GaussianSemanticsConfig()

@@ -32,8 +32,8 @@ class GaussianSemanticsConfig:
 class LookConfig:
     """Views of a capture, from which its regions and statistics are found."""
 
-    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
-    """Direction that points up in the capture's own axes; most captures have y down."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up in the capture's own axes; none = as the file says, else 0 -1 0: most captures have y down."""
     inside: bool | None = None
     """Look from within, as in rooms and streets, or around an object; none = found out."""
     views: int = 32

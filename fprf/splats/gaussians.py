@@ -6,7 +6,7 @@ the real spherical harmonics Y of `fields.harmonics`.
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,6 +18,11 @@ from ..ops.harmonics import HARMONIC
 
 COUNTS = (1, 4, 9, 16, 25)
 """Harmonics a channel, by degree."""
+_LARGEST, _WIDEST, _FLATTEST = 1e15, 88.0, -30.0
+"""Magnitude from which on nothing is drawn (`ops.rasterise_reference`); ln-scales: the largest whose size is finite in float32,
+and the smallest that drawing tells from 0."""
+_SAMPLE = 100_000
+"""Points, about, of which quantiles are taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +67,33 @@ class Gaussians:
 
     @property
     def finite(self) -> Annotated[Tensor, "N"]:
-        """Gaussians that can be drawn: every number finite, but for infinite logits, which are opacities 0 and 1; bool."""
-        parts = (self.means, self.quaternions, self.log_scales, self.harmonics.flatten(1))
-        return torch.stack([part.isfinite().all(1) for part in parts]).all(0) & ~self.logits.isnan()
+        """Gaussians that can be drawn, bool: with finite numbers below 1e15 and rotations of a length above 0.
+
+        Infinite logits are opacities 0 and 1, and ln-scales of -inf those of flat Gaussians: both can be drawn.
+        """
+        return self._bounded & ~self._unrotated
+
+    @property
+    def _bounded(self) -> Annotated[Tensor, "N"]:
+        parts = (self.means, self.quaternions, self.harmonics.flatten(1))
+        sized = (self.log_scales <= _WIDEST).all(1)  # False for NaN
+        return torch.stack([(part.abs() < _LARGEST).all(1) for part in parts]).all(0) & sized & ~self.logits.isnan()
+
+    @property
+    def _unrotated(self) -> Annotated[Tensor, "N"]:
+        return (self.quaternions.abs() < 1e-12).all(1)
+
+    def faults(self) -> list[str]:
+        """How many Gaussians cannot be drawn, for each reason: "3 that are not finite"."""
+        bounded = self._bounded
+        counts = {"that are not finite": ~bounded, "without a rotation": bounded & self._unrotated}
+        return [f"{int(each.sum())} {what}" for what, each in counts.items() if bool(each.any())]
+
+    def drawable(self) -> "Gaussians":
+        """The Gaussians that can be drawn, with finite ln-scales: flat ones get the smallest that makes a difference."""
+        finite = self.finite
+        kept = self if bool(finite.all()) else self.select(finite)
+        return replace(kept, log_scales=kept.log_scales.clamp_min(_FLATTEST))
 
     def recoloured(self, harmonics: Annotated[Tensor, "N K 3"]) -> "Gaussians":
         """The same Gaussians with other harmonics."""
@@ -81,6 +110,25 @@ def from_arrays(
     """Gaussians of arrays of any float type; what is beyond float32 becomes infinite."""
     parts = (means, quaternions, log_scales, logits, harmonics)
     return Gaussians(*(torch.from_numpy(np.array(part, np.float32, order="C")) for part in parts))
+
+
+class Bulk(NamedTuple):
+    """Where most of N points lie, and how far out the others."""
+
+    side: float
+    """Longest side of the box of the middle 80 % along each axis; of all points where that has none."""
+    apart: Annotated[NDArray[np.float64], "N"]
+    """Distance of each point from that box, the largest along an axis, in `side`; 0 within."""
+
+
+def bulk_of(points: Annotated[NDArray[Any], "N 3"]) -> Bulk:
+    """The bulk of finite points. Up to a tenth of them may lie anywhere on either side without moving it."""
+    if not len(points):
+        return Bulk(0.0, np.zeros(0))
+    low, high = np.percentile(points[:: max(1, len(points) // _SAMPLE)].astype(np.float64), (10, 90), axis=0)
+    side = float((high - low).max()) or float(np.ptp(points.astype(np.float64), axis=0).max())
+    apart = np.maximum(low - points, points - high).max(1).clip(0)
+    return Bulk(side, apart / (side or 1.0))
 
 
 def morton_order(cells: Annotated[NDArray[np.int64], "N 3"]) -> NDArray[np.int64]:

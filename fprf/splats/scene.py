@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import Annotated, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,7 @@ from ..errors import CheckpointError, DataError
 from ..interfaces import Encoder, Scene, SceneView, Stylizer, Values
 from ..ops.guided import upsample
 from ..ops.rasterise import Pinhole, lift
+from ..ops.rasterise_reference import MIN_ALPHA
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras, pixel_grid
 from ..rendering.renderer import enlarged
@@ -34,11 +36,11 @@ from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
 from ..types import View
 from .config import LookConfig
-from .gaussians import Gaussians
+from .gaussians import Gaussians, bulk_of
 from .levels import Levels, StyledLevels, seen_by
 from .photographs import camera_of, cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
-from .views import SeenMeans, draw, find_views, seen_means
+from .views import OUTLYING, SeenMeans, draw, find_views, seen_means
 
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
@@ -54,6 +56,8 @@ _COARSER = 2
 """Features, which are smooth, are filtered and carried back at the views' resolution divided by this."""
 _TOGETHER = 8
 """Components of the features that are spread at a time: of all Gaussians there are copies of so many."""
+_UP = (0.0, -1.0, 0.0)
+"""What points up where nothing says so."""
 _NEIGHBOURS, _LEVELS, _REACH = 1.0, 8, 0.02
 """Pixels that the nearest neighbourhood counts for, half of it for each that is twice as wide; how many; the edge of the
 nearest one, as a share of the spread of the positions."""
@@ -251,15 +255,33 @@ def look_at_capture(
     encoder: Encoder,
     config: LookConfig,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    camera: Cameras | None = None,
 ) -> SplatScene:
-    """Find views of Gaussians that are all finite. What they show is found when it is first asked for.
+    """Find views of Gaussians that are all finite, sizes included. What they show is found when it is first asked for.
 
-    Raises DataError where nothing can be seen.
+    `camera` is the view that the capture was made from, where it is known. Raises DataError where nothing can be seen.
     """
-    up = torch.tensor(config.up)
+    up = torch.tensor(config.up or _UP)
     if not bool(up.isfinite().all() & (up.norm() > 0)):
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
-    cameras = find_views(gaussians, count=config.views, size=config.size, up=up, inside=config.inside, antialiased=antialiased)
+    if float(gaussians.opacities.max()) < MIN_ALPHA:
+        raise DataError(f"all {len(gaussians)} Gaussians are transparent; nothing of the capture can be seen or restyled")
+    away, side = float(gaussians.means.abs().max()), bulk_of(gaussians.means.numpy()).side
+    step = float(np.spacing(np.float32(away)))
+    if len(gaussians) > 1 and step > 0.05 * side and bool((gaussians.means != gaussians.means[0]).any()):
+        raise DataError(
+            f"the capture is {side:.2g} across and lies {away:.2g} from the origin, where float32 has steps of {step:.2g}: its "
+            "shape is lost; export it closer to the origin"
+        )
+    cameras = find_views(
+        gaussians,
+        count=config.views,
+        size=config.size,
+        up=up,
+        inside=config.inside,
+        antialiased=antialiased,
+        camera=camera,
+    )
 
     def found() -> Semantics:
         return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, progress=progress)
@@ -390,7 +412,7 @@ def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"6 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
+    digest.update(f"7 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 
@@ -422,9 +444,11 @@ def _spread(
     A point far from whatever was seen takes `none`.
     """
     trust, levels = mass.clone(), []
-    edge = _REACH * float(points.std()) if len(points) > 1 else 0.0
+    # Neither stray Gaussians nor the distance from the origin decide how large neighbourhoods are, nor where they begin.
+    near = points[torch.from_numpy(bulk_of(points.numpy()).apart <= OUTLYING)].double()
+    edge = _REACH * float(near.var(0, correction=0).mean().sqrt())
     for level in range(_LEVELS):
-        box = ((points - points.amin(0)) / max(edge * 2**level, 1e-30)).clamp_max(2.0**20).long()
+        box = ((points - near.amin(0)) / max(edge * 2**level, 1e-30)).clamp(-1, 2.0**20).long() + 1
         _, box = torch.unique((box[:, 0] << 42) + (box[:, 1] << 21) + box[:, 2], return_inverse=True)
         weight = sums.new_zeros(int(box.max()) + 1).index_add_(0, box, mass)
         share = weight.clamp_max(_NEIGHBOURS * 0.5**level) / weight.clamp_min(1e-12)

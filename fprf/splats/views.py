@@ -11,7 +11,7 @@ before the camera.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Annotated, NamedTuple
 
 import torch
@@ -24,13 +24,15 @@ from ..ops.rasterise import Pinhole, Rasterised, lift, rasterise
 from ..ops.rasterise_reference import project_reference
 from ..rendering.cameras import Cameras
 from ..rendering.paths import look_at, pinhole
-from .gaussians import Gaussians
+from .gaussians import Gaussians, bulk_of
 from .photographs import camera_of, cover
 
 _LIFTS = (-8.0, 12.0, 32.0, 55.0)
 """Heights of the rings, in degrees above the middle."""
 _DISTANCES = (1.2, 1.7)
 """Of the rings; at 1 the object just fits into the view."""
+OUTLYING = 128.0
+"""Extents of the bulk from it, beyond which Gaussians are stray."""
 _FOV, _WIDE = 45.0, 70.0
 """Vertical angles of views around and inside, in degrees."""
 _PROBE = 8
@@ -136,13 +138,41 @@ def find_views(
     up: Annotated[Tensor, "3"],
     inside: bool | None = None,
     antialiased: bool = False,
+    camera: Cameras | None = None,
 ) -> Cameras:
     """At most `count` views of `size` (width, height), the nearer ones around an object first.
 
-    `inside` says whether cameras stand within the capture; None = found out. Raises DataError where nothing can be seen from
-    anywhere.
+    `inside` says whether cameras stand within the capture; None = found out. Where the `camera` is known that the capture was
+    made from, it is the first view, and the others stand about it. Gaussians very far from the others play no part. Raises
+    DataError where nothing can be seen from anywhere.
     """
     up = up.double() / up.double().norm()
+    near = torch.from_numpy(bulk_of(gaussians.means.numpy()).apart <= OUTLYING)
+    gaussians = gaussians if bool(near.all()) else gaussians.select(near)
+    if camera is not None:
+        # On the grid of the others, so that all of its picture lies within.
+        share = float((torch.tensor(size) / camera.size[0]).min())
+        first = camera.resized(torch.tensor([size]))
+        centre = torch.tensor(size) / 2 + share * (camera.centre - camera.size / 2)
+        first = replace(first, focal=camera.focal * share, centre=centre)
+        others = _views(gaussians, count - 1, size, up, inside, antialiased, camera.pose[0, :, 3].double())
+        return Cameras(*(torch.cat([getattr(each, field.name) for each in (first, others)]) for field in fields(first)))
+    chosen = _views(gaussians, count, size, up, inside, antialiased, None)
+    if not len(chosen):
+        raise DataError("no view shows anything of the capture; give the axis that points up (--up), or clean the file")
+    return chosen
+
+
+def _views(
+    gaussians: Gaussians,
+    count: int,
+    size: tuple[int, int],
+    up: Tensor,
+    inside: bool | None,
+    antialiased: bool,
+    place: Annotated[Tensor, "3"] | None,
+) -> Cameras:
+    """The views of `find_views`, about a place where that is known; none where nothing can be seen."""
     opacity = gaussians.opacities
     ends = torch.stack([_quantiles(axis, opacity, (0.02, 0.98)) for axis in gaussians.means.T]).double()
     coarse = gaussians
@@ -151,7 +181,7 @@ def find_views(
         coarse = gaussians.select(area.topk(_PROBED).indices)
     within = _from_within(gaussians) if inside is None else inside
     if inside is not False:
-        chosen = _around_place(gaussians, ends, up, size, count, antialiased, _SIZED_WITHIN if within else _SIZED)
+        chosen = _around_place(gaussians, ends, up, size, count, antialiased, _SIZED_WITHIN if within else _SIZED, place)
         if chosen is not None:
             return chosen
     places = _free_places(gaussians, ends, up) if within else torch.zeros(0, 3, dtype=torch.float64)
@@ -160,22 +190,26 @@ def find_views(
         cameras, near = _rings(gaussians, ends, up, size, count)
         worth = _probed(coarse, cameras, near, antialiased)[0]
     best = worth.topk(min(count, len(worth))).indices.sort().values
-    chosen = cameras.select(best[worth[best] > 0])
-    if not len(chosen):
-        raise DataError("no view shows anything of the capture; give the axis that points up (--up), or clean the file")
-    return chosen
+    return cameras.select(best[worth[best] > 0])
 
 
 def _around_place(
-    gaussians: Gaussians, ends: Tensor, up: Tensor, size: tuple[int, int], count: int, antialiased: bool, sized: float
+    gaussians: Gaussians,
+    ends: Tensor,
+    up: Tensor,
+    size: tuple[int, int],
+    count: int,
+    antialiased: bool,
+    sized: float,
+    known: Annotated[Tensor, "3"] | None,
 ) -> Cameras | None:
-    """Views from about where the photographs were taken; None where sizes do not tell as well as `sized`."""
+    """Views from about where the photographs were taken, if known; None where sizes do not tell as well as `sized`."""
     solid = (gaussians.opacities > 0.2).nonzero()[:, 0]
     if len(solid) < 100:
         return None
     some = solid[:: max(1, len(solid) // _SAMPLE)]
     points, extent = gaussians.means.double(), gaussians.log_scales.double().topk(2, dim=1).values.mean(1)
-    place, share = _size_centre(points[some], extent[some], ends)
+    place, share = _size_centre(points[some], extent[some], ends) if known is None else (known, 0.0)
     if share > sized:
         return None
     away = torch.linalg.vector_norm(points[some] - place, dim=1)
@@ -235,6 +269,9 @@ def _rings(
     """Candidates around the middle, more than are needed, and what is close to each."""
     centre = ends.mean(1)
     away = torch.linalg.vector_norm(gaussians.means.double() - centre, dim=1)
+    sizes = gaussians.log_scales.amax(1).exp()
+    # Where all are at one place, their own size is that of the object.
+    away = away.clamp_min(float(_quantiles(sizes, gaussians.opacities, (0.5,))[0]))
     reach = float(_quantiles(away.float(), gaussians.opacities, (0.95,))[0]) / math.sin(math.radians(_FOV / 2))
     rings = [(lift, far) for far in _DISTANCES for lift in _LIFTS]
     each = max(4, round(1.6 * count / len(rings)))
@@ -257,6 +294,8 @@ def _from_within(gaussians: Gaussians) -> bool:
     away = torch.linalg.vector_norm(means - means.median(0).values, dim=1)
     order = away.argsort()
     half, fifth, last = (order[round(share * (len(order) - 1))] for share in (0.5, 0.8, 0.999))
+    if away[half] == 0:
+        return False
     coarser = size[away > away[fifth]].median() - size[away < away[half]].median()
     return bool(coarser.exp() >= _COARSE) or bool(away[last] >= _TAIL * away[half])
 
@@ -300,7 +339,7 @@ def _inside(
     eye = places.repeat_interleave(_TURNS, 0)
     cameras = pinhole(look_at(eye, eye + ahead.repeat(len(places), 1), up), width=size[0], height=size[1], fov=_WIDE)
     every = torch.arange(0, len(cameras), 2)  # half of them overlap enough to tell
-    near = 0.05 * float(gaussians.means.double().var(0).sum().sqrt())
+    near = 0.05 * float(gaussians.means.double().var(0, correction=0).sum().sqrt())
     _, filled = _probed(gaussians, cameras.select(every), torch.full((len(every),), near), antialiased)
     share = filled.view(len(places), _TURNS // 2).mean(1)
     if not len(places) or float(share.quantile(0.75)) < enclosed:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ...errors import DataError
@@ -17,16 +18,18 @@ from ...rendering.cameras import Cameras
 from ...training.run import held
 from ..gaussians import Gaussians
 from ..views import seen_means
-from .base import Capture
-from .ply import compressed_bytes, is_compressed, ply_bytes, ply_head, ply_rows, read_ply
-from .sog import read_sog, sog_bytes, unbundle
+from .base import Bools, Capture
+from .ply import compressed_bytes, compressed_keeps, is_compressed, ply_bytes, ply_head, ply_rows, read_ply
+from .sog import folder_of, read_sog, sog_bytes, sog_keeps, unbundle
 from .splat import read_splat, splat_bytes
-from .spz import read_spz, spz_bytes
+from .spz import read_spz, spz_bytes, spz_keeps, spz_notes
 
-__all__ = ["ENDINGS", "Capture", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
+__all__ = ["ENDINGS", "Capture", "Written", "read_capture", "write_capture", "write_gaussians", "write_ply_parts"]
 
 _ROWS = 1 << 17
 """Gaussians that are in memory at a time while a large scene is written."""
+_TESTED = 1 << 12
+"""Gaussians of which it is asked at a time whether any can be drawn."""
 
 
 class _Format(NamedTuple):
@@ -34,15 +37,34 @@ class _Format(NamedTuple):
     pack: Callable[[Gaussians, bool], bytes]
     plain: bool = False
     """It holds neither view dependence nor whether opacities are compensated."""
+    keeps: Callable[[Gaussians], Bools] = lambda gaussians: np.ones(len(gaussians), bool)
+    """Which of the Gaussians that can be drawn it holds: all but outliers that would cost the others their precision."""
+    notes: Callable[[Gaussians], list[str]] = lambda gaussians: []
+    """What else it cannot hold of them."""
+
+
+class Written(NamedTuple):
+    """What a file that was written does not hold."""
+
+    faulty: bool = False
+    """The Gaussians that cannot be drawn (`Gaussians.faults`) are left out."""
+    far: int = 0
+    """Outliers that are left out: so far from the others that the format's numbers do not reach both."""
+    notes: tuple[str, ...] = ()
+    """What is limited, each as a phrase."""
+
+    def losses(self) -> list[str]:
+        """What was left out but Gaussians that cannot be drawn, and what is limited, each as a phrase."""
+        return [*([f"{self.far} far from the others left out"] if self.far else []), *self.notes]
 
 
 _FORMATS = {
-    ".compressed.ply": _Format(read_ply, compressed_bytes),
+    ".compressed.ply": _Format(read_ply, compressed_bytes, keeps=compressed_keeps),
     ".ply": _Format(read_ply, ply_bytes),
     ".splat": _Format(read_splat, splat_bytes, plain=True),
-    ".spz": _Format(read_spz, spz_bytes),
-    ".sog": _Format(read_sog, sog_bytes),
-    "meta.json": _Format(read_sog, sog_bytes),
+    ".spz": _Format(read_spz, spz_bytes, keeps=spz_keeps, notes=spz_notes),
+    ".sog": _Format(read_sog, sog_bytes, keeps=sog_keeps),
+    "meta.json": _Format(read_sog, sog_bytes, keeps=sog_keeps),
 }
 ENDINGS = tuple(_FORMATS)
 
@@ -60,25 +82,40 @@ def read_capture(path: Path) -> Capture:
         capture = reader(path, data)
     if not len(capture.gaussians):
         raise DataError(f"{path}: holds no Gaussian")
+    parts = (capture.gaussians.select(slice(start, start + _TESTED)) for start in range(0, len(capture.gaussians), _TESTED))
+    if not any(bool(part.finite.any()) for part in parts):  # mostly the first part tells
+        reasons = " and ".join(capture.gaussians.faults())
+        raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again")
     return capture
 
 
 def write_gaussians(
     path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None, plain: bool = False
-) -> None:
+) -> Written:
     """Write a file in the format that its name ends with, whole or not at all. Raises DataError for another ending.
 
-    .ply is exact; the others lose what their bits cannot hold, and .compressed.ply and SOG have an order of their own.
+    .ply is exact; the others lose what their bits cannot hold, Gaussians that cannot be drawn, and outliers that would cost the
+    others their precision; .compressed.ply and SOG have an order of their own.
     .splat holds neither view dependence nor whether opacities are compensated (`antialiased`): it gets the means of what
     `views` show, or the colours over all directions where none are given. With `plain` all formats get such opacities, for
     renderers that do not compensate.
     """
-    form = _FORMATS[_ending(path)]
+    form, faulty, far = _FORMATS[_ending(path)], False, 0
+    if form.pack is not ply_bytes:
+        finite = gaussians.finite
+        faulty = not bool(finite.all())
+        gaussians = gaussians.select(finite) if faulty else gaussians
+        kept = torch.from_numpy(form.keeps(gaussians))
+        far = int((~kept).sum())
+        gaussians = gaussians.select(kept) if far else gaussians
+        if far and not len(gaussians):
+            raise DataError(f"{path}: all Gaussians lie too far from the origin for this format; write a .ply")
     if views is not None and len(views) and ((form.plain and gaussians.degree) or (antialiased and (form.plain or plain))):
         seen = seen_means(gaussians, views, antialiased=antialiased)
         gaussians = seen.gaussians(gaussians) if form.plain else seen.plain(gaussians)
         antialiased = False
     _write(path, form.pack(gaussians, antialiased))
+    return Written(faulty, far, tuple(form.notes(gaussians)))
 
 
 def write_ply_parts(path: Path, part: Callable[[slice], Gaussians], count: int, key: str, *, antialiased: bool = False) -> None:
@@ -114,11 +151,11 @@ def write_ply_parts(path: Path, part: Callable[[slice], Gaussians], count: int, 
             raise unwritable(path, error, len(head) + count * row) from error
 
 
-def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None) -> None:
-    """Write a capture with new harmonics of all its Gaussians, or of all that are finite, in the format that the name says.
+def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N K 3"], views: Cameras | None = None) -> Written:
+    """Write a capture with new harmonics of all its Gaussians, or of all that can be drawn, in the format that the name says.
 
     In the format that it was read from everything else stays as it was, bit for bit; where no harmonic differs from those
-    read, that is the whole file. Another format gets the colours that `write_gaussians` gives it.
+    read, that is the whole file. Another format gets what `write_gaussians` gives it, and no Gaussians that cannot be drawn.
     """
     finite, before = capture.gaussians.finite, capture.gaussians.harmonics
     if len(harmonics) < len(finite):
@@ -128,11 +165,13 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
     plain = ending == ".ply" and here == ".compressed.ply"
     packed = ending == ".compressed.ply" and not is_compressed(capture.data)
     if _FORMATS[ending].read is not _FORMATS[here].read or plain or packed:
-        write_gaussians(path, capture.gaussians.recoloured(harmonics), antialiased=capture.antialiased, views=views)
-        return
+        drawn = capture.gaussians.recoloured(harmonics).select(finite)
+        written = write_gaussians(path, drawn, antialiased=capture.antialiased, views=views)
+        return written._replace(faulty=not bool(finite.all()))
     changed = (harmonics != before).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
     data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))
     _write(path, data)
+    return Written()
 
 
 def _ending(path: Path) -> str:
@@ -146,5 +185,9 @@ def _write(path: Path, data: bytes) -> None:
     if _ending(path) != "meta.json":
         write_bytes(path, data)
         return
-    for name, content in unbundle(path, data).items():
-        write_bytes(path.with_name(name), content)
+    files = unbundle(path, data)
+    folder = folder_of(path, files)
+    for name, content in files.items():
+        own = name.removeprefix(folder)
+        if name.startswith(folder) and own and "/" not in own:
+            write_bytes(path.with_name(own), content)

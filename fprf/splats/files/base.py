@@ -13,14 +13,19 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...ops.harmonics import HARMONIC
-from ..gaussians import Gaussians, morton_order
+from ...rendering.cameras import Cameras
+from ..gaussians import Gaussians, bulk_of, morton_order
 
 Floats: TypeAlias = NDArray[Any]
 Bools: TypeAlias = NDArray[np.bool_]
 
 _EDGE = 1e-6
 """Opacities of exactly 0 and 1 have no logit: both keep this distance, far below a 16-bit step."""
+_MOST = 64.0
+"""Largest magnitude of harmonics and ln-scales that are written: far beyond what is seen, and no number spoils the others."""
 _ROOT = 2**0.5
+_APART = 4.0
+"""Extents of the bulk from it, from which on Gaussians are ordered and bounded apart from it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +40,10 @@ class Capture:
     """The file. Of a folder, its files as one archive."""
     recolour: Callable[[Floats, Bools], bytes]
     """The file with the harmonics [N K 3] of some Gaussians (bool [N]) replaced and everything else as it was."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up, where the file says so."""
+    camera: Cameras | None = None
+    """The view that the capture was made from, where the file holds it."""
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:
@@ -47,10 +56,9 @@ def steps(values: Floats, most: int) -> NDArray[np.int64]:
     return np.rint(np.clip(np.nan_to_num(values.astype(np.float64), nan=0.0), 0, 1) * most).astype(np.int64)
 
 
-def finite(values: Floats) -> NDArray[np.float64]:
-    """Numbers in float64 whose differences are finite in float32, too: 0 for NaN, the largest such for infinite ones."""
-    largest = 0.25 * float(np.finfo(np.float32).max)
-    return np.clip(np.nan_to_num(values.astype(np.float64)), -largest, largest)
+def finite(values: Floats, most: float = _MOST) -> NDArray[np.float64]:
+    """Numbers in float64, 0 for NaN, limited to a magnitude."""
+    return np.clip(np.nan_to_num(values.astype(np.float64)), -most, most)
 
 
 def sigmoid(x: Floats) -> Floats:
@@ -77,11 +85,9 @@ def constants_of(colours: Floats) -> Floats:
 def smallest_three(quaternions: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Of unit quaternions [N 4], up to their sign: which component is the largest [N], and the others times sqrt 2 [N 3].
 
-    The others lie in [-1, 1]. A quaternion of length 0 or NaN becomes the identity.
+    The others lie in [-1, 1].
     """
-    length = np.linalg.norm(quaternions.astype(np.float64), axis=1, keepdims=True)
-    sound = np.isfinite(length) & (length > 0)
-    unit = np.where(sound, quaternions, [1.0, 0.0, 0.0, 0.0]) / np.where(sound, length, 1.0)
+    unit = quaternions / np.linalg.norm(quaternions.astype(np.float64), axis=1, keepdims=True)
     largest = np.abs(unit).argmax(1)
     rows = np.arange(len(unit))
     unit = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -97,12 +103,43 @@ def three_to_four(largest: NDArray[np.int64], three: Floats) -> Floats:
     return out
 
 
+def levels_of(means: Floats) -> NDArray[np.int64]:
+    """0 for the bulk of means [N 3], 1 for the bulk of those far from it, and so on."""
+    level, rest = np.zeros(len(means), np.int64), np.arange(len(means))
+    while len(rest := rest[bulk_of(means[rest]).apart > _APART]):
+        level[rest] += 1
+    return level
+
+
 def spatial_order(means: Floats) -> NDArray[np.int64]:
-    """An order in which neighbours in space follow each other (Z-order curve of 1024 cells a side)."""
-    sound = np.nan_to_num(means.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    low, high = sound.min(0), sound.max(0)
-    cells = ((sound - low) / np.maximum(high - low, np.finfo(np.float32).tiny) * 1023).astype(np.int64)
-    return morton_order(cells)
+    """An order in which neighbours in space follow each other (Z-order curve of 1024 cells a side), outliers last."""
+    level, order = levels_of(means), []
+    for k in range(int(level.max(initial=-1)) + 1):
+        at = np.flatnonzero(level == k)
+        points = means[at].astype(np.float64)
+        low, high = points.min(0), points.max(0)
+        cells = ((points - low) / np.maximum(high - low, np.finfo(np.float32).tiny) * 1023).astype(np.int64)
+        order.append(at[morton_order(cells)])
+    return np.concatenate(order) if order else level
+
+
+def precise(means: Floats, step: Callable[[Floats, Floats], float], share: float) -> Bools:
+    """Which of means [N 3] a file keeps: all, or all but outliers for which the others would lose precision.
+
+    `step` is the distance between positions that the file tells apart, of the means kept and of their bulk. It shall be at most
+    `share` of the extent of the bulk; where the bulk itself does not allow that, what it allows.
+    """
+    bulk = bulk_of(means)
+    if bulk.side == 0:
+        return np.ones(len(means), bool)
+    inner = means[bulk.apart <= 0.5]
+    tried = [np.inf, *(2.0**k for k in range(14, -1, -1))]
+    wanted = max(share * bulk.side, step(means[bulk.apart <= tried[-1]], inner))
+    for reach in tried:
+        kept = bulk.apart <= reach
+        if step(means[kept], inner) <= wanted:
+            break
+    return np.asarray(kept)
 
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

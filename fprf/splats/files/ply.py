@@ -1,14 +1,16 @@
 """The PLY files of 3D Gaussian Splatting: one vertex a Gaussian (INRIA), and SuperSplat's compressed chunks of 256.
 
 INRIA       float32 x y z, f_dc_0..2, f_rest_* channel by channel, opacity (logit), scale_0..2 (ln), rot_0..3 (w x y z), and
-            any other property and element, which are kept. Header comments: `SplatRenderMode: default|mip|2dgs` (Brush),
-            `antialiased 0|1` (Postshot).
+            any other property and element, which are kept. Header comments: `SplatRenderMode: default|mip|2dgs` and
+            `Vertical axis: x|y|z|X Y Z` (Brush), `antialiased 0|1` (Postshot). Elements `extrinsic`, `intrinsic` and
+            `image_size`: the camera of the one photograph that a capture was made of (SHARP).
 compressed  element `chunk`: bounds of positions, ln-scales and, mostly, colours; `vertex`: four 32-bit words, position and
             scale of 11, 10 and 11 bits, rotation of 2 + 3 x 10, RGBA of 8 each; `sh`: bytes, (v + 0.5) / 256 of [-4, 4].
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
+from ...rendering.cameras import Cameras, ideal_cameras
 from ..gaussians import COUNTS, Gaussians, from_arrays
 from .base import (
     Bools,
@@ -25,6 +28,7 @@ from .base import (
     colours_of,
     constants_of,
     finite,
+    levels_of,
     logit,
     short,
     sigmoid,
@@ -40,14 +44,21 @@ _TYPES = {
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
 _NAMES = {"u1": "uchar", "u4": "uint", "i4": "int", "f4": "float"}
-_HEADER = 1 << 16
-"""Bytes within which a header ends."""
+_COMMENT = re.compile(r"(splatrendermode|antialiased|vertical axis)\b[\s:=]*(.*)", re.IGNORECASE)
+_UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
+"""What points up where a vertical axis is named by its letter, as Brush reads it: up is -y and -z."""
+_COLOURS = (-1.5, 2.5)
+"""Mean colours of compressed files: beyond, they are white or black from everywhere, and would spoil those of their chunk."""
 _CHUNK = 256
+_FEW = 32
+"""Outliers that are left out of compressed files; more are surroundings."""
 _POSITION, _SCALE, _COLOUR = (
     (tuple(f"min_{v}" for v in of), tuple(f"max_{v}" for v in of))
     for of in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
 )
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_LONGEST = 64
+"""Values of lists, as of the corners of faces, that are passed over at once where all are as long."""
 _SPAN = 8.0
 """Harmonics of compressed files lie in [-4, 4]."""
 
@@ -58,14 +69,33 @@ class _Element(NamedTuple):
     """Of its first byte in the file."""
 
 
+class _Header(NamedTuple):
+    lines: list[list[str]]
+    """Words of each line but the first and the last."""
+    size: int
+    """Bytes before the first row."""
+
+    def texts(self) -> list[str]:
+        """Comments."""
+        return [" ".join(words[1:]) for words in self.lines if words[0] in ("comment", "obj_info")]
+
+
 def read_ply(path: Path, data: bytes) -> Capture:
     """A PLY of either layout. Raises DataError for others, 2D Gaussians among them."""
-    comments, elements = _parse(path, data)
-    text = "\n".join(comments)
-    antialiased = bool(re.search(r"SplatRenderMode:\s*mip|antialiased\s+1", text))
-    if is_compressed(data):
-        return _read_compressed(path, data, elements, antialiased)
-    if re.search(r"SplatRenderMode:\s*2dgs", text):
+    header = _header(data)
+    if header is None:
+        raise DataError(f"{path}: no PLY header from `ply` to `end_header`; the file is damaged or of another kind")
+    elements = _elements(path, data, header)
+    said = {found[1].lower(): found[2].lower() for text in header.texts() if (found := _COMMENT.match(text))}
+    modes = [key for key in said if key != "vertical axis"]
+    mode = said[modes[-1]] if modes else ""
+    antialiased = mode in ("mip", "1")
+    up, camera = _up(said.get("vertical axis", "")), _camera(elements)
+    if up is None and camera is not None:
+        up = (float(camera.pose[0, 0, 1]), float(camera.pose[0, 1, 1]), float(camera.pose[0, 2, 1]))
+    if _is_compressed(header):
+        return replace(_read_compressed(path, data, elements, antialiased), up=up, camera=camera)
+    if mode == "2dgs":
         raise DataError(f"{path}: 2D Gaussians (SplatRenderMode: 2dgs); only 3D Gaussians are read")
     vertex = elements.get("vertex")
     if vertex is None:
@@ -78,8 +108,10 @@ def read_ply(path: Path, data: bytes) -> Capture:
     count = 1 + rest // 3
     wanted = [*"xyz", "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *colours]
     for name in wanted:
-        if name not in known or table.dtype[name].kind != "f":
-            raise DataError(f"{path}: no property {name} of floats; not a file of 3D Gaussians")
+        if name not in known:
+            raise DataError(f"{path}: no property {name}; not a file of 3D Gaussians")
+        if table.dtype[name].kind != "f" and name not in "xyz":
+            raise DataError(f"{path}: property {name} is of whole numbers; 3D Gaussians have float or double there")
     if rest % 3 or count not in COUNTS:
         raise DataError(f"{path}: {rest} properties f_rest_*; 0, 9, 24, 45 or 72 belong to degrees 0 to 4")
 
@@ -104,7 +136,7 @@ def read_ply(path: Path, data: bytes) -> Capture:
             target[name][changed] = column[changed]
         return bytes(out)
 
-    return Capture(path, gaussians, antialiased, data, recolour)
+    return Capture(path, gaussians, antialiased, data, recolour, up, camera)
 
 
 def ply_bytes(gaussians: Gaussians, antialiased: bool, normals: Floats | None = None) -> bytes:
@@ -133,12 +165,32 @@ def _comments(antialiased: bool) -> list[str]:
 
 def is_compressed(data: bytes) -> bool:
     """True for a PLY with SuperSplat's layout."""
-    return b"packed_position" in data[:_HEADER].partition(b"end_header")[0]
+    header = _header(data)
+    return header is not None and _is_compressed(header)
+
+
+def _is_compressed(header: _Header) -> bool:
+    return any(words[0] == "property" and words[-1] == _PACKED[0] for words in header.lines)
+
+
+def compressed_keeps(gaussians: Gaussians) -> Bools:
+    """Which Gaussians a compressed file holds: all but a few outliers, which would need chunks of their own."""
+    level = levels_of(gaussians.means.numpy())
+    beyond = len(level) - np.cumsum(np.bincount(level, minlength=1))
+    return level <= int((beyond <= _FEW).argmax())
 
 
 def compressed_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
-    """SuperSplat's file. Gaussians are put in spatial order, so that the bounds of chunks are narrow."""
-    gaussians = gaussians.select(torch.from_numpy(spatial_order(gaussians.means.numpy())))
+    """SuperSplat's file. Gaussians are put in spatial order, so that the bounds of chunks are narrow.
+
+    No chunk holds both the bulk and what is far from it: before the latter transparent Gaussians fill up the last one.
+    """
+    order, level = spatial_order(gaussians.means.numpy()), levels_of(gaussians.means.numpy())
+    parts = [order[level[order] == k] for k in range(int(level.max(initial=0)) + 1)]
+    parts = [np.append(part, np.full(-len(part) % _CHUNK, part[-1])) for part in parts[:-1]] + parts[-1:]
+    index = np.concatenate(parts)
+    filled = index[1:] == index[:-1]
+    gaussians = gaussians.select(torch.from_numpy(index))
     means, turns, scales, logits, harmonics = _arrays(gaussians)
     bounds: list[Floats] = []
     words = np.zeros((len(means), 4), np.uint32)
@@ -148,8 +200,10 @@ def compressed_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
         bounds += [low, high]
     largest, three = smallest_three(turns)
     words[:, 1] = largest << 30 | _pack(three / 2 + 0.5, (10, 10, 10))
-    share, low, high = _in_chunks(colours_of(harmonics))
-    words[:, 3] = _pack(np.concatenate([share, sigmoid(logits)[:, None]], 1), (8, 8, 8, 8))
+    share, low, high = _in_chunks(colours_of(harmonics).clip(*_COLOURS))
+    opacity = sigmoid(logits)
+    opacity[1:][filled] = 0
+    words[:, 3] = _pack(np.concatenate([share, opacity[:, None]], 1), (8, 8, 8, 8))
     bounds += [low, high]
     names = [name for pair in (_POSITION, _SCALE, _COLOUR) for of in pair for name in of]
     chunk = np.concatenate(bounds, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
@@ -202,9 +256,9 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
     def recolour(harmonics: Floats, changed: Bools) -> bytes:
         out = bytearray(data)
         target = np.frombuffer(out, vertex.table.dtype, count, vertex.offset)
-        share = colours_of(harmonics)
+        share = colours_of(finite(harmonics))
         if tinted:  # a chunk in which anything changes gets new bounds, and all of its colours are rounded again
-            share, *limits = _in_chunks(share)
+            share, *limits = _in_chunks(share.clip(*_COLOURS))
             there = np.unique(of[changed])
             changed_here = np.isin(of, there)
             bounds = np.frombuffer(out, chunk.table.dtype, len(chunk.table), chunk.offset)
@@ -224,29 +278,119 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
     return Capture(path, gaussians, antialiased, data, recolour)
 
 
-def _parse(path: Path, data: bytes) -> tuple[list[str], dict[str, _Element]]:
-    """Comments, and the elements up to the first of variable length."""
-    end = re.search(rb"\nend_header\r?\n", data[:_HEADER])
-    if not data.startswith(b"ply") or end is None:
-        raise DataError(f"{path}: no PLY header; the file is damaged or of another kind")
-    lines = data[: end.start()].decode("ascii", "replace").splitlines()
-    if "format binary_little_endian 1.0" not in lines:
-        raise DataError(f"{path}: no binary little-endian PLY; export it again as one")
-    comments, offset, elements = [line[8:] for line in lines if line.startswith("comment ")], end.end(), {}
-    starts = [i for i, line in enumerate(lines) if line.startswith("element ")]
+def _header(data: bytes) -> _Header | None:
+    """The header, whose lines end as the first one does: with LF, CR LF or CR. None where it has no begin or no end."""
+    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
+    if first is None:
+        return None
+    newline = rb"\r" if first[1] == b"\r" else rb"\r?\n"
+    end = re.compile(newline + rb"[ \t]*end_header[ \t]*" + newline).search(data, first.start(1))
+    if end is None:
+        return None
+    lines = re.split(newline, data[first.end() : max(first.end(), end.start())])
+    words = [re.split(r"[ \t]+", line.decode("latin-1").strip(" \t")) for line in lines]
+    return _Header([each for each in words if each[0]], end.end())
+
+
+def _elements(path: Path, data: bytes, header: _Header) -> dict[str, _Element]:
+    """Elements by name; those with lists are passed over."""
+    form = next((words[1:] for words in header.lines if words[0] == "format"), [])
+    if form not in (["binary_little_endian", "1.0"], ["binary_big_endian", "1.0"]):
+        raise DataError(f"{path}: a PLY of format {' '.join(form) or 'unknown'}; binary ones are read: export it again as such")
+    types = {name: kind.replace("<", ">") if "big" in form[0] else kind for name, kind in _TYPES.items()}
+    lines = [words for words in header.lines if words[0] in ("element", "property")]
+    starts, offset, elements = [i for i, words in enumerate(lines) if words[0] == "element"], header.size, {}
     for start, stop in zip(starts, [*starts[1:], len(lines)], strict=False):
-        words, properties = lines[start].split(), [line.split() for line in lines[start + 1 : stop] if line[:9] == "property "]
-        if any(each[1] == "list" for each in properties if len(each) > 1):
-            break
-        names = [each[2] for each in properties if len(each) == 3 and each[1] in _TYPES]
-        if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or len({*names}) != len(properties) or not names:
-            raise DataError(f"{path}: {lines[start]!r} or its properties are no valid PLY; export the file again")
-        kind, count = np.dtype([(each[2], _TYPES[each[1]]) for each in properties]), int(words[2])
-        if offset + count * kind.itemsize > len(data):
-            raise short(path, len(data), offset + count * kind.itemsize, f"element {words[1]} of {count} rows")
-        elements[words[1]] = _Element(np.frombuffer(data, kind, count, offset), offset)
-        offset += count * kind.itemsize
-    return comments, elements
+        words, properties = lines[start], lines[start + 1 : stop]
+        names = {each[-1] for each in properties if [kind in types for kind in _kinds(each)] in ([True], [True, True])}
+        if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or len(names) != len(properties) or not names:
+            raise DataError(f"{path}: {' '.join(words)!r} or its properties are no valid PLY; export the file again")
+        count, fields = int(words[2]), [[types[kind] for kind in _kinds(each)] for each in properties]
+        what = f"element {words[1]} of {count} rows"
+        if any(len(kinds) > 1 for kinds in fields):
+            if (after := _after_lists(data, offset, count, fields)) is None and "vertex" not in elements:
+                raise DataError(f"{path}: {what} runs beyond the end of the file; copy it again, it is cut off or damaged")
+            if after is None:
+                break  # what follows the Gaussians may be cut
+            offset = after
+            continue
+        table = np.dtype([(each[-1], kinds[0]) for each, kinds in zip(properties, fields, strict=True)])
+        if offset + count * table.itemsize > len(data):
+            raise short(path, len(data), offset + count * table.itemsize, what)
+        elements[words[1]] = _Element(np.frombuffer(data, table, count, offset), offset)
+        offset += count * table.itemsize
+    return elements
+
+
+def _kinds(words: list[str]) -> list[str]:
+    """Types of a property: one, or those of a list's length and values; none where the line is neither."""
+    if len(words) == 5 and words[1] == "list" and words[2] not in ("float", "float32", "double", "float64"):
+        return words[2:4]
+    return words[1:2] if len(words) == 3 else []
+
+
+def _after_lists(data: bytes, offset: int, count: int, fields: Sequence[Sequence[str]]) -> int | None:
+    """Where rows with lists end; None where that is beyond the end of the file."""
+    if count and len(fields) == 1 and offset + np.dtype(fields[0][0]).itemsize <= len(data):
+        # Mostly all have as many values as the first.
+        length = max(0, int(np.frombuffer(data, fields[0][0], 1, offset)[0]))
+        row = np.dtype([("length", fields[0][0]), ("values", fields[0][1], (min(length, _LONGEST),))])
+        end = offset + count * row.itemsize
+        if length <= _LONGEST and end <= len(data) and (np.frombuffer(data, row, count, offset)["length"] == length).all():
+            return end
+    for _ in range(count):
+        for first, *values in fields:
+            kind = np.dtype(first)
+            if offset + kind.itemsize > len(data):
+                return None
+            length = int(np.frombuffer(data, kind, 1, offset)[0]) if values else 0
+            offset += kind.itemsize + max(length, 0) * (np.dtype(values[0]).itemsize if values else 0)
+        if offset > len(data):
+            return None
+    return offset
+
+
+def _up(text: str) -> tuple[float, float, float] | None:
+    """The direction up of `Vertical axis: z` or `0 0 1`; a letter with a sign is that direction."""
+    numbers = text.replace(",", " ").strip("[]() ").split()
+    if numbers and numbers[0].lstrip("+-") in _UP:
+        letter = numbers[0].lstrip("+-")
+        sign = -1.0 if numbers[0][0] == "-" else 1.0
+        named = [sign * (letter == axis) for axis in _UP]
+        return _UP[letter] if numbers[0] == letter else (named[0], named[1], named[2])
+    try:
+        x, y, z = map(float, numbers)
+    except ValueError:
+        return None
+    return (x, y, z) if 0 < x * x + y * y + z * z < np.inf else None
+
+
+def _camera(elements: Mapping[str, _Element]) -> Cameras | None:
+    """The camera of `extrinsic` (world to camera, OpenCV axes), `intrinsic` and `image_size`; None where there is no sound one.
+
+    Older files have 12 numbers of `extrinsic`, its rotation transposed, and fx, fy, width and height as `intrinsic`.
+    """
+    numbers = {}
+    for name in ("extrinsic", "intrinsic", "image_size"):
+        if name in elements:
+            table = elements[name].table
+            numbers[name] = np.stack([table[each].astype(np.float64) for each in table.dtype.names or ()], 1).ravel()
+    matrix, lens = numbers.get("extrinsic", np.eye(4).ravel()), numbers.get("intrinsic", np.zeros(0))
+    size = numbers.get("image_size", lens[2:4] if len(lens) == 4 else np.zeros(0))
+    if len(matrix) not in (12, 16) or len(lens) not in (4, 9) or len(size) != 2:
+        return None
+    world = matrix[:12].reshape(3, 4)
+    rotation = world[:, :3].T if len(matrix) == 16 else world[:, :3]  # camera to world
+    focal = lens[[0, 1] if len(lens) == 4 else [0, 4]]
+    centre = size / 2 if len(lens) == 4 else lens[[2, 5]]
+    sound = all(np.isfinite(each).all() for each in (world, focal, centre)) and np.abs(world[:, 3]).max() < 1e15
+    if not sound or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
+        return None
+    if focal.min() <= 0 or size.min() < 1 or size.max() > 1 << 16:
+        return None
+    pose = np.concatenate([rotation * [1.0, -1.0, -1.0], -rotation @ world[:, 3:]], 1)  # OpenGL axes
+    cameras = ideal_cameras(torch.from_numpy(pose)[None], 1.0, (int(size[0]), int(size[1])))
+    return replace(cameras, focal=torch.from_numpy(focal)[None], centre=torch.from_numpy(centre)[None])
 
 
 def ply_file(tables: dict[str, NDArray[np.void]], comments: Sequence[str] = ()) -> bytes:
@@ -276,7 +420,7 @@ def _arrays(gaussians: Gaussians) -> tuple[Floats, ...]:
 
 def _flat(harmonics: Floats) -> Floats:
     """Columns as files have them [N 3 K]: the three constants, then channel by channel."""
-    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(harmonics), -1)
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(len(harmonics), 3 * harmonics.shape[1] - 3)
     return np.concatenate([harmonics[:, 0], rest], 1)
 
 
@@ -286,7 +430,7 @@ def _rest_bytes(rest: Floats) -> NDArray[np.uint8]:
 
 def _in_chunks(values: Floats) -> tuple[Floats, Floats, Floats]:
     """Values [N C] as shares of the bounds of their chunks, and these bounds [chunks C]."""
-    starts, values = np.arange(0, len(values), _CHUNK), finite(values)
+    starts = np.arange(0, len(values), _CHUNK)
     low, high = (what.reduceat(values, starts, axis=0).astype(np.float32) for what in (np.minimum, np.maximum))
     at = np.arange(len(values)) // _CHUNK
     span = (high - low).astype(np.float64)[at]

@@ -4,6 +4,7 @@ means     two images, 16 bits between mins and maxs of sign(x) ln(1 + |x|)
 quats     the three smaller components times sqrt 2 as bytes; alpha - 252 says which one is missing (w x y z)
 scales    ln-scales, sh0 constants (alpha: opacity): indices into codebooks of 256 numbers
 shN       labels of 16 bits into a palette of harmonics, 64 entries a row, which are indices into a codebook
+`antialias` or `model` ("antialiased", "2dgs") say what the Gaussians are. An archive may hold all that in a folder.
 Version 1 has ranges (mins, maxs) in the place of codebooks, and logits in sh0's alpha.
 
 Recoloured, a file keeps its labels: each entry of the palette becomes the mean of what its Gaussians became.
@@ -25,7 +26,19 @@ from numpy.typing import NDArray
 from ...datamanagers.images import header_of
 from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians, from_arrays
-from .base import Bools, Capture, Floats, finite, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
+from .base import (
+    Bools,
+    Capture,
+    Floats,
+    finite,
+    logit,
+    precise,
+    sigmoid,
+    smallest_three,
+    spatial_order,
+    steps,
+    three_to_four,
+)
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
@@ -35,6 +48,8 @@ _PALETTE = 1 << 16
 _DENSE = 8
 """Pixels a byte of the low image of positions at most: captures have far fewer, and it bounds what is decoded."""
 _SLACK = 1 << 16
+_PRECISION = 2.0**-12
+"""Steps of positions in extents of the capture, to which outliers do not matter."""
 _MEMBERS = 64
 _LLOYD = 12
 _FIRST = (1980, 1, 1, 0, 0, 0)
@@ -45,11 +60,15 @@ def read_sog(path: Path, data: bytes) -> Capture:
     """A .sog archive, or the meta.json of a folder. Raises DataError for what is neither."""
     if not data.startswith(b"PK"):
         data = bundle(_folder(path, data))
-    parts = unbundle(path, data)
-    meta = _json(path, parts.get("meta.json", b""))
+    files = unbundle(path, data)
+    folder = folder_of(path, files)
+    parts = {name.removeprefix(folder): content for name, content in files.items() if name.startswith(folder)}
+    meta = _json(path, parts["meta.json"])
     version = meta.get("version", 1)
     if version not in (1, 2):
         raise DataError(f"{path}: SOG of version {version!r}; versions 1 and 2 are read")
+    if meta.get("model") == "2dgs":
+        raise DataError(f"{path}: 2D Gaussians (model 2dgs); only 3D Gaussians are read")
     pictures = _Pictures(path, parts, meta)
     count = pictures.count
     low, high = (pictures.rows("means", i)[:, :3].astype(np.int64) for i in (0, 1))
@@ -71,7 +90,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
     )
 
     def recolour(harmonics: Floats, changed: Bools) -> bytes:
-        new, said = dict(parts), json.loads(parts["meta.json"])
+        new, said = {}, json.loads(parts["meta.json"])
         names = said["sh0"]["files"][0]
         index, said["sh0"] = _quantized(harmonics[:, 0], said["sh0"])
         picture = pictures.picture(names)
@@ -85,9 +104,25 @@ def read_sog(path: Path, data: bytes) -> Capture:
             index, said["shN"] = _quantized(entries, said["shN"])
             new[name] = _webp(_palette_picture(index))
         new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
-        return bundle(new, like=data)
+        new = {folder + name: content for name, content in new.items()}
+        return bundle(files | new, like=data)
 
-    return Capture(path, gaussians, meta.get("antialias") is True, data, recolour)
+    antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
+    return Capture(path, gaussians, antialiased, data, recolour)
+
+
+def sog_keeps(gaussians: Gaussians) -> Bools:
+    """Which Gaussians a file holds: all but outliers that would cost the others their 16 bits."""
+
+    def step(kept: Floats, inner: Floats) -> float:
+        ends = [_bent(kept.min(0)), _bent(kept.max(0))]
+        return float(((ends[1] - ends[0]) / 65535 * (1 + np.abs(inner).max(0))).max())
+
+    return precise(gaussians.means.numpy().astype(np.float64), step, _PRECISION)
+
+
+def _bent(means: Floats) -> Floats:
+    return np.sign(means) * np.log1p(np.abs(means))
 
 
 def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
@@ -96,14 +131,13 @@ def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     count = len(gaussians)
     width = -(-int(np.ceil(count**0.5)) // 4) * 4
     shape = (-(-count // max(width, 1)), width)
-    means = finite(gaussians.means.numpy())
-    bent = np.sign(means) * np.log1p(np.abs(means))
+    bent = _bent(gaussians.means.numpy().astype(np.float64))
     least, most = bent.min(0), bent.max(0)
     at = steps((bent - least) / np.where(most > least, most - least, 1.0), 65535)
     largest, three = smallest_three(gaussians.quaternions.numpy())
     harmonics = gaussians.harmonics.numpy()
     opacity = steps(sigmoid(gaussians.logits.numpy()), 255)
-    scale, scales = _quantized(gaussians.log_scales.numpy(), {"files": ["scales.webp"], "codebook": []})
+    scale, scales = _quantized(gaussians.log_scales.numpy().clip(-20, 20), {"files": ["scales.webp"], "codebook": []})
     base, sh0 = _quantized(harmonics[:, 0], {"files": ["sh0.webp"], "codebook": []})
     pictures = {
         "means_l.webp": _picture(at & 255, shape),
@@ -115,7 +149,7 @@ def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     meta: dict[str, Any] = {
         "version": 2,
         "count": count,
-        **({"antialias": True} if antialiased else {}),
+        **({"antialias": True, "model": "antialiased"} if antialiased else {}),
         "means": {"mins": least.tolist(), "maxs": most.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": scales,
         "quats": {"files": ["quats.webp"]},
@@ -145,7 +179,15 @@ def unbundle(path: Path, data: bytes) -> dict[str, bytes]:
                 raise DataError(f"{path}: {len(entries)} files that claim more than the archive holds; copy it again")
             return {entry.filename: archive.read(entry) for entry in entries}
     except (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{path}: no readable .sog archive ({error}); copy it again") from error
+        raise DataError(f"{path}: no readable .sog archive ({error}); copy it again, it is cut off or damaged") from error
+
+
+def folder_of(path: Path, files: Mapping[str, bytes]) -> str:
+    """The folder of an archive, with its slash, that holds the meta.json nearest to the top. Raises DataError without one."""
+    found = [name for name in files if name.rpartition("/")[2] == "meta.json" and not name.startswith("__MACOSX/")]
+    if not found:
+        raise DataError(f"{path}: an archive without meta.json; not a SOG file")
+    return min(found, key=lambda name: (name.count("/"), name)).removesuffix("meta.json")
 
 
 def bundle(parts: Mapping[str, bytes], like: bytes | None = None) -> bytes:
@@ -169,12 +211,14 @@ class _Pictures:
         shape = meta["means"].get("shape") if isinstance(meta.get("means"), dict) else None
         count = meta.get("count", shape[0] if isinstance(shape, list) and shape else None)
         name = self._name("means", 0)
+        if count == 0:
+            raise DataError(f"{path}: holds no Gaussian")
         if not isinstance(count, int) or isinstance(count, bool) or not 0 < count <= _DENSE * len(parts[name]) + _SLACK:
             raise self._wrong(f"{count!r} Gaussians with {len(parts[name])} bytes of positions")
         self.count: int = count
 
-    def numbers(self, group: str, name: str, length: int) -> Floats:
-        """A list of so many finite numbers."""
+    def numbers(self, group: str, name: str, length: int, least: int | None = None) -> Floats:
+        """A list of so many finite numbers, or from `least` on."""
         value = self.meta[group].get(name) if isinstance(self.meta.get(group), dict) else None
         # Exporters write null in the place of the first number of a codebook that is not finite.
         if name == "codebook" and isinstance(value, list) and value[:1] == [None]:
@@ -183,8 +227,10 @@ class _Pictures:
             values = np.array(value if isinstance(value, list) else None, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             values = np.array([np.nan])
-        if values.shape != (length,) or not np.isfinite(values).all():
-            raise self._wrong(f"{group}.{name} is no list of {length} numbers")
+        least = length if least is None else least
+        if values.ndim != 1 or not least <= len(values) <= length or not np.isfinite(values).all():
+            many = length if least == length else f"{least} to {length}"
+            raise self._wrong(f"{group}.{name} is no list of {many} numbers")
         return values
 
     def picture(self, name: str, most: int | None = None) -> _Bytes:
@@ -212,9 +258,13 @@ class _Pictures:
     def decoded(self, group: str, index: NDArray[np.integer[Any]], channels: int) -> Floats:
         """Bytes as the numbers that they stand for: by the codebook, or between mins and maxs."""
         if isinstance(self.meta[group], dict) and "codebook" in self.meta[group]:
-            return np.asarray(self.numbers(group, "codebook", _LEVELS)[index])
+            return np.asarray(self.book(group, index)[index])
         low, high = (self.numbers(group, name, channels) for name in ("mins", "maxs"))
         return np.asarray(low + index / 255 * (high - low))
+
+    def book(self, group: str, index: NDArray[np.integer[Any]]) -> Floats:
+        """A codebook: of as many numbers, at least, as indices use."""
+        return self.numbers(group, "codebook", _LEVELS, int(index.max(initial=0)) + 1)
 
     def palette(self) -> tuple[NDArray[np.int64], Floats]:
         """The label of each Gaussian, and the harmonics that labels mean [entries K-1 3]; no entries where it has none."""
@@ -229,7 +279,7 @@ class _Pictures:
             raise self._wrong(f"{name} is {picture.shape[1]} pixels wide; {_ROW} entries of 3, 8 or 15 harmonics are a row")
         index = picture[..., :3].reshape(entries, coefficients, 3)
         if "codebook" in about:
-            rest = self.numbers("shN", "codebook", _LEVELS)[index]
+            rest = self.book("shN", index)[index]
         else:
             low, high = about.get("mins"), about.get("maxs")
             if not all(isinstance(v, (int, float)) and abs(v) < 1e6 for v in (low, high)):
@@ -322,9 +372,11 @@ def _codebook(values: Floats) -> Floats:
     """256 increasing numbers near to all values (Lloyd's algorithm on a line), float32 in float64."""
     ordered = np.sort(values)
     total = np.concatenate([[0.0], np.cumsum(ordered)])
-    at = np.linspace(0, 1, _LEVELS)
-    # Half by rank and half by distance: rare far values are not left out.
-    book = (np.quantile(ordered, at) + ordered[0] + (ordered[-1] - ordered[0]) * at) / 2
+    ranks = np.rint(np.linspace(0, len(ordered) - 1, _LEVELS)).astype(np.int64)
+    # Half by rank and half by distance: rare far values are not left out. Gaps cost no more than one number.
+    widest = float(np.ptp(np.percentile(ordered, (10, 90)))) / _LEVELS
+    along = np.concatenate([[0.0], np.cumsum(np.minimum(np.diff(ordered), widest or np.inf))])
+    book = (ordered[ranks] + np.interp(np.linspace(0, along[-1], _LEVELS), along, ordered)) / 2
     for _ in range(_LLOYD):
         edges = np.concatenate([[0], np.searchsorted(ordered, (book[1:] + book[:-1]) / 2), [len(ordered)]])
         inside = np.diff(edges)

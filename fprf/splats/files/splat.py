@@ -46,6 +46,6 @@ def splat_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     table["rgba"][:, :3] = steps(colours_of(gaussians.harmonics.numpy()), 255)
     table["rgba"][:, 3] = steps(sigmoid(gaussians.logits.numpy()), 255)
     turn = gaussians.quaternions.numpy().astype(np.float64)
-    turn = turn / np.maximum(np.linalg.norm(turn, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    turn = turn / np.linalg.norm(turn, axis=1, keepdims=True)
     table["turn"] = np.clip(np.rint(turn * 128 + 128), 0, 255)
     return table.tobytes()

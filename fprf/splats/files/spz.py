@@ -2,12 +2,16 @@
 
 Streams: positions of 24 bits with a common number of fractional bits (version 1: float16), opacity, mean colour
 0.15 dc + 0.5, ln-scale (v / 16 - 10), rotation (x y z bytes; from version 3 on the smallest three of 10 bits, index 3 = w),
-harmonics (v - 128) / 128, coefficient by coefficient, channels fastest. Axes are right up back; what this module returns has
-those of PLY files, right down front, so that a capture has the same axes whatever file it comes from.
+harmonics (v - 128) / 128, coefficient by coefficient, channels fastest. Axes are right up back, or those of the extension
+`SPZ_ADOBE_coordinate_system`; what this module returns has those of PLY files, right down front, so that a capture has the same
+axes whatever file it comes from.
 Version 4: a plain header of 32 bytes, a table of (compressed, raw) sizes, one zstd frame a stream. It needs `zstandard`.
+Extensions are records of type, length and payload, where flag 2 is set: before version 4 behind the streams, else before the
+table. All are kept.
 """
 
 import itertools
+import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -15,23 +19,31 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..gaussians import COUNTS, Gaussians, from_arrays
-from .base import Bools, Capture, Floats, finite, logit, short, sigmoid, smallest_three, steps, three_to_four
+from ...fields.planes import harmonics as harmonic_functions
+from ..gaussians import COUNTS, Gaussians, bulk_of, from_arrays
+from .base import Bools, Capture, Floats, finite, logit, precise, short, sigmoid, smallest_three, steps, three_to_four
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 _ENTRY = struct.Struct("<QQ")
+_FRACTION = 23
+"""Fractional bits of positions at most."""
+_PRECISION = 2.0**-13
+"""Steps of positions in extents of the capture, to which outliers do not matter; steps of mm in a room are finer."""
+_SIZES = (-10.0, 5.9375)
+"""Smallest and largest ln-scale."""
 _RATIO = 1032
 """Times its size that deflated data may unpack to at most."""
 _TRAILER = 1 << 20
 """Bytes behind the streams (extensions) that are kept."""
 _TINT = 0.15
-_AXES = np.array([1.0, -1.0, -1.0])
-# Signs of the harmonics, band by band, where y and z change theirs.
-_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1, -1, 1, -1, 1, 1, -1, 1, -1, 1], np.float64)
+_COORDINATES = 0xADBE0003
+"""Type of the extension that says which axes a file has; its payload is a number of `_axes`."""
+_RUB = 4
 _TURN = (1, 2, 3, 0)
 """Where the components x y z w of a file lie in w x y z."""
 
@@ -42,6 +54,8 @@ class _Header(NamedTuple):
     degree: int
     fraction: int
     flags: int
+    size: int
+    """Bytes before the streams, or before the extensions of version 4."""
 
     @property
     def sizes(self) -> list[int]:
@@ -53,14 +67,18 @@ class _Header(NamedTuple):
 def read_spz(path: Path, data: bytes) -> Capture:
     """A .spz file of versions 1 to 4. Raises DataError for others, and for version 4 where `zstandard` is not installed."""
     packed = data[:2] == b"\x1f\x8b"
-    if packed:
-        unpacked = _unzip(path, data)
-        header = _header(path, unpacked)
-        ends = np.cumsum([_HEADER.size, *header.sizes]).tolist()
+    unpacked, after = _unzip(path, data) if packed else (data, b"")
+    header = _header(path, unpacked)
+    if header.version < 4:
+        ends = np.cumsum([header.size, *header.sizes]).tolist()
+        if ends[-1] > len(unpacked):
+            raise short(path, len(unpacked), ends[-1], f"{header.number} Gaussians{' unpacked' * packed}")
         streams = [unpacked[start:stop] for start, stop in itertools.pairwise(ends)]
+        extensions = unpacked[ends[-1] :]
     else:
-        header = _header(path, data)
         streams = _frames(path, data, header)
+        extensions = data[header.size : _WIDE_HEADER.unpack_from(data)[-1]]
+    axes = _axes(path, _coordinates(extensions) if header.flags & 2 else _RUB, header.degree)
     means, opacity, tint, scales, turns, rest = (np.frombuffer(each, np.uint8) for each in streams)
     count, bands = header.number, COUNTS[header.degree]
     if header.version == 1:
@@ -80,38 +98,63 @@ def read_spz(path: Path, data: bytes) -> Capture:
     bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
     harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
     gaussians = from_arrays(
-        points * _AXES,
-        quaternions * np.concatenate([[1.0], _AXES]),
+        axes.points(points),
+        axes.quaternions(quaternions),
         scales.reshape(count, 3) / 16 - 10,
         logit(opacity / 255),
-        harmonics * _SIGNS[:bands, None],
+        axes.harmonics(harmonics),
     )
 
     def recolour(harmonics: Floats, changed: Bools) -> bytes:
         colours = (tint.reshape(count, 3).copy(), rest.reshape(count, bands - 1, 3).copy())
-        for stream, bytes_ in zip(colours, _colour_bytes(harmonics[changed]), strict=True):
+        for stream, bytes_ in zip(colours, _colour_bytes(axes.inverse(finite(harmonics[changed]))), strict=True):
             stream[changed] = bytes_
         new = dict(zip((2, 5), (stream.tobytes() for stream in colours), strict=True))
-        if not packed:
+        if header.version > 3:
             return _framed(path, data, header, new)
         parts = [new.get(i, each) for i, each in enumerate(streams)]
-        return _zipped(b"".join([unpacked[: _HEADER.size], *parts, unpacked[ends[-1] :]]))
+        whole = b"".join([unpacked[: header.size], *parts, extensions])
+        return _zipped(whole) + after if packed else whole
 
     return Capture(path, gaussians, bool(header.flags & 1), data, recolour)
 
 
+def spz_keeps(gaussians: Gaussians) -> Bools:
+    """Which Gaussians a file holds: those within the reach of 24 bits whose steps suit the bulk."""
+    means = gaussians.means.numpy()
+    return np.asarray(precise(means, lambda kept, _: _step(kept), _PRECISION) & (np.abs(means) <= 2**23 - 1).all(1))
+
+
+def spz_notes(gaussians: Gaussians) -> list[str]:
+    """What else of Gaussians a file cannot hold."""
+    means, largest = gaussians.means.numpy(), gaussians.log_scales.amax(1).numpy()
+    step, side, notes = _step(means), bulk_of(means).side, []
+    if step > 1e-3 * side > 0:
+        notes.append(f"positions in steps of {step:g}, as they lie {float(np.abs(means).max()):.2g} from the origin")
+    limited = int(((largest < _SIZES[0] - 1 / 32) | (largest > _SIZES[1] + 1 / 32)).sum())
+    if limited:
+        notes.append(f"{limited} with sizes that .spz limits to {np.exp(_SIZES[0]):.2g} to {np.exp(_SIZES[1]):.3g}")
+    return notes
+
+
+def _step(means: Floats) -> float:
+    """Distance between positions that 24 bits tell apart; infinite for those that they do not reach."""
+    largest = float(np.abs(means).max(initial=0.0))
+    if largest > 2**23 - 1:
+        return np.inf
+    return float(2.0 ** -np.clip(np.floor(np.log2((2**23 - 1) / max(largest, 1e-9))), 0, _FRACTION))
+
+
 def spz_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     """A file of version 3, with as many fractional bits as the largest coordinate leaves."""
-    means = finite(gaussians.means.numpy()) * _AXES
-    largest = float(np.abs(means).max(initial=0.0))
-    fraction = int(np.clip(np.floor(np.log2((2**23 - 1) / max(largest, 2.0**-10))), 0, 23))
-    at = np.clip(np.rint(means * 2.0**fraction), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
-    turn = (gaussians.quaternions.numpy() * np.concatenate([[1.0], _AXES]))[:, _TURN]
-    most, three = smallest_three(_whole(turn))
+    axes, means = _Axes(False, (1.0, -1.0, -1.0)), gaussians.means.numpy().astype(np.float64)
+    fraction = -int(np.log2(_step(means)))
+    at = np.clip(np.rint(axes.points(means) * 2.0**fraction), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
+    most, three = smallest_three(axes.quaternions(gaussians.quaternions.numpy().astype(np.float64))[:, _TURN])
     word = most.astype(np.uint32)
     for column in three.T:
         word = word << 10 | (column < 0).astype(np.uint32) << 9 | steps(np.abs(column), 511).astype(np.uint32)
-    tint, rest = _colour_bytes(gaussians.harmonics.numpy())
+    tint, rest = _colour_bytes(axes.harmonics(finite(gaussians.harmonics.numpy())))
     flags = 1 if antialiased else 0
     parts = [
         _HEADER.pack(_MAGIC, 3, len(gaussians), gaussians.degree, fraction, flags, 0),
@@ -125,45 +168,132 @@ def spz_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
     return _zipped(b"".join(parts))
 
 
-def _whole(turn: Floats) -> Floats:
-    """Quaternions x y z w; those without a length become the identity, whose w comes last here."""
-    none = ~(np.isfinite(turn).all(1) & (np.abs(turn).max(1) > 0))
-    return np.where(none[:, None], [0.0, 0.0, 0.0, 1.0], turn)
+class _Axes(NamedTuple):
+    """The axes of a file, against right down front: turned by 90 degrees about x, then mirrored."""
+
+    turned: bool
+    """z is up or down, y front or back."""
+    signs: tuple[float, float, float]
+
+    def points(self, points: Floats) -> Floats:
+        """Points [N 3] of a file, right down front."""
+        if self.turned:
+            points = np.stack([points[:, 0], points[:, 2], -points[:, 1]], 1)
+        return np.asarray(points * np.array(self.signs))
+
+    def quaternions(self, turns: Floats) -> Floats:
+        """Rotations [N 4], w x y z, as `points`. Mirroring the world and the own axes of a Gaussian leaves its shape."""
+        if self.turned:
+            w, x, y, z = turns.T * 0.5**0.5
+            turns = np.stack([w + x, x - w, y + z, z - y], 1)
+        a, b, c = self.signs
+        return np.asarray(turns * np.array([1.0, b * c, a * c, a * b]))
+
+    def harmonics(self, harmonics: Floats) -> Floats:
+        """Harmonics [N K 3] as `points`."""
+        bands = harmonics.shape[1]
+        turned = np.einsum("kj,njc->nkc", _turn(bands), harmonics) if self.turned else harmonics
+        return turned * self._parity(bands)
+
+    def inverse(self, harmonics: Floats) -> Floats:
+        """Harmonics [N K 3] of a file."""
+        bands = harmonics.shape[1]
+        mirrored = harmonics * self._parity(bands)
+        return np.einsum("jk,njc->nkc", _turn(bands), mirrored) if self.turned else mirrored
+
+    def _parity(self, bands: int) -> Floats:
+        """The sign of each harmonic [K 1] under mirroring."""
+        x, y, z = self.signs
+        third = [y, x * y * z, y, z, x, z, x]
+        fourth = [x * y, y * z, x * y, y * z, 1, x * z, 1, x * z, 1]
+        return np.array([1, y, z, x, x * y, y * z, 1, x * z, 1, *third, *fourth])[:bands, None]
+
+
+def _turn(bands: int) -> Floats:
+    """The orthogonal matrix [K K] of harmonics under the turn of `_Axes`: found from values before and after it."""
+    there = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)).double(), dim=1)
+    before = torch.stack([there[:, 0], -there[:, 2], there[:, 1]], 1)
+    degree = math.isqrt(bands)
+    return np.asarray(torch.linalg.lstsq(harmonic_functions(there, degree), harmonic_functions(before, degree)).solution)
+
+
+def _axes(path: Path, number: int, degree: int) -> _Axes:
+    """Axes by their number in `SPZ_ADOBE_coordinate_system`: right, up and front are bits, another one swaps y and z."""
+    if not 0 <= number <= 16:
+        raise DataError(f"{path}: axes of number {number} (SPZ_ADOBE_coordinate_system); 1 to 16 are known")
+    bits = (number or _RUB) - 1
+    right, up, front, turned = (bits >> k & 1 for k in range(4))
+    if turned and degree > 3:
+        raise DataError(f"{path}: harmonics of degree 4 with z up or down; save the file with y up, or with degree 3")
+    x, down, ahead = 2.0 * right - 1, 1 - 2.0 * up, 2.0 * front - 1
+    # Turned, a point of right front up is (x, z, -y), and of right down front (x, -z, y).
+    return _Axes(True, (x, down, -ahead)) if turned else _Axes(False, (x, down, ahead))
+
+
+def _coordinates(extensions: bytes) -> int:
+    """The number of the axes that extension records name; right up back where none does."""
+    at = 0
+    while at + 8 <= len(extensions):
+        kind, size = struct.unpack_from("<II", extensions, at)
+        if kind == _COORDINATES and size == 4 and at + 12 <= len(extensions):
+            return int(struct.unpack_from("<I", extensions, at + 8)[0])
+        at += 8 + size
+    return _RUB
 
 
 def _colour_bytes(harmonics: Floats) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Constants [N 3] and the other harmonics [N K-1 3] as a file has them."""
-    turned = finite(harmonics) * _SIGNS[: harmonics.shape[1], None]
-    tint = steps(turned[:, 0] * _TINT + 0.5, 255).astype(np.uint8)
-    return tint, np.clip(np.rint(turned[:, 1:] * 128) + 128, 0, 255).astype(np.uint8)
+    """Constants [N 3] and the other harmonics [N K-1 3] of a file, as it has them."""
+    tint = steps(harmonics[:, 0] * _TINT + 0.5, 255).astype(np.uint8)
+    return tint, np.clip(np.rint(harmonics[:, 1:] * 128) + 128, 0, 255).astype(np.uint8)
 
 
 def _header(path: Path, data: bytes) -> _Header:
     if len(data) < _HEADER.size:
         raise short(path, len(data), _HEADER.size, "the header")
     magic, version, count, degree, fraction, flags, _ = _HEADER.unpack_from(data)
-    if magic != _MAGIC or not 1 <= version <= 4 or degree >= len(COUNTS) or fraction > 30:
-        raise DataError(
-            f"{path}: no .spz header of versions 1 to 4 (version {version}, harmonics of degree {degree}, {fraction} "
-            "fractional bits); the file is damaged or of another kind"
-        )
-    return _Header(version, count, degree, fraction, flags)
+    if magic != _MAGIC:
+        raise DataError(f"{path}: does not begin as a .spz file does; it is damaged or of another kind")
+    for what, value, least, most in (
+        ("version", version, 1, 4),
+        ("degree of harmonics", degree, 0, len(COUNTS) - 1),
+        ("number of fractional bits", fraction, 0, 30),
+    ):
+        if not least <= value <= most:
+            raise DataError(f"{path}: a .spz whose {what} is {value}; {least} to {most} can be read")
+    return _Header(version, count, degree, fraction, flags, _HEADER.size if version < 4 else _WIDE_HEADER.size)
 
 
-def _unzip(path: Path, data: bytes) -> bytes:
-    """Return the content of a gzip file: the header first, then no more than that announces."""
+def _unzip(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """Return the content of all members of a gzip file, no more than its header announces, and what lies behind them."""
+    content, left, most = b"", data, _HEADER.size
     try:
-        head = zlib.decompressobj(31).decompress(data, _HEADER.size)
-        header = _header(path, head)
-        needs = _HEADER.size + sum(header.sizes)
-        if header.version > 3 or needs > _RATIO * len(data):
-            raise short(path, len(data), needs // _RATIO, f"{header.number} Gaussians of version {header.version}")
-        unpacked = zlib.decompressobj(31).decompress(data, needs + _TRAILER)
+        while left[:2] == b"\x1f\x8b":
+            packer, piece = zlib.decompressobj(31), left
+            while not packer.eof and len(content) < most:
+                got, piece = packer.decompress(piece, most - len(content)), packer.unconsumed_tail
+                content += got
+                if len(content) == most == _HEADER.size:  # the header bounds the rest
+                    most += _announced(path, content, len(data)) + _TRAILER
+                if not got and not piece and not packer.eof:
+                    return content, b""
+            if not packer.eof:
+                raise DataError(f"{path}: more than {_TRAILER} bytes behind the Gaussians; it is damaged or of another kind")
+            left = packer.unused_data
     except zlib.error as error:
-        raise DataError(f"{path}: no readable gzip ({error}); copy the file again") from error
-    if len(unpacked) < needs:
-        raise short(path, len(unpacked), needs, f"{header.number} Gaussians unpacked")
-    return unpacked
+        reason = "its checksum is another" if "data check" in str(error) else str(error)
+        raise DataError(f"{path}: damaged gzip ({reason}); copy the file again") from error
+    return content, left
+
+
+def _announced(path: Path, head: bytes, size: int) -> int:
+    """Bytes of the streams that the header of a gzip file of `size` bytes announces."""
+    header = _header(path, head)
+    if header.version > 3:
+        raise DataError(f"{path}: .spz of version 4 within gzip; unpack it first (gunzip)")
+    needs = sum(header.sizes)
+    if needs > _RATIO * size:
+        raise short(path, size, needs // _RATIO, f"{header.number} Gaussians")
+    return needs
 
 
 def _zipped(data: bytes) -> bytes:
