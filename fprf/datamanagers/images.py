@@ -119,14 +119,19 @@ def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
     head = file.read(64)
     if not head:
         raise DataError(f"{name}: the file is empty; restore the image or remove it from the scene")
-    kind = next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), None)
-    if kind is None:
+    kind = kind_of(head)
+    if not kind:
         raise DataError(
             f"{name}: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF header; replace the file or convert the image to PNG"
         )
     file.seek(0)
     with _decoding(kind, name), _silent():
         return kind, _READERS[kind][1](file)
+
+
+def kind_of(head: bytes) -> str:
+    """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF or HEIC; empty for another."""
+    return next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), "")
 
 
 def load_image(
@@ -397,7 +402,7 @@ def _decoding(kind: str, name: object) -> Iterator[None]:
     except Exception as error:
         if "out of memory" in str(error):
             raise MemoryError(str(error)) from error
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).lower().split()) or type(error).__name__
         raise DataError(f"{name}: the {kind} data cannot be decoded ({reason}); copy or export the image again") from error
 
 
