@@ -40,7 +40,7 @@ def run(args: list[str]) -> int:
         raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
     from ..io.atomic import write_json
     from ..reconstruction.colmap import find_features, find_matches, find_poses
-    from ..reconstruction.images import gather_images
+    from ..reconstruction.images import gather_images, lost_files
     from ..reconstruction.scene_folder import MatchTables, SceneFolder, State, report
 
     place = SceneFolder(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
@@ -49,6 +49,9 @@ def run(args: list[str]) -> int:
     matching: str = config.matching
     with Display() as display:
         gather_images(config.source, place, state, config, display.count)
+        lost = lost_files(state)
+        if lost:
+            display.say(lost)
         find_features(place, state, config, display.count)
         matching = find_matches(place, state, config, display.count)
         try:

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from PIL import ImageCms
 from PIL.AvifImagePlugin import AvifImageFile
 from PIL.BmpImagePlugin import BmpImageFile
+from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
@@ -132,6 +133,19 @@ def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
 def kind_of(head: bytes) -> str:
     """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF or HEIC; empty for another."""
     return next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), "")
+
+
+def read_exif(path: Path) -> PIL.Image.Exif:
+    """The EXIF block of an image file; an empty one where there is none, it cannot be understood, or the file is none."""
+    try:
+        with _opened(path) as file:
+            image = open_image(file, path)[1]
+            with _silent():
+                exif = image.getexif()
+                exif.get_ifd(IFD.Exif)  # while the file is open: of a TIFF it is read only when asked for
+                return exif
+    except Exception:  # whatever is wrong with it, it is not needed
+        return PIL.Image.Exif()
 
 
 def load_image(
@@ -324,7 +338,7 @@ def _orientation(image: ImageFile) -> int:
     try:
         with _silent():
             found = image.getexif().get(Tag.Orientation, 1)
-    except Exception:  # whatever is wrong with the EXIF block, the pixels are whole
+    except Exception:  # whatever is wrong with the block, the pixels are whole
         return 1
     return int(found) if found in _TURNS else 1
 
