@@ -207,6 +207,7 @@ def _version(package: str) -> str:
 
 def scene_folder(data: Path) -> Iterator[Finding]:
     """Format, views, sizes and splits of a scene. Raises DataError where it cannot be parsed."""
+    from ..datamanagers.images import useless_masks
     from ..datamanagers.parsers.config import DataParserConfig, recognise
 
     parser = recognise(data)
@@ -222,6 +223,9 @@ def scene_folder(data: Path) -> Iterator[Finding]:
         yield Finding("images", f"{len(absent)} are absent, the first is {absent[0]}", "restore them, or remove their poses")
     points = 0 if scene.points is None else len(scene.points)
     yield Finding("points", f"{points} of the reconstruction" if points else "none; bounds come from the cameras")
+    if scene.masks:
+        useless, there = useless_masks(scene), sum(mask is not None for mask in scene.masks)
+        yield Finding("masks", f"{there} of {len(scene.masks)} views have one", useless, optional=True)
     yield Finding("next", f"fprf train --data {shlex.quote(str(data))}")
 
 

@@ -15,7 +15,7 @@ import os
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
@@ -197,15 +197,20 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool 
     return np.asarray(bright if size is None else cv2.resize(bright, size, interpolation=cv2.INTER_NEAREST)).astype(np.bool_)
 
 
-def useless_masks(masks: Iterable[NDArray[np.bool_]]) -> str:
-    """What is wrong with the masks of all views of a scene, in one clause: they leave nothing, or everything; else empty."""
-    shares = {bool(mask.any()) + bool(mask.all()) for mask in masks}
-    return {
-        frozenset({0}): "the masks of all views are black: no pixel is used; paint white, or opaque, what is to be used",
-        frozenset(
-            {2}
-        ): "the masks of all views are white: every pixel is used; paint black, or transparent, what is to be left out",
-    }.get(frozenset(shares), "")
+def useless_masks(scene: "Scene") -> str:
+    """What is said of masks that leave no pixel of any view, or every pixel of all; empty of others and without masks.
+
+    Reads masks only until one, or two of them, tell that they are of use.
+    """
+    used: set[bool] = set()
+    for path in scene.masks:
+        used |= {True} if path is None else set(np.unique(load_mask(path)).tolist())
+        if len(used) == 2:
+            return ""
+    count = f"the masks of all {len(scene.masks)} views"
+    if used == {False}:
+        return f"{count} are black: no pixel is used; paint white, or opaque, what is to be used"
+    return f"{count} are white: every pixel is used; paint black, or transparent, what is to be left out" if used else ""
 
 
 def load_images(scene: "Scene", background: Sequence[float] | None = None, views: Sequence[int] | None = None) -> list[Image]:
@@ -348,7 +353,7 @@ def _pixels(image: PIL.Image.Image) -> Image:
     image = image if image.mode == "RGB" else image.convert("RGB")
     pixels = np.empty((image.height, image.width, 3), dtype=np.uint8)
     for top in range(0, image.height, _STRIP):
-        pixels[top : top + _STRIP] = image.crop((0, top, image.width, min(top + _STRIP, image.height)))
+        pixels[top : top + _STRIP] = np.asarray(image.crop((0, top, image.width, min(top + _STRIP, image.height))))
     return pixels
 
 
@@ -417,7 +422,7 @@ def _decoding(kind: str, name: object) -> Iterator[None]:
         if "out of memory" in str(error):
             raise MemoryError(str(error)) from error
         reason = " ".join(str(error).lower().split()) or type(error).__name__
-        raise DataError(f"{name}: the {kind} data cannot be decoded ({reason}); copy or export the image again") from error
+        raise DataError(f"{name}: the {kind} data cannot be decoded: {reason}; copy or export the image again") from error
 
 
 @contextmanager
