@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from PIL import ImageCms
 from PIL.AvifImagePlugin import AvifImageFile
 from PIL.BmpImagePlugin import BmpImageFile
-from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
@@ -126,26 +125,13 @@ def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
             f"{name}: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF header; replace the file or convert the image to PNG"
         )
     file.seek(0)
-    with _decoding(kind, name), _silent():
+    with _decoding(kind, name), silent():
         return kind, _READERS[kind][1](file)
 
 
 def kind_of(head: bytes) -> str:
     """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF or HEIC; empty for another."""
     return next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), "")
-
-
-def read_exif(path: Path) -> PIL.Image.Exif:
-    """The EXIF block of an image file; an empty one where there is none, it cannot be understood, or the file is none."""
-    try:
-        with _opened(path) as file:
-            image = open_image(file, path)[1]
-            with _silent():
-                exif = image.getexif()
-                exif.get_ifd(IFD.Exif)  # while the file is open: of a TIFF it is read only when asked for
-                return exif
-    except Exception:  # whatever is wrong with it, it is not needed
-        return PIL.Image.Exif()
 
 
 def load_image(
@@ -294,13 +280,11 @@ def _decode(
         if image.width * image.height > most:
             raise DataError(f"{path}: {image.width}x{image.height} pixels; at most {most:.0e} are read: reduce the image")
         with _decoding(kind, path):
-            if kind == "PNG":  # loading reads no checksum, and verifying uses the image up
-                image.verify()
+            if kind == "PNG":
+                image.verify()  # the checksums, which loading ignores; it uses the image up
                 image = open_image(file, path)[1]
-            if (
-                kind == "PNG" and "transparency" in image.info
-            ):  # Pillow scales grey of 2 and 4 bits, and not what is transparent
-                image.info["transparency"] *= {"L;2": 85, "L;4": 17}.get(str(image.tile[0].args), 1)
+                if "transparency" in image.info:  # Pillow scales grey of 2 and 4 bits, but not the transparent one
+                    image.info["transparency"] *= {"L;2": 85, "L;4": 17}.get(str(image.tile[0].args), 1)
             deep = ";16" in str(image.tile)
             turn = _TURNS.get(_load(kind, image, upright))
     profile, alpha = image.info.get("icc_profile"), None
@@ -341,7 +325,7 @@ def _load(kind: str, image: ImageFile, upright: bool) -> int:
 def _orientation(image: ImageFile) -> int:
     """The EXIF orientation, 1 to 8; 1 where the file says none, or nothing that can be understood."""
     try:
-        with _silent():
+        with silent():
             found = image.getexif().get(Tag.Orientation, 1)
     except Exception:  # whatever is wrong with the block, the pixels are whole
         return 1
@@ -388,12 +372,12 @@ def _transform(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform | None]:
         transform = ImageCms.buildTransform(given, ImageCms.createProfile("sRGB"), mode, "RGB")
     except (ImageCms.PyCMSError, OSError, KeyError):
         return "", None
+    if mode != "RGB":
+        return mode, transform
     # sRGB has many profiles, so it is told by what it does to colours all over the cube.
-    bands = len(PIL.Image.new(mode, (1, 1)).getbands())
-    cube = (np.indices((16,) * bands).reshape(bands, -1).T * 17).astype(np.uint8)
-    colours = PIL.Image.fromarray(np.ascontiguousarray(cube[None, :, 0] if bands == 1 else cube[None]), mode)
-    plain, moved = (np.asarray(each, dtype=np.int16) for each in (colours.convert("RGB"), transform.apply(colours)))
-    return mode, None if np.abs(plain - moved).max() <= 2 else transform
+    cube = np.indices((16, 16, 16)).reshape(3, 1, -1).transpose(1, 2, 0) * 17
+    moved = transform.apply(PIL.Image.fromarray(np.ascontiguousarray(cube, dtype=np.uint8)))
+    return mode, None if np.abs(np.asarray(moved) - cube).max() <= 2 else transform
 
 
 @contextmanager
@@ -426,7 +410,7 @@ def _decoding(kind: str, name: object) -> Iterator[None]:
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
+def silent() -> Iterator[None]:
     """No warnings, which Pillow gives of EXIF blocks. Filters are of the process, so one thread at a time changes them."""
     with _WARNINGS, warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -21,7 +21,7 @@ import PIL.Image
 from PIL.ExifTags import IFD
 from PIL.ExifTags import Base as Tag
 
-from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image, read_exif, read_header
+from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image, open_image, read_header, silent
 from ..errors import DataError, UsageError
 from ..io.atomic import atomic_path, write_bytes
 from .config import SfmConfig
@@ -157,7 +157,7 @@ class Lens(NamedTuple):
 
 def read_lens(path: Path) -> Lens:
     """The lens of a photograph by its EXIF block; an empty one where that says nothing, or nothing that can be understood."""
-    exif = read_exif(path)
+    exif = _exif(path)
     try:
         inner = exif.get_ifd(IFD.Exif)
         focal, focal_35 = float(inner.get(Tag.FocalLength, 0)), float(inner.get(Tag.FocalLengthIn35mmFilm, 0))
@@ -165,6 +165,19 @@ def read_lens(path: Path) -> Lens:
     except Exception:  # values of other types, and whatever Pillow raises over a damaged block
         return Lens()
     return Lens(model, focal if 0 < focal < math.inf else 0.0, int(focal_35) if 0 < focal_35 < math.inf else 0)
+
+
+def _exif(path: Path) -> PIL.Image.Exif:
+    """The EXIF block of an image file; an empty one where there is none, it cannot be understood, or the file is none."""
+    try:
+        with path.open("rb") as file:
+            image = open_image(file, path)[1]
+            with silent():
+                exif = image.getexif()
+                exif.get_ifd(IFD.Exif)  # while the file is open: of a TIFF it is read only when asked for
+                return exif
+    except Exception:  # whatever is wrong with it, it is not needed
+        return PIL.Image.Exif()
 
 
 _FEWEST = 3
@@ -290,7 +303,7 @@ def _from_video(
 
 def _write_jpeg(path: Path, target: Path) -> None:
     """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be decoded."""
-    pixels, exif, data = load_image(path, upright=True), read_exif(path), BytesIO()
+    pixels, exif, data = load_image(path, upright=True), _exif(path), BytesIO()
     exif.pop(Tag.Orientation, None)
     try:
         block = exif.tobytes()

@@ -41,7 +41,8 @@ def with_lens(path: Path, **options: object) -> Path:
     """A photograph whose EXIF block, with an orientation, names its camera and its focal length."""
     exif = Image.Exif()
     exif[Base.Model], exif[Base.Orientation] = "Phone 9", 6
-    exif[IFD.Exif] = {Base.FocalLength: 4.25, Base.FocalLengthIn35mmFilm: 26}
+    exif.get_ifd(IFD.Exif).update({Base.FocalLength: 4.25, Base.FocalLengthIn35mmFilm: 26})
+    exif[IFD.Exif] = exif.get_ifd(IFD.Exif)  # else TIFF would be without
     Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(path, exif=exif, **options)
     return path
 
