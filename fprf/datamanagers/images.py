@@ -279,7 +279,7 @@ def _decode(
         most = min(MAX_PIXELS, PIL.Image.MAX_IMAGE_PIXELS or MAX_PIXELS) if kind == "TIFF" else MAX_PIXELS
         if image.width * image.height > most:
             raise DataError(f"{path}: {image.width}x{image.height} pixels; at most {most:.0e} are read: reduce the image")
-        with _decoding(kind, path):
+        with _decoding(kind, path, 8 * image.width * image.height):
             if kind == "PNG":
                 image.verify()  # the checksums, which loading ignores; it uses the image up
                 image = open_image(file, path)[1]
@@ -392,8 +392,8 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
 
 
 @contextmanager
-def _decoding(kind: str, name: object) -> Iterator[None]:
-    """Whatever a decoder raises over the bytes of a stranger, as a DataError; MemoryError stays one."""
+def _decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
+    """Whatever a decoder raises over the bytes of a stranger, as a DataError; MemoryError where `room` bytes are not there."""
     try:
         yield
     except (DataError, MemoryError):
@@ -403,8 +403,7 @@ def _decoding(kind: str, name: object) -> Iterator[None]:
             f"{name}: is HEIC, which needs the package pillow-heif: pip install 'fprf[heic]', or convert the image to JPEG"
         ) from error
     except Exception as error:
-        if "out of memory" in str(error):
-            raise MemoryError(str(error)) from error
+        np.empty(room, np.uint8)  # raises MemoryError where that is what the decoder lacked: few of them say so
         reason = " ".join(str(error).lower().split()) or type(error).__name__
         raise DataError(f"{name}: the {kind} data cannot be decoded: {reason}; copy or export the image again") from error
 

@@ -17,7 +17,7 @@ from ..datamanagers.bounds import find_space
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.parsers.config import parse_scene
 from ..datamanagers.scene import Scene, find_sightings, sparser
-from ..errors import CheckpointError, DataError, NumericsError, UsageError
+from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Encoder
 from ..rendering.cameras import Cameras
 from ..style.references import Encoders
@@ -107,13 +107,10 @@ def _bounded(config: GaussiansConfig, scene: Scene) -> GaussiansConfig:
 def prepare(config: GaussiansConfig, scene: Scene, saved: Facts | None = None) -> Prepared:
     """Load photographs and find the first points.
 
-    `saved` are the facts of a run that goes on: its exposures are not measured again. Raises DataError where the masks leave
-    nothing.
+    `saved` are the facts of a run that goes on: its exposures are not measured again.
     """
     config = _bounded(config, scene)
     images, masks = load_photographs(config, scene, scene.train.tolist())
-    if len(masks) == len(images) and not any(mask.any() for mask in masks.values()):
-        raise DataError(f"{scene.name}: the masks leave no pixel of {len(images)} views; paint white, or opaque, what is used")
     facts = saved or lit(facts_of(config, scene), config, scene, lambda view: images[view])
     draw = np.random.default_rng((config.seed, 0))
     points, origin = initial_points(scene, images, config.initial, draw)
