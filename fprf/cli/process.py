@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from .. import __version__
@@ -81,7 +82,7 @@ def _print(content: dict[str, Any], root: Path) -> None:
         for head in ("lost in", "image", "why"):
             table.add_column(head, overflow="fold")
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(escape, row))
         console.print(table)
         console.print(f"all of them in {root / 'process.json'}", soft_wrap=True)
 

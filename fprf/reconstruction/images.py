@@ -187,7 +187,7 @@ _FOREIGN = frozenset({"WebP", "AVIF", "HEIC"})
 _EXIF_BYTES = (1 << 16) - 16
 """Bytes of an EXIF block that a JPEG takes."""
 _NAMED = 3
-"""Files that a sentence names, at most."""
+"""Files, or reasons, that a sentence names, at most."""
 
 
 def gather_images(source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
@@ -221,10 +221,18 @@ def lost_files(state: State) -> str:
     """The files of a folder that could not be decoded, in one clause; empty where all could be, and of a video."""
     if not state.dropped or "frames" in state.done:
         return ""
-    named = [f"{name} ({reason})" for name, reason in list(state.dropped.items())[:_NAMED]]
-    more = [f"{len(state.dropped) - _NAMED} more"] if len(state.dropped) > _NAMED else []
+    alike: dict[str, list[str]] = {}
+    for name, reason in state.dropped.items():
+        alike.setdefault(reason, []).append(name)
+    told = [f"{_some(names)} ({reason})" for reason, names in alike.items()]
     total = len(state.dropped) + len(state.images)
-    return f"{len(state.dropped)} of {total} files could not be decoded: {', '.join(named + more)}"
+    return f"{len(state.dropped)} of {total} files could not be decoded: {_some(told)}"
+
+
+def _some(words: list[str]) -> str:
+    """The first ones of a list, and how many there are beside."""
+    beside = [f"{len(words) - _NAMED} more"] if len(words) > _NAMED else []
+    return ", ".join(words[:_NAMED] + beside)
 
 
 def natural_order(names: Iterable[str]) -> list[str]:

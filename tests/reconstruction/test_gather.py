@@ -120,7 +120,10 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
         (source / f"IMG {k}.HEIC").write_bytes(HEIC)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "pillow_heif", None)
-        with pytest.raises(DataError, match=r"3 of 3 files could not .*: IMG 0\.HEIC \(is HEIC.*pip install 'fprf\[heic\]'"):
+        with pytest.raises(
+            DataError,
+            match=r"3 of 3 files could not .*: IMG 0\.HEIC, IMG 1\.HEIC, IMG 2\.HEIC \(is HEIC.*pip install 'fprf\[heic\]'",
+        ):
             gathered(source, SceneFolder(tmp_path / "without"))
     pytest.importorskip("pillow_heif")
     place = SceneFolder(tmp_path / "scene")
