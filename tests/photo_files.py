@@ -1,11 +1,13 @@
 """Photographs as phones write them: with an EXIF orientation, and as HEIC."""
 
 import base64
+import io
 import struct
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 HEIC = base64.b64decode(
     "AAAAHGZ0eXBoZWljAAAAAG1pZjFoZWljbWlhZgAAAchtZXRhAAAAAAAAACFoZGxyAAAAAAAAAABwaWN0AAAAAAAAAAAAAAAAAAAAADRpbG9jAAAAAERA"
@@ -33,9 +35,21 @@ def turned_jpeg(path: Path, stored: np.ndarray, orientation: int) -> np.ndarray:
     exif = exif_block(orientation)
     path.write_bytes(plain[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + plain[2:])
     pixels = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
-    # EXIF 2.3, tag 0x0112: where the first row and the first column of the stored pixels belong.
-    turns = [lambda x: x, lambda x: x[:, ::-1], lambda x: x[::-1, ::-1], lambda x: x[::-1]]
-    shown = turns[(orientation - 1) % 4](pixels)
-    if orientation > 4:
-        shown = {5: pixels, 6: pixels[::-1], 7: pixels[::-1, ::-1], 8: pixels[:, ::-1]}[orientation].transpose(1, 0, 2)
+    return upright(pixels, orientation)
+
+
+def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Stored pixels [H W C] as they are shown: EXIF 2.3, tag 0x0112, says where the first row and column belong."""
+    turns = {2: pixels[:, ::-1], 3: pixels[::-1, ::-1], 4: pixels[::-1]}
+    columns = {5: pixels, 6: pixels[::-1], 7: pixels[::-1, ::-1], 8: pixels[:, ::-1]}
+    shown = columns[orientation].transpose(1, 0, 2) if orientation in columns else turns.get(orientation, pixels)
     return np.ascontiguousarray(shown)
+
+
+def oriented(image: Image.Image, form: str, orientation: int, **options: object) -> bytes:
+    """The file of an image with an EXIF orientation."""
+    exif, out = Image.Exif(), io.BytesIO()
+    exif[0x0112] = orientation
+    where = {"tiffinfo": {0x0112: orientation}} if form == "TIFF" else {"exif": exif}
+    image.save(out, form, **where, **options)
+    return out.getvalue()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from .. import __version__
@@ -40,7 +41,7 @@ def run(args: list[str]) -> int:
         raise UsageError("fprf process: pycolmap is not installed; install it with: pip install 'fprf[sfm]'")
     from ..io.atomic import write_json
     from ..reconstruction.colmap import find_features, find_matches, find_poses
-    from ..reconstruction.images import gather_images
+    from ..reconstruction.images import gather_images, lost_files
     from ..reconstruction.scene_folder import MatchTables, SceneFolder, State, report
 
     place = SceneFolder(config.output if config.output is not None else Path("scenes") / config.source.resolve().stem)
@@ -49,6 +50,9 @@ def run(args: list[str]) -> int:
     matching: str = config.matching
     with Display() as display:
         gather_images(config.source, place, state, config, display.count)
+        lost = lost_files(state)
+        if lost:
+            display.say(lost)
         find_features(place, state, config, display.count)
         matching = find_matches(place, state, config, display.count)
         try:
@@ -78,7 +82,7 @@ def _print(content: dict[str, Any], root: Path) -> None:
         for head in ("lost in", "image", "why"):
             table.add_column(head, overflow="fold")
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(escape, row))
         console.print(table)
         console.print(f"all of them in {root / 'process.json'}", soft_wrap=True)
 

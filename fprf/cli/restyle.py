@@ -245,6 +245,8 @@ def _write_page(
         scene={"Gaussians": len(scene.gaussians), "Regions": len(scene.measured()[0].share), "Styles": len(styles)},
         view_names=[view for view, _ in pictures],
         originals=[row[0] for _, row in pictures],
-        references=[Reference(label, load_image(path)) for label, path in zip(names, config.references, strict=True)],
+        references=[
+            Reference(label, load_image(path, upright=True)) for label, path in zip(names, config.references, strict=True)
+        ],
         styles=styles,
     )

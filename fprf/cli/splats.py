@@ -137,7 +137,7 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
     from ..ops.rasterise_training import compile_beside
 
     compiling = compile_beside((config.degree + 1) ** 2)  # while torch is imported and images are read
-    from ..datamanagers.images import load_images
+    from ..datamanagers.images import load_images, useless_masks
     from ..io.atomic import remove_unfinished
     from ..splats.cell_training import OVERVIEW
     from ..splats.training import facts_of, lit, prepare, scene_of, state_of, train, with_downscale
@@ -160,6 +160,9 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
         scene = scene_of(config)
         for note in scene.notes:
             display.say(f"note: {note}")
+        said = useless_masks(scene) if config.masks else ""
+        if said:
+            display.say(said)
         marks = image_hashes(scene)
         if folder.exists and not others:
             check_images(output, scene, marks)

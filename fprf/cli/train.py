@@ -132,6 +132,7 @@ def train_scene(
 
     Raises UsageError where packages, weights or the scene are missing, DataError where another process is training there.
     """
+    from ..datamanagers.images import useless_masks
     from ..io.atomic import remove_unfinished
     from ..style.scene import to_tensors
     from ..training import prepare, style_pass, trainer
@@ -160,6 +161,9 @@ def train_scene(
         def look(scene: "Scene") -> None:
             for note in scene.notes:
                 display.say(f"note: {note}")
+            said = useless_masks(scene)
+            if said:
+                display.say(said)
             marks.update(image_hashes(scene))
             if folder.exists and not others:
                 check_images(output, scene, marks)

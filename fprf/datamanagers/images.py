@@ -1,220 +1,137 @@
 """Image files to 8-bit arrays [H W 3], sRGB, at the size that a scene's cameras have.
 
-Pixels of captures are taken as stored: EXIF orientation is ignored, as COLMAP does, because the cameras were calibrated so.
-Photographs without a camera, such as references, are turned upright.
-Transparency is straight (not premultiplied) and composited before any reduction, which averages areas.
+Pillow decodes them; of a file with several images the first one counts. What a file's pixels are is decided in `_decode`:
 
-Size and transparency come from a file's first bytes (PNG, JPEG, WebP, BMP, TIFF, HEIC and AVIF, told by their content), so that
-a bomb costs nothing. OpenCV tells neither before it decodes; Pillow would be one more dependency and reads WebP and AVIF whole.
+- Photographs of captures are taken as COLMAP takes them, because their cameras were calibrated so: the EXIF orientation of
+  JPEG, PNG, WebP and TIFF is ignored. Photographs without a camera, such as references, are turned upright.
+- HEIC and AVIF store their rotation in the image itself (`irot`, `imir`), which every decoder applies: always upright.
+- Colours of an embedded ICC profile become sRGB. A profile that is broken or does not fit the pixels is ignored.
+- Transparency is straight (not premultiplied) and composited before any reduction, which averages areas.
+
+Opening a file reads its header only, so that sizes are checked before anything is decoded.
 """
 
 import os
-import struct
-import zlib
+import re
+import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import IO, TYPE_CHECKING, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
+from PIL import ImageCms
+from PIL.AvifImagePlugin import AvifImageFile
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.ExifTags import Base as Tag
+from PIL.ImageFile import ImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import TiffImageFile
+from PIL.WebPImagePlugin import WebPImageFile
 
 from ..errors import DataError
-from ..memory import out_of_memory
 
 if TYPE_CHECKING:
     from .scene import Scene
 
-
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif"})
-"""Suffixes of images in a folder's list, in lower case."""
+"""Suffixes of images in a folder's list, in lower case. What a file is, its content says."""
+MAX_PIXELS = 100_000_000
+"""Files that claim more are refused before they are decoded."""
+WHITE = (1.0, 1.0, 1.0)
+"""Default colour behind transparent pixels."""
 
-_HEAD = 1 << 18
-"""Bytes read at first: more than any camera's EXIF block with its thumbnail."""
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_TIFF_TYPES = {1: "B", 3: "H", 4: "I"}
-_AVIF = frozenset({b"avif", b"avis"})
-_HEIF = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
-"""Brands of the ISO base media format that mark still images."""
-_ALPHA = (b"auxiliary:alpha", b"hevc:2015:auxid:1")
-"""Types of an auxiliary image that is the alpha channel."""
+Image: TypeAlias = NDArray[np.uint8]
+
+
+def _open_heif(file: IO[bytes]) -> ImageFile:
+    """Open HEIC with the optional package, without registering it with Pillow for the whole process."""
+    from pillow_heif import HeifImageFile
+
+    image: ImageFile = HeifImageFile(file)
+    return image
+
+
+_READERS: dict[str, tuple[bytes, Callable[[IO[bytes]], ImageFile]]] = {
+    "JPEG": (rb"\xff\xd8\xff", JpegImageFile),
+    "PNG": (rb"\x89PNG\r\n\x1a\n", PngImageFile),
+    "WebP": (rb"RIFF.{4}WEBP", WebPImageFile),
+    "BMP": (rb"BM", BmpImageFile),
+    "TIFF": (rb"II[*+]\0|MM\0[*+]", TiffImageFile),
+    "AVIF": (rb".{4}ftyp(.{4}){0,9}avi[fs]", AvifImageFile),
+    "HEIC": (rb".{4}ftyp(.{4}){0,9}(hei[cmsx]|hev[cmsx]|mif1|msf1)", _open_heif),
+}
+"""Each format's first bytes and reader. `PIL.Image.open` is not used: it warns of large images, tries formats that we don't
+want, and HEIC would have to be registered."""
+_TURNS = {
+    2: PIL.Image.Transpose.FLIP_LEFT_RIGHT,
+    3: PIL.Image.Transpose.ROTATE_180,
+    4: PIL.Image.Transpose.FLIP_TOP_BOTTOM,
+    5: PIL.Image.Transpose.TRANSPOSE,
+    6: PIL.Image.Transpose.ROTATE_270,
+    7: PIL.Image.Transpose.TRANSVERSE,
+    8: PIL.Image.Transpose.ROTATE_90,
+}
+"""What turns an image upright, by its EXIF orientation."""
+_STRIP = 128
+"""Rows that are copied at once."""
+_WARNINGS = threading.Lock()
 
 
 class ImageHeader(NamedTuple):
-    """Header of an image file, as stored: EXIF orientation is not applied.
-
-    HEIC and AVIF store rotation in the image itself (`irot`), which decoders apply: width and height are those after it.
-    """
+    """Header of an image file: of the pixels that `load_image` delivers where they are not turned upright."""
 
     width: int
     height: int
     alpha: bool
     kind: str
-    """png, jpeg, webp, bmp, tiff, heic or avif."""
+    """JPEG, PNG, WebP, BMP, TIFF, AVIF or HEIC."""
 
 
 def read_header(path: Path) -> ImageHeader:
     """The header of an image file. Raises DataError where the file is absent, empty, or of no known format."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-            header = header_of(head)
-            if header is None and len(head) == _HEAD:
-                header = header_of(head + file.read())
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
-    if not head:
-        raise DataError(f"{path}: the file is empty; restore the image or remove it from the scene")
-    if header is None:
-        raise DataError(
-            f"{path}: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF header; replace the file or convert the image to PNG"
-        )
-    if header.width < 1 or header.height < 1:
-        raise DataError(f"{path}: the header says {header.width}x{header.height} pixels; replace the file")
-    return header
+    with _opened(path) as file:
+        return header_of(file, path)
 
 
-def header_of(data: bytes) -> ImageHeader | None:
-    """The header in the first bytes of a file; None where they hold no known or no whole one."""
-    try:
-        if data.startswith(b"\x89PNG\r\n\x1a\n"):
-            return _png(data)
-        if data.startswith(b"\xff\xd8\xff"):
-            return _jpeg(data)
-        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-            return _webp(data)
-        if data.startswith(b"BM"):
-            return _bmp(data)
-        if data[:4] in (b"II*\0", b"MM\0*"):
-            return _tiff(data)
-        if data[4:8] == b"ftyp":
-            return _heif(data)
-    except (struct.error, IndexError, KeyError):
-        return None
-    return None
-
-
-def _png(data: bytes) -> ImageHeader | None:
-    if data[12:16] != b"IHDR":
-        return None
-    width, height, _, colour = struct.unpack_from(">IIBB", data, 16)
-    alpha = colour in (4, 6)
-    at = 33
-    while not alpha and at + 8 <= len(data) and data[at + 4 : at + 8] != b"IDAT":
-        alpha = data[at + 4 : at + 8] == b"tRNS"
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-    return ImageHeader(width, height, alpha, "png")
-
-
-def _jpeg(data: bytes) -> ImageHeader | None:
-    at = 2
-    while True:
-        while data[at] == 0xFF and data[at + 1] == 0xFF:
-            at += 1
-        if data[at] != 0xFF:
-            return None
-        marker = data[at + 1]
-        if marker in _JPEG_FRAMES:
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return ImageHeader(width, height, False, "jpeg")
-        if marker in (0xD9, 0xDA):
-            return None
-        at += 2 if marker == 0x01 or 0xD0 <= marker <= 0xD8 else 2 + struct.unpack_from(">H", data, at + 2)[0]
-
-
-def _webp(data: bytes) -> ImageHeader | None:
-    if data[12:16] == b"VP8X":
-        width = 1 + int.from_bytes(data[24:27], "little")
-        height = 1 + int.from_bytes(data[27:30], "little")
-        return ImageHeader(width, height, bool(data[20] & 0x10), "webp") if len(data) >= 30 else None
-    if data[12:16] == b"VP8L" and data[20] == 0x2F:
-        bits = struct.unpack_from("<I", data, 21)[0]
-        return ImageHeader(1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF), bool(bits >> 28 & 1), "webp")
-    if data[12:16] == b"VP8 ":
-        width, height = struct.unpack_from("<HH", data, 26)
-        return ImageHeader(width & 0x3FFF, height & 0x3FFF, False, "webp")
-    return None
-
-
-def _bmp(data: bytes) -> ImageHeader | None:
-    width, height, _, bits = struct.unpack_from("<iiHH", data, 18)
-    return ImageHeader(width, abs(height), bits == 32, "bmp")
-
-
-def _tiff(data: bytes) -> ImageHeader | None:
-    order = "<" if data[:2] == b"II" else ">"
-    start = struct.unpack_from(order + "I", data, 4)[0]
-    tags: dict[int, int] = {}
-    for k in range(struct.unpack_from(order + "H", data, start)[0]):
-        at = start + 2 + 12 * k
-        tag, type_, count = struct.unpack_from(order + "HHI", data, at)
-        if count == 1 and type_ in _TIFF_TYPES:
-            tags[tag] = struct.unpack_from(order + _TIFF_TYPES[type_], data, at + 8)[0]
-    if 256 not in tags or 257 not in tags:
-        return None
-    return ImageHeader(tags[256], tags[257], tags.get(277, 1) in (2, 4), "tiff")
-
-
-def _heif(data: bytes) -> ImageHeader | None:
-    """The primary image of a HEIC or AVIF file (ISO/IEC 23008-12), cropped and rotated by its own properties."""
-    brands = {data[at : at + 4] for at in range(8, min(struct.unpack_from(">I", data)[0], 256), 4)}
-    if not brands & (_AVIF | _HEIF):
-        return None
-    whole = {kind: (start, end) for kind, start, end in _boxes(data, 0, len(data))}
-    meta = {kind: (start, end) for kind, start, end in _boxes(data, whole[b"meta"][0] + 4, whole[b"meta"][1])}
-    parts = {kind: (start, end) for kind, start, end in _boxes(data, *meta[b"iprp"])}
-    properties = list(_boxes(data, *parts[b"ipco"]))
-    at = meta[b"pitm"][0]
-    (primary,) = struct.unpack_from(">H" if data[at] == 0 else ">I", data, at + 4)
-    width, height, turned = 0, 0, False
-    for index in _properties_of(data, parts[b"ipma"][0], primary):
-        kind, start, _ = properties[index - 1]
-        if kind == b"ispe":
-            width, height = struct.unpack_from(">II", data, start + 4)
-        elif kind == b"clap":
-            across, by, down, by_too = struct.unpack_from(">4I", data, start)
-            width, height = across // max(by, 1), down // max(by_too, 1)
-        elif kind == b"irot":
-            turned = bool(data[start] & 1)
-    alpha = any(kind == b"auxC" and any(name in data[start:end] for name in _ALPHA) for kind, start, end in properties)
-    if turned:
+def header_of(file: IO[bytes], name: object) -> ImageHeader:
+    """The header of an open file. Raises DataError, which begins with `name`, where it is empty or of no known format."""
+    kind, image = open_image(file, name)
+    width, height = image.size
+    if isinstance(image, TiffImageFile):  # Pillow gives the size that they have upright
+        width, height = image.tag_v2[Tag.ImageWidth], image.tag_v2[Tag.ImageLength]
+    elif kind == "AVIF" and _orientation(image) > 4:
         width, height = height, width
-    return ImageHeader(width, height, alpha, "avif" if brands & _AVIF else "heic")
+    return ImageHeader(width, height, image.has_transparency_data, kind)
 
 
-def _properties_of(data: bytes, at: int, item: int) -> list[int]:
-    """Numbers, from 1, of the properties of an item, by the content of an `ipma` box at `at`."""
-    version, long = data[at], data[at + 3] & 1
-    (count,) = struct.unpack_from(">I", data, at + 4)
-    at += 8
-    for _ in range(count):
-        (number,) = struct.unpack_from(">I" if version else ">H", data, at)
-        at += 4 if version else 2
-        size, at = data[at], at + 1
-        end = at + size * (1 + long)
-        if number == item:
-            return [n & (0x7FFF if long else 0x7F) for n in struct.unpack_from(f">{size}{'H' if long else 'B'}", data, at)]
-        at = end
-    return []
+def open_image(file: IO[bytes], name: object) -> tuple[str, ImageFile]:
+    """The format of an open file and its first image, of which only the header was read. Raises DataError as `header_of`."""
+    file.seek(0)
+    head = file.read(64)
+    if not head:
+        raise DataError(f"{name}: the file is empty; restore the image or remove it from the scene")
+    kind = kind_of(head)
+    if not kind:
+        raise DataError(
+            f"{name}: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF header; replace the file or convert the image to PNG"
+        )
+    file.seek(0)
+    with _decoding(kind, name), silent():
+        return kind, _READERS[kind][1](file)
 
 
-def _boxes(data: bytes, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of the content of each box in a part of an ISO base media file."""
-    while at + 8 <= end:
-        length, kind = struct.unpack_from(">I4s", data, at)
-        if length < 8:  # 0: up to the end of the file, 1: longer than 4 GiB; neither holds what describes an image
-            return
-        yield kind, at + 8, at + length
-        at += length
-
-
-MAX_PIXELS = 100_000_000
-"""Files that claim more are refused before they are decoded."""
-
-Image: TypeAlias = NDArray[np.uint8]
-WHITE = (1.0, 1.0, 1.0)
-"""Default colour behind transparent pixels."""
+def kind_of(head: bytes) -> str:
+    """The format of a file by its first 64 bytes: JPEG, PNG, WebP, BMP, TIFF, AVIF or HEIC; empty for another."""
+    return next((kind for kind, (first, _) in _READERS.items() if re.match(first, head, re.DOTALL)), "")
 
 
 def load_image(
@@ -227,29 +144,59 @@ def load_image(
     """An image [H W 3] in sRGB, 0 to 255, resized to `size` (width, height), or as delivered without one.
 
     16-bit files are rounded to 8 bits, grey ones repeated. Transparent pixels show `background` (RGB in [0, 1]; white
-    by default). `upright` obeys EXIF orientation, except in files with transparency. Raises DataError where the file is
-    absent, truncated, damaged, of no known format or over 1e8 pixels.
+    by default). `upright` obeys EXIF orientation. Raises DataError where the file is absent, truncated, damaged, of no
+    known format or over 1e8 pixels.
     """
-    pixels = _to_rgb(path, _decode(path, upright), WHITE if background is None else background)
-    if size is None or size == (pixels.shape[1], pixels.shape[0]):
+    colour, alpha = _decode(path, upright)
+    pixels = _pixels(colour)
+    if alpha is not None:
+        share = np.asarray(alpha, dtype=np.float32)[:, :, None] / 255
+        behind = np.asarray(WHITE if background is None else background, dtype=np.float32) * 255
+        pixels = np.clip(np.rint(pixels * share + behind * (1 - share)), 0, 255).astype(np.uint8)
+    if size is None or size == colour.size:
         return pixels
-    smaller = size[0] <= pixels.shape[1] and size[1] <= pixels.shape[0]
+    smaller = size[0] <= colour.width and size[1] <= colour.height
     resized = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     return np.asarray(resized, dtype=np.uint8)
 
 
-def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask [H W] of `size` (width, height): true where the file's first channel is bright (above a half; of files that hold
-    but 0 and 1, where it is 1). The nearest pixel is taken. Raises DataError as `load_image` does.
+def load_mask(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> NDArray[np.bool_]:
+    """A mask [H W] at `size` (width, height), or as delivered without one: true where it is white or opaque.
+
+    Alpha decides where it varies; else the luminance of the colours, also of a palette's. True is what is above a half.
+    Where nothing is, as with labels 0 and 1 or red painted on black, it is what is brighter than the darkest pixel (than
+    black, in a mask of one colour); not in JPEG and the like, where that would be noise. The nearest pixel is taken.
+    Raises DataError as `load_image` does, and where the shape is not that of `size`.
     """
-    pixels = _decode(path)
-    height, width = pixels.shape[:2]
-    if abs(size[0] * height - size[1] * width) > width + height + size[0] + size[1]:
+    colour, alpha = _decode(path, upright, np.ceil)  # so that 1 of 65535 is not black
+    width, height = colour.size
+    if size is not None and abs(size[0] * height - size[1] * width) > width + height + size[0] + size[1]:
         raise DataError(f"{path}: {width}x{height} pixels do not fit an image of {size[0]}x{size[1]}; mend it")
-    grey = pixels.reshape(height, width, -1)[:, :, 0].astype(np.int64)
-    half = 0 if grey.max() <= 1 else 127 if grey.max() <= 255 else 32767
-    mask = np.asarray(cv2.resize((grey > half).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
-    return mask.astype(np.bool_)
+    grey = np.asarray(colour.convert("L"))
+    if alpha is not None:
+        opaque = np.asarray(alpha)
+        grey = opaque if np.ptp(opaque) else grey if np.ptp(grey) else np.minimum(grey, opaque)
+    half = 127
+    if grey.max() <= half and read_header(path).kind in ("PNG", "BMP", "TIFF"):
+        half = int(grey.min()) if np.ptp(grey) else 0
+    bright = (grey > half).astype(np.uint8)
+    return np.asarray(bright if size is None else cv2.resize(bright, size, interpolation=cv2.INTER_NEAREST)).astype(np.bool_)
+
+
+def useless_masks(scene: "Scene") -> str:
+    """What is said of masks that leave no pixel of any view, or every pixel of all; empty of others and without masks.
+
+    Reads masks only until one, or two of them, tell that they are of use.
+    """
+    used: set[bool] = set()
+    for path in scene.masks:
+        used |= {True} if path is None else set(np.unique(load_mask(path)).tolist())
+        if len(used) == 2:
+            return ""
+    count = f"the masks of all {len(scene.masks)} views"
+    if used == {False}:
+        return f"{count} are black: no pixel is used; paint white, or opaque, what is to be used"
+    return f"{count} are white: every pixel is used; paint black, or transparent, what is to be left out" if used else ""
 
 
 def load_images(scene: "Scene", background: Sequence[float] | None = None, views: Sequence[int] | None = None) -> list[Image]:
@@ -319,102 +266,151 @@ def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
     return [path for path in images if not faults[path]]
 
 
-def _decode(path: Path, upright: bool = False) -> NDArray[np.generic]:
-    """Pixels as OpenCV orders them, BGR; EXIF orientation is obeyed on request, and not where there is transparency."""
-    header = read_header(path)
-    if header.width * header.height > MAX_PIXELS:
-        raise DataError(f"{path}: {header.width}x{header.height} pixels; at most {MAX_PIXELS:.0e} are read: reduce the image")
+def _decode(
+    path: Path, upright: bool, rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]] = np.rint
+) -> tuple[PIL.Image.Image, PIL.Image.Image | None]:
+    """The colours of a file in mode L, RGB or CMYK, sRGB where it has a profile, and its alpha in mode L where it has one.
+
+    Colours of 16 bits become 8 with `rounded`.
+    """
+    with _opened(path) as file:
+        kind, image = open_image(file, path)
+        # For TIFF Pillow has a limit of its own, above which it warns.
+        most = min(MAX_PIXELS, PIL.Image.MAX_IMAGE_PIXELS or MAX_PIXELS) if kind == "TIFF" else MAX_PIXELS
+        if image.width * image.height > most:
+            raise DataError(f"{path}: {image.width}x{image.height} pixels; at most {most:.0e} are read: reduce the image")
+        with _decoding(kind, path, 8 * image.width * image.height):
+            if kind == "PNG":
+                image.verify()  # the checksums, which loading ignores; it uses the image up
+                image = open_image(file, path)[1]
+                if "transparency" in image.info:  # Pillow scales grey of 2 and 4 bits, but not the transparent one
+                    image.info["transparency"] *= {"L;2": 85, "L;4": 17}.get(str(image.tile[0].args), 1)
+            deep = ";16" in str(image.tile)
+            turn = _TURNS.get(_load(kind, image, upright))
+    profile, alpha = image.info.get("icc_profile"), None
+    pixels: PIL.Image.Image = image
+    if image.mode.startswith("I;16"):
+        values = np.asarray(image)
+        if "transparency" in image.info:
+            alpha = PIL.Image.fromarray(np.uint8(255) * (values != image.info["transparency"]))
+        pixels = PIL.Image.fromarray(rounded(values * np.float32(255 / 65535)).astype(np.uint8))
+    elif image.mode in ("I", "F"):
+        raise DataError(f"{path}: pixels of 32 bits; 8 or 16 bits a channel are read: convert the image")
+    elif deep:
+        pixels = _from_16_bits(path, image, rounded)
+    if alpha is None and pixels.has_transparency_data:
+        grey = pixels.mode in ("1", "L", "LA")
+        pixels = pixels.convert("RGBA")
+        alpha, pixels = pixels.getchannel("A"), pixels.getchannel("R") if grey else pixels.convert("RGB")
+    if pixels.mode not in ("L", "RGB", "CMYK"):
+        pixels = pixels.convert("L" if pixels.mode == "1" else "RGB")
+    if profile:
+        pixels = _to_srgb(pixels, profile)
+    if turn is not None:
+        pixels, alpha = pixels.transpose(turn), alpha and alpha.transpose(turn)
+    return pixels, alpha
+
+
+def _load(kind: str, image: ImageFile, upright: bool) -> int:
+    """Decode an image; the EXIF orientation by which its pixels are still to be turned."""
+    if kind == "TIFF":
+        # Pillow turns TIFFs while it loads them: they are turned back. 6 and 8 are each other's inverse, the rest their own.
+        stored = _orientation(image)
+        image.load()
+        return 1 if upright else {6: 8, 8: 6}.get(stored, stored)
+    image.load()
+    return _orientation(image) if kind == "AVIF" or (upright and kind != "HEIC") else 1
+
+
+def _orientation(image: ImageFile) -> int:
+    """The EXIF orientation, 1 to 8; 1 where the file says none, or nothing that can be understood."""
     try:
-        data = path.read_bytes()
+        with silent():
+            found = image.getexif().get(Tag.Orientation, 1)
+    except Exception:  # whatever is wrong with the block, the pixels are whole
+        return 1
+    return int(found) if found in _TURNS else 1
+
+
+def _pixels(image: PIL.Image.Image) -> Image:
+    """The pixels [H W 3] of an image. In strips: the whole would be copied three times, which takes as long as decoding."""
+    image = image if image.mode == "RGB" else image.convert("RGB")
+    pixels = np.empty((image.height, image.width, 3), dtype=np.uint8)
+    for top in range(0, image.height, _STRIP):
+        pixels[top : top + _STRIP] = np.asarray(image.crop((0, top, image.width, min(top + _STRIP, image.height))))
+    return pixels
+
+
+def _from_16_bits(
+    path: Path, image: PIL.Image.Image, rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+) -> PIL.Image.Image:
+    """Colours of 16 bits, rounded, by OpenCV: Pillow keeps their upper 8 bits only. Pillow's where the two disagree."""
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    found = cv2.imdecode(np.fromfile(path, dtype=np.uint8), flags)
+    if found is None or found.dtype != np.uint16 or found.shape[2:] not in ((3,), (4,)):
+        return image
+    eight = rounded(found[:, :, [2, 1, 0, 3][: found.shape[2]]] * np.float32(255 / 65535)).astype(np.uint8)
+    upper = np.asarray(image.convert("RGB"), dtype=np.int16)
+    same = eight.shape[:2] == upper.shape[:2] and np.abs(eight[:, :, :3] - upper).max() <= 1
+    return PIL.Image.fromarray(eight) if same else image
+
+
+def _to_srgb(pixels: PIL.Image.Image, profile: bytes) -> PIL.Image.Image:
+    """Colours of an ICC profile in sRGB; as they are where the profile is sRGB, broken or not one of such pixels."""
+    mode, transform = _transform(profile)
+    if mode == "RGB" and pixels.mode == "L":
+        pixels = pixels.convert("RGB")
+    return pixels if transform is None or pixels.mode != mode else transform.apply(pixels)
+
+
+@lru_cache(maxsize=16)
+def _transform(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform | None]:
+    """The mode that a profile is for, and the transform to sRGB; None for sRGB itself and for what is broken."""
+    try:
+        given = ImageCms.ImageCmsProfile(BytesIO(profile))
+        mode = {"GRAY": "L", "RGB": "RGB", "CMYK": "CMYK"}[given.profile.xcolor_space.strip()]
+        transform = ImageCms.buildTransform(given, ImageCms.createProfile("sRGB"), mode, "RGB")
+    except (ImageCms.PyCMSError, OSError, KeyError):
+        return "", None
+    if mode != "RGB":
+        return mode, transform
+    # sRGB has many profiles, so it is told by what it does to colours all over the cube.
+    cube = np.indices((16, 16, 16)).reshape(3, 1, -1).transpose(1, 2, 0) * 17
+    moved = transform.apply(PIL.Image.fromarray(np.ascontiguousarray(cube, dtype=np.uint8)))
+    return mode, None if np.abs(np.asarray(moved) - cube).max() <= 2 else transform
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """A file open for reading. Raises DataError where that cannot be."""
+    try:
+        file = path.open("rb")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
-    damage = _damage(data, header)
-    if damage:
-        raise DataError(f"{path}: {damage}; copy or export the image again")
-    if header.kind == "heic":
-        return _decode_heic(path, data)
-    # OpenCV obeys the orientation only where it may also drop the alpha channel.
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
-    if header.alpha or not upright:
-        flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    again = "convert the image to PNG or JPEG" if header.kind == "avif" else "copy or export the image again"
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    except cv2.error as error:
-        if out_of_memory(error):
-            raise
-        raise DataError(f"{path}: the {header.kind} data cannot be decoded; {again}") from error
-    if pixels is None:
-        np.empty(8 * header.width * header.height, np.uint8)  # raises MemoryError where that is what the decoder lacked
-        raise DataError(f"{path}: the {header.kind} data cannot be decoded; {again}")
-    return np.asarray(pixels)
+    with file:
+        yield file
 
 
-def _decode_heic(path: Path, data: bytes) -> NDArray[np.generic]:
-    """The image of a HEIC file. Its rotation is part of the format, so it comes upright."""
+@contextmanager
+def _decoding(kind: str, name: object, room: int = 0) -> Iterator[None]:
+    """Whatever a decoder raises over the bytes of a stranger, as a DataError; MemoryError where `room` bytes are not there."""
     try:
-        import pillow_heif
-    except ImportError:
+        yield
+    except (DataError, MemoryError):
+        raise
+    except ImportError as error:
         raise DataError(
-            f"{path}: is HEIC, which needs the package pillow-heif: pip install 'fprf[heic]', or convert the image to JPEG"
-        ) from None
-    try:
-        return np.asarray(pillow_heif.open_heif(data, bgr_mode=True))
-    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError, IndexError) as error:
-        raise DataError(f"{path}: the heic data cannot be decoded; copy or export the image again") from error
+            f"{name}: is HEIC, which needs the package pillow-heif: pip install 'fprf[heic]', or convert the image to JPEG"
+        ) from error
+    except Exception as error:
+        np.empty(room, np.uint8)  # raises MemoryError where that is what the decoder lacked: few of them say so
+        reason = " ".join(str(error).lower().split()) or type(error).__name__
+        raise DataError(f"{name}: the {kind} data cannot be decoded: {reason}; copy or export the image again") from error
 
 
-def _damage(data: bytes, header: ImageHeader) -> str:
-    """Damage of a file, as far as its structure tells; decoders fill what is missing with grey, silently."""
-    if header_of(data) != header:
-        return "the file changed while it was read"
-    if header.kind == "jpeg":
-        scan = _first_scan(data)
-        return "" if data.rfind(b"\xff\xd9", scan) >= 0 else "the JPEG is truncated (no end-of-image marker)"
-    if header.kind == "png":
-        return _png_damage(data)
-    return ""
-
-
-def _first_scan(data: bytes) -> int:
-    """Offset of the first scan: an end marker before it belongs to a thumbnail."""
-    at = 2
-    while at + 4 <= len(data) and data[at + 1] != 0xDA:
-        stuffed = data[at + 1] == 0xFF
-        bare = data[at + 1] == 0x01 or 0xD0 <= data[at + 1] <= 0xD8
-        at += 1 if stuffed else 2 if bare else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return at
-
-
-def _png_damage(data: bytes) -> str:
-    at = 8
-    while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
-        end = at + 8 + length
-        if end + 4 > len(data):
-            break
-        if zlib.crc32(memoryview(data)[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            return f"the PNG is damaged (checksum of the chunk at byte {at})"
-        if data[at + 4 : at + 8] == b"IEND":
-            return ""
-        at = end + 4
-    return "the PNG is truncated (no end chunk)"
-
-
-def _to_rgb(path: Path, pixels: NDArray[np.generic], background: Sequence[float]) -> Image:
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise DataError(f"{path}: pixels of type {pixels.dtype}; 8 or 16 bits a channel are read: convert the image")
-    if pixels.ndim == 2:
-        pixels = pixels[:, :, None]
-    channels = pixels.shape[2]
-    if channels not in (1, 2, 3, 4):
-        raise DataError(f"{path}: {channels} channels; grey, RGB and either with alpha are read: convert the image")
-    colour = pixels[:, :, :1] if channels < 3 else pixels[:, :, 2::-1]
-    top = np.float32(255 if pixels.dtype == np.uint8 else 65535)
-    if channels in (2, 4):
-        alpha = pixels[:, :, -1:].astype(np.float32) / top
-        behind = np.asarray(background, dtype=np.float32) * 255
-        blended = colour.astype(np.float32) * (255 / top) * alpha + behind * (1 - alpha)
-        return np.asarray(np.clip(np.rint(blended), 0, 255), dtype=np.uint8)
-    eight = colour if pixels.dtype == np.uint8 else np.rint(colour.astype(np.float32) * (255 / top))
-    return np.ascontiguousarray(np.broadcast_to(eight, (*pixels.shape[:2], 3)), dtype=np.uint8)
+@contextmanager
+def silent() -> Iterator[None]:
+    """No warnings, which Pillow gives of EXIF blocks. Filters are of the process, so one thread at a time changes them."""
+    with _WARNINGS, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from ..errors import DataError, UsageError
 from ..io.atomic import write_json, write_text
 from .config import SfmConfig
-from .scene_folder import Progress, SceneFolder, State, count_rows, reading, step_key
+from .images import lost_files
+from .scene_folder import MatchTables, Progress, SceneFolder, State, count_rows, reading, step_key
 from .worker import NO_MODEL, NO_PYCOLMAP
 
 
@@ -249,8 +250,13 @@ def _run(
     if code == NO_PYCOLMAP:
         raise UsageError("fprf process: pycolmap 4 or newer is needed; install it with: pip install 'fprf[sfm]'")
     if code == NO_MODEL:
+        # What the decoders lost comes first: it may be all that is wrong.
+        unread = sorted(set(state.images) - set(MatchTables(place.database).ids))
+        missed = f"COLMAP cannot decode {len(unread)} of {len(state.images)} images, for example {unread[0]}" if unread else ""
+        lost = "; ".join(filter(None, [lost_files(state), missed]))
+        rest = "no two of the other images fit together" if lost else "no two images fit together"
         raise DataError(
-            f"{place.root}: no two images fit together; take more views with more overlap, of places with texture "
+            f"{place.root}: {f'{lost}; ' if lost else ''}{rest}; take more views with more overlap, of places with texture "
             f"({place.log} has COLMAP's words)"
         )
     if code:

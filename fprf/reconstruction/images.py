@@ -5,20 +5,23 @@ depends on what is shown, so frames are compared with their neighbours only.
 """
 
 import hashlib
+import math
 import re
 import shutil
-import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import PIL.Image
+from PIL.ExifTags import IFD
+from PIL.ExifTags import Base as Tag
 
-from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image
+from ..datamanagers.images import IMAGE_SUFFIXES, Image, load_image, open_image, read_header, silent
 from ..errors import DataError, UsageError
 from ..io.atomic import atomic_path, write_bytes
 from .config import SfmConfig
@@ -142,13 +145,6 @@ def _frames(reader: cv2.VideoCapture, wanted: set[int] | None = None) -> Iterato
         index += 1
 
 
-_HEAD = 1 << 17
-"""EXIF lies within the first 64 KiB of a JPEG."""
-_MODEL, _EXIF, _FOCAL, _FOCAL_35 = 0x0110, 0x8769, 0x920A, 0xA405
-_SIZES = {2: 1, 3: 2, 4: 4, 5: 8}
-"""Bytes of a value by type: text, short, long, fraction."""
-
-
 class Lens(NamedTuple):
     """Two photographs of equal size and equal lens are taken with one camera."""
 
@@ -160,79 +156,38 @@ class Lens(NamedTuple):
 
 
 def read_lens(path: Path) -> Lens:
-    """The lens of a photograph; an empty one where its file says nothing, or nothing that can be understood."""
+    """The lens of a photograph by its EXIF block; an empty one where that says nothing, or nothing that can be understood."""
+    exif = _exif(path)
+    try:
+        inner = exif.get_ifd(IFD.Exif)
+        focal, focal_35 = float(inner.get(Tag.FocalLength, 0)), float(inner.get(Tag.FocalLengthIn35mmFilm, 0))
+        model = str(exif.get(Tag.Model, "")).split("\0")[0].strip()
+    except Exception:  # values of other types, and whatever Pillow raises over a damaged block
+        return Lens()
+    return Lens(model, focal if 0 < focal < math.inf else 0.0, int(focal_35) if 0 < focal_35 < math.inf else 0)
+
+
+def _exif(path: Path) -> PIL.Image.Exif:
+    """The EXIF block of an image file; an empty one where there is none, it cannot be understood, or the file is none."""
     try:
         with path.open("rb") as file:
-            return lens_of(file.read(_HEAD))
-    except OSError:
-        return Lens()
-
-
-def heic_exif_block(path: Path) -> bytes:
-    """The EXIF block of a HEIC file that can be decoded, for a JPEG of its pixels: without orientation, which these have had.
-
-    Empty where there is none, it is longer than a JPEG takes, or the file is none.
-    """
-    if not find_spec("pillow_heif"):
-        return b""
-    import pillow_heif
-
-    if not pillow_heif.is_supported(path):
-        return b""
-    info = pillow_heif.open_heif(path).info
-    pillow_heif.set_orientation(info)
-    block: bytes = info.get("exif") or b""
-    return block if len(block) < (1 << 16) - 2 else b""
-
-
-def lens_of(data: bytes) -> Lens:
-    """The lens of a photograph by the first bytes of its file."""
-    try:
-        return _lens(_tiff(data))
-    except (struct.error, IndexError, ValueError):
-        return Lens()
-
-
-def _tiff(data: bytes) -> bytes:
-    """The TIFF structure within a JPEG's EXIF segment; empty without one."""
-    at = 2
-    while data.startswith(b"\xff\xd8") and at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        length = int.from_bytes(data[at + 2 : at + 4], "big")
-        if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
-            return data[at + 10 : at + 2 + length]
-        at += 2 + length
-    return b""
-
-
-def _lens(tiff: bytes) -> Lens:
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if order is None:
-        return Lens()
-    first = _entries(tiff, order, struct.unpack_from(order + "I", tiff, 4)[0])
-    inner = _entries(tiff, order, int.from_bytes(first[_EXIF], "little" if order == "<" else "big")) if _EXIF in first else {}
-    focal, short = inner.get(_FOCAL, b""), inner.get(_FOCAL_35, b"")
-    top, bottom = struct.unpack(order + "II", focal) if len(focal) == 8 else (0, 1)
-    model = first.get(_MODEL, b"").split(b"\0")[0].decode("ascii", "replace").strip()
-    return Lens(model, top / bottom if bottom else 0.0, struct.unpack(order + "H", short)[0] if len(short) == 2 else 0)
-
-
-def _entries(tiff: bytes, order: str, at: int) -> dict[int, bytes]:
-    """Values of a directory by tag, of the types that are read."""
-    entries = {}
-    (count,) = struct.unpack_from(order + "H", tiff, at)
-    for k in range(min(count, 256)):
-        tag, kind, number = struct.unpack_from(order + "HHI", tiff, at + 2 + 12 * k)
-        size, place = _SIZES.get(kind, 0) * number, at + 10 + 12 * k
-        if 0 < size <= 4096:
-            start = place if size <= 4 else struct.unpack_from(order + "I", tiff, place)[0]
-            entries[tag] = tiff[start : start + size]
-    return entries
+            image = open_image(file, path)[1]
+            with silent():
+                exif = image.getexif()
+                exif.get_ifd(IFD.Exif)  # while the file is open: of a TIFF it is read only when asked for
+                return exif
+    except Exception:  # whatever is wrong with it, it is not needed
+        return PIL.Image.Exif()
 
 
 _FEWEST = 3
 """Images that a scene needs at least."""
-_FOREIGN = frozenset({".heic", ".heif", ".hif", ".avif"})
-"""Endings of formats that COLMAP does not read."""
+_FOREIGN = frozenset({"WebP", "AVIF", "HEIC"})
+"""Formats that COLMAP does not read, as it is packaged. It tells formats by their content, as we do."""
+_EXIF_BYTES = (1 << 16) - 16
+"""Bytes of an EXIF block that a JPEG takes."""
+_NAMED = 3
+"""Files, or reasons, that a sentence names, at most."""
 
 
 def gather_images(source: Path, place: SceneFolder, state: State, config: SfmConfig, progress: Progress) -> None:
@@ -252,13 +207,32 @@ def gather_images(source: Path, place: SceneFolder, state: State, config: SfmCon
         kinds = " ".join(sorted(VIDEO_SUFFIXES))
         raise UsageError(f"{source}: neither a folder of images nor a video ({kinds}); check the path")
     if len(gathered) < _FEWEST:
-        why = next((f"{name}: {reason}" for name, reason in state.dropped.items()), _holds(source))
-        raise DataError(f"{source}: {len(gathered)} usable images, at least {_FEWEST} are needed; {why}")
+        state.images = gathered
+        why = lost_files(state) or _holds(source)
+        raise DataError(f"{source}: {why}; {len(gathered)} usable images, at least {_FEWEST} are needed")
     for name in set(state.images) - set(gathered):
         if place.images.resolve() != source.resolve():
             (place.images / name).unlink(missing_ok=True)
     state.source, state.images = here, {name: gathered[name] for name in natural_order(gathered)}
     state.save(place)
+
+
+def lost_files(state: State) -> str:
+    """The files of a folder that could not be decoded, in one clause; empty where all could be, and of a video."""
+    if not state.dropped or "frames" in state.done:
+        return ""
+    alike: dict[str, list[str]] = {}
+    for name, reason in state.dropped.items():
+        alike.setdefault(reason, []).append(name)
+    told = [f"{_some(names)} ({reason})" for reason, names in alike.items()]
+    total = len(state.dropped) + len(state.images)
+    return f"{len(state.dropped)} of {total} files could not be decoded: {_some(told)}"
+
+
+def _some(words: list[str]) -> str:
+    """The first ones of a list, and how many there are beside."""
+    beside = [f"{len(words) - _NAMED} more"] if len(words) > _NAMED else []
+    return ", ".join(words[:_NAMED] + beside)
 
 
 def natural_order(names: Iterable[str]) -> list[str]:
@@ -278,7 +252,8 @@ def _rank(part: str) -> tuple[bool, int, str]:
 def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progress) -> dict[str, dict[str, Any]]:
     """Every image below the folder that can be decoded, under its relative name without blanks.
 
-    Formats that COLMAP does not read become JPEGs: IMG_1.heic is IMG_1.heic.jpg in the scene.
+    Formats that COLMAP does not read become JPEGs, whatever the name says: IMG_1.heic is IMG_1.heic.jpg in the scene. All
+    others are copied: COLMAP and `load_image` see the same pixels in them.
     """
     inplace = place.images.resolve() == source.resolve()
     files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
@@ -292,22 +267,24 @@ def _from_folder(source: Path, place: SceneFolder, state: State, progress: Progr
         if name in entries or (inplace and name != given):
             raise UsageError(f"{path}: COLMAP takes no blanks in names; rename the image, so that no other is called {name}")
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        foreign = path.suffix.lower() in _FOREIGN
-        name = f"{name}.jpg" if foreign else name
-        known = state.images.get(name, {})
-        if known.get("sha256") != digest or not (place.images / name).is_file():
-            try:
-                if foreign and inplace:
-                    raise DataError(f"{path}: COLMAP reads no {path.suffix} files: name another --output, where JPEGs are made")
-                if foreign:
-                    _write_jpeg(path, place.images / name)
+        try:
+            kind = read_header(path).kind
+            foreign = kind in _FOREIGN
+            name = f"{name}.jpg" if foreign else name
+            known = state.images.get(name, {})
+            fresh = known.get("sha256") != digest or not (place.images / name).is_file()
+            if foreign and inplace:
+                raise DataError(f"{path}: COLMAP reads no {kind}: name another --output, where JPEGs are made")
+            if fresh and foreign:
+                _write_jpeg(path, place.images / name)
+            if fresh:
                 known = _described(place.images / name if foreign else path, digest)
-            except DataError as fault:
-                state.dropped[given] = str(fault).removeprefix(f"{path}: ").partition(";")[0]
-                continue
-            if not (inplace or foreign):
+            if fresh and not (inplace or foreign):
                 with atomic_path(place.images / name) as temporary:
                     shutil.copyfile(path, temporary)
+        except DataError as fault:
+            state.dropped[given] = str(fault).removeprefix(f"{path}: ").partition(";")[0]
+            continue
         entries[name] = known
     progress(len(files), len(files), "reading images")
     return entries
@@ -334,12 +311,15 @@ def _from_video(
 
 def _write_jpeg(path: Path, target: Path) -> None:
     """The image as JPEG, upright, with what the file says of its camera. Raises DataError where it cannot be decoded."""
-    pixels = cv2.cvtColor(load_image(path, upright=True), cv2.COLOR_RGB2BGR)
-    options = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-    data, exif = cv2.imencode(".jpg", pixels, options)[1].tobytes(), heic_exif_block(path)
-    if exif:
-        data = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
-    write_bytes(target, data)
+    pixels, exif, data = load_image(path, upright=True), _exif(path), BytesIO()
+    exif.pop(Tag.Orientation, None)
+    try:
+        block = exif.tobytes()
+    except Exception:  # values that Pillow read and cannot write
+        block = b""
+    block = block if len(block) < _EXIF_BYTES else b""
+    PIL.Image.fromarray(pixels).save(data, "JPEG", quality=97, subsampling=0, exif=block)
+    write_bytes(target, data.getvalue())
 
 
 def _holds(source: Path) -> str:

@@ -157,8 +157,10 @@ def dropped_images(
 
 def _lost(name: str, matches: MatchTables, models: Sequence[Mapping[str, Any]]) -> Drop:
     features, partners = matches.features_of(name), matches.partners(name)
+    if name not in matches.ids:
+        return Drop(name, "features", "COLMAP cannot decode it; convert it to JPEG")
     if not features:
-        return Drop(name, "features", "nothing with texture in it, or COLMAP cannot decode it")
+        return Drop(name, "features", "nothing with texture in it")
     if not partners:
         return Drop(name, "matching", f"{features} features, but it fits no other image; take views in between")
     for number, model in enumerate(models[1:], 2):

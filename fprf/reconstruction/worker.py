@@ -1,7 +1,8 @@
 """`python -m fprf.reconstruction.worker JOB.json`: one step of COLMAP, in a process of its own.
 
-pycolmap brings libraries that clash with OpenCV's in one process, so nothing here imports cv2, numpy or torch, and nothing
-else in this package imports pycolmap. Progress goes to standard output as JSON lines, COLMAP's own words to standard error.
+pycolmap brings libraries that clash with those of OpenCV and Pillow in one process, so nothing here imports these, numpy or
+torch, and nothing else in this package imports pycolmap. Progress goes to standard output as JSON lines, COLMAP's own words to
+standard error.
 Exit codes: 0 done, 3 pycolmap is absent or too old, 4 no reconstruction; anything else is COLMAP's failure.
 """
 

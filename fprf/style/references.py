@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..datamanagers.config import GuidedConfig
-from ..datamanagers.images import Image, load_image
+from ..datamanagers.images import Image, load_image, load_mask
 from ..errors import DataError
 from ..interfaces import Encoder
 from ..ops.guided import apply, coefficients
@@ -32,9 +32,6 @@ SHORTEST_REFERENCE = 128
 """References are encoded at the scene's size, but not below this: clusters would have too few pixels."""
 _SHORTEST = 64
 """No side is encoded smaller: deep encoders have nothing to pad with on a photograph of a few pixels."""
-
-_WHITE = 128
-"""Grey level, of 255, from which a mask selects."""
 
 _CELL = 16
 """Pixels between guided-filter coefficients."""
@@ -121,15 +118,14 @@ def _inside(mask: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "N 2"]:
 
 def _mask(path: Path, photo_path: Path, photo: Image, size: tuple[int, int]) -> Annotated[Tensor, "H W"]:
     """A mask at that size (width, height), bool: at least half covered, else whatever is covered at all."""
-    picture = load_image(path, upright=True)
-    (height, width), (own_height, own_width) = picture.shape[:2], photo.shape[:2]
+    white = load_mask(path, upright=True)
+    (height, width), (own_height, own_width) = white.shape, photo.shape[:2]
     if abs(width * own_height - height * own_width) > 0.5 * (width + height + own_width + own_height):
         raise DataError(
             f"{path}: a mask of {width}x{height} pixels does not fit {photo_path.name} of {own_width}x{own_height}; "
             "draw it on the photograph itself"
         )
-    white = (picture.mean(axis=2) >= _WHITE).astype(np.float32)
-    cover = torch.from_numpy(np.asarray(cv2.resize(white, size, interpolation=cv2.INTER_AREA)))
+    cover = torch.from_numpy(np.asarray(cv2.resize(white.astype(np.float32), size, interpolation=cv2.INTER_AREA)))
     selected = cover >= 0.5 if bool((cover >= 0.5).any()) else cover > 0
     if not bool(selected.any()):
         raise DataError(f"{path}: the mask selects no pixel of {photo_path.name}; paint white what makes the style")

@@ -4,11 +4,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..datamanagers.basis import Basis
-from ..datamanagers.images import load_image
+from ..datamanagers.images import load_mask
 from ..errors import UsageError
 from ..interfaces import Scene
 from ..rendering.cameras import Cameras, pixel_grid
@@ -141,7 +143,8 @@ def _covered(regions: Regions, view: int, mask: Path) -> list[int]:
     """Regions of which the mask covers more than half of what the view shows, and the one that fills most of the mask."""
     share, opacity = membership_view(regions, view, _SIDE)
     height, width = opacity.shape
-    white = torch.from_numpy(load_image(mask, (width, height))).float().mean(-1) / 255
+    painted = load_mask(mask, upright=True).astype(np.float32)
+    white = torch.from_numpy(np.asarray(cv2.resize(painted, (width, height), interpolation=cv2.INTER_AREA)))
     mass = (share * opacity[..., None]).flatten(0, 1)
     inside, total = white.flatten() @ mass, mass.sum(0)
     if float(inside.sum()) < _SOLID:

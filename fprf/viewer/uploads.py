@@ -1,4 +1,4 @@
-"""Photographs that clients upload: checked by their header, then decoded by a process of its own.
+"""Photographs that clients upload: checked by their first bytes, then decoded by a process of its own.
 
 The result is a PNG that we wrote ourselves, of bounded size, in a folder of ours under a name of ours. The decoder
 (`python -m fprf.viewer.uploads`) is started once and kept, since starting it takes longer than decoding. Its memory is limited;
@@ -16,7 +16,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import TextIO
 
-from ..datamanagers.images import MAX_PIXELS, header_of
+from ..datamanagers.images import kind_of
 from ..errors import DataError, FprfError
 
 MAX_BYTES = 20 << 20
@@ -32,14 +32,11 @@ _NAME = 48
 
 
 def check_photograph(data: bytes, name: str = "photograph") -> None:
-    """Raise DataError for what is no photograph, or too large a one, by its first bytes."""
+    """Raise DataError for what is no photograph by its first bytes, or has too many. Its pixels are counted by the decoder."""
     if len(data) > MAX_BYTES:
         raise DataError(f"{name}: {len(data)} bytes; at most {MAX_BYTES} are taken: make it smaller")
-    header = header_of(data)
-    if header is None:
+    if not kind_of(data[:64]):
         raise DataError(f"{name}: no PNG, JPEG, WebP, BMP, TIFF, HEIC or AVIF; convert it to one of these")
-    if header.width < 1 or header.height < 1 or header.width * header.height > MAX_PIXELS:
-        raise DataError(f"{name}: {header.width}x{header.height} pixels; 1 to {MAX_PIXELS:.0e} are taken: make it smaller")
 
 
 def shown_name(text: str) -> str:
@@ -180,7 +177,7 @@ def _decode(source: Path, target: Path, side: int) -> None:
 
 
 if __name__ == "__main__":
-    import cv2  # noqa: F401  what it maps does not count against the limit
+    from ..datamanagers import images  # noqa: F401  what it maps does not count against the limit
 
     limit_memory(_MEMORY)
     serve_decoder(sys.stdin, sys.stdout)

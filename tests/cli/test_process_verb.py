@@ -126,6 +126,14 @@ def test_nothing_fits_together(photos: Path, capsys: pytest.CaptureFixture[str])
     assert report(photos)["images"]["posed"] == 0, "the report is written all the same"
 
 
+def test_what_the_decoder_lost_is_told_first(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (photos / "empty [1].jpg").write_bytes(b"")
+    assert process(photos, plan={"nothing": True}) == 2
+    told = capsys.readouterr().err
+    line = next(line for line in told.splitlines() if line.startswith("error: "))
+    assert line.index("could not be decoded: empty [1].jpg (the file is empty)") < line.index("fit together")
+
+
 def test_without_pycolmap_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,4 @@
 import json
-import struct
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -7,16 +6,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from photo_files import HEIC
+from photo_files import HEIC, oriented
+from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from fprf.datamanagers.images import load_image
 from fprf.errors import ConfigError, DataError, UsageError
 from fprf.io.video import write_video
 from fprf.reconstruction.config import SfmConfig
-from fprf.reconstruction.images import Lens, choose_frames, gather_images, lens_of, natural_order, read_lens, save_frames
+from fprf.reconstruction.images import Lens, choose_frames, gather_images, lost_files, natural_order, read_lens, save_frames
 from fprf.reconstruction.scene_folder import SceneFolder, State
+
+NOISE = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
 
 
 def photo(path: Path, seed: int = 0, size: tuple[int, int] = (24, 16)) -> Path:
@@ -34,39 +37,40 @@ def test_every_frame_is_chosen_or_has_a_reason(scores: list[float], count: int, 
     assert all(choice.dropped.values())
 
 
-def tiff(order: str) -> bytes:
-    """Header, a directory with the model and the inner directory, the inner one, and the values that don't fit."""
-    inner_at, model_at = 8 + 30, 8 + 2 * 30
-    model = b"Phone 9\0"
-    head = (b"II" if order == "<" else b"MM") + struct.pack(order + "HI", 42, 8)
-    first = struct.pack(order + "HHHIIHHIII", 2, 0x0110, 2, len(model), model_at, 0x8769, 4, 1, inner_at, 0)
-    inner = struct.pack(order + "HHHIIHHIHHI", 2, 0x920A, 5, 1, model_at + len(model), 0xA405, 3, 1, 26, 0, 0)
-    return head + first + inner + model + struct.pack(order + "II", 425, 100)
+def with_lens(path: Path, **options: object) -> Path:
+    """A photograph whose EXIF block, with an orientation, names its camera and its focal length."""
+    exif = Image.Exif()
+    exif[Base.Model], exif[Base.Orientation] = "Phone 9", 6
+    exif.get_ifd(IFD.Exif).update({Base.FocalLength: 4.25, Base.FocalLengthIn35mmFilm: 26})
+    exif[IFD.Exif] = exif.get_ifd(IFD.Exif)  # else TIFF would be without
+    Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(path, exif=exif, **options)
+    return path
 
 
-JPEG = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "avif"])
+def test_the_lens_is_read_from_every_format(tmp_path: Path, suffix: str) -> None:
+    assert read_lens(with_lens(tmp_path / f"a.{suffix}")) == Lens("Phone 9", 4.25, 26)
 
 
-def with_exif(block: bytes) -> bytes:
-    return JPEG[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 8) + b"Exif\0\0" + block + JPEG[2:]
+def test_no_lens_is_an_empty_one(tmp_path: Path) -> None:
+    (tmp_path / "text.jpg").write_text("no image")
+    for path in (photo(tmp_path / "a.jpg"), photo(tmp_path / "a.png"), tmp_path / "gone", tmp_path / "text.jpg"):
+        assert read_lens(path) == Lens()
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_model_and_focal_length_in_both_byte_orders(order: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.jpg"
-    path.write_bytes(with_exif(tiff(order)))
-    assert read_lens(path) == Lens("Phone 9", 4.25, 26)
-    assert cv2.imread(str(path)).shape == (8, 8, 3), "still a photograph"
-    assert read_lens(photo(path)) == read_lens(photo(tmp_path / "a.png")) == read_lens(tmp_path / "gone") == Lens()
-
-
-@settings(deadline=None)
-@given(st.binary(max_size=200))
-def test_no_damage_makes_it_fail(noise: bytes) -> None:
-    whole = tiff("<")
-    for block in (noise, whole[: len(noise)], whole[:20] + noise, whole[:8] + noise + whole[8:]):
-        assert isinstance(lens_of(with_exif(block)), Lens)
-    assert isinstance(lens_of(noise), Lens) and lens_of(b"") == Lens()
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=200), st.integers(0, 160))
+def test_a_damaged_exif_block_is_no_fault(tmp_path: Path, noise: bytes, cut: int) -> None:
+    whole = with_lens(tmp_path / "a.jpg").read_bytes()
+    start = whole.index(b"Exif")
+    length = int.from_bytes(whole[start - 2 : start], "big")
+    block = whole[start : start + length - 2]
+    block = block[:cut] + noise + block[cut + len(noise) :]
+    rest = whole[start + length - 2 :]
+    (tmp_path / "b.jpg").write_bytes(whole[: start - 2] + (len(block) + 2).to_bytes(2, "big") + block + rest)
+    lens = read_lens(tmp_path / "b.jpg")
+    assert isinstance(lens.model, str) and 0 <= lens.focal < np.inf and lens.focal_35 >= 0
+    assert json.dumps(lens) == json.dumps(list(lens)), "it goes into a file"
 
 
 @pytest.fixture
@@ -105,7 +109,8 @@ def test_what_cannot_be_used_is_dropped_with_its_reason(photos: Path, tmp_path: 
     photo(photos / ".hidden" / "x.jpg")
     state = gathered(photos, SceneFolder(tmp_path / "scene"))
     assert len(state.images) == 3 and state.dropped.keys() == {"empty.jpg", "text.png", "half.jpg"}
-    assert state.dropped["half.jpg"] == "the JPEG is truncated (no end-of-image marker)"
+    assert "truncated" in state.dropped["half.jpg"]
+    assert lost_files(state).startswith("3 of 6 files could not be decoded: empty.jpg (the file is empty), half.jpg (")
 
 
 def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +120,10 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
         (source / f"IMG {k}.HEIC").write_bytes(HEIC)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "pillow_heif", None)
-        with pytest.raises(DataError, match=r"0 usable images.*IMG 0\.HEIC: is HEIC.*pip install 'fprf\[heic\]'"):
+        with pytest.raises(
+            DataError,
+            match=r"3 of 3 files could not .*: IMG 0\.HEIC, IMG 1\.HEIC, IMG 2\.HEIC \(is HEIC.*pip install 'fprf\[heic\]'",
+        ):
             gathered(source, SceneFolder(tmp_path / "without"))
     pytest.importorskip("pillow_heif")
     place = SceneFolder(tmp_path / "scene")
@@ -126,6 +134,34 @@ def test_heic_becomes_jpeg_with_its_lens_or_says_what_is_missing(tmp_path: Path,
     jpeg = place.images / "IMG_0.HEIC.jpg"
     assert np.array_equal(load_image(jpeg), load_image(jpeg, upright=True)), "it is upright already"
     assert abs(load_image(jpeg).astype(int) - load_image(source / "IMG 0.HEIC")).mean() < 3
+
+
+def test_what_colmap_does_not_read_becomes_jpeg_whatever_it_is_called(tmp_path: Path) -> None:
+    source, image = tmp_path / "in", Image.fromarray(cv2.resize(NOISE, (48, 32), interpolation=cv2.INTER_CUBIC))
+    source.mkdir()
+    kinds = {
+        "a.webp": "WEBP",
+        "b.JPG": "WEBP",
+        "c.avif": "AVIF",
+        "d.png": "AVIF",
+        "e.webp": "JPEG",
+        "f.jpg": "PNG",
+        "g.tif": "TIFF",
+    }
+    for name, form in kinds.items():
+        (source / name).write_bytes(oriented(image, form, 6))
+    place = SceneFolder(tmp_path / "scene")
+    state = gathered(source, place)
+    assert not state.dropped and lost_files(state) == ""
+    assert list(state.images) == ["a.webp.jpg", "b.JPG.jpg", "c.avif.jpg", "d.png.jpg", "e.webp", "f.jpg", "g.tif"]
+    for name, about in state.images.items():
+        kept = load_image(place.images / name)
+        assert kept.shape[1::-1] == (about["width"], about["height"])
+        if name in kinds:
+            assert (place.images / name).read_bytes() == (source / name).read_bytes()
+        else:  # upright, and nothing left that would turn it again
+            assert abs(kept.astype(int) - load_image(source / name.removesuffix(".jpg"), upright=True)).mean() < 3
+            assert np.array_equal(kept, load_image(place.images / name, upright=True)) and kept.shape == (48, 32, 3)
 
 
 def test_a_second_time_follows_what_has_changed(photos: Path, tmp_path: Path) -> None:
@@ -177,7 +213,9 @@ def test_mistakes_are_named(photos: Path, tmp_path: Path) -> None:
             gathered(source, place)
     photo(tmp_path / "few" / "a.jpg")
     (tmp_path / "few" / "b.jpg").write_bytes(b"")
-    with pytest.raises(DataError, match=r"1 usable images, at least 3 are needed; b\.jpg: the file is empty"):
+    with pytest.raises(
+        DataError, match=r"1 of 2 files could not .*: b\.jpg \(the file is empty\); 1 usable images, at least 3"
+    ):
         gathered(tmp_path / "few", place)
     (tmp_path / "few" / "no.mp4").write_bytes(b"nothing of the kind" * 100)
     with pytest.raises(DataError, match=r"no\.mp4: no video that can be opened"):

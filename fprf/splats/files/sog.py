@@ -235,9 +235,12 @@ class _Pictures:
 
     def picture(self, name: str, most: int | None = None) -> _Bytes:
         """An image [H W 4], RGBA, of at most so many pixels."""
-        header = header_of(self.parts[name])
         most = 2 * self.count + _SLACK if most is None else most
-        if header is None or header.kind not in ("webp", "png") or not 0 < header.width * header.height <= most:
+        try:
+            header = header_of(io.BytesIO(self.parts[name]), name)
+        except DataError:
+            header = None
+        if header is None or header.kind not in ("WebP", "PNG") or not 0 < header.width * header.height <= most:
             raise self._wrong(f"{name} is no image of at most {most} pixels")
         try:
             image = cv2.imdecode(np.frombuffer(self.parts[name], np.uint8), cv2.IMREAD_UNCHANGED)
