@@ -78,8 +78,13 @@ class TrainedScene:
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras of the captured views, in the order of `names`."""
+        """Cameras of the captured views, in the order of `names`; relative to `origin`."""
         return self.trained.known.cameras
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """What was taken off the capture's coordinates for `cameras`, or is to be for others: 0 unless it lies far from 0."""
+        return self.trained.scene.origin
 
     @property
     def references(self) -> tuple[str, ...]:
@@ -93,7 +98,7 @@ class TrainedScene:
     def camera_at(
         self, position: Sequence[float], target: Sequence[float], *, fov: float = 60.0, width: int = 640, height: int = 480
     ) -> Cameras:
-        """A pinhole camera at a place (world units) that looks at another; `fov` is its vertical angle in degrees.
+        """A pinhole camera at a place (capture's coordinates) that looks at another; `fov` is its vertical angle in degrees.
 
         Up is where the captured cameras have it. Raises UsageError where position and target are one, ConfigError for an
         angle or a size that no camera has.
@@ -105,11 +110,11 @@ class TrainedScene:
         if here.shape != (1, 3) or there.shape != (1, 3) or bool(torch.equal(here, there)):
             raise UsageError(f"camera_at: position {position} and target {target} must be two places of three numbers each")
         pose = look_at(here, there, upwards(self.cameras))
-        return pinhole(pose, width=width, height=height, fov=fov)
+        return pinhole(pose, width=width, height=height, fov=fov).shifted([-x for x in self.origin])
 
     def path(self, motion: str, frames: int = 120, split: Split = "all") -> Cameras:
         """Cameras of a flight: spiral, orbit, interpolate, dataset, or a camera-path JSON file. Raises UsageError."""
-        return make_path(self.cameras, self.trained.known.split(split), motion, frames)
+        return make_path(self.cameras, self.trained.known.split(split), motion, frames, self.origin)
 
     def stylize(
         self,

@@ -32,13 +32,13 @@ from ..style.references import Encoders
 from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
-from ..types import View
+from ..types import Origin, View
 from .config import LookConfig
 from .gaussians import Gaussians
 from .levels import Levels, StyledLevels, seen_by
 from .photographs import camera_of, cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
-from .views import SeenMeans, draw, find_views, seen_means
+from .views import SeenMeans, clip_distance, draw, find_views, seen_means
 
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
@@ -98,6 +98,8 @@ class SplatScene(Scene):
     """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are drawn."""
     levels: Callable[[], Levels] | None = None
     """Levels of detail of the Gaussians as captured, for scenes that are drawn merged."""
+    origin: Origin = (0.0, 0.0, 0.0)
+    """Origin of the Gaussians and the views."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -262,7 +264,8 @@ def look_at_capture(
     cameras = find_views(gaussians, count=config.views, size=config.size, up=up, inside=config.inside, antialiased=antialiased)
 
     def found() -> Semantics:
-        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, progress=progress)
+        near = clip_distance(gaussians)
+        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=progress)
 
     return captured(gaussians, antialiased, cameras, cache(found), encoder)
 
@@ -272,7 +275,8 @@ def captured(
 ) -> SplatScene:
     """The scene of a capture; its views are numbered."""
     names = tuple(f"{view:02d}" for view in range(len(cameras)))
-    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, int(cameras.size.amax()))
+    longest, near = int(cameras.size.amax()), clip_distance(gaussians)
+    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, longest, near)
 
 
 @torch.inference_mode()
@@ -283,7 +287,7 @@ def find_semantics(
     cameras: Cameras,
     regions: int,
     *,
-    near: float = 0.01,
+    near: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Semantics:
     """Encode views of Gaussians, carry the features back, and find the regions. Lenses are left out.
@@ -390,7 +394,7 @@ def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def cache_name(data: bytes, encoder: str, config: LookConfig) -> str:
     """A name for what is found out about a file: by its content, the encoder, and how it is looked at."""
     digest = hashlib.sha256(data)
-    digest.update(f"6 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
+    digest.update(f"7 {encoder} {config.up} {config.inside} {config.views} {config.size} {config.regions}".encode())
     return f"{digest.hexdigest()[:32]}.safetensors"
 
 

@@ -85,18 +85,18 @@ def new_folder(root: Path) -> Path:
 
 
 def write_film_files(
-    folder: Path, transform: PageTransform, plan: FilmPlan, encoder: str, stylizer: RegionToneConfig | None = None
+    folder: Path, transform: PageTransform, plan: FilmPlan, scene: Scene, stylizer: RegionToneConfig | None = None
 ) -> None:
     """Write path.json, keys.json, and a folder a look with style.json and its photographs.
 
-    `encoder` is the identity of the scene's semantic encoder, `stylizer` what its looks are based on; None = the default.
+    `stylizer` is what looks are based on; None = the default.
     """
-    write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps)
+    write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps, scene.origin)
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
     for i, key in enumerate(plan.keys):
         if not simplified(key.look).plain and key.look not in looks:
-            looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, encoder, stylizer)
+            looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, scene.semantic_encoder, stylizer)
         style = looks.get(key.look)
         rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
@@ -116,7 +116,7 @@ def film_frames(
     """
     end: Exception | None = None
     try:
-        cameras, _ = read_camera_path(folder / "path.json")
+        cameras, _ = read_camera_path(folder / "path.json", scene.origin)
         looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
         for frame in range(len(cameras)):
             picture = yield from renderer.frame(cameras, frame, looks(frame))
@@ -219,7 +219,7 @@ class FilmRecorder:
             if session.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
             folder = new_folder(session.viewed.root)
-            write_film_files(folder, session.transform, plan, session.viewed.scene.semantic_encoder, session.viewed.stylizer)
+            write_film_files(folder, session.transform, plan, session.viewed.scene, session.viewed.stylizer)
             frames: Frames = Queue(2)
             rendered = film_frames(folder, session.viewed.scene, session.renderer, frames, progress, abandoned.is_set)
             self._worker.run_when_idle(rendered)

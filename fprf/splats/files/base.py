@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...ops.harmonics import HARMONIC
+from ...rendering.local_frame import local_origin
+from ...types import Origin
 from ..gaussians import Gaussians, morton_order
 
 Floats: TypeAlias = NDArray[Any]
@@ -35,6 +38,22 @@ class Capture:
     """The file. Of a folder, its files as one archive."""
     recolour: Callable[[Floats, Bools], bytes]
     """The file with the harmonics [N K 3] of some Gaussians (bool [N]) replaced and everything else as it was."""
+    shift: Origin = (0.0, 0.0, 0.0)
+    """What was taken off the file's coordinates, which lie far from 0."""
+    offset: Origin = (0.0, 0.0, 0.0)
+    """What a file beside it adds to them (see `rendering.local_frame`)."""
+
+    @property
+    def origin(self) -> Origin:
+        """Of the local frame that the Gaussians are in."""
+        return self.shift[0] + self.offset[0], self.shift[1] + self.offset[1], self.shift[2] + self.offset[2]
+
+
+def centred(means: Floats) -> tuple[NDArray[np.float64], Origin]:
+    """Positions of any type about their local origin, and that."""
+    means = means.astype(np.float64)
+    shift = local_origin(torch.from_numpy(means))
+    return means - shift, shift
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ...datamanagers.images import header_of
 from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians, from_arrays
-from .base import Bools, Capture, Floats, finite, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
+from .base import Bools, Capture, Floats, centred, finite, logit, sigmoid, smallest_three, spatial_order, steps, three_to_four
 
 _Bytes: TypeAlias = NDArray[np.uint8]
 _LEVELS = 256
@@ -62,8 +62,9 @@ def read_sog(path: Path, data: bytes) -> Capture:
     labels, rest = pictures.palette()
     alpha = base[:, 3:] if version == 2 else pictures.decoded("sh0", base, 4)[:, 3:]
     constants = pictures.decoded("sh0", base[:, :3] if version == 2 else base, 3 if version == 2 else 4)[:, :3]
+    means, shift = centred(np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)))
     gaussians = from_arrays(
-        np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)),
+        means,
         quaternions,
         pictures.decoded("scales", scale[:, :3], 3),
         logit(alpha[:, 0] / 255) if version == 2 else alpha[:, 0],
@@ -87,7 +88,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
         new["meta.json"] = json.dumps(said, separators=(",", ":")).encode()
         return bundle(new, like=data)
 
-    return Capture(path, gaussians, meta.get("antialias") is True, data, recolour)
+    return Capture(path, gaussians, meta.get("antialias") is True, data, recolour, shift)
 
 
 def sog_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ..gaussians import COUNTS, Gaussians, from_arrays
-from .base import Bools, Capture, Floats, finite, logit, short, sigmoid, smallest_three, steps, three_to_four
+from .base import Bools, Capture, Floats, centred, finite, logit, short, sigmoid, smallest_three, steps, three_to_four
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
@@ -79,8 +79,9 @@ def read_spz(path: Path, data: bytes) -> Capture:
         quaternions[:, _TURN] = found
     bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
     harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
+    points, shift = centred(points * _AXES)
     gaussians = from_arrays(
-        points * _AXES,
+        points,
         quaternions * np.concatenate([[1.0], _AXES]),
         scales.reshape(count, 3) / 16 - 10,
         logit(opacity / 255),
@@ -97,7 +98,7 @@ def read_spz(path: Path, data: bytes) -> Capture:
         parts = [new.get(i, each) for i, each in enumerate(streams)]
         return _zipped(b"".join([unpacked[: _HEADER.size], *parts, unpacked[ends[-1] :]]))
 
-    return Capture(path, gaussians, bool(header.flags & 1), data, recolour)
+    return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift)
 
 
 def spz_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:
