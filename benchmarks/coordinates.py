@@ -94,9 +94,8 @@ def restyled(whole: Gaussians, folder: Path, factor: float, shift: Origin) -> ND
     given = replace(whole, means=whole.means * factor, log_scales=whole.log_scales + math.log(factor))
     write_gaussians(folder / "in.ply", given, antialiased=True, origin=shift)
     output = folder / "out.ply"
-    run_verb(
-        ["restyle", str(folder / "in.ply"), "--references", str(REFERENCE), "--output", str(output), "--cache", str(folder), "--views", "8"]
-    )
+    flags = ["--references", str(REFERENCE), "--views", "8", "--cache", str(folder)]
+    run_verb(["restyle", str(folder / "in.ply"), *flags, "--output", str(output)])
     return read_capture(output).gaussians.colours.clamp(0, 1).numpy()
 
 

@@ -169,7 +169,7 @@ def _points(place: _Place, cloud: "Cloud") -> dict[str, Any]:
 
     from ..export.colours import best_views, expected_presence, single_view
     from ..export.point_cloud import Cloud, concatenate, sky_dome, write_points
-    from ..export.splats import surface_discs, write_discs, write_splat
+    from ..export.splats import surface_discs, write_gaussians, write_splat
     from ..splats.initial import Points
 
     config, kinds, origin = place.config, place.what.kinds, place.trained.origin
@@ -195,7 +195,7 @@ def _points(place: _Place, cloud: "Cloud") -> dict[str, Any]:
                 write_points(path, cloud, colour, origin, local=config.local)
         if "splat" in kinds and config.fit == 0:
             for path in place.paths("splats", look, ".ply"):
-                write_discs(path, splats, every, origin, local=config.local)
+                write_gaussians(path, splats, every, origin, local=config.local)
             for path in place.paths("splats", look, ".splat"):
                 write_splat(path, splats, every, origin)
     return made

@@ -243,7 +243,7 @@ def vertex_normals(point: Annotated[Tensor, "N 3"], face: Annotated[Tensor, "F 3
     return torch.nn.functional.normalize(total, dim=-1).float()
 
 
-def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool) -> None:
+def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
     """Write the mesh as PLY, in the world or `local`, with 8-bit sRGB colours."""
     faces = np.empty(len(mesh.face), [("vertex_indices", [("count", "u1"), ("corners", "<i4", 3)])])
     faces["vertex_indices"]["count"], faces["vertex_indices"]["corners"] = 3, mesh.face.numpy()
@@ -252,7 +252,7 @@ def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], ori
     write_offset(path, beside)
 
 
-def write_mesh_glb(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool) -> None:
+def write_mesh_glb(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
     """Write the mesh as binary glTF, shown as it is: unlit, with 16-bit linear colours, which glTF asks for.
 
     Vertices are local, since glTF has float32; its node's translation, or where `local` a file beside, is the origin.

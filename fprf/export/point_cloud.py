@@ -245,7 +245,7 @@ def sky_dome(maps: DepthMaps, cloud: Cloud) -> Cloud | None:
     return Cloud(centre + radius * mean, -mean.float(), radius * width, _LOOSE * radius * width, view[first])
 
 
-def write_points(path: Path, cloud: Cloud, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool) -> None:
+def write_points(path: Path, cloud: Cloud, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
     """Write the coloured cloud with normals as PLY, in the world or `local`."""
     added, beside = added_and_beside(origin, local)
     write_bytes(path, ply_file({"vertex": vertex_table(cloud.point, cloud.normal, colour, added)}))
@@ -253,7 +253,10 @@ def write_points(path: Path, cloud: Cloud, colour: Annotated[Tensor, "N 3"], ori
 
 
 def vertex_table(
-    point: Annotated[Tensor, "N 3"], normal: Annotated[Tensor, "N 3"], colour: Annotated[Tensor, "N 3"], origin: Origin
+    point: Annotated[Tensor, "N 3"],
+    normal: Annotated[Tensor, "N 3"],
+    colour: Annotated[Tensor, "N 3"],
+    origin: Origin = (0.0, 0.0, 0.0),
 ) -> NDArray[np.void]:
     """Vertices of a PLY: float x y z nx ny nz, uchar red green blue, rounded as pictures are.
 

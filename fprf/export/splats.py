@@ -64,7 +64,9 @@ def rotation_to_normal(normal: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N
     return torch.nn.functional.normalize(torch.where(none, back, turn), dim=-1)
 
 
-def write_discs(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool) -> None:
+def write_gaussians(
+    path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False
+) -> None:
     """Write the 3D Gaussian PLY, in the world or `local`. Colours are sRGB in [0, 1], without view dependence."""
     gaussians = Gaussians(
         means=splats.point.float(),

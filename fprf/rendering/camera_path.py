@@ -28,7 +28,7 @@ _STRAY = 1e-3
 """Tolerance of a rotation's orthonormality: viewers round to a few digits."""
 
 
-def read_camera_path(path: Path, origin: Origin) -> tuple[Cameras, float]:
+def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Cameras, float]:
     """The frames of a file as pinhole cameras about an origin, float64, and its frames a second.
 
     Raises DataError with the place.
@@ -61,7 +61,7 @@ def read_camera_path(path: Path, origin: Origin) -> tuple[Cameras, float]:
     return frames.shifted([-x for x in origin]), fps
 
 
-def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin) -> None:
+def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin = (0.0, 0.0, 0.0)) -> None:
     """Write frames about an origin, all of the first one's size.
 
     What the format cannot say (distortion, fx unlike fy) is left out.

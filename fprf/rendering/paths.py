@@ -216,7 +216,7 @@ def _sweep(azimuth: Annotated[Tensor, "V"], frames: int) -> Annotated[Tensor, "F
 MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
 
 
-def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int, origin: Origin) -> Cameras:
+def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int, origin: Origin = (0.0, 0.0, 0.0)) -> Cameras:
     """Cameras of a motion, or of a camera-path JSON file, about the `origin` that the captured `cameras` have.
 
     `interpolate` and `dataset` go through `views` of the captured `cameras`, the latter with their own lenses. `frames` are

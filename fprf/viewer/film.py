@@ -27,6 +27,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
 from ..style.keyframes import keyed_looks, read_keyframes
+from ..types import Origin
 from .cameras import CameraState, PageTransform
 from .render_worker import RenderWorker, Steps
 from .renderer import RenderRequest, SceneRenderer
@@ -85,18 +86,24 @@ def new_folder(root: Path) -> Path:
 
 
 def write_film_files(
-    folder: Path, transform: PageTransform, plan: FilmPlan, scene: Scene, stylizer: RegionToneConfig | None = None
+    folder: Path,
+    transform: PageTransform,
+    plan: FilmPlan,
+    encoder: str,
+    stylizer: RegionToneConfig | None = None,
+    origin: Origin = (0.0, 0.0, 0.0),
 ) -> None:
     """Write path.json, keys.json, and a folder a look with style.json and its photographs.
 
-    `stylizer` is what looks are based on; None = the default.
+    `encoder` is the identity of the scene's semantic encoder, `stylizer` what its looks are based on; None = the default.
+    The path is in the capture's coordinates; `origin` is that of the scene.
     """
-    write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps, scene.origin)
+    write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps, origin)
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
     for i, key in enumerate(plan.keys):
         if not simplified(key.look).plain and key.look not in looks:
-            looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, scene.semantic_encoder, stylizer)
+            looks[key.look] = _write_look(folder / f"style-{len(looks) + 1}", key.look, encoder, stylizer)
         style = looks.get(key.look)
         rows.append({"frame": i * plan.gap, "style": None if style is None else str(style.relative_to(folder))})
     write_json(folder / "keys.json", {"format": 1, "keyframes": rows})
@@ -219,7 +226,8 @@ class FilmRecorder:
             if session.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
             folder = new_folder(session.viewed.root)
-            write_film_files(folder, session.transform, plan, session.viewed.scene, session.viewed.stylizer)
+            scene = session.viewed.scene
+            write_film_files(folder, session.transform, plan, scene.semantic_encoder, session.viewed.stylizer, scene.origin)
             frames: Frames = Queue(2)
             rendered = film_frames(folder, session.viewed.scene, session.renderer, frames, progress, abandoned.is_set)
             self._worker.run_when_idle(rendered)
