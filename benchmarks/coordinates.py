@@ -78,7 +78,7 @@ def exported(run: Path, folder: Path, factor: float, shift: Origin) -> dict[str,
         capture = read_capture(folder / "splats.splat")
         world = capture.gaussians.means.double().numpy() + (np.array(capture.origin) - shift)
         found["splats.splat"] = float(np.abs(world - (local + (origin - shift))).max()) / extent
-        vertex = trimesh.load(folder / "splats.ply", process=False).vertices  # another reader
+        vertex = np.asarray(trimesh.load_scene(folder / "splats.ply", process=False).to_geometry().vertices)  # another reader
         found["splats.ply"] = float(np.abs((vertex - shift) - (local + (origin - shift))).max()) / extent
     document = json.loads((folder / "transforms.json").read_text()) if (folder / "transforms.json").is_file() else None
     if document is not None:

@@ -141,6 +141,7 @@ def test_far_from_0_positions_are_float64_or_local_with_a_file_that_says_so(tmp_
     assert read_offset(tmp_path / "local.ply") == (0, 0, 0), "no offset of a file before is left"
 
 
+@given(seed=seeds)
 def test_coarse_points_give_way_to_finer_ones_in_their_voxel(seed: int) -> None:
     points = drawn(seed, 60, 3) * 8
     level = torch.randint(0, 3, (60,), generator=torch.Generator().manual_seed(seed))
