@@ -69,7 +69,7 @@ def moved(scene: Scene, folder: Path, factor: float, shift: Origin) -> Path:
 
 def exported(run: Path, folder: Path, factor: float, shift: Origin) -> dict[str, Any]:
     """Largest errors of positions in the exported files, as shares of the scene's extent."""
-    run_verb(["export", str(run), "--output", str(folder)])
+    run_verb(["export", str(run), "ply", "splat", "cameras", "--output", str(folder)])
     scene = open_run(run, "cpu").scene
     extent = float((scene.cameras.pose[:, :, 3].amax(0) - scene.cameras.pose[:, :, 3].amin(0)).norm())
     found: dict[str, Any] = {"origin": list(scene.origin)}
@@ -80,11 +80,10 @@ def exported(run: Path, folder: Path, factor: float, shift: Origin) -> dict[str,
         found["splats.splat"] = float(np.abs(world - (local + (origin - shift))).max()) / extent
         vertex = np.asarray(trimesh.load_scene(folder / "splats.ply", process=False).to_geometry().vertices)  # another reader
         found["splats.ply"] = float(np.abs((vertex - shift) - (local + (origin - shift))).max()) / extent
-    document = json.loads((folder / "transforms.json").read_text()) if (folder / "transforms.json").is_file() else None
-    if document is not None:
-        given = np.array([frame["transform_matrix"] for frame in document["frames"]])[:, :3, 3]
-        own = scene.cameras.pose[:, :, 3].numpy() + np.array(scene.origin)
-        found["transforms.json"] = float(np.abs(given - own).max()) / extent
+    document = json.loads((folder / "transforms.json").read_text())
+    given = np.array([frame["transform_matrix"] for frame in document["frames"]])[:, :3, 3]
+    own = scene.cameras.pose[:, :, 3].numpy() + np.array(scene.origin)
+    found["transforms.json"] = float(np.abs(given - own).max()) / extent
     return found
 
 
