@@ -66,7 +66,7 @@ _NEAR = 3.0
 """What a pixel with something close before the camera costs, in filled ones."""
 _MEAN_VIEWS, _UNSEEN = 32, 1e-4
 """Views that means are taken from, at most; weight, in pixels, of those that do not show a Gaussian."""
-_CLIP, _CLIPPED = 0.01, (1e-4, 1e-2)
+_CLIP, _CLIPPED = 0.01, (1e-4, 2e-2)
 """Distance from a camera from which on a capture is drawn, and its bounds as shares of the capture's extent."""
 
 
