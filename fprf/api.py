@@ -78,13 +78,8 @@ class TrainedScene:
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras of the captured views, in the order of `names`; relative to `origin`."""
-        return self.trained.known.cameras
-
-    @property
-    def origin(self) -> tuple[float, float, float]:
-        """What was taken off the capture's coordinates for `cameras`, or is to be for others: 0 unless it lies far from 0."""
-        return self.trained.scene.origin
+        """Cameras of the captured views, in the order of `names`: as all cameras here, in the capture's coordinates."""
+        return self.trained.known.cameras.shifted(self.trained.scene.origin)
 
     @property
     def references(self) -> tuple[str, ...]:
@@ -110,11 +105,11 @@ class TrainedScene:
         if here.shape != (1, 3) or there.shape != (1, 3) or bool(torch.equal(here, there)):
             raise UsageError(f"camera_at: position {position} and target {target} must be two places of three numbers each")
         pose = look_at(here, there, upwards(self.cameras))
-        return pinhole(pose, width=width, height=height, fov=fov).shifted([-x for x in self.origin])
+        return pinhole(pose, width=width, height=height, fov=fov)
 
     def path(self, motion: str, frames: int = 120, split: Split = "all") -> Cameras:
         """Cameras of a flight: spiral, orbit, interpolate, dataset, or a camera-path JSON file. Raises UsageError."""
-        return make_path(self.cameras, self.trained.known.split(split), motion, frames, self.origin)
+        return make_path(self.cameras, self.trained.known.split(split), motion, frames)
 
     def stylize(
         self,
@@ -184,7 +179,7 @@ class TrainedScene:
 
     def film(self, cameras: Cameras) -> Iterator[Shot]:
         """Views of many cameras, one after the other, each when it is asked for."""
-        scene = self.trained.scene.restyled(self.restyle)
+        scene, cameras = self.trained.scene.restyled(self.restyle), self._local(cameras)
         for view in range(len(cameras)):
             made = scene.render(cameras, view)
             yield Shot(made.rgb, made.depth, made.opacity)
@@ -192,12 +187,16 @@ class TrainedScene:
     def matches(self, camera: Cameras | int | str) -> MatchMap:
         """Style codes that each pixel of a view takes; `styled.codes` names them. Raises UsageError without a style."""
         styled, one = self._style("matches"), self._single("matches", camera)
-        return match_map(self.trained.scene, styled, 0, one)
+        return match_map(self.trained.scene, styled, 0, self._local(one))
 
     @property
     def restyle(self) -> Restyle | None:
         """The look that is rendered; None = as captured."""
         return None if self.styled is None else self.styled.restyle
+
+    def _local(self, cameras: Cameras) -> Cameras:
+        """Cameras about the scene's origin."""
+        return cameras.shifted([-x for x in self.trained.scene.origin])
 
     def _style(self, what: str) -> Styled:
         if self.styled is None:

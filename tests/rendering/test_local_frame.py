@@ -64,5 +64,5 @@ def test_offset_files_are_read_again_and_do_not_outlive_their_file(tmp_path: Pat
 @pytest.mark.parametrize("text", ["[]", "{}", '{"offset": [1, 2]}', '{"offset": "far"}', '{"offset": [1, 2, null]}', "{"])
 def test_damaged_offset_files_are_refused(tmp_path: Path, text: str) -> None:
     offset_file(tmp_path / "a.ply").write_text(text)
-    with pytest.raises(DataError, match="a.ply.offset.json"):
+    with pytest.raises(DataError, match=r"a\.ply\.offset\.json"):
         read_offset(tmp_path / "a.ply")
