@@ -69,8 +69,9 @@ def moved(scene: Scene, folder: Path, factor: float, shift: Origin) -> Path:
 
 def exported(run: Path, folder: Path, factor: float, shift: Origin) -> dict[str, Any]:
     """Largest errors of positions in the exported files, as shares of the scene's extent."""
-    run_verb(["export", str(run), "ply", "splat", "cameras", "--output", str(folder)])
     scene = open_run(run, "cpu").scene
+    kinds = ["ply", "splat", "cameras"] if isinstance(scene, SplatScene) else ["cameras"]
+    run_verb(["export", str(run), *kinds, "--output", str(folder)])
     extent = float((scene.cameras.pose[:, :, 3].amax(0) - scene.cameras.pose[:, :, 3].amin(0)).norm())
     found: dict[str, Any] = {"origin": list(scene.origin)}
     if isinstance(scene, SplatScene):
