@@ -9,6 +9,7 @@ from fprf.process import keep_memory
 BENCHMARKS = {
     "blocks_scenes": "a capture in blocks against one field, for the same seconds",
     "cells": "captures in cells of Gaussians against one piece and blocks of fields",
+    "coordinates": "a capture in projected, Earth-centred, very large and very small coordinates against its own",
     "decoders": "fidelity of decoders, and what a style loss buys",
     "district": "a district of 2000 images in cells: seconds, memory and killed workers",
     "district_style": "a style on millions of Gaussians: seconds and memory, part by part, killed half-way",

@@ -63,7 +63,8 @@ def main(argv: list[str]) -> None:
     folder = config.folder or config.run / "exports"
     if not (folder / "export.json").is_file():
         style = ["--styles", "style=" + ",".join(map(str, config.references))] if config.references else []
-        command = [sys.executable, "-m", "fprf", "export", str(config.run), "ply", "splat", "glb", "cameras", *style]
+        words = ["export", str(config.run), "ply", "splat", "glb", "cameras", "--local", "true", *style]
+        command = [sys.executable, "-m", "fprf", *words]
         command += ["--fit", str(config.fit)] if config.fit else []
         subprocess.run([*command, "--output", str(folder)], check=True)
     scene = fprf.load(config.run)

@@ -78,8 +78,8 @@ class TrainedScene:
 
     @property
     def cameras(self) -> Cameras:
-        """Cameras of the captured views, in the order of `names`."""
-        return self.trained.known.cameras
+        """Cameras of the captured views, in the order of `names`: as all cameras here, in the capture's coordinates."""
+        return self.trained.known.cameras.shifted(self.trained.scene.origin)
 
     @property
     def references(self) -> tuple[str, ...]:
@@ -93,7 +93,7 @@ class TrainedScene:
     def camera_at(
         self, position: Sequence[float], target: Sequence[float], *, fov: float = 60.0, width: int = 640, height: int = 480
     ) -> Cameras:
-        """A pinhole camera at a place (world units) that looks at another; `fov` is its vertical angle in degrees.
+        """A pinhole camera at a place (capture's coordinates) that looks at another; `fov` is its vertical angle in degrees.
 
         Up is where the captured cameras have it. Raises UsageError where position and target are one, ConfigError for an
         angle or a size that no camera has.
@@ -179,7 +179,7 @@ class TrainedScene:
 
     def film(self, cameras: Cameras) -> Iterator[Shot]:
         """Views of many cameras, one after the other, each when it is asked for."""
-        scene = self.trained.scene.restyled(self.restyle)
+        scene, cameras = self.trained.scene.restyled(self.restyle), self._local(cameras)
         for view in range(len(cameras)):
             made = scene.render(cameras, view)
             yield Shot(made.rgb, made.depth, made.opacity)
@@ -187,12 +187,16 @@ class TrainedScene:
     def matches(self, camera: Cameras | int | str) -> MatchMap:
         """Style codes that each pixel of a view takes; `styled.codes` names them. Raises UsageError without a style."""
         styled, one = self._style("matches"), self._single("matches", camera)
-        return match_map(self.trained.scene, styled, 0, one)
+        return match_map(self.trained.scene, styled, 0, self._local(one))
 
     @property
     def restyle(self) -> Restyle | None:
         """The look that is rendered; None = as captured."""
         return None if self.styled is None else self.styled.restyle
+
+    def _local(self, cameras: Cameras) -> Cameras:
+        """Cameras about the scene's origin."""
+        return cameras.shifted([-x for x in self.trained.scene.origin])
 
     def _style(self, what: str) -> Styled:
         if self.styled is None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .types import Batch, Boxes, FieldSample, Rays, Rendered, Sampled, Site, View, Want
+from .types import Batch, Boxes, FieldSample, Origin, Rays, Rendered, Sampled, Site, View, Want
 
 if TYPE_CHECKING:
     from .datamanagers.basis import Basis
@@ -206,6 +206,11 @@ class Scene(ABC):
     @abstractmethod
     def cameras(self) -> "Cameras":
         """The scene's own views."""
+
+    @property
+    def origin(self) -> Origin:
+        """Of the local frame that its cameras are in: the capture's own coordinates less this (see `rendering.local_frame`)."""
+        return (0.0, 0.0, 0.0)
 
     @property
     @abstractmethod

@@ -9,9 +9,12 @@ Images are [H W 3] sRGB in [0, 1] float32, channels last; encoders alone take [B
 
 from collections.abc import Mapping
 from enum import Flag, auto
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeAlias
 
 from torch import Tensor
+
+Origin: TypeAlias = tuple[float, float, float]
+"""Of a local frame: world = local + origin (see `rendering.local_frame`)."""
 
 
 class Want(Flag):

@@ -93,11 +93,12 @@ def run(args: list[str]) -> int:
                 scene.restyled(style.styled.restyle).shown,
                 antialiased=True,
                 views=scene.views,
+                origin=scene.origin,
                 plain=True,
             )
         looks = [styles[0].styled.restyle.faded, *(style.styled.restyle for style in styles[: len(references)])]
         # From one held-out view to the next, where other views surround the camera.
-        tour = make_path(opened.known.cameras, views, "interpolate", config.frames)
+        tour = make_path(opened.known.cameras, views, "interpolate", config.frames, scene.origin)
         frames = list(frames_of(scene, tour, fading(looks, len(tour)), display))
     film = config.output / "film.mp4"
     if write_video(film, frames, fps=12) == "mp4v":  # browsers do not play that

@@ -207,12 +207,12 @@ def _version(package: str) -> str:
 
 def scene_folder(data: Path) -> Iterator[Finding]:
     """Format, views, sizes, splits and content of a scene. Raises DataError where it cannot be parsed."""
-    from ..datamanagers.parsers.config import DataParserConfig, recognise
+    from ..datamanagers.parsers.config import DataParserConfig, parse_scene, recognise
     from .doctor_scene import inspect_scene
 
     parser = recognise(data)
     yield Finding("format", registry.name_of(DataParserConfig.group, type(parser)))
-    scene = parser.build().parse(data, 1)
+    scene = parse_scene(data, 1, parser)
     sizes = sorted({(int(w), int(h)) for w, h in scene.cameras.size.tolist()})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (f" and {len(sizes) - 3} more" if len(sizes) > 3 else "")
     lenses = sorted({("pinhole", "OpenCV", "fisheye")[lens] for lens in scene.cameras.lens.tolist()})

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from PIL import Image as Pillow
 from PIL import ImageCms
-from torch import Tensor
 
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.scene import Scene, exposures_differ, find_sightings, sparser, with_exposure
@@ -33,8 +32,6 @@ _AROUND = 3
 """Frames on each side that a photograph's sharpness is compared with."""
 _FEW_POINTS = 100
 """Points below which the first Gaussians are not placed at them."""
-_ROUNDING = 1e-5
-"""Share of the cameras' extent below which steps of float32 do not matter."""
 _TAIL = 1 << 16
 """Bytes by which files of equal size are compared first."""
 _ORIENTATION = 0x0112
@@ -46,7 +43,7 @@ def inspect_scene(data: Path, scene: Scene) -> Iterator[Finding]:
     looked = np.unique(np.linspace(0, count - 1, min(count, LOOKED)).round().astype(int)).tolist()
     if len(looked) < count:
         yield Finding("sample", f"masks, profiles, exposure and blur are looked at in {len(looked)} of {count} views")
-    yield from _coordinates(scene.cameras.pose[:, :, 3])
+    yield from _coordinates(scene)
     yield _points(data, scene)
     for name, masks in (("masks", scene.masks), ("sky masks", scene.sky_masks)):
         if masks:
@@ -64,15 +61,11 @@ def inspect_scene(data: Path, scene: Scene) -> Iterator[Finding]:
     yield from _blurred(scene, pixels)
 
 
-def _coordinates(position: Tensor) -> Iterator[Finding]:
-    """Positions at which float32 is too coarse for the extent of the cameras."""
-    low, high = position.amin(0), position.amax(0)
-    extent, largest = float((high - low).max()), float(position.abs().max())
-    step = float(np.spacing(np.float32(largest)))
-    if extent > 0 and step > _ROUNDING * extent:
-        centre = ", ".join(f"{float(x):.9g}" for x in (low + high) / 2)
-        found = f"centre at ({centre}), where float32 has steps of {step:.2g}, cameras span {extent:.3g}"
-        yield Finding("coordinates", f"{found}: trained about a local origin")
+def _coordinates(scene: Scene) -> Iterator[Finding]:
+    """The local origin of a capture that lies far from 0."""
+    if any(scene.origin):
+        centre = ", ".join(f"{x:.9g}" for x in scene.origin)
+        yield Finding("coordinates", f"about ({centre}), beyond what float32 resolves: trained about that as a local origin")
 
 
 def _points(data: Path, scene: Scene) -> Finding:

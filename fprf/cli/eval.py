@@ -69,10 +69,11 @@ def views_to_judge(config: EvalConfig, trained: "RunConfig", known: "Known") -> 
 
     Raises UsageError where its images are not those of the run, or the split has no views.
     """
+    from ..datamanagers.scene import at_origin
     from ..training.run import view_names
 
     trained = replace(trained, data=config.data or trained.data)
-    scene = trained.read_scene()
+    scene = at_origin(trained.read_scene(), known.facts.origin)
     if tuple(view_names(scene.paths)) != known.names:
         raise UsageError(f"{trained.data}: its images are not those of the run; name the folder with --data")
     return scene, views_of(known, config.split)

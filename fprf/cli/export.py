@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -99,7 +98,6 @@ class _Place(NamedTuple):
     what: Plan
     looks: Sequence[Look]
     maps: "DepthMaps"
-    origin: "Tensor"
     display: Display
 
     def paths(self, base: str, look: Look, ending: str) -> list[Path]:
@@ -130,7 +128,7 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
     if not {"ply", "splat", "glb"} & set(what.kinds):
         return {}
     from ..export.depth_maps import default_reach, render_depth_maps, spread_views
-    from ..export.point_cloud import fuse, origin_of
+    from ..export.point_cloud import fuse
 
     maps = render_depth_maps(
         trained.model,
@@ -151,9 +149,9 @@ def _geometry(trained: "Trained", config: ExportConfig, what: Plan, looks: Seque
         report=partial(display.count, what="fusing"),
         counts=counts,
     )
-    place = _Place(trained, config, what, looks, maps, origin_of(cloud), display)
+    place = _Place(trained, config, what, looks, maps, display)
     made: dict[str, Any] = {
-        "origin": place.origin.tolist(),
+        "origin": list(trained.origin),
         "views": len(maps.depth),
         "pixels": {"all": sum(depth.numel() for depth in maps.depth), **counts},
         "finest_edge": float(cloud.edge.amin()),
@@ -174,7 +172,7 @@ def _points(place: _Place, cloud: "Cloud") -> dict[str, Any]:
     from ..export.splats import surface_discs, write_gaussians, write_splat
     from ..splats.initial import Points
 
-    config, kinds = place.config, place.what.kinds
+    config, kinds, origin = place.config, place.what.kinds, place.trained.origin
     seen = best_views(place.maps, cloud.point, cloud.normal, cloud.edge, config.witnesses)
     stored = place.colours(cloud.point, seen, config.tolerance)
     solid = stored.presence >= config.presence * expected_presence(place.maps, cloud.point, seen, config.tolerance)
@@ -194,12 +192,12 @@ def _points(place: _Place, cloud: "Cloud") -> dict[str, Any]:
         every = colour if beyond is None else torch.cat([colour, beyond[number]])
         if "ply" in kinds:
             for path in place.paths("points", look, ".ply"):
-                write_points(path, cloud, colour, place.origin)
+                write_points(path, cloud, colour, origin, local=config.local)
         if "splat" in kinds and config.fit == 0:
             for path in place.paths("splats", look, ".ply"):
-                write_gaussians(path, splats, every, place.origin)
+                write_gaussians(path, splats, every, origin, local=config.local)
             for path in place.paths("splats", look, ".splat"):
-                write_splat(path, splats, every, place.origin)
+                write_splat(path, splats, every, origin)
     return made
 
 
@@ -214,17 +212,24 @@ def _fitted(place: _Place, points: "Points") -> int:
     config = place.config
     views = spread_views(place.trained.known.train, config.views)
     cameras = place.trained.known.cameras.select(torch.tensor(views))
-    cameras = replace(cameras, pose=torch.cat([cameras.pose[:, :, :3], cameras.pose[:, :, 3:] - place.origin[:, None]], 2))
     looks = [look.restyle for look in place.looks]
     fitted = fit_gaussians(
         place.trained, points, views, looks,
-        minutes=config.fit, cap=config.fit_cap, origin=place.origin, report=place.display.count,
+        minutes=config.fit, cap=config.fit_cap, report=place.display.count,
     )  # fmt: skip
     count = 0
     for look, gaussians in zip(place.looks, fitted, strict=True):
         for ending in (".ply", ".splat"):
             for path in place.paths("splats", look, ending):
-                write_gaussians(path, gaussians, antialiased=True, views=cameras, plain=config.plain)
+                write_gaussians(
+                    path,
+                    gaussians,
+                    antialiased=True,
+                    views=cameras,
+                    plain=config.plain,
+                    origin=place.trained.origin,
+                    local=config.local,
+                )
         count = len(gaussians)
     return count
 
@@ -239,9 +244,9 @@ def _mesh(place: _Place, cloud: "Cloud") -> dict[str, Any]:
     seen = best_views(place.maps, mesh.point, mesh.normal, mesh.edge, config.witnesses)
     for look, colour in zip(place.looks, place.colours(mesh.point, seen, config.tolerance).colours, strict=True):
         for path in place.paths("mesh", look, ".ply"):
-            write_mesh_ply(path, mesh, colour, place.origin)
+            write_mesh_ply(path, mesh, colour, place.trained.origin, local=config.local)
         for path in place.paths("mesh", look, ".glb"):
-            write_mesh_glb(path, mesh, colour, place.origin)
+            write_mesh_glb(path, mesh, colour, place.trained.origin, local=config.local)
     return {"vertices": len(mesh.point), "triangles": len(mesh.face), "mesh_edge": mesh.edge}
 
 
@@ -252,6 +257,7 @@ def export_cameras(
     from ..export.transforms import transforms
     from ..io.atomic import write_json
     from ..io.images import to_uint8, write_image
+    from ..rendering.local_frame import added_and_beside, write_offset
 
     folder, shown = what.folder, scene.restyled(looks[-1].restyle)
     files = [f"images/{name}.png" for name in known.names]
@@ -261,8 +267,10 @@ def export_cameras(
             write_image(folder / file, to_uint8(shown.render(known.cameras, view).rgb))
         display.count(len(files), len(files), "rendering views")
     cloud = look_file("points", looks[-1].name, ".ply") if "ply" in what.kinds and what.single is None else None
-    document = transforms(known.cameras, files, train=known.train, test=known.test, cloud=cloud)
-    write_json(what.single or folder / "transforms.json", document)
+    added, beside = added_and_beside(scene.origin, config.local)
+    path = what.single or folder / "transforms.json"
+    write_json(path, transforms(known.cameras.shifted(added), files, train=known.train, test=known.test, cloud=cloud))
+    write_offset(path, beside)
     return {"cameras": len(files)}
 
 

@@ -109,7 +109,7 @@ def run(args: list[str]) -> int:
         shown = restyled(scene, chosen, views, display)
         if config.frames:
             film = output.with_suffix(".mp4")
-            flight = make_path(known.cameras, known.split("all"), config.path, config.frames)
+            flight = make_path(known.cameras, known.split("all"), config.path, config.frames, scene.origin)
             write_video(film, frames_of(scene, flight, lambda _: shown[-1].styled.restyle, display), fps=24)
     width, height = known.cameras.size[views[0]].tolist()
     write_page(

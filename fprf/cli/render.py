@@ -96,7 +96,7 @@ def run(args: list[str]) -> int:
     opened = open_run(config.run, config.device, config)
     known = opened.known
     views = views_of(known, config.split) if config.path in ("interpolate", "dataset") else []
-    cameras = make_path(known.cameras, views, config.path, config.frames)
+    cameras = make_path(known.cameras, views, config.path, config.frames, opened.scene.origin)
     # Captured views keep the stem of their image.
     names = [known.names[view] for view in views] if config.path == "dataset" else [f"{i:05d}" for i in range(len(cameras))]
     if config.lens != "own":

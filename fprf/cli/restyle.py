@@ -170,7 +170,7 @@ def seen_capture(
             say(f"looking again: {error}")
         else:
             path.touch()
-            return scene
+            return replace(scene, origin=capture.origin)
     scene = look_at_capture(gaussians, capture.antialiased, encoder, look, progress, capture.camera)
 
     def found() -> "Semantics":
@@ -180,7 +180,7 @@ def seen_capture(
             old.unlink(missing_ok=True)
         return semantics
 
-    return replace(scene, found=functools.cache(found))
+    return replace(scene, found=functools.cache(found), origin=capture.origin)
 
 
 def _named(path: Path, name: str) -> Path:

@@ -120,11 +120,28 @@ class SplatVerbs(Verbs):
             for kind in kinds:
                 paths.append(path := output if single else output / look_file("splats", look.name, f".{kind}"))
                 if path.suffix.lower() == ".ply" and not path.name.lower().endswith(".compressed.ply") and not config.plain:
-                    key = f"{digest(opened.run.checkpoints)} {'' if look.restyle is None else look.restyle.digest}"
+                    style = "" if look.restyle is None else look.restyle.digest
+                    key = f"{digest(opened.run.checkpoints)} {style}{' local' * config.local}"
                     key = hashlib.sha256(key.encode()).hexdigest()
-                    write_ply_parts(path, shown.part, len(scene.gaussians), key, antialiased=True)
+                    write_ply_parts(
+                        path,
+                        shown.part,
+                        len(scene.gaussians),
+                        key,
+                        antialiased=True,
+                        origin=scene.origin,
+                        local=config.local,
+                    )
                 else:
-                    written = write_gaussians(path, shown.shown, antialiased=True, views=scene.views, plain=config.plain)
+                    written = write_gaussians(
+                        path,
+                        shown.shown,
+                        antialiased=True,
+                        views=scene.views,
+                        plain=config.plain,
+                        origin=scene.origin,
+                        local=config.local,
+                    )
                     losses |= {f", {path.name}: {loss}": None for loss in written.losses()}
         if paths:
             print(
@@ -157,7 +174,8 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
         config = with_downscale(config)
         check_same(folder, config)
         remove_unfinished(output)
-        scene = scene_of(config)
+        saved = folder.load_known().facts if folder.checkpoints.is_dir() or (output / OVERVIEW).is_dir() else None
+        scene = scene_of(config, saved)
         for note in scene.notes:
             display.say(f"note: {note}")
         said = useless_masks(scene) if config.masks else ""
@@ -166,7 +184,6 @@ def _train(config: "GaussiansConfig", method: str, quiet: bool, view: "LiveViewe
         marks = image_hashes(scene)
         if folder.exists and not others:
             check_images(output, scene, marks)
-        saved = folder.load_known().facts if folder.checkpoints.is_dir() or (output / OVERVIEW).is_dir() else None
         prepared = prepare(config, scene, saved=saved) if config.cells == 1 else None
         folder.root.mkdir(parents=True, exist_ok=True)
         folder.save_config(replace(config, output=None), method)  # the folder may be moved

@@ -169,7 +169,7 @@ def train_scene(
                 check_images(output, scene, marks)
 
         if config.blocks.cuts:
-            scene, plan = plan_scene(config)
+            scene, plan = plan_scene(config, folder.saved_facts())
             if plan.cut:
                 look(scene)
                 save_image_hashes(output, marks)

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 
 from ..rendering.cameras import Cameras, project
+from ..rendering.local_frame import local_origin
+from ..types import Origin
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +49,23 @@ class Scene:
     """Images carry transparency."""
     notes: tuple[str, ...] = ()
     """What was decided while the capture was read, a line each, for the user."""
+    origin: Origin = (0.0, 0.0, 0.0)
+    """What was taken off the capture's coordinates, along its own axes: cameras and points are relative to it."""
+
+
+def in_local_frame(scene: Scene) -> Scene:
+    """The scene about its `local_origin`: projected metres (UTM) and Earth-centred ones are beyond float32."""
+    further = local_origin(scene.cameras.pose[:, :, 3], scene.points)
+    return at_origin(scene, (scene.origin[0] + further[0], scene.origin[1] + further[1], scene.origin[2] + further[2]))
+
+
+def at_origin(scene: Scene, origin: Origin) -> Scene:
+    """The same scene relative to another origin, such as that of a run which goes on."""
+    if origin == scene.origin:
+        return scene
+    move = torch.tensor(scene.origin, dtype=torch.float64) - torch.tensor(origin, dtype=torch.float64)
+    points = None if scene.points is None else scene.points + move
+    return replace(scene, cameras=scene.cameras.shifted(move.tolist()), points=points, origin=origin)
 
 
 TILES = 16

@@ -60,6 +60,9 @@ class ExportConfig(StyleConfig):
     plain: bool = False
     """Trained Gaussians get the opacities that views show, for viewers that do not compensate opacities (Mip-Splatting), most
     among them; others show thin Gaussians too heavily. Not exact: leave it out where fprf reads the file again."""
+    local: bool = False
+    """Of a capture whose coordinates are too large for float32 (projected metres): write all files relative to the run's
+    origin, each with NAME.offset.json beside it, for programs that do not read float64 positions or a node's translation."""
     mesh_edge: float | None = None
     """Edge of the mesh's lattice in world units, above 0; none = twice the finest voxel's."""
     lut_size: int = 33

@@ -43,7 +43,7 @@ class Surface(NamedTuple):
     """The N pixels of a view in which a surface with a direction is seen."""
 
     point: Annotated[Tensor, "N 3"]
-    """float64, world."""
+    """float64, local."""
     normal: Annotated[Tensor, "N 3"]
     """float32, unit, towards the camera."""
     facing: Annotated[Tensor, "N"]

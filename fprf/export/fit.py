@@ -8,11 +8,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from ..datamanagers.images import Image
 from ..datamanagers.scene import Scene
@@ -23,7 +21,7 @@ from ..splats.gaussians import Gaussians
 from ..splats.initial import Points
 from ..splats.learner import Learner
 from ..splats.photographs import make_levels
-from ..splats.training import find_near
+from ..splats.training import find_near, reach_of
 from ..style.look import Restyle
 from ..training.loading import Trained
 
@@ -41,31 +39,26 @@ def fit_gaussians(
     *,
     minutes: float,
     cap: int,
-    origin: Annotated[Tensor, "3"],
     report: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> Iterator[Gaussians]:
-    """Gaussians of each look, their positions relative to `origin`, float32; trained for `minutes` after rendering.
+    """Gaussians of each look, trained for `minutes` after rendering.
 
     What is rendered are `views` and as many between them. `points` are where Gaussians begin; at most 0.7 `cap` of them are
     taken, and there are at most `cap` Gaussians in the end.
     """
-    seen, facts = _with_midpoints(trained.known.cameras.select(torch.tensor(views))), trained.known.facts
-    cameras = seen
-    pose = cameras.pose.clone()
-    pose[:, :, 3] -= origin
-    cameras = replace(cameras, pose=pose)
+    cameras, facts = _with_midpoints(trained.known.cameras.select(torch.tensor(views))), trained.known.facts
     count, every = len(cameras), torch.arange(len(cameras))
     paths = (Path("field"),) * count
     scene = Scene(name="field", paths=paths, cameras=cameras, train=every, test=every[:0])
     draw = np.random.default_rng(trained.config.seed)
     some = np.sort(draw.permutation(len(points.position))[: max(1, round(0.7 * cap))])
-    points = Points(points.position[some] - origin.numpy(), points.colour[some])
+    points = Points(points.position[some], points.colour[some])
     near = find_near(scene, points)
     config = GaussiansConfig(cap=cap, seed=trained.config.seed, background=facts.background or (0.0, 0.0, 0.0))
-    reach = 1.1 * float((pose[:, :, 3] - pose[:, :, 3].mean(0)).norm(dim=1).max()) or 1.0
+    reach = reach_of(scene)
     learner = None
     for number, look in enumerate(looks):
-        images = _renders(trained, seen, look, report)
+        images = _renders(trained, cameras, look, report)
         levels = make_levels(scene, images, {}, near)
         if learner is None:
             learner = Learner(config, levels, reach, cap)

@@ -20,9 +20,11 @@ from torch import Tensor
 from ..errors import DataError
 from ..io.atomic import write_bytes
 from ..io.images import srgb_to_linear
+from ..rendering.local_frame import added_and_beside, write_offset
 from ..splats.files.ply import ply_file
+from ..types import Origin
 from .depth_maps import DepthMaps, at_nearest, cosine_map, depth_gaps
-from .point_cloud import SPAN, Cloud, cells, keys, origin_comment, vertex_table
+from .point_cloud import SPAN, Cloud, cells, keys, vertex_table
 
 _TRUNCATION = 3.0
 """Distances are cut at so many edges."""
@@ -43,7 +45,7 @@ class SignedDistance(NamedTuple):
     value: Annotated[Tensor, "M"]
     """In truncation distances, [-1, 1], float32."""
     origin: Annotated[Tensor, "3"]
-    """float64, world."""
+    """float64, local."""
     edge: float
 
 
@@ -186,7 +188,7 @@ class Mesh(NamedTuple):
     """N vertices and F triangles, counter-clockwise seen from outside."""
 
     point: Annotated[Tensor, "N 3"]
-    """float64, world."""
+    """float64, local."""
     face: Annotated[Tensor, "F 3"]
     """int64."""
     normal: Annotated[Tensor, "N 3"]
@@ -241,31 +243,44 @@ def vertex_normals(point: Annotated[Tensor, "N 3"], face: Annotated[Tensor, "F 3
     return torch.nn.functional.normalize(total, dim=-1).float()
 
 
-def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """The mesh as PLY, 8-bit sRGB colours."""
+def write_mesh_ply(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
+    """Write the mesh as PLY, in the world or `local`, with 8-bit sRGB colours."""
     faces = np.empty(len(mesh.face), [("vertex_indices", [("count", "u1"), ("corners", "<i4", 3)])])
     faces["vertex_indices"]["count"], faces["vertex_indices"]["corners"] = 3, mesh.face.numpy()
-    tables = {"vertex": vertex_table(mesh.point - origin, mesh.normal, colour), "face": faces}
-    write_bytes(path, ply_file(tables, origin_comment(origin)))
+    added, beside = added_and_beside(origin, local)
+    write_bytes(path, ply_file({"vertex": vertex_table(mesh.point, mesh.normal, colour, added), "face": faces}))
+    write_offset(path, beside)
 
 
-def write_mesh_glb(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """Write the mesh as binary glTF, shown as it is: unlit, with 16-bit linear colours, which glTF asks for."""
+def write_mesh_glb(path: Path, mesh: Mesh, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
+    """Write the mesh as binary glTF, shown as it is: unlit, with 16-bit linear colours, which glTF asks for.
+
+    Vertices are local, since glTF has float32; its node's translation, or where `local` a file beside, is the origin.
+    """
     import trimesh
 
     shade = np.ones((len(mesh.point), 4))
     shade[:, :3] = srgb_to_linear(np.clip(colour.double().numpy(), 0, 1))
     body = trimesh.Trimesh(
-        (mesh.point - origin).float().numpy(),
+        mesh.point.float().numpy(),
         mesh.face.numpy(),
         vertex_normals=mesh.normal.numpy(),
         # trimesh rounds colours to 8 bits, which band in the dark where they are linear: they go in as an attribute.
         vertex_attributes={"_COLOR_0": np.rint(shade * 65535).astype("<u2")},
         process=False,
     )
-    data = body.export(file_type="glb", include_normals=True, unitize_normals=False, tree_postprocessor=_unlit)
+    added, beside = added_and_beside(origin, local)
+
+    def processed(tree: dict[str, Any]) -> None:
+        _unlit(tree)
+        for node in tree["nodes"]:
+            if "mesh" in node and any(added):
+                node["translation"] = list(added)
+
+    data = body.export(file_type="glb", include_normals=True, unitize_normals=False, tree_postprocessor=processed)
     assert isinstance(data, bytes)
     write_bytes(path, data)
+    write_offset(path, beside)
 
 
 def _unlit(tree: dict[str, Any]) -> None:

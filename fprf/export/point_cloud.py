@@ -17,7 +17,9 @@ from torch import Tensor
 from ..errors import DataError
 from ..io.atomic import write_bytes
 from ..rendering.cameras import pixel_grid, rays_through
-from ..splats.files.ply import ply_file
+from ..rendering.local_frame import added_and_beside, write_offset
+from ..splats.files.ply import in_world, ply_file
+from ..types import Origin
 from .depth_maps import DepthMaps, Surface, depth_gaps, surface_points
 
 LEVELS = 12
@@ -93,7 +95,7 @@ class Cloud(NamedTuple):
     """N points of a scene's surfaces."""
 
     point: Annotated[Tensor, "N 3"]
-    """float64, world."""
+    """float64, local."""
     normal: Annotated[Tensor, "N 3"]
     """float32, unit, towards the views that saw it."""
     edge: Annotated[Tensor, "N"]
@@ -243,36 +245,25 @@ def sky_dome(maps: DepthMaps, cloud: Cloud) -> Cloud | None:
     return Cloud(centre + radius * mean, -mean.float(), radius * width, _LOOSE * radius * width, view[first])
 
 
-_FINE = 1 / 16
-"""Largest rounding of a coordinate that is accepted, in edges of the finest voxel."""
-
-
-def origin_of(cloud: Cloud) -> Annotated[Tensor, "3"]:
-    """Return the offset of coordinates, so that float32 holds them: 0 unless the capture lies far from its origin."""
-    finest = float(cloud.edge.amin())
-    if float(cloud.point.abs().amax()) * 2**-24 <= _FINE * finest:
-        return torch.zeros(3, dtype=torch.float64)
-    return cloud.point.mean(0).round()
-
-
-def write_points(path: Path, cloud: Cloud, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """Write the coloured cloud with normals as PLY."""
-    write_bytes(path, ply_file({"vertex": vertex_table(cloud.point - origin, cloud.normal, colour)}, origin_comment(origin)))
+def write_points(path: Path, cloud: Cloud, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False) -> None:
+    """Write the coloured cloud with normals as PLY, in the world or `local`."""
+    added, beside = added_and_beside(origin, local)
+    write_bytes(path, ply_file({"vertex": vertex_table(cloud.point, cloud.normal, colour, added)}))
+    write_offset(path, beside)
 
 
 def vertex_table(
-    point: Annotated[Tensor, "N 3"], normal: Annotated[Tensor, "N 3"], colour: Annotated[Tensor, "N 3"]
+    point: Annotated[Tensor, "N 3"],
+    normal: Annotated[Tensor, "N 3"],
+    colour: Annotated[Tensor, "N 3"],
+    origin: Origin = (0.0, 0.0, 0.0),
 ) -> NDArray[np.void]:
-    """Vertices of a PLY: float x y z nx ny nz, uchar red green blue, rounded as pictures are."""
+    """Vertices of a PLY: float x y z nx ny nz, uchar red green blue, rounded as pictures are.
+
+    Where the origin is not 0, x y z are double, of the world.
+    """
     table = np.empty(len(point), [("real", "<f4", 6), ("shade", "u1", 3)])
     table["real"] = torch.cat([point, normal.to(point)], 1).float().numpy()
     table["shade"] = (colour.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
     named = [*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((c, "u1") for c in ("red", "green", "blue"))]
-    return table.view(named)
-
-
-def origin_comment(origin: Annotated[Tensor, "3"]) -> list[str]:
-    """The comment of a file whose coordinates are relative to an origin; none for the capture's own frame."""
-    if not bool(origin.any()):
-        return []
-    return [f"coordinates are relative to {' '.join(f'{value:.0f}' for value in origin.tolist())}"]
+    return in_world(table.view(named), point.numpy(), origin)

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from ..io.atomic import write_bytes
 from ..ops.harmonics import HARMONIC
+from ..rendering.local_frame import added_and_beside, write_offset
 from ..splats.files.ply import ply_bytes
 from ..splats.gaussians import Gaussians
+from ..types import Origin
 from .point_cloud import Cloud
 
 _WIDTH = 0.55
@@ -30,7 +32,7 @@ class Splats(NamedTuple):
     """N Gaussians without colour."""
 
     point: Annotated[Tensor, "N 3"]
-    """float64, world."""
+    """float64, local."""
     normal: Annotated[Tensor, "N 3"]
     deviation: Annotated[Tensor, "N 3"]
     """Standard deviations along the Gaussian's own axes, world units, float32; the third is the normal's."""
@@ -62,25 +64,30 @@ def rotation_to_normal(normal: Annotated[Tensor, "N 3"]) -> Annotated[Tensor, "N
     return torch.nn.functional.normalize(torch.where(none, back, turn), dim=-1)
 
 
-def write_gaussians(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """Write the 3D Gaussian PLY. Positions are relative to `origin`; colours are sRGB in [0, 1], without view dependence."""
+def write_gaussians(
+    path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Origin, *, local: bool = False
+) -> None:
+    """Write the 3D Gaussian PLY, in the world or `local`. Colours are sRGB in [0, 1], without view dependence."""
     gaussians = Gaussians(
-        means=(splats.point - origin).float(),
+        means=splats.point.float(),
         quaternions=splats.rotation,
         log_scales=splats.deviation.log(),
         logits=torch.logit(splats.opacity.double()).float(),
         harmonics=((colour.double() - 0.5) / HARMONIC).float()[:, None],
     )
-    write_bytes(path, ply_bytes(gaussians, False, splats.normal.float().numpy()))
+    added, beside = added_and_beside(origin, local)
+    write_bytes(path, ply_bytes(gaussians, False, splats.normal.float().numpy(), added))
+    write_offset(path, beside)
 
 
-def write_splat(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Annotated[Tensor, "3"]) -> None:
-    """The .splat file."""
+def write_splat(path: Path, splats: Splats, colour: Annotated[Tensor, "N 3"], origin: Origin) -> None:
+    """Write the .splat file, which is local."""
     order = (splats.deviation.log().sum(-1) + splats.opacity.log()).argsort(descending=True, stable=True).numpy()
     table = np.empty(len(order), dtype=[("at", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
-    table["at"] = (splats.point - origin).numpy()[order]
+    table["at"] = splats.point.numpy()[order]
     table["deviation"] = splats.deviation.numpy()[order]
     rgba = torch.cat([colour.float(), splats.opacity[:, None]], 1)
     table["rgba"] = (rgba.clamp(0, 1) * 255).round().numpy()[order]
     table["turn"] = (splats.rotation * 128 + 128).round().clamp(0, 255).numpy()[order]
     write_bytes(path, table.tobytes())
+    write_offset(path, origin)

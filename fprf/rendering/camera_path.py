@@ -3,8 +3,8 @@
     {"camera_type": "perspective", "render_width": W, "render_height": H, "fps": F, "seconds": S,
      "camera_path": [{"camera_to_world": [16 numbers, row by row], "fov": vertical degrees, "aspect": W / H}, ...]}
 
-Poses are in world coordinates of the scene with OpenGL's axes. Pixels are square and the principal point is the middle:
-the format can say nothing else.
+Poses are in the capture's own coordinates, whatever the scene's origin, with OpenGL's axes. Pixels are square and the
+principal point is the middle: the format can say nothing else.
 """
 
 import json
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..errors import DataError
 from ..io.atomic import write_json
+from ..types import Origin
 from .cameras import Cameras, ideal_cameras
 
 _FPS = 24.0
@@ -27,8 +28,11 @@ _STRAY = 1e-3
 """Tolerance of a rotation's orthonormality: viewers round to a few digits."""
 
 
-def read_camera_path(path: Path) -> tuple[Cameras, float]:
-    """The frames of a file as pinhole cameras, float64, and its frames a second. Raises DataError with the place."""
+def read_camera_path(path: Path, origin: Origin = (0.0, 0.0, 0.0)) -> tuple[Cameras, float]:
+    """The frames of a file as pinhole cameras about an origin, float64, and its frames a second.
+
+    Raises DataError with the place.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -53,15 +57,19 @@ def read_camera_path(path: Path) -> tuple[Cameras, float]:
         poses.append(_pose(path, f"{where}.camera_to_world", frame.get("camera_to_world")))
         fov = _number(path, f"{where}.fov", frame.get("fov"), 0.0, 180.0)
         focals.append(height / 2 / math.tan(math.radians(fov) / 2))
-    return ideal_cameras(torch.stack(poses), torch.tensor(focals, dtype=torch.float64), (width, height)), fps
+    frames = ideal_cameras(torch.stack(poses), torch.tensor(focals, dtype=torch.float64), (width, height))
+    return frames.shifted([-x for x in origin]), fps
 
 
-def write_camera_path(path: Path, cameras: Cameras, fps: float) -> None:
-    """Write frames, all of the first one's size. What the format cannot say (distortion, fx unlike fy) is left out."""
+def write_camera_path(path: Path, cameras: Cameras, fps: float, origin: Origin = (0.0, 0.0, 0.0)) -> None:
+    """Write frames about an origin, all of the first one's size.
+
+    What the format cannot say (distortion, fx unlike fy) is left out.
+    """
     if not len(cameras):
         raise DataError(f"{path}: a camera path of no frames cannot be written")
     width, height = (int(side) for side in cameras.size[0])
-    frames = []
+    cameras, frames = cameras.shifted(origin), []
     for view in range(len(cameras)):
         matrix = [*cameras.pose[view].flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
         fov = math.degrees(2 * math.atan(float(cameras.size[view, 1]) / 2 / float(cameras.focal[view, 1])))

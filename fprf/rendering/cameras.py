@@ -7,6 +7,7 @@ Undistortion takes a dozen Newton steps a pixel; training asks for the same pixe
 need one table (24 bytes a pixel). Above `LIMIT` bytes, for thousands of different lenses, rays are solved as they come.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Annotated
@@ -50,6 +51,11 @@ class Cameras:
     def to(self, device: torch.device) -> "Cameras":
         """The same views, their numbers on a device."""
         return Cameras(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+    def shifted(self, offset: Sequence[float]) -> "Cameras":
+        """The same views with this added to their places, in world axes."""
+        place = self.pose[:, :, 3:] + torch.tensor(offset).to(self.pose)[:, None]
+        return replace(self, pose=torch.cat([self.pose[:, :, :3], place], 2))
 
     def resized(self, size: Annotated[Tensor, "V 2"]) -> "Cameras":
         """The same views on another pixel grid: intrinsics move by the exact ratio of each axis."""

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ..errors import UsageError
+from ..types import Origin
 from .camera_path import read_camera_path
 from .cameras import Cameras, ideal_cameras, project, rays_through
 from .lens import PANORAMA, PINHOLE
@@ -215,8 +216,8 @@ def _sweep(azimuth: Annotated[Tensor, "V"], frames: int) -> Annotated[Tensor, "F
 MOTIONS = ("spiral", "orbit", "interpolate", "dataset")
 
 
-def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int) -> Cameras:
-    """Cameras of a motion, or of a camera-path JSON file.
+def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int, origin: Origin = (0.0, 0.0, 0.0)) -> Cameras:
+    """Cameras of a motion, or of a camera-path JSON file, about the `origin` that the captured `cameras` have.
 
     `interpolate` and `dataset` go through `views` of the captured `cameras`, the latter with their own lenses. `frames` are
     those of a spiral or orbit, and about those of an interpolation; a file and the captured views bring their own number.
@@ -236,7 +237,7 @@ def make_path(cameras: Cameras, views: Sequence[int], motion: str, frames: int) 
     file = Path(motion)
     if not file.is_file():
         raise UsageError(f"--path {motion}: neither a file nor one of {', '.join(MOTIONS)}")
-    return read_camera_path(file)[0]
+    return read_camera_path(file, origin)[0]
 
 
 def upwards(cameras: Cameras) -> Annotated[Tensor, "3"]:

@@ -138,10 +138,9 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
 
     Raises CheckpointError where the list cannot be read.
     """
-    file = root / _VIEWS
+    file, known = root / _VIEWS, Run(root).load_known()
     if not file.is_file():
-        return scene_of(replace(config, data=data))
-    known = Run(root).load_known()
+        return scene_of(replace(config, data=data), known.facts)
     with open_json(file, _WRITTEN) as document:
         paths = from_json(document["paths"], tuple[str, ...], path="paths")
         masks = from_json(document["masks"], tuple[str | None, ...], path="masks")
@@ -157,6 +156,7 @@ def _read_views(root: Path, config: GaussiansConfig, data: Path) -> Scene:
         test=test,
         masks=tuple(None if name is None else data / name for name in masks),
         sky_masks=tuple(None if name is None else data / name for name in skies),
+        origin=known.facts.origin,
     )
 
 
@@ -217,10 +217,10 @@ def train_overview(
         steps=max(1, round(config.overview * config.steps)),
         minutes=None if config.minutes is None else config.overview * config.minutes,
     )
-    small = scene_of(own)
+    facts = Run(root).load_known().facts
+    small = scene_of(own, facts)
     small = replace(small, train=small.train[:: -(-pixels // (factor**2 * _PIXELS))])
     own = replace(own, steps=max(own.steps, _VISITS * len(small.train)))
-    facts = Run(root).load_known().facts
     facts = replace(facts, held=other_views(small, small.train.tolist()) if facts.exposure or facts.centres else ())
     train(own, prepare(own, small, saved=facts), Run(folder), report, spent=spent)
     write_json(folder / "done.json", {"format": _FORMAT, "task": task})

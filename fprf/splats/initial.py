@@ -17,6 +17,8 @@ from .gaussians import morton_order
 from .photographs import cover, undistorted
 
 Doubles = NDArray[np.float64]
+_TINY = float(np.finfo(np.float32).tiny)
+"""Keeps what is divided by above 0, in whatever units a capture is."""
 _ENOUGH = 100
 """Points that are worth starting from."""
 _WINDOW = 100
@@ -64,7 +66,7 @@ def surroundings(scene: Scene, images: Mapping[int, Image], points: Points, coun
     centres = scene.cameras.pose[scene.train][:, :, 3].numpy()
     centre = centres.mean(0)
     away = np.linalg.norm(points.position - centre, axis=1)
-    radius = max(np.linalg.norm(centres - centre, axis=1).max(), np.quantile(away, 0.95), 1e-6)
+    radius = max(np.linalg.norm(centres - centre, axis=1).max(), np.quantile(away, 0.95), _TINY)
     # Fibonacci's spiral.
     height = 1 - (2 * np.arange(count) + 1) / count
     turn, level = np.arange(count) * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - height**2)
@@ -98,14 +100,15 @@ def spacing(position: Annotated[Doubles, "P 3"]) -> Annotated[Doubles, "P"]:
             for row in near[:, part]:
                 row[:], left = np.minimum(row, left), np.maximum(row, left)
     mean = np.empty(count)
-    mean[order] = np.maximum(near.mean(0), 1e-7)
-    return np.minimum(mean, np.percentile(mean, 99))
+    mean[order] = near.mean(0)
+    widest = np.percentile(mean, 99) or 1.0
+    return np.clip(mean, 1e-6 * widest, widest)  # points in one place have a logarithm, too
 
 
 def spatial_order(position: Annotated[NDArray[np.floating], "P 3"]) -> NDArray[np.int64]:
     """Indices along a Morton curve: what is near in space is then near in memory."""
     low, high = np.percentile(position, 2, axis=0), np.percentile(position, 98, axis=0)
-    cell = np.clip((position - low) / np.maximum(high - low, 1e-9) * 1023, 0, 1023).astype(np.int64)
+    cell = np.clip((position - low) / np.maximum(high - low, _TINY) * 1023, 0, 1023).astype(np.int64)
     return morton_order(cell)
 
 
@@ -146,7 +149,7 @@ def _matched(scene: Scene, images: Mapping[int, Image]) -> Points:
     centre = {v: scene.cameras.pose[v][:, 3].numpy() for v in views}
     axis = {v: -scene.cameras.pose[v][:, 2].numpy() for v in views}
     middle = np.mean([*centre.values()], axis=0)
-    spread = max(float(np.mean([np.linalg.norm(c - middle) for c in centre.values()])), 1e-9)
+    spread = max(float(np.mean([np.linalg.norm(c - middle) for c in centre.values()])), _TINY)
     positions, colours, done = [np.zeros((0, 3))], [np.zeros((0, 3), np.float32)], set()
     for i in features:
         apart = {j: np.linalg.norm(centre[j] - centre[i]) / spread + 2 * (1 - axis[i] @ axis[j]) for j in features if j != i}
@@ -199,7 +202,7 @@ def _scattered(scene: Scene, images: Mapping[int, Image], count: int, rng: np.ra
     """Points on random rays, their distances spread evenly over the logarithm: from a third to 30 times the cameras' spread."""
     views = rng.choice(scene.train.numpy(), count)
     centre = scene.cameras.pose[:, :, 3].numpy()
-    spread = max(float(np.linalg.norm(centre - centre.mean(0), axis=1).mean()), 1e-6)
+    spread = max(float(np.linalg.norm(centre - centre.mean(0), axis=1).mean()), _TINY)
     size = scene.cameras.size[views].numpy()
     pixel = rng.random((count, 2)) * size
     colour = np.stack([images[v][int(y), int(x)] for v, (x, y) in zip(views, pixel, strict=True)])

@@ -13,7 +13,6 @@ from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import Annotated, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,13 +33,13 @@ from ..style.references import Encoders
 from ..style.scene import SceneStyle, region_contacts, scene_style
 from ..style.scene import from_tensors as style_from
 from ..style.scene import to_tensors as style_tensors
-from ..types import View
+from ..types import Origin, View
 from .config import LookConfig
 from .gaussians import Gaussians, bulk_of
 from .levels import Levels, StyledLevels, seen_by
 from .photographs import camera_of, cover, distorted
 from .restyle import Colours, region_maps, restyled_harmonics
-from .views import OUTLYING, SeenMeans, draw, find_views, seen_means
+from .views import OUTLYING, SeenMeans, clip_distance, draw, find_views, seen_means
 
 _CHANNELS = 31
 """Principal components of the semantics that are kept; with the weight they are carried back in four vectors of eight."""
@@ -102,6 +101,8 @@ class SplatScene(Scene):
     """Pixels within which Gaussians are drawn as one, and those out of view not at all; None = all are drawn."""
     levels: Callable[[], Levels] | None = None
     """Levels of detail of the Gaussians as captured, for scenes that are drawn merged."""
+    origin: Origin = (0.0, 0.0, 0.0)
+    """Origin of the Gaussians and the views."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -266,13 +267,6 @@ def look_at_capture(
         raise DataError(f"up {config.up}: no direction; give three numbers, not all 0")
     if float(gaussians.opacities.max()) < MIN_ALPHA:
         raise DataError(f"all {len(gaussians)} Gaussians are transparent; nothing of the capture can be seen or restyled")
-    away, side = float(gaussians.means.abs().max()), bulk_of(gaussians.means.numpy()).side
-    step = float(np.spacing(np.float32(away)))
-    if len(gaussians) > 1 and step > 0.05 * side and bool((gaussians.means != gaussians.means[0]).any()):
-        raise DataError(
-            f"the capture is {side:.2g} across and lies {away:.2g} from the origin, where float32 has steps of {step:.2g}: its "
-            "shape is lost; export it closer to the origin"
-        )
     cameras = find_views(
         gaussians,
         count=config.views,
@@ -284,7 +278,8 @@ def look_at_capture(
     )
 
     def found() -> Semantics:
-        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, progress=progress)
+        near = clip_distance(gaussians)
+        return find_semantics(gaussians, antialiased, encoder, cameras, config.regions, near=near, progress=progress)
 
     return captured(gaussians, antialiased, cameras, cache(found), encoder)
 
@@ -294,7 +289,8 @@ def captured(
 ) -> SplatScene:
     """The scene of a capture; its views are numbered."""
     names = tuple(f"{view:02d}" for view in range(len(cameras)))
-    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, int(cameras.size.amax()))
+    longest, near = int(cameras.size.amax()), clip_distance(gaussians)
+    return SplatScene(gaussians, antialiased, cameras, names, found, lambda: encoder, longest, near)
 
 
 @torch.inference_mode()
@@ -305,7 +301,7 @@ def find_semantics(
     cameras: Cameras,
     regions: int,
     *,
-    near: float = 0.01,
+    near: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Semantics:
     """Encode views of Gaussians, carry the features back, and find the regions. Lenses are left out.

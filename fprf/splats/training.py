@@ -16,7 +16,7 @@ from torch import Tensor
 from ..datamanagers.bounds import find_space
 from ..datamanagers.images import Image, load_images, load_mask
 from ..datamanagers.parsers.config import parse_scene
-from ..datamanagers.scene import Scene, find_sightings, sparser
+from ..datamanagers.scene import Scene, at_origin, find_sightings, sparser
 from ..errors import CheckpointError, NumericsError, UsageError
 from ..interfaces import Encoder
 from ..rendering.cameras import Cameras
@@ -62,6 +62,8 @@ _LEVELS, _MANY = "levels", 400_000
 """Folder of a run; Gaussians from which on levels of detail are kept there and mapped, not made in memory."""
 _NEAR = 0.25
 """Of the distance that all but 1 % of the points in view have: nothing is drawn nearer to a camera."""
+_NEAR_UNSEEN, _DEPTHS = 1e-3, 10_000_000
+"""The same where no view has any point, in the radius of the cameras; depths that are looked at, at most."""
 
 
 class Prepared(NamedTuple):
@@ -80,11 +82,15 @@ class Prepared(NamedTuple):
     """Facts of the whole scene, where it is whole."""
 
 
-def scene_of(config: GaussiansConfig) -> Scene:
-    """The scene of a config, at its size. Raises UsageError where it names none, DataError where that cannot be read."""
+def scene_of(config: GaussiansConfig, saved: Facts | None = None) -> Scene:
+    """The scene of a config, at its size, about the origin of a run that goes on (`saved`).
+
+    Raises UsageError where it names none, DataError where that cannot be read.
+    """
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data town for the embedded one")
-    return parse_scene(config.data, config.downscale or 1, config.parser)
+    scene = parse_scene(config.data, config.downscale or 1, config.parser)
+    return scene if saved is None else at_origin(scene, saved.origin)
 
 
 def with_downscale(config: GaussiansConfig) -> GaussiansConfig:
@@ -243,6 +249,7 @@ def facts_of(config: GaussiansConfig, scene: Scene) -> Facts:
         content_scale=1.0,
         semantic_scale=1.0,
         background=config.background,
+        origin=scene.origin,
     )
 
 
@@ -379,6 +386,7 @@ def open_gaussians(root: Path, config: GaussiansConfig, quality: QualityConfig) 
         tone=mixed_tone(_tones(saved, known.facts), known, quality.tone) if quality.tone else (1.0, 1.0, 1.0),
         merged=merged,
         levels=cache(lambda: _levels(root / _LEVELS, gaussians, key)),
+        origin=known.facts.origin,
     )
     return LoadedRun(run, run.load_config()[1], known, saved.step, saved.seconds, scene)
 
@@ -400,8 +408,9 @@ class UnfinishedGaussians(UnfinishedRun):
 
         cameras, longest = self.known.cameras, int(views.size.amax())
         self._scene = SplatScene(
-            gaussians, True, cameras, self.known.names, cache(found), self._encoder, longest, near, self.config.background
-        )
+            gaussians, True, cameras, self.known.names, cache(found), self._encoder, longest, near, self.config.background,
+            origin=self.known.facts.origin,
+        )  # fmt: skip
         return self._scene
 
     def encoders(self, before: Encoders | None) -> Encoders:
@@ -495,4 +504,6 @@ def find_near(scene: Scene, points: Points) -> float:
     """Distance from cameras, along z, from which on things are drawn."""
     some = torch.from_numpy(points.position[:: -(-len(points.position) // _SOME)])
     seen = torch.cat([depth[inside] for _, _, depth, inside in projected(scene, some)])
-    return _NEAR * float(seen.quantile(0.01)) if 0 < len(seen) < 10_000_000 else 0.01
+    if not len(seen):
+        return _NEAR_UNSEEN * reach_of(scene)
+    return _NEAR * float(seen[:: -(-len(seen) // _DEPTHS)].quantile(0.01))

@@ -23,6 +23,7 @@ from ..ops.harmonics import HARMONIC
 from ..ops.rasterise import Pinhole, Rasterised, lift, rasterise
 from ..ops.rasterise_reference import project_reference
 from ..rendering.cameras import Cameras
+from ..rendering.local_frame import extent_of
 from ..rendering.paths import look_at, pinhole
 from .gaussians import Gaussians, bulk_of
 from .photographs import camera_of, cover
@@ -65,9 +66,10 @@ _CLOSE, _BLUR = 0.15, 3.0
 as seen from the place, at which Gaussians are as bad as none."""
 _NEAR = 3.0
 """What a pixel with something close before the camera costs, in filled ones."""
-_MEAN_VIEWS, _UNSEEN, _CLIP = 32, 1e-4, 0.01
-"""Views that means are taken from, at most; weight, in pixels, of those that do not show a Gaussian; distance from
-which on they do."""
+_MEAN_VIEWS, _UNSEEN = 32, 1e-4
+"""Views that means are taken from, at most; weight, in pixels, of those that do not show a Gaussian."""
+_CLIP, _CLIPPED = 0.01, (1e-4, 2e-2)
+"""Distance from a camera from which on a capture is drawn, and its bounds as shares of the capture's extent."""
 
 
 def draw(
@@ -82,6 +84,12 @@ def draw(
     parts = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits, gaussians.harmonics[:, :16])
     behind = torch.tensor(background)
     return rasterise(*parts, camera, features=features, background=behind, antialiased=antialiased)
+
+
+def clip_distance(gaussians: Gaussians) -> float:
+    """Nothing of a capture is drawn nearer to a camera than this, along z, in whatever units it is."""
+    extent = extent_of(gaussians.means)[1]
+    return min(max(_CLIP, _CLIPPED[0] * extent), _CLIPPED[1] * extent) if extent > 0 else _CLIP
 
 
 class SeenMeans(NamedTuple):
@@ -115,8 +123,9 @@ def seen_means(gaussians: Gaussians, cameras: Cameras, *, antialiased: bool) -> 
     bands = min(gaussians.degree, 3) + 1
     shape = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.logits)
     functions, opacities, weights = (torch.zeros(len(gaussians), n) for n in (bands**2, 1, 1))
+    near = clip_distance(gaussians)
     for view in torch.linspace(0, len(cameras) - 1, min(_MEAN_VIEWS, len(cameras))).round().long().tolist():
-        camera = cover(cameras, view, _CLIP)[0]
+        camera = cover(cameras, view, near)[0]
         direction = torch.nn.functional.normalize(gaussians.means - cameras.pose[view, :, 3].float(), dim=1)
         pixels = torch.zeros(camera.height, camera.width, 1)
         weight = _UNSEEN + lift(*shape, camera, pixels, antialiased=antialiased).weights[:, None]
@@ -230,11 +239,11 @@ def _around_place(
     seen = 2 * (extent - torch.linalg.vector_norm(points - place, dim=1).clamp_min(0.05 * middle).log())
     shown = (seen + gaussians.opacities.log()).topk(min(_PROBED, len(seen))).indices
     coarse, points, extent = gaussians.select(shown), points[shown].float(), extent[shown].float()
-    small, worth = cameras.scaled(_PROBE), torch.zeros(len(cameras))
+    small, worth, near = cameras.scaled(_PROBE), torch.zeros(len(cameras)), clip_distance(gaussians)
     for view in range(len(small)):
         apart = torch.linalg.vector_norm(points - eye[view].float(), dim=1).clamp_min(1e-9)
         blurred = ((extent - apart.log() - usual) / _BLUR).clamp(0, 1)[:, None]
-        drawn = draw(coarse, camera_of(small, view), antialiased=antialiased, features=blurred)
+        drawn = draw(coarse, camera_of(small, view, near), antialiased=antialiased, features=blurred)
         close = (drawn.opacity > 0.5) & (drawn.depth < _CLOSE * middle)
         worth[view] = drawn.opacity.mean() - _NEAR * close.float().mean() - drawn.features.mean()
     # The best of each direction before the second of any, as long as they are about as good.
@@ -353,8 +362,9 @@ def _probed(
 ) -> tuple[Annotated[Tensor, "V"], Annotated[Tensor, "V"]]:
     """Worth of views, how much of a small picture is filled less what lies in the way, and the former alone."""
     small, worth, filled = cameras.scaled(_PROBE), torch.zeros(len(cameras)), torch.zeros(len(cameras))
+    clip = clip_distance(gaussians)
     for view in range(len(small)):
-        drawn = draw(gaussians, camera_of(small, view), antialiased=antialiased)
+        drawn = draw(gaussians, camera_of(small, view, clip), antialiased=antialiased)
         close = (drawn.opacity > 0.5) & (drawn.depth < float(near[view]))
         filled[view] = drawn.opacity.mean()
         worth[view] = filled[view] - _NEAR * close.float().mean()

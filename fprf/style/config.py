@@ -13,12 +13,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ..checks import at_least, between
 from ..errors import ConfigError, UsageError
 from ..plugins.registry import nearest
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
+
+if TYPE_CHECKING:
+    from ..types import Origin
 
 _PIXEL = re.compile(r"(-?\d+(?:\.\d+)?),(-?\d+(?:\.\d+)?)")
 
@@ -38,7 +41,7 @@ class Pixel(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A part of space, in the coordinates of the Gaussians: a box, or all that lies near to a path."""
+    """A part of space, in the capture's coordinates: a box, or all that lies near to a path."""
 
     points: tuple[tuple[float, ...], ...]
     """Lowest and highest corner of the box, or the corners of the path."""
@@ -46,6 +49,10 @@ class Place(NamedTuple):
     """Of the path, from side to side; None = a box."""
     border: float
     """Width of the soft border around it; 0 = a sharp one."""
+
+    def about(self, origin: "Origin") -> "Place":
+        """The place in the local frame of an origin."""
+        return self._replace(points=tuple(tuple(x - of for x, of in zip(each, origin, strict=True)) for each in self.points))
 
 
 def parse_place(field: str, text: str) -> Place | None:

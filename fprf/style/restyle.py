@@ -90,7 +90,7 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
         moved = None if colours is None else colours.to(device)
         return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance)
 
-    places = tuple((place, look(allowed)) for place, allowed in controls.places)
+    places = tuple((place.about(here.origin), look(allowed)) for place, allowed in controls.places)
     mine = replace(look(controls.allowed), places=places)
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
     return Styled(mine, dictionary, scene, codes, controls)

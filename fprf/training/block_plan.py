@@ -42,9 +42,9 @@ class Laid(NamedTuple):
     basis: Basis | None
 
 
-def plan_scene(config: TrainConfig) -> tuple[Scene, Plan]:
-    """The scene and how it is cut."""
-    scene = scene_of(config)
+def plan_scene(config: TrainConfig, saved: Facts | None = None) -> tuple[Scene, Plan]:
+    """The scene, about the origin of a run that goes on (`saved`), and how it is cut."""
+    scene = scene_of(config, saved)
     return scene, make_plan(scene, config.blocks)
 
 

@@ -261,7 +261,7 @@ def _train_held(task: BlockTask, report: Callable[[Report], None], begun: Callab
     run, folder = Run(root), folder_of(root, task.block)
     config = run.load_config()[0].fields_only(root)
     facts, boxes, rays = run.load_known().facts, load_boxes(root), tensorfiles.read(folder / RAYS)
-    scene, views = scene_of(replace(config, data=Path(task.data))), rays["views"]
+    scene, views = scene_of(replace(config, data=Path(task.data)), facts), rays["views"]
     if len(views) and int(views.max()) >= len(scene.paths):
         raise ConfigError(f"{folder}: its views are not those of {scene.name}; train with the scene that the run was cut from")
     asked = asked_of(config, facts, scene, boxes, task.block, rays)

@@ -17,12 +17,13 @@ from ..errors import CheckpointError, WeightsError
 from ..interfaces import Decoder, Scene, Stylizer, Values
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.cameras import Cameras
+from ..rendering.local_frame import local_origin
 from ..style.colours import ColourMaps, colour_maps
 from ..style.dictionary import StyleDictionary
 from ..style.look import Restyle
 from ..style.references import Encoders
 from ..style.scene import SceneStyle, from_tensors
-from ..types import Boxes, View
+from ..types import Boxes, Origin, View
 from . import checkpoint
 from .blocks import SURROUNDINGS, assemble, folder_of, load_boxes, load_finished, read_done, restore, restore_all, surroundings
 from .model import Model, build_model
@@ -120,6 +121,10 @@ class Trained(Scene):
         return self.known.cameras
 
     @property
+    def origin(self) -> Origin:
+        return self.known.facts.origin
+
+    @property
     def device(self) -> torch.device:
         return self.model.device
 
@@ -213,7 +218,7 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     run = Run(root)
     saved_config, method = run.load_config()
     config = saved_config.fields_only(root)
-    known = run.load_known()
+    known = _in_local_frame(run.load_known())
     if known.facts.space.kind == "open":
         return _load_blocks(run, config, method, known, device_of(device), max_memory)
     saved, damaged = checkpoint.load_latest(run.checkpoints)
@@ -224,6 +229,24 @@ def load_run(root: Path, device: str = "auto", max_memory: float | None = None) 
     model.requires_grad_(False)
     model = model.to(device_of(device)).eval()
     return Trained(run, config, method, _where_refined(known, model), model, saved.step, saved.seconds, tuple(damaged))
+
+
+def _in_local_frame(known: Known) -> Known:
+    """What is known, about a local origin also where a run of before has none: the world meets a field in its space alone."""
+    facts = known.facts
+    origin = local_origin(known.cameras.pose[:, :, 3])
+    if any(facts.origin) or not any(origin):
+        return known
+    away = (-origin[0], -origin[1], -origin[2])
+    space = replace(facts.space, centre=_sum(facts.space.centre, away))
+    centres = tuple(_sum(centre, away) for centre in facts.centres)
+    return replace(
+        known, cameras=known.cameras.shifted(away), facts=replace(facts, space=space, centres=centres, origin=origin)
+    )
+
+
+def _sum(a: Origin, b: Origin) -> Origin:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _load_blocks(

@@ -16,6 +16,7 @@ from ..plugins.decoders.config import pretrain_line
 from ..rendering.plugin_checks import check_parts
 from ..rendering.renderer import Parts
 from ..rendering.space import Space
+from ..types import Origin
 from .camera_optimizers import Poses, Tones
 
 
@@ -62,6 +63,8 @@ class Facts:
     """Of the cameras, in the world, as the capture says; empty where poses are not refined."""
     reach: float = 1.0
     """World distance that views commonly see: the unit in which cameras are shifted."""
+    origin: Origin = (0.0, 0.0, 0.0)
+    """Of the local frame that all of the run is in (see `rendering.local_frame`)."""
 
     def __post_init__(self) -> None:
         for name in ("channels", "dim"):

@@ -17,7 +17,7 @@ from ..datamanagers.bounds import find_space
 from ..datamanagers.features import FeatureStore
 from ..datamanagers.images import WHITE
 from ..datamanagers.parsers.config import parse_scene, recognise
-from ..datamanagers.scene import Scene, exposures_differ, find_sightings, with_exposure
+from ..datamanagers.scene import Scene, at_origin, exposures_differ, find_sightings, with_exposure
 from ..errors import CheckpointError, DataError, PluginError, UsageError, WeightsError
 from ..interfaces import DataManager, Encoder
 from ..plugins.config import Need
@@ -70,12 +70,16 @@ def with_downscale(config: TrainConfig) -> TrainConfig:
     return replace(config, downscale=find_downscale(config, sizes, device_of(config.device).type) if len(sizes) else 1)
 
 
-def scene_of(config: TrainConfig) -> Scene:
-    """The scene of a config, at its size. Raises UsageError where it names none, DataError where that cannot be read."""
+def scene_of(config: TrainConfig, saved: Facts | None = None) -> Scene:
+    """The scene of a config, at its size, about the origin of a run that goes on (`saved`).
+
+    Raises UsageError where it names none, DataError where that cannot be read.
+    """
     if config.data is None:
         raise UsageError("no scene is named: give --data FOLDER, or --data town for the embedded one")
     size = with_downscale(config).downscale
-    return parse_scene(config.data, size or 1, config.datamanager.parser)
+    scene = parse_scene(config.data, size or 1, config.datamanager.parser)
+    return scene if saved is None else at_origin(scene, saved.origin)
 
 
 def prepare(
@@ -86,9 +90,9 @@ def prepare(
 ) -> Prepared:
     """Everything but the model. `progress(done, total, what)` is told of the features; `look` may refuse the scene before.
 
-    `saved` are the facts of a run that goes on: its exposures are not measured again.
+    `saved` are the facts of a run that goes on: its exposures are not measured again, and its origin stays.
     """
-    scene = scene_of(config)
+    scene = scene_of(config, saved)
     look(scene)
     content, semantic = build_encoders(config)
     build_decoder(config, encoder=content.identity, channels=content.channels)  # refused now, not after all the features
@@ -154,6 +158,7 @@ def facts_of(
         held=tuple(sorted(set(range(len(scene.paths))) - set(scene.train.tolist()))) if exposure or config.poses else (),
         centres=tuple((float(x), float(y), float(z)) for x, y, z in scene.cameras.pose[:, :, 3]) if config.poses else (),
         reach=reach_of(scene, space) if config.poses else 1.0,
+        origin=scene.origin,
     )
 
 

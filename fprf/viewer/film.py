@@ -27,6 +27,7 @@ from ..rendering.cameras import Cameras
 from ..rendering.paths import interpolate
 from ..style.files import StyleFile, write_style
 from ..style.keyframes import keyed_looks, read_keyframes
+from ..types import Origin
 from .cameras import CameraState, PageTransform
 from .render_worker import RenderWorker, Steps
 from .renderer import RenderRequest, SceneRenderer
@@ -85,13 +86,19 @@ def new_folder(root: Path) -> Path:
 
 
 def write_film_files(
-    folder: Path, transform: PageTransform, plan: FilmPlan, encoder: str, stylizer: RegionToneConfig | None = None
+    folder: Path,
+    transform: PageTransform,
+    plan: FilmPlan,
+    encoder: str,
+    stylizer: RegionToneConfig | None = None,
+    origin: Origin = (0.0, 0.0, 0.0),
 ) -> None:
     """Write path.json, keys.json, and a folder a look with style.json and its photographs.
 
     `encoder` is the identity of the scene's semantic encoder, `stylizer` what its looks are based on; None = the default.
+    The path is in the capture's coordinates; `origin` is that of the scene.
     """
-    write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps)
+    write_camera_path(folder / "path.json", film_cameras(transform, plan), plan.fps, origin)
     looks: dict[Look, Path] = {}
     rows: list[dict[str, object]] = []
     for i, key in enumerate(plan.keys):
@@ -116,7 +123,7 @@ def film_frames(
     """
     end: Exception | None = None
     try:
-        cameras, _ = read_camera_path(folder / "path.json")
+        cameras, _ = read_camera_path(folder / "path.json", scene.origin)
         looks = keyed_looks(scene, read_keyframes(folder / "keys.json"))
         for frame in range(len(cameras)):
             picture = yield from renderer.frame(cameras, frame, looks(frame))
@@ -219,7 +226,8 @@ class FilmRecorder:
             if session.viewed.root is None:
                 raise UsageError("this scene has no folder to put a film in")
             folder = new_folder(session.viewed.root)
-            write_film_files(folder, session.transform, plan, session.viewed.scene.semantic_encoder, session.viewed.stylizer)
+            scene = session.viewed.scene
+            write_film_files(folder, session.transform, plan, scene.semantic_encoder, session.viewed.stylizer, scene.origin)
             frames: Frames = Queue(2)
             rendered = film_frames(folder, session.viewed.scene, session.renderer, frames, progress, abandoned.is_set)
             self._worker.run_when_idle(rendered)

@@ -242,7 +242,7 @@ class Session:
             path = self.uploads.folder / "restyled.ply"
             shown = scene.restyled(self.restyler.restyle(self.state.look)).shown
             if viewed.capture is None:
-                write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True)
+                write_gaussians(path, shown, antialiased=scene.antialiased, views=scene.views, plain=True, origin=scene.origin)
             else:
                 write_capture(path, viewed.capture, shown.harmonics)
             return path.read_bytes()

@@ -13,8 +13,9 @@ from fprf.export.depth_maps import DepthMaps
 from fprf.export.mesh import Mesh, build_mesh, surface_nets, write_mesh_glb, write_mesh_ply
 from fprf.export.point_cloud import Cloud, fuse
 from fprf.io.images import srgb_to_linear
+from fprf.rendering.local_frame import read_offset
 
-ZERO = torch.zeros(3, dtype=torch.float64)
+ZERO = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +65,24 @@ def test_both_files_are_read_again_whole(mesh: Mesh, tmp_path: Path) -> None:
     assert np.abs(shade[:, :3] / 65535 - srgb_to_linear(colour.double().numpy())).max() < 1e-5, "glTF's colours are linear"
     document = (tmp_path / "m.glb").read_bytes()
     assert document[:4] == b"glTF" and int.from_bytes(document[8:12], "little") == len(document)
+
+
+def test_far_from_0_the_mesh_lies_where_the_capture_does(mesh: Mesh, tmp_path: Path) -> None:
+    """PLY in float64, glTF by its node, both local where that is asked for."""
+    origin, colour = (500_000.0, -16.0, 5_600_000.0), torch.rand(len(mesh.point), 3)
+    write_mesh_ply(tmp_path / "m.ply", mesh, colour, origin)
+    write_mesh_glb(tmp_path / "m.glb", mesh, colour, origin)
+    glb = trimesh.load_scene(tmp_path / "m.glb", process=False)
+    [node] = glb.graph.nodes_geometry
+    matrix, name = glb.graph[node]
+    assert np.array_equal(matrix[:3, 3], origin) and np.array_equal(glb.geometry[name].vertices, mesh.point.float().numpy())
+    assert np.abs(trimesh.load(tmp_path / "m.ply", process=False).vertices - origin - mesh.point.numpy()).max() < 1e-8
+    for write, ending in ((write_mesh_ply, "ply"), (write_mesh_glb, "glb")):
+        path = tmp_path / f"local.{ending}"
+        write(path, mesh, colour, origin, local=True)
+        whole = trimesh.load_scene(path, process=False)
+        assert np.abs(whole.to_geometry().vertices - mesh.point.numpy()).max() < 1e-6
+        assert read_offset(path) == origin
 
 
 def test_a_lattice_too_coarse_for_anything_is_a_clear_mistake(seen: tuple[DepthMaps, Cloud]) -> None:

@@ -21,13 +21,12 @@ from fprf.export.point_cloud import (
     finest_only,
     fuse,
     keys,
-    origin_comment,
-    origin_of,
     sky_dome,
     spacing,
     write_points,
 )
 from fprf.rendering.cameras import grid_rays
+from fprf.rendering.local_frame import read_offset
 
 
 def fused(maps: DepthMaps, edge: float = 0.2) -> Cloud:
@@ -126,18 +125,20 @@ def test_the_dome_lies_where_views_see_nothing() -> None:
     assert float(ahead.amin()) > 0.7
 
 
-def test_far_from_its_origin_a_capture_is_moved_and_the_file_says_so(tmp_path: Path) -> None:
+def test_far_from_0_positions_are_float64_or_local_with_a_file_that_says_so(tmp_path: Path) -> None:
     near = fused(globe(6))
-    shift = torch.tensor([4_500_000.0, 500_000.0, 200.0], dtype=torch.float64)
-    far = near._replace(point=near.point + shift)
-    origin = origin_of(far)
-    assert bool(origin.any()) and torch.equal(origin, origin.round())
-    write_points(tmp_path / "points.ply", far, torch.rand(len(far.point), 3), origin)
-    found = trimesh.load(tmp_path / "points.ply")
-    # float32 at 4.5e6 has steps of 0.5; here the grain is that of coordinates of some metres.
-    assert np.abs(found.vertices + origin.numpy() - far.point.numpy()).max() < 1e-6
-    assert f"comment {origin_comment(origin)[0]}".encode() in (tmp_path / "points.ply").read_bytes()
-    assert all(f"{value:.0f}" in origin_comment(origin)[0] for value in origin.tolist())
+    colour = torch.rand(len(near.point), 3)
+    origin = (4_500_000.0, 500_000.0, 200.0)
+    write_points(tmp_path / "world.ply", near, colour, origin)
+    write_points(tmp_path / "local.ply", near, colour, origin, local=True)
+    world, local = (trimesh.load(tmp_path / f"{name}.ply") for name in ("world", "local"))
+    # float32 at 4.5e6 has steps of 0.5.
+    assert np.abs(world.vertices - origin - near.point.numpy()).max() < 1e-8
+    assert np.array_equal(local.vertices, near.point.float().numpy())
+    assert np.array_equal(world.colors, local.colors)
+    assert read_offset(tmp_path / "local.ply") == origin and read_offset(tmp_path / "world.ply") == (0, 0, 0)
+    write_points(tmp_path / "local.ply", near, colour, (0.0, 0.0, 0.0))
+    assert read_offset(tmp_path / "local.ply") == (0, 0, 0), "no offset of a file before is left"
 
 
 @given(seed=seeds)

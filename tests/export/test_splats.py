@@ -12,8 +12,9 @@ from splatter import draw, matrices, read_gaussians, read_splat, table
 
 from fprf.export.point_cloud import Cloud, fuse
 from fprf.export.splats import rotation_to_normal, surface_discs, write_gaussians, write_splat
+from fprf.rendering.local_frame import read_offset
 
-ZERO = torch.zeros(3, dtype=torch.float64)
+ZERO = (0.0, 0.0, 0.0)
 STANDARD = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), "opacity"]
 STANDARD += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # Kerbl et al., degree 0
 
@@ -37,18 +38,19 @@ def test_turns_bring_the_z_axis_to_the_normal(seed: int) -> None:
 def test_both_files_hold_the_same_gaussians(cloud: Cloud, tmp_path: Path) -> None:
     splats = surface_discs(cloud)._replace(opacity=torch.linspace(0.2, 0.99, len(cloud.point)))
     colour = torch.rand(len(cloud.point), 3)
-    origin = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    origin = (500_000.0, -2.0, 5_600_000.5)
     write_gaussians(tmp_path / "g.ply", splats, colour, origin)
     write_splat(tmp_path / "g.splat", splats, colour, origin)
     data = (tmp_path / "g.ply").read_bytes()
-    assert list(table(data).dtype.names or ()) == STANDARD
+    assert list(table(data).dtype.names or ()) == STANDARD and table(data).dtype["x"] == np.float64
     ply, splat = read_gaussians(data), read_splat((tmp_path / "g.splat").read_bytes())
-    assert np.allclose(ply.at, (cloud.point - origin).numpy(), atol=1e-6)
+    assert np.allclose(ply.at - origin, cloud.point.numpy(), atol=1e-6)
     assert np.allclose(ply.deviation, splats.deviation.numpy(), rtol=1e-5)
     assert np.allclose(ply.colour, colour.numpy(), atol=1e-6)
     assert np.allclose(ply.opacity, splats.opacity.numpy(), atol=1e-5)
     match = (splats.deviation.prod(1) * splats.opacity).argsort(descending=True).numpy()  # the largest first
-    assert np.array_equal(np.float32(splat.at), np.float32(ply.at)[match])
+    assert np.array_equal(np.float32(splat.at), np.float32(ply.at - origin)[match])
+    assert read_offset(tmp_path / "g.splat") == origin
     assert np.abs(splat.colour - ply.colour[match]).max() <= 0.5 / 255 + 1e-6
     assert np.abs(splat.opacity - ply.opacity[match]).max() <= 0.5 / 255 + 1e-5
     # 8 bits a component: half a step of 1/128 each, in four of them.

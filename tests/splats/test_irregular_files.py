@@ -20,6 +20,7 @@ from fprf.errors import DataError
 from fprf.fields.planes import harmonics as functions
 from fprf.ops.rasterise_reference import _rotations
 from fprf.plugins.encoders.config import BundledSemanticConfig
+from fprf.rendering.local_frame import read_offset
 from fprf.splats.config import LookConfig
 from fprf.splats.files import Capture, Written, read_capture, write_capture, write_gaussians
 from fprf.splats.files.ply import ply_bytes
@@ -179,14 +180,20 @@ def test_the_others_survive_any_mixture_of_bad_rows_between_any_two_formats(
     assert (found.colours[nearest].clamp(0, 1) - whole.colours[sound].clamp(0, 1)).abs().max() < 0.03
 
 
-def test_what_lies_far_from_the_origin_is_said(tmp_path: Path) -> None:
-    made = ball(200)
-    made.means[:, 1] += 2e5
-    found, written = converted(capture_of(tmp_path, made), tmp_path / "out.spz")
-    assert errors(made, found)[0] <= 1 / 64 + 0.016 and len(written.notes) == 1 and "0.03125" in written.notes[0]
+def test_captures_far_from_the_origin_keep_their_shape_or_are_refused(tmp_path: Path) -> None:
+    made, far = ball(200), ball(200)
+    far.means[:, 1] += 2e5
+    step = float(np.spacing(np.float32(2e5)))
+    found, written = converted(capture_of(tmp_path, far), tmp_path / "out.spz")
+    offset = torch.tensor(read_offset(tmp_path / "out.spz"))
+    assert errors(Gaussians(far.means - offset, *list(vars(far).values())[1:]), found)[0] <= 1e-4 and not written.notes
+    assert ((found.means + offset).amax(0) - far.means.amax(0)).abs().max() <= step
     made.means[:, 1] += 1e7
     with pytest.raises(DataError):
-        converted(capture_of(tmp_path, made), tmp_path / "out.spz")
+        capture_of(tmp_path, made)
+
+
+def test_sizes_beyond_those_of_spz_are_said(tmp_path: Path) -> None:
     small = ball(200)
     small = Gaussians(small.means * 1e-3, small.quaternions, small.log_scales - 9, small.logits, small.harmonics)
     assert converted(capture_of(tmp_path, small), tmp_path / "out.spz")[1].notes[0].startswith("200 ")

@@ -296,9 +296,14 @@ def recognise(data: Path) -> DataParserConfig:
 
 
 def parse_scene(data: Path, downscale: int, parser: DataParserConfig | None) -> Scene:
-    """The scene of a folder at 1/downscale of its size, by the parser that is named or, without one, recognised."""
+    """The scene of a folder at 1/downscale of its size, by the parser that is named or, without one, recognised.
+
+    Where the capture lies far from 0 the scene is in a local frame, whatever the parser (`Scene.origin`).
+    """
+    from ..scene import in_local_frame
+
     chosen = recognise(data) if parser is None else parser
-    return chosen.build().parse(data, downscale)
+    return in_local_frame(chosen.build().parse(data, downscale))
 
 
 def _content(data: Path) -> str:

@@ -5,6 +5,7 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -15,8 +16,10 @@ from torch import Tensor
 from ...errors import DataError
 from ...io.atomic import unwritable, write_bytes
 from ...rendering.cameras import Cameras
+from ...rendering.local_frame import added_and_beside, read_offset, write_offset
 from ...training.run import held
-from ..gaussians import Gaussians
+from ...types import Origin
+from ..gaussians import Gaussians, bulk_of
 from ..views import seen_means
 from .base import Bools, Capture
 from .ply import compressed_bytes, compressed_keeps, is_compressed, ply_bytes, ply_head, ply_rows, read_ply
@@ -86,11 +89,35 @@ def read_capture(path: Path) -> Capture:
     if not any(bool(part.finite.any()) for part in parts):  # mostly the first part tells
         reasons = " and ".join(capture.gaussians.faults())
         raise DataError(f"{path}: holds no Gaussian that can be drawn, but {reasons}; export the capture again")
-    return capture
+    _check_shape(capture)
+    x, y, z = capture.shift
+    camera = None if capture.camera is None else capture.camera.shifted((-x, -y, -z))
+    return replace(capture, camera=camera, offset=read_offset(path))
+
+
+def _check_shape(capture: Capture) -> None:
+    """Raise DataError where float32 has rounded a capture far from 0 to a few places along an axis."""
+    local = capture.gaussians.means[capture.gaussians.finite].numpy()
+    for axis, away in zip(local.T, np.abs(capture.shift), strict=True):
+        step = float(np.spacing(np.float32(away)))
+        if not away or step <= 0.05 * bulk_of(local).side or bool((axis == axis[0]).all()):
+            continue
+        if not (axis % np.float32(step)).any():  # positions that were float64 have further digits
+            raise DataError(
+                f"{capture.path}: lies {away:.2g} from 0, where float32 has steps of {step:.2g}, too coarse for its shape; export "
+                "it closer to the origin, or with float64 positions"
+            )
 
 
 def write_gaussians(
-    path: Path, gaussians: Gaussians, *, antialiased: bool = False, views: Cameras | None = None, plain: bool = False
+    path: Path,
+    gaussians: Gaussians,
+    *,
+    antialiased: bool = False,
+    views: Cameras | None = None,
+    plain: bool = False,
+    origin: Origin = (0.0, 0.0, 0.0),
+    local: bool = False,
 ) -> Written:
     """Write a file in the format that its name ends with, whole or not at all. Raises DataError for another ending.
 
@@ -98,7 +125,8 @@ def write_gaussians(
     others their precision; .compressed.ply and SOG have an order of their own.
     .splat holds neither view dependence nor whether opacities are compensated (`antialiased`): it gets the means of what
     `views` show, or the colours over all directions where none are given. With `plain` all formats get such opacities, for
-    renderers that do not compensate.
+    renderers that do not compensate. Where the Gaussians' `origin` is not 0, .ply holds float64 positions in the world; the
+    others, and .ply where `local`, hold those relative to the origin, with a file beside them that says so.
     """
     form, faulty, far = _FORMATS[_ending(path)], False, 0
     if form.pack is not ply_bytes:
@@ -114,18 +142,30 @@ def write_gaussians(
         seen = seen_means(gaussians, views, antialiased=antialiased)
         gaussians = seen.gaussians(gaussians) if form.plain else seen.plain(gaussians)
         antialiased = False
-    _write(path, form.pack(gaussians, antialiased))
+    added, beside = added_and_beside(origin, local or form.pack is not ply_bytes)
+    data = ply_bytes(gaussians, antialiased, origin=added) if any(added) else form.pack(gaussians, antialiased)
+    _write(path, data, beside)
     return Written(faulty, far, tuple(form.notes(gaussians)))
 
 
-def write_ply_parts(path: Path, part: Callable[[slice], Gaussians], count: int, key: str, *, antialiased: bool = False) -> None:
+def write_ply_parts(
+    path: Path,
+    part: Callable[[slice], Gaussians],
+    count: int,
+    key: str,
+    *,
+    antialiased: bool = False,
+    origin: Origin = (0.0, 0.0, 0.0),
+    local: bool = False,
+) -> None:
     """Write the .ply of `count` Gaussians, whole or not at all; `part` gives slices of them, and no more is in memory.
 
-    Where writing was cut off, the next call with the same key goes on with what is there. Raises DataError where another
-    process is at it, or the system refuses.
+    Where writing was cut off, the next call with the same key goes on with what is there. Positions are those of
+    `write_gaussians`. Raises DataError where another process is at it, or the system refuses.
     """
+    added, beside = added_and_beside(origin, local)
     first = part(slice(0, 1))
-    head, row = ply_head(first, antialiased, count), ply_rows(first).nbytes
+    head, row = ply_head(first, antialiased, count, added), ply_rows(first, origin=added).nbytes
     unfinished = path.with_name(f".{path.stem[:40]}.{key[:16]}")
     for other in path.parent.glob(f".{glob.escape(path.stem[:40])}.{'[0-9a-f]' * 16}"):
         if other != unfinished:
@@ -143,10 +183,12 @@ def write_ply_parts(path: Path, part: Callable[[slice], Gaussians], count: int, 
                 file.truncate(len(head) + begun * row * _ROWS)
                 file.seek(0, os.SEEK_END)
                 for start in range(begun * _ROWS, count, _ROWS):
-                    file.write(ply_rows(part(slice(start, min(start + _ROWS, count)))).tobytes())
+                    rows_here = part(slice(start, min(start + _ROWS, count)))
+                    file.write(ply_rows(rows_here, origin=added).tobytes())
                     file.flush()
                     os.fsync(file.fileno())
             os.replace(rows, path)
+            write_offset(path, beside)
         except OSError as error:
             raise unwritable(path, error, len(head) + count * row) from error
 
@@ -166,11 +208,11 @@ def write_capture(path: Path, capture: Capture, harmonics: Annotated[Tensor, "N 
     packed = ending == ".compressed.ply" and not is_compressed(capture.data)
     if _FORMATS[ending].read is not _FORMATS[here].read or plain or packed:
         drawn = capture.gaussians.recoloured(harmonics).select(finite)
-        written = write_gaussians(path, drawn, antialiased=capture.antialiased, views=views)
+        written = write_gaussians(path, drawn, antialiased=capture.antialiased, views=views, origin=capture.origin)
         return written._replace(faulty=not bool(finite.all()))
     changed = (harmonics != before).flatten(1).any(1) & harmonics.isfinite().flatten(1).all(1)
     data = capture.data if not bool(changed.any()) else capture.recolour(harmonics.numpy(), np.asarray(changed))
-    _write(path, data)
+    _write(path, data, capture.offset)
     return Written()
 
 
@@ -181,7 +223,8 @@ def _ending(path: Path) -> str:
     raise DataError(f"{path}: no file of Gaussians by its name; known endings are {', '.join(ENDINGS)}")
 
 
-def _write(path: Path, data: bytes) -> None:
+def _write(path: Path, data: bytes, offset: Origin) -> None:
+    write_offset(path, offset)
     if _ending(path) != "meta.json":
         write_bytes(path, data)
         return

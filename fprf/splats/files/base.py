@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...ops.harmonics import HARMONIC
 from ...rendering.cameras import Cameras
+from ...rendering.local_frame import local_origin
+from ...types import Origin
 from ..gaussians import Gaussians, bulk_of, morton_order
 
 Floats: TypeAlias = NDArray[Any]
@@ -44,6 +47,22 @@ class Capture:
     """Direction that points up, where the file says so."""
     camera: Cameras | None = None
     """The view that the capture was made from, where the file holds it."""
+    shift: Origin = (0.0, 0.0, 0.0)
+    """What was taken off the file's coordinates, which lie far from 0."""
+    offset: Origin = (0.0, 0.0, 0.0)
+    """What a file beside it adds to them (see `rendering.local_frame`)."""
+
+    @property
+    def origin(self) -> Origin:
+        """Of the local frame that the Gaussians are in."""
+        return self.shift[0] + self.offset[0], self.shift[1] + self.offset[1], self.shift[2] + self.offset[2]
+
+
+def centred(means: Floats) -> tuple[NDArray[np.float64], Origin]:
+    """Positions of any type about their local origin, and that."""
+    means = means.astype(np.float64)
+    shift = local_origin(torch.from_numpy(means))
+    return means - shift, shift
 
 
 def short(path: Path, has: int, needs: int, what: str) -> DataError:

@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...rendering.cameras import Cameras, ideal_cameras
+from ...types import Origin
 from ..gaussians import COUNTS, Gaussians, from_arrays
 from .base import (
     Bools,
     Capture,
     Floats,
+    centred,
     colours_of,
     constants_of,
     finite,
@@ -43,7 +45,7 @@ _TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-_NAMES = {"u1": "uchar", "u4": "uint", "i4": "int", "f4": "float"}
+_NAMES = {"u1": "uchar", "u4": "uint", "i4": "int", "f4": "float", "f8": "double"}
 _COMMENT = re.compile(r"(splatrendermode|antialiased|vertical axis)\b[\s:=]*(.*)", re.IGNORECASE)
 _UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 """What points up where a vertical axis is named by its letter, as Brush reads it: up is -y and -z."""
@@ -121,8 +123,9 @@ def read_ply(path: Path, data: bytes) -> Capture:
     harmonics = columns(*colours[:3])[:, None]
     if rest:
         harmonics = np.concatenate([harmonics, columns(*colours[3:]).reshape(-1, 3, count - 1).transpose(0, 2, 1)], 1)
+    means, shift = centred(np.stack([table[name] for name in "xyz"], 1))
     gaussians = from_arrays(
-        columns("x", "y", "z"),
+        means,
         columns("rot_0", "rot_1", "rot_2", "rot_3"),
         columns("scale_0", "scale_1", "scale_2"),
         columns("opacity")[:, 0],
@@ -136,27 +139,42 @@ def read_ply(path: Path, data: bytes) -> Capture:
             target[name][changed] = column[changed]
         return bytes(out)
 
-    return Capture(path, gaussians, antialiased, data, recolour, up, camera)
+    return Capture(path, gaussians, antialiased, data, recolour, up, camera, shift)
 
 
-def ply_bytes(gaussians: Gaussians, antialiased: bool, normals: Floats | None = None) -> bytes:
-    """The INRIA file, exact. Normals [N 3] are 0 unless given."""
-    return ply_file({"vertex": ply_rows(gaussians, normals)}, _comments(antialiased))
+def ply_bytes(
+    gaussians: Gaussians, antialiased: bool, normals: Floats | None = None, origin: Origin = (0.0, 0.0, 0.0)
+) -> bytes:
+    """The INRIA file, exact. Normals [N 3] are 0 unless given; with an origin positions are in the world, float64."""
+    return ply_file({"vertex": ply_rows(gaussians, normals, origin)}, _comments(antialiased))
 
 
-def ply_head(of: Gaussians, antialiased: bool, count: int) -> bytes:
+def ply_head(of: Gaussians, antialiased: bool, count: int, origin: Origin) -> bytes:
     """What stands before the rows of an INRIA file of `count` Gaussians such as these."""
-    return _head({"vertex": ply_rows(of)}, _comments(antialiased), [count])
+    return _head({"vertex": ply_rows(of, origin=origin)}, _comments(antialiased), [count])
 
 
-def ply_rows(gaussians: Gaussians, normals: Floats | None = None) -> NDArray[np.void]:
-    """Rows of the INRIA file."""
+def ply_rows(gaussians: Gaussians, normals: Floats | None = None, origin: Origin = (0.0, 0.0, 0.0)) -> NDArray[np.void]:
+    """Rows of the INRIA file, as `ply_bytes` has them."""
     names = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * gaussians.harmonics.shape[1] - 3)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     means, turns, scales, logits, harmonics = _arrays(gaussians)
     parts = [means, np.zeros_like(means) if normals is None else normals, _flat(harmonics), logits[:, None], scales, turns]
-    return np.ascontiguousarray(np.concatenate(parts, 1), "<f4").view([(name, "<f4") for name in names])[:, 0]
+    return in_world(
+        np.ascontiguousarray(np.concatenate(parts, 1), "<f4").view([(name, "<f4") for name in names])[:, 0], means, origin
+    )
+
+
+def in_world(table: NDArray[np.void], local: Floats, origin: Origin) -> NDArray[np.void]:
+    """Rows with local x y z [N 3] about an origin as float64 of the world; as they are where the origin is 0."""
+    if not any(origin):
+        return table
+    kinds = {name: "<f8" if name in ("x", "y", "z") else table.dtype[name] for name in table.dtype.names or ()}
+    out = table.astype([*kinds.items()])
+    for name, column, of in zip("xyz", local.astype(np.float64).T, origin, strict=True):
+        out[name] = column + of
+    return out
 
 
 def _comments(antialiased: bool) -> list[str]:
@@ -245,8 +263,9 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
         share = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
         harmonics = np.concatenate([harmonics, ((share - 0.5) * _SPAN).reshape(count, 3, -1).transpose(0, 2, 1)], 1)
     turned = words["packed_rotation"]
+    means, shift = centred(unpacked(_unpack(words["packed_position"], (11, 10, 11)), _POSITION))
     gaussians = from_arrays(
-        unpacked(_unpack(words["packed_position"], (11, 10, 11)), _POSITION),
+        means,
         three_to_four((turned >> 30).astype(np.int64), 2 * _unpack(turned, (10, 10, 10)) - 1),
         unpacked(_unpack(words["packed_scale"], (11, 10, 11)), _SCALE),
         logit(rgba[:, 3]),
@@ -275,7 +294,7 @@ def _read_compressed(path: Path, data: bytes, elements: dict[str, _Element], ant
                 into[name][changed] = column[changed]
         return bytes(out)
 
-    return Capture(path, gaussians, antialiased, data, recolour)
+    return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
 
 
 def _header(data: bytes) -> _Header | None:

@@ -30,6 +30,7 @@ from .base import (
     Bools,
     Capture,
     Floats,
+    centred,
     finite,
     logit,
     precise,
@@ -81,8 +82,9 @@ def read_sog(path: Path, data: bytes) -> Capture:
     labels, rest = pictures.palette()
     alpha = base[:, 3:] if version == 2 else pictures.decoded("sh0", base, 4)[:, 3:]
     constants = pictures.decoded("sh0", base[:, :3] if version == 2 else base, 3 if version == 2 else 4)[:, :3]
+    means, shift = centred(np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)))
     gaussians = from_arrays(
-        np.sign(bent) * np.expm1(np.minimum(np.abs(bent), 80)),
+        means,
         quaternions,
         pictures.decoded("scales", scale[:, :3], 3),
         logit(alpha[:, 0] / 255) if version == 2 else alpha[:, 0],
@@ -108,7 +110,7 @@ def read_sog(path: Path, data: bytes) -> Capture:
         return bundle(files | new, like=data)
 
     antialiased = meta.get("antialias") is True or meta.get("model") == "antialiased"
-    return Capture(path, gaussians, antialiased, data, recolour)
+    return Capture(path, gaussians, antialiased, data, recolour, shift=shift)
 
 
 def sog_keeps(gaussians: Gaussians) -> Bools:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...errors import DataError
 from ..gaussians import Gaussians, from_arrays
-from .base import Bools, Capture, Floats, colours_of, constants_of, logit, sigmoid, steps
+from .base import Bools, Capture, Floats, centred, colours_of, constants_of, logit, sigmoid, steps
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("deviation", "<f4", 3), ("rgba", "u1", 4), ("turn", "u1", 4)])
 _LEAST = 1e-12
@@ -22,8 +22,9 @@ def read_splat(path: Path, data: bytes) -> Capture:
         raise DataError(f"{path}: {len(data)} bytes; a .splat file has {_RECORD.itemsize} for each Gaussian")
     table = np.frombuffer(data, _RECORD)
     share = table["rgba"] / 255
+    means, shift = centred(table["mean"])
     gaussians = from_arrays(
-        table["mean"],
+        means,
         (table["turn"].astype(np.float32) - 128) / 128,
         np.log(np.maximum(table["deviation"], _LEAST)),
         logit(share[:, 3]),
@@ -35,7 +36,7 @@ def read_splat(path: Path, data: bytes) -> Capture:
         np.frombuffer(out, _RECORD)["rgba"][changed, :3] = steps(colours_of(harmonics[changed]), 255)
         return bytes(out)
 
-    return Capture(path, gaussians, False, data, recolour)
+    return Capture(path, gaussians, False, data, recolour, shift=shift)
 
 
 def splat_bytes(gaussians: Gaussians, antialiased: bool) -> bytes:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ...fields.planes import harmonics as harmonic_functions
 from ..gaussians import COUNTS, Gaussians, bulk_of, from_arrays
-from .base import Bools, Capture, Floats, finite, logit, precise, short, sigmoid, smallest_three, steps, three_to_four
+from .base import Bools, Capture, Floats, centred, finite, logit, precise, short, sigmoid, smallest_three, steps, three_to_four
 
 _MAGIC = 0x5053474E
 _HEADER, _WIDE_HEADER = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
@@ -97,8 +97,9 @@ def read_spz(path: Path, data: bytes) -> Capture:
         quaternions[:, _TURN] = found
     bits = rest.reshape(count, bands - 1, 3).astype(np.float64)
     harmonics = np.concatenate([(tint.reshape(count, 1, 3) / 255 - 0.5) / _TINT, (bits - 128) / 128], 1)
+    points, shift = centred(axes.points(points))
     gaussians = from_arrays(
-        axes.points(points),
+        points,
         axes.quaternions(quaternions),
         scales.reshape(count, 3) / 16 - 10,
         logit(opacity / 255),
@@ -116,7 +117,7 @@ def read_spz(path: Path, data: bytes) -> Capture:
         whole = b"".join([unpacked[: header.size], *parts, extensions])
         return _zipped(whole) + after if packed else whole
 
-    return Capture(path, gaussians, bool(header.flags & 1), data, recolour)
+    return Capture(path, gaussians, bool(header.flags & 1), data, recolour, shift=shift)
 
 
 def spz_keeps(gaussians: Gaussians) -> Bools:
