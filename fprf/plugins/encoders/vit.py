@@ -56,7 +56,7 @@ def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
     except ImportError as error:
         raise WeightsError(
             f"{family}: needs the package transformers ({error}); pip install 'fprf[encoders]', "
-            "or choose one that ships: --semantic.encoder bundled-semantic"
+            "or choose one that ships: --semantic.encoder dinov2"
         ) from error
     verbosity = logging.get_verbosity()
     logging.set_verbosity_error()  # else it lists the blocks that are left out
@@ -72,7 +72,7 @@ def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
         raise WeightsError(
             f"{family}: {name} cannot be loaded ({reason}); with a network run `hf download {name}` once, "
             "or name a folder with its config.json and model.safetensors by --semantic.encoder.model FOLDER, "
-            "or choose an encoder that ships: --semantic.encoder bundled-semantic"
+            "or choose an encoder that ships: --semantic.encoder dinov2"
         ) from error
     finally:
         logging.set_verbosity(verbosity)
