@@ -8,7 +8,7 @@ from ..checks import at_least, between, positive
 from ..config import RunConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
-from ..plugins.encoders.config import BundledSemanticConfig, EncoderConfig
+from ..plugins.encoders.config import SEMANTICS, EncoderConfig
 from ..plugins.executors.config import ExecutorConfig, SerialConfig
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class GaussianSemanticsConfig:
     """Semantics of Gaussians: features of rendered views, carried back to what they show. Nothing is trained for them."""
 
-    encoder: EncoderConfig = BundledSemanticConfig()
+    encoder: EncoderConfig = SEMANTICS
     """Encoder whose features find the fitting reference."""
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ...errors import WeightsError
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
-from .frozen import FrozenEncoder, freeze
+from .frozen import CELLS, FrozenEncoder, freeze, patch_grid
 
 PATCH, WIDTH, HEADS = 14, 384, 6
 GRID = 37
@@ -77,10 +77,10 @@ class Dinov2(nn.Module):
 
 
 class Dinov2Encoder(FrozenEncoder):
-    """Tokens or keys of one block, one for each `stride` pixels: the image is resized until a patch covers that many."""
+    """Tokens or keys of one block; the image is resized to the patches of `patch_grid`."""
 
-    def __init__(self, network: Dinov2, *, kind: Literal["tokens", "keys"], stride: int) -> None:
-        settings = f"block{len(network.blocks)}:{kind}:stride{stride}"
+    def __init__(self, network: Dinov2, *, kind: Literal["tokens", "keys"], stride: int | None) -> None:
+        settings = f"block{len(network.blocks)}:{kind}:" + (f"stride{stride}" if stride else f"cells{CELLS}")
         super().__init__(f"dinov2-small:{settings}:{tensors_hash(network.state_dict())}", WIDTH)
         self.network = network
         self._keys, self._stride = kind == "keys", stride
@@ -89,7 +89,7 @@ class Dinov2Encoder(FrozenEncoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features; cells cover the whole image evenly, at least one along each axis."""
-        size = [PATCH * max(1, round(n / self._stride)) for n in image.shape[-2:]]
+        size = [PATCH * n for n in patch_grid(*image.shape[-2:], self._stride)]
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bicubic", align_corners=False, antialias=True)
         mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
@@ -97,7 +97,7 @@ class Dinov2Encoder(FrozenEncoder):
         return features
 
 
-def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int, path: Path = WEIGHTS) -> Dinov2Encoder:
+def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | None, path: Path = WEIGHTS) -> Dinov2Encoder:
     """The encoder up to block `layer` (negative: from the last of 12). Raises WeightsError where the file has no such block."""
     block = layer if layer > 0 else BLOCKS + 1 + layer
     if not 1 <= block <= HELD:
