@@ -181,7 +181,7 @@ class Dinov2Config(EncoderConfig):
     features: Literal["tokens", "keys"] = "tokens"
     """The block's output, or the keys of its attention. A model of the hub gives tokens, which pass its final norm."""
     stride: int | None = None
-    """Pixels of the image per feature: the image is resized until one patch covers that many. none = 24 features along its
+    """Pixels of the image per feature: the image is resized until one patch covers that many. none = 22 features along its
     longer side, whatever its size."""
 
     def __post_init__(self) -> None:

@@ -38,18 +38,16 @@ class Block(nn.Module):
         self.fc1, self.fc2 = nn.Linear(WIDTH, 4 * WIDTH), nn.Linear(4 * WIDTH, WIDTH)
         self.scale1, self.scale2 = nn.Parameter(torch.empty(WIDTH)), nn.Parameter(torch.empty(WIDTH))
 
-    def keys(self, x: Annotated[Tensor, "B T 384"]) -> Annotated[Tensor, "B T 384"]:
-        """Keys of all heads side by side."""
-        key = slice(WIDTH, 2 * WIDTH)
-        return F.linear(self.norm1(x), self.qkv.weight[key], self.qkv.bias[key])
-
-    def forward(self, x: Annotated[Tensor, "B T 384"]) -> Annotated[Tensor, "B T 384"]:
+    def forward(self, x: Annotated[Tensor, "B T 384"], keys: bool = False) -> Annotated[Tensor, "B T 384"]:
+        """The tokens after the block, or the keys of all its heads side by side."""
         # [B T 3 heads 64] to three of [B heads T 64].
         query, key, value = self.qkv(self.norm1(x)).unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
+        if keys:
+            result: Tensor = key.transpose(1, 2).flatten(2)
+            return result
         attended = F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
         x = x + self.scale1 * self.proj(attended)
-        result: Tensor = x + self.scale2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
-        return result
+        return x + self.scale2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
 
 
 class Dinov2(nn.Module):
@@ -69,10 +67,8 @@ class Dinov2(nn.Module):
         positions = F.interpolate(self.pos_embed[None], shape, mode="bicubic", align_corners=False)
         tokens = (patches + positions).flatten(2).transpose(1, 2)
         x = torch.cat([self.cls_token.expand(len(image), 1, -1), tokens], 1)
-        for block in self.blocks[:-1]:
-            x = block(x)
-        last = self.blocks[-1]
-        x = last.keys(x) if keys else last(x)
+        for index, block in enumerate(self.blocks, start=1):
+            x = block(x, keys and index == len(self.blocks))
         return x[:, 1:].transpose(1, 2).unflatten(2, shape)
 
 
@@ -89,7 +85,7 @@ class Dinov2Encoder(FrozenEncoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features; cells cover the whole image evenly, at least one along each axis."""
-        size = [PATCH * n for n in patch_grid(*image.shape[-2:], self._stride)]
+        size = [PATCH * n for n in patch_grid(image.shape[-2:], self._stride)]
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bicubic", align_corners=False, antialias=True)
         mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))

@@ -38,7 +38,7 @@ class VitEncoder(FrozenEncoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features, one per `stride` pixels, cells covering the whole image evenly."""
-        height, width = patch_grid(*image.shape[-2:], self._stride)
+        height, width = patch_grid(image.shape[-2:], self._stride)
         size = (height * self._patch, width * self._patch)
         if size != tuple(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
