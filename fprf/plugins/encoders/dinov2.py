@@ -43,11 +43,11 @@ class Block(nn.Module):
         # [B T 3 heads 64] to three of [B heads T 64].
         query, key, value = self.qkv(self.norm1(x)).unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
         if keys:
-            result: Tensor = key.transpose(1, 2).flatten(2)
-            return result
-        attended = F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
-        x = x + self.scale1 * self.proj(attended)
-        return x + self.scale2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
+            x = key.transpose(1, 2).flatten(2)
+        else:
+            x = x + self.scale1 * self.proj(F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2))
+            x = x + self.scale2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
+        return x
 
 
 class Dinov2(nn.Module):
@@ -69,7 +69,7 @@ class Dinov2(nn.Module):
         x = torch.cat([self.cls_token.expand(len(image), 1, -1), tokens], 1)
         for index, block in enumerate(self.blocks, start=1):
             x = block(x, keys and index == len(self.blocks))
-        return x[:, 1:].transpose(1, 2).unflatten(2, shape)
+        return x[:, 1:].transpose(1, 2).reshape(len(image), WIDTH, *shape)
 
 
 class Dinov2Encoder(FrozenEncoder):
