@@ -20,6 +20,7 @@ over the range of colours there.
 
     rmse   = mean over t of sqrt( mean over valid pixels and channels of (I_t - W(I_{t-k}))² )     Stylos, AnyStyle, StyleRF
     e_warp = mean over t of the same mean square                                                   FPRF, after Lai et al. 2018
+    lpips  = mean over t of LPIPS(M I_t, M W(I_{t-k})), M = 0 where not valid: black in both       Stylos, AnyStyle, StyleRF
 """
 
 import math
@@ -33,6 +34,7 @@ from torch.nn.functional import grid_sample
 
 from ..errors import DataError, NumericsError
 from ..rendering.cameras import Cameras, grid_rays, project
+from .lpips import lpips
 
 SHORT, LONG = 1, 7
 """Frames between the two views of a pair (Lai et al. 2018, and every peer since)."""
@@ -263,7 +265,7 @@ def _highest(maps: Annotated[Tensor, "1 C H W"]) -> Annotated[Tensor, "1 C H W"]
 def published(
     images: Sequence[Annotated[Tensor, "H W 3"]], depths: Sequence[Annotated[Tensor, "H W"]], cameras: Cameras
 ) -> dict[str, dict[str, float | int | None]]:
-    """`short` and `long`: `rmse`, `e_warp` (both of colours in [0, 1]), `lpips` (None) and the number of `pairs` compared.
+    """`short` and `long`: `rmse`, `e_warp` (both of colours in [0, 1]), `lpips` and the number of `pairs` compared.
 
     Raises DataError where images, depths and cameras differ in number.
     """
@@ -271,16 +273,17 @@ def published(
         raise DataError(f"{len(images)} images, {len(depths)} depths, {len(cameras)} cameras: one of each per frame is needed")
     summary: dict[str, dict[str, float | int | None]] = {}
     for name, gap in (("short", SHORT), ("long", LONG)):
-        squares = []
+        squares, perceived = [], []
         for t in range(gap, len(images)):
             there, valid = warp(images[t - gap], depths[t], depths[t - gap], cameras, t, t - gap)
             if bool(valid.any()):
                 squares.append(float((images[t][valid].double() - there[valid].double()).square().mean()))
+                perceived.append(lpips(torch.where(valid[..., None], images[t], 0.0), there))
         count = len(squares)
         summary[name] = {
             "rmse": math.fsum(map(math.sqrt, squares)) / count if count else None,
             "e_warp": math.fsum(squares) / count if count else None,
-            "lpips": None,
+            "lpips": math.fsum(perceived) / count if count else None,
             "pairs": count,
         }
     return summary

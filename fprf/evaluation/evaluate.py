@@ -87,7 +87,6 @@ def judge_views(
     means = mean_metrics(rows.values())
     return {
         **means,
-        "lpips": None,
         "views": len(views),
         "render_seconds": seconds,
         "seconds_per_view": seconds / max(1, len(views)),

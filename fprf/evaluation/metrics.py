@@ -42,6 +42,7 @@ from ..style.clusters import kmeans
 from ..style.controls import luma
 from ..style.matching import unit
 from ..style.statistics import covariance, moments, symmetric_root
+from .lpips import lpips
 
 PSNR_CAP = 99.0
 """PSNR of identical images, in dB: means over views stay finite. Reached at a mean squared error of 1.3e-10."""
@@ -96,14 +97,19 @@ def image_metrics(
 ) -> dict[str, float]:
     """Every metric of one view, by name. Pixels that are not `where` (a capture's mask) are left out.
 
-    Windows of SSIM about the others still see them: the same in both images. Raises DataError where the mask leaves nothing.
+    Windows of SSIM and cells of LPIPS about the others still see them: the same in both images. Raises DataError where the
+    mask leaves nothing.
     """
     if where is None:
-        return {"psnr": psnr(render, truth), "ssim": ssim(render, truth)}
+        return {"psnr": psnr(render, truth), "ssim": ssim(render, truth), "lpips": lpips(render, truth)}
     if not bool(where.any()):
         raise DataError("a mask leaves nothing of a view that is to be judged; leave the view out, or its mask")
     filled = torch.where(where[..., None], render, truth)
-    return {"psnr": psnr(render[where][None], truth[where][None]), "ssim": ssim(filled, truth, where)}
+    return {
+        "psnr": psnr(render[where][None], truth[where][None]),
+        "ssim": ssim(filled, truth, where),
+        "lpips": lpips(filled, truth, where),
+    }
 
 
 def mean_metrics(views: Iterable[Mapping[str, float]]) -> dict[str, float]:

@@ -29,7 +29,7 @@ from ..style.restyle import dress
 from ..training.loading import open_run
 from ..types import Want
 from .config import RestyleConfig
-from .consistency import steadiness
+from .consistency import published, steadiness
 from .report import Column, contact_sheet, markdown, words
 from .single_image import encoded, flat_look, flat_scene, histogram_matching, reinhard, render_flat
 from .town_truth import (
@@ -176,8 +176,6 @@ GOALS: Mapping[str, tuple[str, float, str, str]] = {
 }
 """Goals of the recommended stylizer with three references: figures with their units, and what they are of."""
 JUDGED = "three"
-LPIPS_MISSING = "its weights do not ship with the package, and no dependency brings them"
-"""Why that figure is null."""
 
 Progress = Callable[[int, int, str], None]
 
@@ -226,8 +224,6 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
             "regions": len(encoders.scene.share),
             "semantic_encoder": scene.semantic_encoder,
         },
-        "lpips": None,
-        "lpips_missing": LPIPS_MISSING,
         "recommended": best,
         "reconstruction": score(plain, true_views(stage, settings.palette), [each.labels for each in stage.truth])[0],
         "means": means,
@@ -328,6 +324,11 @@ def _case(
     return Case(*names, references, truth, {name: shown[name] for name in rows}, rows, by_class)
 
 
+PUBLISHED = {f"{gap}_{figure}": (gap, figure) for gap in ("short", "long") for figure in ("lpips", "rmse")}
+"""Figures of `consistency.published` by their names in a row."""
+SECONDS = ("style_seconds", "view_seconds")
+
+
 def _rest(
     stage: Stage,
     method: Shown | None,
@@ -337,7 +338,7 @@ def _rest(
     spent: float,
 ) -> Row:
     """Match rates, consistency and seconds; None where a method has none."""
-    row: Row = dict.fromkeys((*Matched._fields, "consistency", "warp_short", "warp_long", "style_seconds", "view_seconds"))
+    row: Row = dict.fromkeys((*Matched._fields, "consistency", "warp_short", "warp_long", *PUBLISHED, *SECONDS))
     if method is None:
         return row
     count = len(stage.shown)
@@ -349,6 +350,8 @@ def _rest(
     depths = [each.depth for each in stage.path_truth]
     steady = steadiness(plain_path, method.pictures[count:], depths, stage.path)
     row |= {"consistency": steady.score, "warp_short": steady.short, "warp_long": steady.long}
+    reported = published(method.pictures[count:], depths, stage.path)
+    row |= {name: reported[gap][figure] for name, (gap, figure) in PUBLISHED.items()}
     row["view_seconds"] = method.view_seconds
     return row
 
@@ -360,6 +363,7 @@ def _less(a: float | None, b: float | None) -> float | None:
 COLUMNS: tuple[Column, ...] = (
     ("psnr", "PSNR dB", ".2f"),
     ("ssim", "SSIM", ".3f"),
+    ("lpips", "LPIPS", ".3f"),
     ("delta_e", "ΔE2000", ".1f"),
     ("match", "match", ".1%"),
     ("match_inside", "match inside", ".1%"),
@@ -386,7 +390,8 @@ the street and its sky.
   loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/consistency.py`).
 - **style s**: to make the style of the references, once. **view s**: to colour a view whose geometry is there (for `reinhard`,
   `histogram` and `2d`: a rendered picture).
-- **LPIPS** is not given (null in the JSON): its weights do not ship with the package, and no dependency brings them.
+- **LPIPS**: AlexNet, version 0.1, to the truth; less is nearer. The JSON also has consistency as other papers report it
+  (`short_lpips`, `short_rmse`, `long_lpips`, `long_rmse`: `published` in `fprf/evaluation/consistency.py`).
 - **2d** is the recommended stylizer on each picture alone, with the picture's own statistics and regions.
 - **true classes** is no method: it knows the classes, and carries the colours of each to those of the same class in the
   references, as a perfect match would.

@@ -136,6 +136,7 @@ def test_a_camera_at_rest_compares_pixel_with_pixel() -> None:
     found = published(images, depths, still)
     assert found["short"]["rmse"] == pytest.approx(0.01, rel=1e-4) and found["short"]["pairs"] == 8
     assert found["short"]["e_warp"] == pytest.approx(1e-4, rel=1e-4)
+    assert 0 < found["short"]["lpips"] < found["long"]["lpips"] < 0.1
     assert found["long"]["rmse"] == pytest.approx(0.07, rel=1e-4) and found["long"]["pairs"] == 2
     nothing = published(images, [torch.zeros(12, 12)] * 9, still)
     assert nothing["short"] == {"rmse": None, "e_warp": None, "lpips": None, "pairs": 0}

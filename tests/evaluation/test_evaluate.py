@@ -30,7 +30,7 @@ def test_metrics_are_those_of_the_renders(world: World) -> None:
     assert metrics["psnr"] == pytest.approx(sum(v["psnr"] for v in metrics["per_view"].values()) / 2)
     assert metrics["rays_per_second"] == pytest.approx(2 * 24 * 32 / metrics["render_seconds"])
     assert metrics["seconds_per_view"] == pytest.approx(metrics["render_seconds"] / 2)
-    assert (metrics["train_steps"], metrics["train_seconds"]) == (15, trained.seconds) and metrics["lpips"] is None
+    assert (metrics["train_steps"], metrics["train_seconds"]) == (15, trained.seconds) and 0 < metrics["lpips"] < 2
     assert metrics["consistency"]["pairs"] == 1 and 0 < metrics["kept_samples_share"] <= 1
 
 

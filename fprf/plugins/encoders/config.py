@@ -116,6 +116,25 @@ class Vgg19Config(_VggConfig):
     the download cache."""
 
 
+def _hub_needs(model: str) -> tuple[Need, ...]:
+    """transformers, and a model of the hub that is neither cached nor a folder."""
+    needs = []
+    if importlib.util.find_spec("transformers") is None:
+        ships = "or choose an encoder that ships: --semantic.encoder dinov2"
+        needs.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
+    home = os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface"
+    hub = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub")
+    cached = any(hub.glob(f"models--{model.replace('/', '--')}/snapshots/*/config.json"))
+    if not cached and not (Path(model) / "config.json").is_file():
+        needs.append(Need(f"the model {model}", f"hf download {model}", downloaded=True))
+    return tuple(needs)
+
+
+def _check_layer(layer: int) -> None:
+    if layer == 0:
+        raise ConfigError("layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last")
+
+
 @dataclass(frozen=True, kw_only=True)
 class _TransformerConfig(EncoderConfig):
     family: ClassVar[str]
@@ -128,21 +147,11 @@ class _TransformerConfig(EncoderConfig):
     """Pixels of the image per feature: the image is resized until one patch covers that many."""
 
     def __post_init__(self) -> None:
-        if self.layer == 0:
-            raise ConfigError("layer: 0 is no block; allowed are 1, 2 ... from the first and -1, -2 ... from the last")
+        _check_layer(self.layer)
         at_least("stride", self.stride, 1)
 
     def needs(self) -> tuple[Need, ...]:
-        needs = []
-        if importlib.util.find_spec("transformers") is None:
-            ships = "or choose an encoder that ships: --semantic.encoder bundled-semantic"
-            needs.append(Need("the package transformers", f"pip install 'fprf[encoders]', {ships}"))
-        home = os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface"
-        hub = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub")
-        cached = any(hub.glob(f"models--{self.model.replace('/', '--')}/snapshots/*/config.json"))
-        if not cached and not (Path(self.model) / "config.json").is_file():
-            needs.append(Need(f"the model {self.model}", f"hf download {self.model}", downloaded=True))
-        return tuple(needs)
+        return _hub_needs(self.model)
 
     def build(self) -> Encoder:
         from .vit import build_vit
@@ -161,13 +170,38 @@ class DinoConfig(_TransformerConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dinov2Config(_TransformerConfig):
-    """DINOv2: the successor, with steadier semantics. Needs the extra `encoders`."""
+class Dinov2Config(EncoderConfig):
+    """DINOv2: a self-supervised vision transformer, DINO's successor. The small one ships; others need the extra `encoders`."""
 
-    family: ClassVar[str] = "dinov2"
+    model: str | None = None
+    """A model of the Hugging Face hub, for example facebook/dinov2-base, or a folder that holds one; none = the small one that
+    ships, blocks 1 to 11."""
+    layer: int = 9
+    """Block whose features are taken, from 1; negative counts from the last."""
+    features: Literal["tokens", "keys"] = "tokens"
+    """The block's output, or the keys of its attention. A model of the hub gives tokens, which pass its final norm."""
+    stride: int | None = None
+    """Pixels of the image per feature: the image is resized until one patch covers that many. none = 22 features along its
+    longer side, whatever its size."""
 
-    model: str = "facebook/dinov2-small"
-    """A model of the Hugging Face hub, or a folder that holds one."""
+    def __post_init__(self) -> None:
+        _check_layer(self.layer)
+        if self.stride is not None:
+            at_least("stride", self.stride, 1)
+        if self.model is not None and self.features != "tokens":
+            raise ConfigError(f"features: {self.features!r} with the model {self.model}; only the one that ships has keys")
+
+    def needs(self) -> tuple[Need, ...]:
+        return () if self.model is None else _hub_needs(self.model)
+
+    def build(self) -> Encoder:
+        if self.model is None:
+            from .dinov2 import load_dinov2
+
+            return load_dinov2(layer=self.layer, kind=self.features, stride=self.stride)
+        from .vit import build_vit
+
+        return build_vit("dinov2", self.model, layer=self.layer, stride=self.stride)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,7 +336,7 @@ class AveragedConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ConcatConfig(EncoderConfig):
-    """Two or three encoders side by side, each of unit length times its weight, at the finest one's stride."""
+    """Two or three encoders side by side, each of unit length times its weight."""
 
     first: EncoderConfig = BundledSemanticConfig()
     """An encoder."""
@@ -312,6 +346,8 @@ class ConcatConfig(EncoderConfig):
     """A third one; none = two."""
     weights: tuple[float, ...] = ()
     """Weight of each, in their order: the root mean square length of its centred features; 1 for those left out."""
+    cells: Literal["finest", "first"] = "finest"
+    """Whose cells the features have: coarser encoders are interpolated, finer ones averaged over them, which steadies them."""
 
     def __post_init__(self) -> None:
         for weight in self.weights:
@@ -324,4 +360,9 @@ class ConcatConfig(EncoderConfig):
         if len(self.weights) > len(parts):
             raise ConfigError(f"weights: {len(self.weights)} for {len(parts)} encoders; give one each at most")
         weights = (*self.weights, *(1.0,) * (len(parts) - len(self.weights)))
-        return build_concat([part.build() for part in parts], weights)
+        return build_concat([part.build() for part in parts], weights, cells=self.cells)
+
+
+SEMANTICS = ConcatConfig(first=Dinov2Config(), second=BundledSemanticConfig(), cells="first")
+"""Semantics by default: what things are, by DINOv2, beside what is steady in any light. Together they find the right region of
+more photographs than either (docs/encoders.md)."""

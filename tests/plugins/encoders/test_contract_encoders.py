@@ -16,6 +16,7 @@ from fprf.plugins.encoders.config import (
     BundledSemanticConfig,
     ConcatConfig,
     DeepLabConfig,
+    Dinov2Config,
     EncoderConfig,
     EspNetConfig,
     MobileNetV2Config,
@@ -41,6 +42,8 @@ ENCODERS: dict[str, tuple[Make, int]] = {
     "deeplab": (lambda folder: DeepLabConfig(weights=deeplab_file(folder)), 16),
     "deeplab-logits": (lambda folder: DeepLabConfig(weights=deeplab_file(folder), layer="logits"), 16),
     "espnet": (lambda folder: EspNetConfig(weights=espnet_file(folder)), 16),
+    "dinov2": (lambda _: Dinov2Config(layer=3, stride=5), 5),
+    "dinov2-keys": (lambda _: Dinov2Config(layer=2, features="keys", stride=20), 20),
     "averaged": (lambda _: AveragedConfig(inner=RandomConfig(stride=4), scales=(1.0, 2.0)), 2),
     "concat": (lambda _: ConcatConfig(first=RandomConfig(stride=8), second=RandomConfig(stride=4, channels=3)), 4),
 }
@@ -99,8 +102,10 @@ def test_identities_differ_with_settings(tmp_path: Path) -> None:
         DeepLabConfig(weights=deeplab_file(tmp_path), layer="logits"), EspNetConfig(weights=espnet_file(tmp_path)),
         EspNetConfig(weights=espnet_file(tmp_path), layer="level3"), AveragedConfig(inner=one), AveragedConfig(inner=two),
         AveragedConfig(inner=one, flip=False), AveragedConfig(inner=one, scales=(1.0, 2.0)),
+        Dinov2Config(layer=3), Dinov2Config(layer=2), Dinov2Config(layer=3, stride=8), Dinov2Config(layer=3, features="keys"),
         ConcatConfig(first=one, second=two), ConcatConfig(first=two, second=one),
-        ConcatConfig(first=one, second=two, weights=(0.5,)), ConcatConfig(first=one, second=two, third=RandomConfig(seed=2)),
+        ConcatConfig(first=one, second=two, cells="first"), ConcatConfig(first=one, second=two, weights=(0.5,)),
+        ConcatConfig(first=one, second=two, third=RandomConfig(seed=2)),
     ]  # fmt: skip
     identities = [config.build().identity for config in configs]
     assert len(set(identities)) == len(configs)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from fprf.errors import WeightsError
-from fprf.plugins.encoders.config import DinoConfig, Dinov2Config, Dinov3Config
+from fprf.plugins.encoders.config import DinoConfig, Dinov2Config, Dinov3Config, EncoderConfig
 from fprf.plugins.encoders.vit import VitEncoder
 from fprf.testing import check_encoder
 
@@ -47,10 +47,10 @@ def test_tokens_lie_where_their_patch_is() -> None:
     torch.testing.assert_close(stand_in(4)(image), expected)
 
 
-@pytest.mark.parametrize("config", [DinoConfig(), Dinov2Config(), Dinov3Config()])
-def test_without_transformers_one_line_says_what_to_do(config: DinoConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("config", [DinoConfig(), Dinov2Config(model="facebook/dinov2-small"), Dinov3Config()])
+def test_without_transformers_one_line_says_what_to_do(config: EncoderConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(WeightsError, match=r"pip install 'fprf\[encoders\]'.*bundled-semantic"):
+    with pytest.raises(WeightsError, match=r"pip install 'fprf\[encoders\]'.*--semantic.encoder dinov2"):
         config.build()
 
 
@@ -69,14 +69,14 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"dino": folder / "dino", "dinov2": folder / "v2", "dinov3": folder / "v3"}
 
 
-KINDS: dict[str, type[DinoConfig]] = {"dino": DinoConfig, "dinov2": Dinov2Config, "dinov3": Dinov3Config}
+KINDS: dict[str, type[DinoConfig] | type[Dinov2Config]] = {"dino": DinoConfig, "dinov2": Dinov2Config, "dinov3": Dinov3Config}
 
 
 @pytest.mark.parametrize("family", KINDS)
 def test_real_models(models: dict[str, Path], family: str) -> None:
     folder, kind = str(models[family]), KINDS[family]
     image = torch.rand(2, 3, 45, 70)
-    last, third, second = (kind(model=folder, layer=layer).build() for layer in (-1, 3, 2))
+    last, third, second = (kind(model=folder, layer=layer, stride=8).build() for layer in (-1, 3, 2))
     assert last(image).shape == (2, 32, 6, 9)
     assert last.identity == third.identity != second.identity
     assert torch.equal(last(image), third(image))
@@ -90,7 +90,7 @@ def test_real_models(models: dict[str, Path], family: str) -> None:
 
 @pytest.mark.parametrize("family", KINDS)
 def test_real_models_keep_to_the_contract(models: dict[str, Path], family: str) -> None:
-    check_encoder(KINDS[family](model=str(models[family])))
+    check_encoder(KINDS[family](model=str(models[family]), layer=-1))
 
 
 @pytest.mark.parametrize(("family", "other"), [("dino", "dinov3"), ("dinov2", "dino"), ("dinov3", "dinov2")])
