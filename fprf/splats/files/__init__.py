@@ -104,8 +104,8 @@ def _check_shape(capture: Capture) -> None:
             continue
         if not (axis % np.float32(step)).any():  # positions that were float64 have further digits
             raise DataError(
-                f"{capture.path}: lies {away:.2g} from 0, where float32 has steps of {step:.2g}, too coarse for its shape; export "
-                "it closer to the origin, or with float64 positions"
+                f"{capture.path}: lies {away:.2g} from 0, where float32 has steps of {step:.2g}, too coarse for its "
+                "shape; export it closer to the origin, or with float64 positions"
             )
 
 
