@@ -12,10 +12,12 @@ from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.plugin_checks import check_stylizer
+from .colours import own_colours
 from .config import NO_MASK, Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength
 from .controls import allowed_references
 from .dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
 from .files import StyleFile, check_photographs, read_style
+from .light import light_of
 from .look import Restyle
 from .matching import scores, unit
 from .references import Encoders, encode_photograph
@@ -82,16 +84,22 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
     partly = bool((controls.strength != 1).any())
     weight = RegionWeight(scene, controls.strength[:, None]).to(device) if partly else None
 
-    def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
+    def look(allowed: Annotated[Tensor, "K references"], pinned: Annotated[Tensor, "K"]) -> Restyle:
         stylizer = regional(dictionary, scene, allowed, chosen)
         check_stylizer(chosen, stylizer, dictionary, scene)
         stylizer = stylizer.to(device)
         colours = here.colour_maps(stylizer, dictionary, scene, chosen, allowed)
         moved = None if colours is None else colours.to(device)
-        return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance)
+        light = None
+        if chosen.light and style.bold < 1:
+            table = stylizer.region_match(scene.keys.to(device))
+            own = own_colours(stylizer, scene, here.decoder)
+            light = light_of(scene, dictionary, table, own, bold=style.bold, allowed=allowed, pinned=pinned)
+            light = None if light is None else light.to(device)
+        return Restyle(stylizer, style.strength, weight, chosen.features, moved, light, style.luminance)
 
-    places = tuple((place, look(allowed)) for place, allowed in controls.places)
-    mine = replace(look(controls.allowed), places=places)
+    places = tuple((place, look(allowed, torch.ones_like(controls.pinned))) for place, allowed in controls.places)
+    mine = replace(look(controls.allowed, controls.pinned), places=places)
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
     return Styled(mine, dictionary, scene, codes, controls)
 
@@ -157,6 +165,8 @@ class RegionControls(NamedTuple):
     regions: Regions
     notes: tuple[str, ...]
     """A line for each thing that the user may not expect."""
+    pinned: Annotated[Tensor, "K"]
+    """Regions that somebody has chosen a reference for, bool."""
     places: tuple[tuple[Place, Annotated[Tensor, "K references"]], ...]
     """References that each region may take from in places, each over those before it."""
 
@@ -219,7 +229,9 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         region_strength=tuple(f"{book.name(f)}={value:g}" for f, value in strengths),
     )
     file = StyleFile(saved, book.keys, regions.views.semantic_encoder)
-    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)), tuple(places))
+    chosen = torch.zeros(len(allowed), dtype=torch.bool)
+    chosen[list(pinned)] = True
+    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)), chosen, tuple(places))
 
 
 class _Book:
