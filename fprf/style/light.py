@@ -9,15 +9,15 @@ of their luma. A gain of light is a product, in linear light and, but for the bl
 
 - Exposure: what all regions agree on, and a quarter of what the region's own match says: a night is dark for what it does not
   show. The sky is a source of light and no thing; it changes more than what it lights, so smooth regions follow their match.
-- White balance: the cast that regions and their matches agree on as far as these are sure, else the cast that all codes of
-  the references share (`shared`). A sunset is warm in sky, road and tree: that is light. A meadow with a blue sky and a red
-  barn shares nothing: that is material.
+- White balance: the cast that all codes of the references share (`shared`), less that of the scene. A sunset is warm in sky,
+  road and tree: that is light. A meadow with a blue sky and a red barn shares nothing: that is material.
 
-A point of confidence p takes p paint(c) + (1 - p) light(c) + 4 p (1 - p) u_k. On the way from blue to yellow the mean of both is
-greenish: u_k takes the green out of the middle where the two are opposite along red and blue.
+A point of confidence p takes p paint(c) + (1 - p) light(c) + 4 p (1 - p) u_k. On the way from blue to yellow lies green: u_k
+takes it out of the middle where both are opposite along red and blue.
 
-Confidence is about the share of right matches among equally good ones, `benchmarks/match_confidence.py`. Scores count in units of the spread of
-cosines between the scene's own regions, which differs between encoders as the scores of unlike things do.
+Confidence is the rate at which matches of that score are right where a right one is as likely as none, on painted pairs of
+photographs (`benchmarks/match_confidence.py`). Scores count in spreads of the cosines between the scene's own regions: encoders
+differ in these as they do in the scores of unlike things.
 """
 
 from typing import Annotated, NamedTuple
@@ -28,10 +28,10 @@ from torch import Tensor, nn
 from ..ops.precision import double
 from .controls import luma
 from .dictionary import StyleDictionary, code_odds
-from .matching import score_spread, unit
+from .matching import score_spread, share_mean, unit
 from .scene import Membership, SceneStyle
 
-UNSURE, SURE = 0.3, 1.7
+UNSURE, SURE = 0.1, 1.3
 """Scores, in spreads of the scene's own regions, up to which a match counts nothing and from which on it counts wholly."""
 _NEAREST = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
@@ -71,9 +71,11 @@ class Light(nn.Module):
     bias: Annotated[Tensor, "K 3"]
     between: Annotated[Tensor, "K 3"]
     keys: Annotated[Tensor, "T D"]
+    beyond: Annotated[Tensor, "T"]
+    middles: Annotated[Tensor, "references D"]
     share: Annotated[Tensor, "T"]
     reference: Annotated[Tensor, "T"]
-    forbidden: Annotated[Tensor, "K T"]
+    forbidden: Annotated[Tensor, "K references"]
     regions: Annotated[Tensor, "K 1"]
     pinned: Annotated[Tensor, "K 1"]
 
@@ -83,34 +85,47 @@ class Light(nn.Module):
         dictionary: StyleDictionary,
         maps: LightMaps,
         bold: float,
-        forbidden: Annotated[Tensor, "K T"],
+        regions: Annotated[Tensor, "K"],
+        allowed: Annotated[Tensor, "K references"],
         pinned: Annotated[Tensor, "K"],
     ) -> None:
         super().__init__()
         self.membership, self.bold, self._spread = Membership(scene), bold, _spread(scene)
-        self._restricted, self._pinned = bool(forbidden.any()), bool(pinned.any())
+        self._restricted, self._pinned = not bool(allowed.all()), bool(pinned.any())
         # The identity is taken out, as in ColourMaps.
         self.register_buffer("matrix", (maps.matrix - torch.eye(3).to(maps.matrix)).float())
         self.register_buffer("bias", maps.bias.float())
         self.register_buffer("between", maps.between.float())
-        self.register_buffer("keys", unit(dictionary.keys, scene.semantic_mean).float())
+        self.register_buffer("keys", dictionary.keys.float())
+        self.register_buffer("beyond", _beyond(dictionary).float())
+        self.register_buffer("middles", _middles(scene, dictionary).float())
         self.register_buffer("share", dictionary.share.float())
         self.register_buffer("reference", dictionary.reference)
-        self.register_buffer("forbidden", forbidden.float())
-        self.register_buffer("regions", likeness(scene, dictionary, forbidden).float()[:, None])
+        self.register_buffer("forbidden", (~allowed).float())
+        self.register_buffer("regions", regions.float()[:, None])
         self.register_buffer("pinned", pinned.float()[:, None])
 
     def confidence(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
     ) -> Annotated[Tensor, "N 1"]:
-        """How sure points are of their match, in [0, 1]: by themselves and by their regions, half each; 1 where pinned."""
+        """How sure points are of their match, in [0, 1]; 1 where pinned."""
         belongs = self._belongs(semantic, belongs)
-        cosine = unit(semantic.to(self.keys), self.membership.centre) @ self.keys.T
-        if self._restricted:
-            cosine = cosine - 2 * (belongs @ self.forbidden)
-        own = nearest_mean(cosine, self.share, self.reference)[:, None]
-        sure = certainty((own + belongs @ self.regions) / 2, self._spread)
+        sure = certainty(self.score(semantic, belongs))
         return torch.maximum(sure, belongs @ self.pinned) if self._pinned else sure
+
+    def score(
+        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+    ) -> Annotated[Tensor, "N 1"]:
+        """Likeness of points to their nearest codes and of their regions to those that they take, half each, in spreads."""
+        belongs, points = self._belongs(semantic, belongs), semantic.to(self.keys)
+        own = points.new_full((len(points),), -1.0)
+        for i, middle in enumerate(self.middles):
+            codes = (self.reference == i).nonzero().squeeze(1)
+            near = cosines(points, self.keys[codes], self.beyond[codes], self.membership.centre, middle)
+            if self._restricted:  # of references that are forbidden to their regions, points know nothing
+                near = near - 2 * (belongs @ self.forbidden[:, i, None])
+            own = torch.maximum(own, nearest_mean(near, self.share[codes]))
+        return (own[:, None] / self._spread + belongs @ self.regions) / 2
 
     def paint(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
@@ -165,41 +180,72 @@ def light_of(
     """
     if bold == 1 or len(scene.share) == 1 or dictionary.colour_mean is None:
         return None
-    forbidden = torch.zeros(len(scene.share), len(dictionary.keys), dtype=torch.bool)
-    if allowed is not None:
-        forbidden = ~allowed.cpu()[:, dictionary.reference]
-    fixed = torch.zeros(len(scene.share), dtype=torch.bool) if pinned is None else pinned.cpu()
-    sure = certainty(likeness(scene, dictionary, forbidden), _spread(scene)).maximum(double(fixed))
+    count, table = len(scene.share), double(table).cpu()
+    every = torch.ones(count, len(dictionary.names), dtype=torch.bool) if allowed is None else allowed.cpu()
+    fixed = torch.zeros(count, dtype=torch.bool) if pinned is None else pinned.cpu()
+    scores = region_scores(scene, dictionary, table)
     mean, covariance = (double(part).cpu() for part in colours)
-    maps = light_maps(mean, covariance, double(scene.share), double(table).cpu(), dictionary, sure)
-    return Light(scene, dictionary, maps, bold, forbidden, fixed)
+    sure = certainty(scores).maximum(double(fixed))
+    maps = light_maps(mean, covariance, double(scene.share), table, dictionary, sure)
+    return Light(scene, dictionary, maps, bold, scores, every, fixed)
 
 
-def nearest_mean(
-    cosine: Annotated[Tensor, "N T"], share: Annotated[Tensor, "T"], reference: Annotated[Tensor, "T"]
-) -> Annotated[Tensor, "N"]:
-    """Mean cosine with the nearest twentieth of a reference's pixels; of several references the largest."""
-    best = cosine.new_full((len(cosine),), -1.0)
-    for i in reference.unique().tolist():
-        codes = (reference == i).nonzero().squeeze(1)
-        near, order = cosine[:, codes].sort(1, descending=True)
-        size = share[codes][order]
-        taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
-        best = torch.maximum(best, (taken * near).sum(1) / taken.sum(1))
-    return best
+def cosines(
+    x: Annotated[Tensor, "N D"],
+    keys: Annotated[Tensor, "T D"],
+    beyond: Annotated[Tensor, "T"],
+    centre: Annotated[Tensor, "D"],
+    middle: Annotated[Tensor, "D"],
+) -> Annotated[Tensor, "N T"]:
+    """The lesser of the cosines seen from the scene's mean and from the middle between scene and reference.
+
+    In a room all of a meadow lies in one direction from the mean, and from the middle all of the room does. What codes have
+    `beyond` the basis of the scene (squared length) is at right angles to all that the scene has.
+    """
+
+    def seen(at: Tensor) -> Tensor:
+        length = (keys - at).square().sum(1)
+        shown = (length / (length + beyond).clamp_min(torch.finfo(length.dtype).tiny)).sqrt()
+        return unit(x, at) @ unit(keys, at).T * shown
+
+    return torch.minimum(seen(centre), seen(middle))
 
 
-def likeness(
-    scene: SceneStyle, dictionary: StyleDictionary, forbidden: Annotated[Tensor, "K T"]
-) -> Annotated[Tensor, "K"]:
-    """`nearest_mean` of the regions' keys, float64, seen from the scene's mean."""
-    cosine = double(unit(scene.keys, scene.semantic_mean)) @ double(unit(dictionary.keys, scene.semantic_mean)).T
-    return nearest_mean(cosine - 2 * double(forbidden), double(dictionary.share), dictionary.reference)
+def nearest_mean(cosine: Annotated[Tensor, "N T"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "N"]:
+    """Mean cosine with the nearest twentieth of a reference's pixels."""
+    near, order = cosine.sort(1, descending=True)
+    size = (share / share.sum())[order]
+    taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
+    return (taken * near).sum(1) / taken.sum(1)
 
 
-def certainty(score: Annotated[Tensor, "..."], spread: float) -> Annotated[Tensor, "..."]:
-    """Confidence in [0, 1] of scores."""
-    return ((score / spread - UNSURE) / (SURE - UNSURE)).clamp(0, 1)
+def region_scores(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
+    """Mean cosine of each region with the codes that it takes, float64, in spreads of the scene's own regions."""
+    own, keys, centre = double(scene.keys), double(dictionary.keys), double(scene.semantic_mean)
+    beyond = double(_beyond(dictionary))
+    total = own.new_zeros(len(own))
+    for i, middle in enumerate(double(_middles(scene, dictionary))):
+        codes = (dictionary.reference == i).nonzero().squeeze(1)
+        total = total + (table[:, codes] * cosines(own, keys[codes], beyond[codes], centre, middle)).sum(1)
+    return total / _spread(scene)
+
+
+def _beyond(dictionary: StyleDictionary) -> Annotated[Tensor, "T"]:
+    return torch.zeros_like(dictionary.share) if dictionary.beyond is None else dictionary.beyond
+
+
+def _middles(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor, "references D"]:
+    """Centre between the scene's mean and that of each reference."""
+    rows = []
+    for i in range(len(dictionary.names)):
+        own = dictionary.reference == i
+        rows.append((scene.semantic_mean + share_mean(dictionary.keys[own], dictionary.share[own])) / 2)
+    return torch.stack(rows)
+
+
+def certainty(score: Annotated[Tensor, "..."]) -> Annotated[Tensor, "..."]:
+    """Confidence in [0, 1] of scores in spreads."""
+    return ((score - UNSURE) / (SURE - UNSURE)).clamp(0, 1)
 
 
 def light_maps(
@@ -222,15 +268,11 @@ def light_maps(
     change = (luma(wanted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
     thing = torch.lerp(change.new_tensor(agreed(change, vote * (sure + _LEAST_VOTE))), change, _MATCHED)
     gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
-    # White balance: of sure matches what they agree on, of the rest what all codes share and the scene doesn't.
+    # White balance, from the logarithms of colours.
     axes = torch.tensor(_AXES, dtype=torch.float64)
-    tints = [(part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, wanted, codes)]
-    weight, bright = float((vote * sure).sum() / vote.sum()), odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
-    cast = [
-        weight * (agreed(tints[1][:, a] - tints[0][:, a], vote * sure) if weight > 0 else 0.0)
-        + (1 - weight) * (shared(tints[2][:, a], bright) - shared(tints[0][:, a], share))
-        for a in range(len(axes))
-    ]
+    here, there = ((part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, codes))
+    bright = odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
+    cast = [shared(there[:, a], bright) - shared(here[:, a], share) for a in range(len(axes))]
     balance = (torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
     saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
