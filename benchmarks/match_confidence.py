@@ -23,7 +23,7 @@ from fprf.errors import FprfError
 from fprf.interfaces import Encoder
 from fprf.plugins.encoders.config import Dinov2Config, EncoderConfig
 from fprf.plugins.stylizers.config import RegionToneConfig
-from fprf.style.dictionary import Reference, build_dictionary
+from fprf.style.dictionary import Reference, StyleDictionary, build_dictionary
 from fprf.style.light import SURE, UNSURE, certainty, light_of
 from fprf.style.references import semantic_samples
 from fprf.style.scene import scene_style
@@ -57,6 +57,10 @@ def measured_scores(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], l
     here, _, _, kinds = _sampled(triplet.content, triplet.content_regions, encoder, basis)
     there, beyond, colour, shown = _sampled(triplet.style, triplet.style_regions, encoder, basis)
     scene = scene_style(here[:, :3], here, torch.ones(len(here)), None, _REGIONS, 0)
+
+    def match(dictionary: StyleDictionary) -> Tensor:
+        return RegionToneConfig().build(dictionary=dictionary, scene=scene).region_match(scene.keys)
+
     regions, right, wrong = shared_regions(triplet), [], []
     for gone in (None, *regions):
         left = shown != gone if gone is not None else torch.ones_like(shown, dtype=torch.bool)
@@ -65,8 +69,7 @@ def measured_scores(encoder: Encoder, triplet: Triplet) -> tuple[list[Tensor], l
         dictionary = build_dictionary(
             [Reference("style", there[left, :3], there[left], colour=colour[left], beyond=beyond[left])]
         )
-        table = RegionToneConfig().build(dictionary=dictionary, scene=scene).region_match(scene.keys)
-        light = light_of(scene, dictionary, table, (scene.region_mean, scene.region_covariance), bold=0.5)
+        light = light_of(scene, dictionary, match, (scene.region_mean, scene.region_covariance), bold=0.5)
         assert light is not None  # a photograph has several regions
         score = light.score(here)[:, 0]
         if gone is None:

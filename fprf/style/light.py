@@ -20,6 +20,7 @@ photographs (`benchmarks/match_confidence.py`). Scores count in spreads of the c
 differ in these as they do in the scores of unlike things.
 """
 
+from collections.abc import Callable
 from typing import Annotated, NamedTuple
 
 import torch
@@ -27,11 +28,11 @@ from torch import Tensor, nn
 
 from ..ops.precision import double
 from .controls import luma
-from .dictionary import StyleDictionary, code_odds
+from .dictionary import StyleDictionary, choose, code_odds
 from .matching import score_spread, share_mean, unit
 from .scene import Membership, SceneStyle
 
-UNSURE, SURE = 0.1, 1.3
+UNSURE, SURE = 0.0, 1.3
 """Scores, in spreads of the scene's own regions, up to which a match counts nothing and from which on it counts wholly."""
 _NEAREST = 0.05
 """Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
@@ -77,7 +78,6 @@ class Light(nn.Module):
     reference: Annotated[Tensor, "T"]
     forbidden: Annotated[Tensor, "K references"]
     regions: Annotated[Tensor, "K 1"]
-    pinned: Annotated[Tensor, "K 1"]
 
     def __init__(
         self,
@@ -87,11 +87,10 @@ class Light(nn.Module):
         bold: float,
         regions: Annotated[Tensor, "K"],
         allowed: Annotated[Tensor, "K references"],
-        pinned: Annotated[Tensor, "K"],
     ) -> None:
         super().__init__()
         self.membership, self.bold, self._spread = Membership(scene), bold, _spread(scene)
-        self._restricted, self._pinned = not bool(allowed.all()), bool(pinned.any())
+        self._restricted = not bool(allowed.all())
         # The identity is taken out, as in ColourMaps.
         self.register_buffer("matrix", (maps.matrix - torch.eye(3).to(maps.matrix)).float())
         self.register_buffer("bias", maps.bias.float())
@@ -103,15 +102,12 @@ class Light(nn.Module):
         self.register_buffer("reference", dictionary.reference)
         self.register_buffer("forbidden", (~allowed).float())
         self.register_buffer("regions", regions.float()[:, None])
-        self.register_buffer("pinned", pinned.float()[:, None])
 
     def confidence(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
     ) -> Annotated[Tensor, "N 1"]:
-        """How sure points are of their match, in [0, 1]; 1 where pinned."""
-        belongs = self._belongs(semantic, belongs)
-        sure = certainty(self.score(semantic, belongs))
-        return torch.maximum(sure, belongs @ self.pinned) if self._pinned else sure
+        """How sure points are of their match, in [0, 1]."""
+        return certainty(self.score(semantic, belongs))
 
     def score(
         self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
@@ -166,28 +162,33 @@ class Light(nn.Module):
 def light_of(
     scene: SceneStyle,
     dictionary: StyleDictionary,
-    table: Annotated[Tensor, "K T"],
+    match: Callable[[StyleDictionary], Annotated[Tensor, "K T"]],
     colours: tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]],
     *,
     bold: float,
     allowed: Annotated[Tensor, "K references"] | None = None,
-    pinned: Annotated[Tensor, "K"] | None = None,
 ) -> Light | None:
-    """The light of references on a scene; None where all is painted (`bold` 1), or nothing tells regions or colours.
+    """The light of references on a scene; None where all is painted (`bold` 1), or nothing tells regions or colours apart.
 
-    `table` holds the share of each code in each region, `colours` mean and covariance of the regions' own colours. Regions that
-    are `pinned` (bool) are sure.
+    `match` gives the share of each code of a dictionary in each region, `colours` are mean and covariance of the regions' own
+    colours. A region that may not take from all references is lit as if there were only those that it may take from.
     """
     if bold == 1 or len(scene.share) == 1 or dictionary.colour_mean is None:
         return None
-    count, table = len(scene.share), double(table).cpu()
+    count = len(scene.share)
     every = torch.ones(count, len(dictionary.names), dtype=torch.bool) if allowed is None else allowed.cpu()
-    fixed = torch.zeros(count, dtype=torch.bool) if pinned is None else pinned.cpu()
-    scores = region_scores(scene, dictionary, table)
     mean, covariance = (double(part).cpu() for part in colours)
-    sure = certainty(scores).maximum(double(fixed))
-    maps = light_maps(mean, covariance, double(scene.share), table, dictionary, sure)
-    return Light(scene, dictionary, maps, bold, scores, every, fixed)
+    scores = mean.new_zeros(count)
+    maps = LightMaps(mean.new_zeros(count, 3, 3), torch.zeros_like(mean), torch.zeros_like(mean))
+    for chosen in every.unique(dim=0):
+        part, rows = choose(dictionary, chosen)[0], (every == chosen).all(1)
+        table = double(match(part)).cpu()
+        found = region_scores(scene, part, table)
+        scores[rows] = found[rows]
+        made = light_maps(mean, covariance, double(scene.share), table, part, certainty(found))
+        for whole, own in zip(maps, made, strict=True):
+            whole[rows] = own[rows]
+    return Light(scene, dictionary, maps, bold, scores, every)
 
 
 def cosines(

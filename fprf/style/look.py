@@ -38,11 +38,11 @@ class Restyle:
     """Share of the stylizer's change of features at full strength."""
     colours: ColourMaps | None = None
     """Change of colours behind the decoder at full strength; None = none."""
+    luminance: float = 0.0
+    """Share of the scene's own luminance that is kept."""
     light: Light | None = None
     """What points take, as far as they are not sure of their match, instead of all that the stylizer and `colours` do; None =
     all are sure."""
-    luminance: float = 0.0
-    """Share of the scene's own luminance that is kept."""
     share: float = 1.0
     """Its part of the mix; those of all parts sum to 1."""
     places: tuple[tuple[Place, "Restyle"], ...] = ()

@@ -84,7 +84,7 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
     partly = bool((controls.strength != 1).any())
     weight = RegionWeight(scene, controls.strength[:, None]).to(device) if partly else None
 
-    def look(allowed: Annotated[Tensor, "K references"], pinned: Annotated[Tensor, "K"]) -> Restyle:
+    def look(allowed: Annotated[Tensor, "K references"]) -> Restyle:
         stylizer = regional(dictionary, scene, allowed, chosen)
         check_stylizer(chosen, stylizer, dictionary, scene)
         stylizer = stylizer.to(device)
@@ -92,14 +92,16 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
         moved = None if colours is None else colours.to(device)
         light = None
         if chosen.light and style.bold < 1:
-            table = stylizer.region_match(scene.keys.to(device))
             own = own_colours(stylizer, scene, here.decoder)
-            light = light_of(scene, dictionary, table, own, bold=style.bold, allowed=allowed, pinned=pinned)
+            light = light_of(scene, dictionary, match, own, bold=style.bold, allowed=allowed)
             light = None if light is None else light.to(device)
-        return Restyle(stylizer, style.strength, weight, chosen.features, moved, light, style.luminance)
+        return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance, light=light)
 
-    places = tuple((place, look(allowed, torch.ones_like(controls.pinned))) for place, allowed in controls.places)
-    mine = replace(look(controls.allowed, controls.pinned), places=places)
+    def match(part: StyleDictionary) -> Annotated[Tensor, "K T"]:
+        return chosen.build(dictionary=part, scene=scene).region_match(scene.keys)
+
+    places = tuple((place, look(allowed)) for place, allowed in controls.places)
+    mine = replace(look(controls.allowed), places=places)
     codes = Codes(dictionary.reference, dictionary.names, unit(dictionary.keys, scene.semantic_mean))
     return Styled(mine, dictionary, scene, codes, controls)
 
@@ -165,8 +167,6 @@ class RegionControls(NamedTuple):
     regions: Regions
     notes: tuple[str, ...]
     """A line for each thing that the user may not expect."""
-    pinned: Annotated[Tensor, "K"]
-    """Regions that somebody has chosen a reference for, bool."""
     places: tuple[tuple[Place, Annotated[Tensor, "K references"]], ...]
     """References that each region may take from in places, each over those before it."""
 
@@ -229,9 +229,7 @@ def region_controls(regions: Regions, dictionary: StyleDictionary, style: StyleC
         region_strength=tuple(f"{book.name(f)}={value:g}" for f, value in strengths),
     )
     file = StyleFile(saved, book.keys, regions.views.semantic_encoder)
-    chosen = torch.zeros(len(allowed), dtype=torch.bool)
-    chosen[list(pinned)] = True
-    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)), chosen, tuple(places))
+    return RegionControls(allowed, strength, score, file, regions, tuple(dict.fromkeys(book.notes)), tuple(places))
 
 
 class _Book:
