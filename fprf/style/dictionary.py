@@ -96,7 +96,7 @@ def build_dictionary(
     _check(references)
     ordered = sorted(references, key=lambda r: (_content_hash(r), r.name, r.weight))
     parts = [_codes(r, clusters, blend, seed, min_members) for r in ordered]
-    names = _TENSORS if any(r.colour is None for r in ordered) else _TENSORS + _COLOURS
+    names: tuple[str, ...] = _TENSORS if any(r.colour is None for r in ordered) else _TENSORS + _COLOURS
     names += () if any(r.beyond is None for r in ordered) else _BEYOND
     tables = {name: torch.cat([part[name] for part in parts]).cpu() for name in names if name != "reference"}
     count = torch.tensor([len(part["keys"]) for part in parts])

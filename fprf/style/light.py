@@ -180,7 +180,8 @@ def light_of(
     mean, covariance = (double(part).cpu() for part in colours)
     scores = mean.new_zeros(count)
     maps = LightMaps(mean.new_zeros(count, 3, 3), torch.zeros_like(mean), torch.zeros_like(mean))
-    for chosen in every.unique(dim=0):
+    for row in sorted({tuple(row) for row in every.tolist()}):
+        chosen = torch.tensor(row)
         part, rows = choose(dictionary, chosen)[0], (every == chosen).all(1)
         table = double(match(part)).cpu()
         found = region_scores(scene, part, table)
