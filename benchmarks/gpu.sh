@@ -6,8 +6,8 @@
 #                     [-- FLAGS OF fprf train]
 #   benchmarks/gpu.sh --dry            the same steps on a CPU, at a tiny size, on the embedded scene
 #
-# --scene is an LLFF capture. Semantics are those of the bundled encoder, which needs no download; name another after the `--`,
-# for example -- --semantic.encoder dino --semantic.encoder.model FOLDER
+# --scene is an LLFF capture. Semantics are those of the method, which need no download; name others after the `--`, for example
+# -- --semantic.encoder dino --semantic.encoder.model FOLDER
 # --long also trains that many steps (30000 in the paper) and compares; it can take an hour.
 #
 # A step that fails or takes too long is reported and the others go on; the exit status is then 1. Nothing is downloaded or
@@ -61,7 +61,6 @@ else
     time=(--minutes "$minutes") again=(--steps "$long")
     size=(--rays 762048 --repeats 5) points=(--points 262144)
     tests+=(-k "not pretended" "$root/tests/test_gpu.py" "$root/tests/ops/test_triplane_triton.py")
-    case " $* " in *" --semantic.encoder "*) ;; *) set -- --semantic.encoder bundled-semantic "$@" ;; esac
 fi
 
 # step NAME SECONDS COMMAND...: run it, note its exit status, print the end of its log where it failed.

@@ -98,7 +98,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     import torch
 
     from fprf.memory import peak
-    from fprf.plugins.encoders.config import BundledSemanticConfig
+    from fprf.plugins.encoders.config import SEMANTICS
     from fprf.plugins.stylizers.config import RegionToneConfig
     from fprf.splats.config import LookConfig
     from fprf.splats.files import read_capture, write_capture
@@ -111,7 +111,7 @@ def measured(path: Path, references: list[Path]) -> dict[str, Any]:
     start = time.process_time()
     capture = read_capture(path)
     read = time.process_time() - start
-    encoder = BundledSemanticConfig().build()
+    encoder = SEMANTICS.build()
     with tempfile.TemporaryDirectory() as folder:  # compiles
         made_up(Path(folder) / "x.splat", 2000)
         look_at_capture(read_capture(Path(folder) / "x.splat").gaussians, False, encoder, LookConfig(views=1, size=(64, 48)))

@@ -10,7 +10,7 @@ from .errors import ConfigError, UsageError
 from .fields.config import ContentFieldConfig, PlanesConfig, SemanticFieldConfig, SemanticPlanesConfig
 from .fields.layouts import LayoutConfig, SingleConfig
 from .plugins.decoders.config import DecoderConfig, MlpDecoderConfig
-from .plugins.encoders.config import DinoConfig, EncoderConfig, Vgg19Config
+from .plugins.encoders.config import SEMANTICS, EncoderConfig, Vgg19Config
 from .plugins.executors.config import ExecutorConfig, SerialConfig
 from .plugins.losses.config import LossTermConfig
 from .plugins.samplers.config import ProposalConfig, SamplerConfig
@@ -42,7 +42,7 @@ class ContentConfig:
 class SemanticConfig:
     """The semantic field: what finds the fitting reference."""
 
-    encoder: EncoderConfig | None = DinoConfig()
+    encoder: EncoderConfig | None = SEMANTICS
     """Encoder whose features the semantic field learns; none = no semantics, global styles alone."""
     field: SemanticFieldConfig = SemanticPlanesConfig()
     """Representation of the semantics."""

@@ -4,13 +4,13 @@ from .config import ContentConfig, LossConfig, OptimizerConfig, RenderConfig, Se
 from .datamanagers.config import RayBatchesConfig
 from .fields.config import PlanesConfig, SemanticPlanesConfig
 from .plugins.decoders.config import MlpDecoderConfig
-from .plugins.encoders.config import BundledContentConfig, BundledSemanticConfig
+from .plugins.encoders.config import BundledContentConfig
 from .plugins.samplers.config import ProposalConfig
 from .splats.config import GaussiansConfig
 
 
 def fprf() -> TrainConfig:
-    """The paper's sizes: VGG-19 relu2_1 content, DINO semantics, tri-planes 64 to 512, 256 + 128 + 48 samples.
+    """The paper's sizes: VGG-19 relu2_1 content, DINOv2 semantics, tri-planes 64 to 512, 256 + 128 + 48 samples.
 
     As in the paper it learns from pixels alone. Where exposures differ, `--tones none` learns them; with few photographs,
     `--datamanager.depth-share 0.25` asks a quarter of the rays to end at sparse points, as `fprf-lite` does with its rays.
@@ -27,7 +27,7 @@ def fprf_lite() -> TrainConfig:
         datamanager=RayBatchesConfig(rays=2048, semantic_share=0.25),
         sampler=ProposalConfig(samples=(48,), final=14, resolutions=(128,), anneal_steps=500),
         content=ContentConfig(encoder=BundledContentConfig(), field=_LITE_PLANES, moves_density=False),
-        semantic=SemanticConfig(encoder=BundledSemanticConfig(), field=_LEAN_SEMANTICS, dim=32, samples=2),
+        semantic=SemanticConfig(field=_LEAN_SEMANTICS, dim=32, samples=2),
         # At twice this rate fox diverged after 450 steps (24.8 -> 17.7 dB); it must fall with the steps, not the minutes.
         optimizer=OptimizerConfig(rate=1e-2, final=0.05, warm_up=100, hold=500),
         # Strong smoothing: few rays and steps must not leave floaters before cameras (fox, one minute: 21.5 -> 27.1 dB). With

@@ -14,7 +14,7 @@ from fprf.fields.config import PlanesConfig
 from fprf.methods import fprf
 from fprf.plugins import registry
 from fprf.plugins.codec import from_json, load_config, save_config, to_json
-from fprf.plugins.encoders.config import DinoConfig, Vgg19Config
+from fprf.plugins.encoders.config import SEMANTICS, Vgg19Config
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.plugins.slots import replace, slots
 from fprf.testing import check_config
@@ -84,5 +84,5 @@ def test_the_papers_method_has_the_papers_sizes() -> None:
     field, sampler = config.content.field, config.sampler
     assert isinstance(field, PlanesConfig) and field.resolutions == (64, 128, 256, 512)
     assert isinstance(sampler, ProposalConfig) and (*sampler.samples, sampler.final) == (256, 128, 48)
-    assert config.content.encoder == Vgg19Config(layer="relu2_1") and isinstance(config.semantic.encoder, DinoConfig)
+    assert config.content.encoder == Vgg19Config(layer="relu2_1") and config.semantic.encoder == SEMANTICS
     assert config.render.train_budget == 0 and config.content.moves_density

@@ -17,6 +17,7 @@ from fprf.fields.config import PlanesConfig, SemanticPlanesConfig
 from fprf.interfaces import DataManager
 from fprf.io.images import write_image
 from fprf.methods import fprf_lite
+from fprf.plugins.encoders.config import BundledSemanticConfig
 from fprf.plugins.samplers.config import ProposalConfig
 from fprf.rendering.cameras import PixelRays
 from fprf.town.write import write_town
@@ -91,7 +92,12 @@ def tiny(data: Path, output: Path) -> TrainConfig:
         datamanager=RayBatchesConfig(rays=256, semantic_share=0.5),
         sampler=ProposalConfig(samples=(16,), final=8, resolutions=(8,), anneal_steps=10),
         content=replace(lite.content, field=PlanesConfig(resolutions=(8, 16), channels=8, hidden=32, layers=1)),
-        semantic=replace(lite.semantic, field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1), dim=8),
+        semantic=replace(
+            lite.semantic,
+            encoder=BundledSemanticConfig(),  # the quickest one that ships
+            field=SemanticPlanesConfig(resolutions=(8,), channels=8, hidden=16, layers=1),
+            dim=8,
+        ),
         loss=replace(lite.loss, penalty_every=2),
         optimizer=replace(lite.optimizer, warm_up=5),
         statistics=StatisticsConfig(rays=2048, regions=4),
@@ -105,7 +111,7 @@ def flags(world: World, output: Path) -> list[str]:
         --sampler.anneal-steps 10 --content.field.resolutions 8 16 --content.field.channels 8 --content.field.hidden 32
         --content.field.layers 1 --semantic.field.resolutions 8 --semantic.field.channels 8 --semantic.field.hidden 16
         --semantic.field.layers 1 --semantic.dim 8 --loss.penalty-every 2 --optimizer.warm-up 5 --statistics.rays 2048
-        --statistics.regions 4"""
+        --statistics.regions 4 --semantic.encoder bundled-semantic"""
     return ["--data", str(world.town), "--output", str(output), *words.split()]
 
 

@@ -219,7 +219,7 @@ def peer_page(document: Mapping[str, Any]) -> str:
         lines.append(f"| {label} | {'–' if value is None else format(value, form)} |")
     for key, label in _PUBLISHED:
         published = document["published"] and document["published"][key]
-        for figure, name, form in (("rmse", "RMSE", ".4f"), ("e_warp", "E_warp", ".2e")):
+        for figure, name, form in (("lpips", "LPIPS", ".4f"), ("rmse", "RMSE", ".4f"), ("e_warp", "E_warp", ".2e")):
             value = None if not published else published[figure]
             lines.append(f"| as others report it: {name} ({label}) | {'–' if value is None else format(value, form)} |")
     if document["missing"]:

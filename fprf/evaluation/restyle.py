@@ -431,7 +431,8 @@ the street and its sky.
   loses; 0 = as steady and sharp as the unstylised render (`fprf/evaluation/consistency.py`).
 - **style s**: to make the style of the references, once. **view s**: to colour a view whose geometry is there (for `reinhard`,
   `histogram` and `2d`: a rendered picture).
-- **LPIPS** is not given (null in the JSON): its weights do not ship with the package, and no dependency brings them.
+- **LPIPS**: AlexNet, version 0.1, to the truth; less is nearer. The JSON also has consistency as other papers report it
+  (`short_lpips`, `short_rmse`, `long_lpips`, `long_rmse`: `published` in `fprf/evaluation/consistency.py`).
 - **2d** is the recommended stylizer on each picture alone, with the picture's own statistics and regions.
 - **true classes** is no method: it knows the classes, and carries the colours of each to those of the same class in the
   references, as a perfect match would.

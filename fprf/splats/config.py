@@ -8,7 +8,7 @@ from ..checks import at_least, between, positive
 from ..config import RunConfig
 from ..datamanagers.parsers.config import DataParserConfig
 from ..errors import ConfigError
-from ..plugins.encoders.config import BundledSemanticConfig, EncoderConfig
+from ..plugins.encoders.config import SEMANTICS, EncoderConfig
 from ..plugins.executors.config import ExecutorConfig, SerialConfig
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class GaussianSemanticsConfig:
     """Semantics of Gaussians: features of rendered views, carried back to what they show. Nothing is trained for them."""
 
-    encoder: EncoderConfig = BundledSemanticConfig()
+    encoder: EncoderConfig = SEMANTICS
     """Encoder whose features find the fitting reference."""
 
 
@@ -107,7 +107,7 @@ class GaussiansConfig(RunConfig):
     """Semantic regions of the scene (with 16, 24, 32 of them 89, 91, 91 % of the town's pixels take from the right class)."""
     semantic_size: int = 240
     """Longest side in pixels, at most, of the views that semantics are found in and of references as they are encoded: at 240
-    the bundled encoder tells things apart best (docs/train-gaussians.md); encoders with large patches may want more."""
+    the bundled encoder tells things apart best (docs/train-gaussians.md)."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind everything, also where images have transparency."""
 

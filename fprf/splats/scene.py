@@ -46,6 +46,8 @@ _SOLID = 0.5
 """Pixels and cells less opaque than this say nothing about the scene."""
 _BACKDROPS = (1.0, 0.0)
 """Greys behind a capture where it is encoded; features are the mean, so that none of them decides what a single thing is."""
+_OPAQUE = 0.005
+"""Mean transparency of a view up to which its backdrop decides nothing."""
 _TRUST = 4.0
 """Pixels count by this power of their opacity: a soft edge would carry the backdrop's semantics."""
 _SAMPLES = 65_536
@@ -298,7 +300,9 @@ def find_semantics(
         drawn = draw(gaussians.select(seen_by(gaussians, camera)), camera, antialiased=antialiased)
         pictures.append((drawn.image, drawn.opacity))
         behind = (1 - drawn.opacity)[..., None]
-        filled = torch.stack([drawn.image + behind * grey for grey in _BACKDROPS]).clamp(0, 1)
+        # Where nothing shows through, all backdrops give one picture, and encoders take most of the time.
+        backdrops = _BACKDROPS if float(behind.mean()) > _OPAQUE else _BACKDROPS[:1]
+        filled = torch.stack([drawn.image + behind * grey for grey in backdrops]).clamp(0, 1)
         maps = encoder(filled.permute(0, 3, 1, 2)).float().mean(0)
         cover = torch.nn.functional.interpolate(drawn.opacity[None, None], maps.shape[1:], mode="area")[0, 0]
         cells.append(maps)

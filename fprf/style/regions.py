@@ -113,7 +113,8 @@ def _like(regions: Regions, name: str) -> list[RegionMatch]:
     if regions.basis is None or lengths != {len(regions.basis.mean)} or regions.encoder not in ("", encoder):
         raise UsageError(
             f"region {name!r}: the style file knows it by the semantic encoder {regions.encoder or '(unnamed)'}, the scene has "
-            f"{encoder or 'none'}; name the region by its number or a pixel of a view instead"
+            f"{encoder or 'none'}; name the region by its number or a pixel of a view instead, or choose "
+            "that encoder with --semantic.encoder"
         )
     if len(scene.share) == 1:
         return [RegionMatch(0, name)]

@@ -3,6 +3,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fake_packages import packages_in
 from tiny_world import World
 
 from fprf.cli.doctor import Finding, machine, method_needs, run, run_folder, scene_folder
@@ -59,17 +60,30 @@ def test_scene_folders(world: World, capsys: pytest.CaptureFixture[str]) -> None
     assert run(["--target", str(world.town)]) == 0 and "32 x 24" in capsys.readouterr().out
 
 
+METHOD = """
+from dataclasses import replace
+from fprf.methods import fprf
+from fprf.plugins.encoders.config import DinoConfig
+def m():
+    return replace(fprf(), semantic=replace(fprf().semantic, encoder=DinoConfig()))
+"""
+"""A method with an encoder of the hub."""
+
+
 def test_a_method_says_what_it_needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert run(["fprf-lite"]) == 0 and run(["fprf"]) == 1
-    package, model = (finding for finding in method_needs("fprf") if finding.what == "needs")
-    assert "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
-    assert model.remedy == "hf download facebook/dino-vits8" and model.optional, "it is downloaded where there is a network"
-    snapshot = tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1"
-    snapshot.mkdir(parents=True)
-    (snapshot / "config.json").touch()
-    assert [finding for finding in method_needs("fprf") if finding.what == "needs"] == [package]
+    assert run(["fprf-lite"]) == run(["fprf"]) == 0, "what they need ships"
+    with packages_in(tmp_path) as packages:
+        packages.install("acme-m", {"fprf.methods": {"acme-m": "acme_methods:m"}}, code={"acme_methods": METHOD})
+        assert run(["acme-m"]) == 1
+        package, model = (finding for finding in method_needs("acme-m") if finding.what == "needs")
+        assert "transformers" in package.found and package.remedy.startswith("pip install") and not package.optional
+        assert model.remedy == "hf download facebook/dino-vits8" and model.optional, "it is downloaded where there is a network"
+        snapshot = tmp_path / "models--facebook--dino-vits8" / "snapshots" / "1"
+        snapshot.mkdir(parents=True)
+        (snapshot / "config.json").touch()
+        assert [finding for finding in method_needs("acme-m") if finding.what == "needs"] == [package]
 
 
 def test_the_feature_cache_is_told_and_cleaned(

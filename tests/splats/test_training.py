@@ -25,7 +25,7 @@ from fprf.evaluation.metrics import psnr
 from fprf.io.images import write_image
 from fprf.ops.rasterise import lift
 from fprf.ops.rasterise_training import learn
-from fprf.plugins.encoders.config import BundledSemanticConfig, RandomConfig
+from fprf.plugins.encoders.config import SEMANTICS, RandomConfig
 from fprf.rendering.cameras import Cameras, project
 from fprf.splats import initial, photographs, training
 from fprf.splats.config import GaussiansConfig
@@ -286,7 +286,7 @@ def test_verbs_of_a_run(run: Path, tmp_path: Path) -> None:
     for folder in (run, tmp_path / "other"):
         assert (folder / "checkpoints" / "step-0000040" / "manifest.json").read_bytes() == before
     plain, other = (open_run(folder, "cpu").scene for folder in (run, tmp_path / "other"))
-    assert plain.semantic_encoder == BundledSemanticConfig().build().identity and len(plain.measured()[0].share) > 3
+    assert plain.semantic_encoder == SEMANTICS.build().identity and len(plain.measured()[0].share) > 3
     encoder = RandomConfig(channels=6).build().identity
     assert other.semantic_encoder == other.encoders().semantic.identity == encoder and len(other.measured()[0].share) == 3
     assert main(["train", str(run / "config.json"), "--semantic.encoder", "vgg16", "--semantic.encoder.weights", "no.pth"]) == 2

@@ -7,8 +7,8 @@ image's features depend on the image alone. On photographs the units of nine enc
 An encoder can also be averaged over mirrored and resized images: steadier, and finer where a size is above 1.
 """
 
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
@@ -43,6 +43,7 @@ class AveragedEncoder(FrozenEncoder):
         return features
 
 
+Cells = Literal["finest", "first"]
 DIGITS = 3
 """Of a unit: more would differ between machines, and with them the identity."""
 
@@ -50,24 +51,42 @@ DIGITS = 3
 class ConcatEncoder(FrozenEncoder):
     """`parts` side by side, each divided by its `unit` and multiplied by its weight."""
 
-    def __init__(self, parts: Sequence[Encoder], weights: Sequence[float], units: Sequence[float]) -> None:
+    def __init__(
+        self, parts: Sequence[Encoder], weights: Sequence[float], units: Sequence[float], *, cells: Cells = "finest"
+    ) -> None:
         names = [f"{weight!r}/{unit!r}*[{part.identity}]" for weight, unit, part in zip(weights, units, parts, strict=True)]
-        super().__init__("concat:" + "+".join(names), sum(part.channels for part in parts))
+        kind = "concat:" if cells == "finest" else f"concat:{cells}:"
+        super().__init__(kind + "+".join(names), sum(part.channels for part in parts))
+        self._cells = cells
         self.parts = nn.ModuleList(parts)
         self._factors = [weight / unit for weight, unit in zip(weights, units, strict=True)]
         freeze(self)
 
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
-        """Features at the stride of the finest part; coarser ones are interpolated."""
+        """Features on the cells of the finest part, or of the first; coarser ones are interpolated, finer ones averaged."""
         maps = [part(image) * factor for part, factor in zip(self.parts, self._factors, strict=True)]
+        if self._cells == "first":
+            size = maps[0].shape[2:]
+            maps = [F.interpolate(F.adaptive_avg_pool2d(each, _least(each, size)), size, mode="bilinear") for each in maps]
         return torch.cat(finest(maps), dim=1)
 
 
-def build_concat(parts: Sequence[Encoder], weights: Sequence[float]) -> ConcatEncoder:
-    """The encoder, the parts' units measured."""
-    images = street()
-    return ConcatEncoder(parts, weights, [unit_of(part, images) for part in parts])
+def _least(features: Annotated[Tensor, "B C h w"], size: Sequence[int]) -> tuple[int, int]:
+    return min(features.shape[2], size[0]), min(features.shape[3], size[1])
+
+
+UNITS: Mapping[str, float] = {
+    "dinov2-small:block9:tokens:cells22:baafd5682cf3": 3.23,
+    "bundled-semantic:f3992247b7b2": 5.84,
+}
+"""Units of the encoders that are semantics by default, by identity: to measure them takes a second."""
+
+
+def build_concat(parts: Sequence[Encoder], weights: Sequence[float], *, cells: Cells) -> ConcatEncoder:
+    """The encoder, the parts' units measured where they are not known."""
+    units = [UNITS[part.identity] if part.identity in UNITS else unit_of(part, street()) for part in parts]
+    return ConcatEncoder(parts, weights, units, cells=cells)
 
 
 def unit_of(encoder: Encoder, images: Annotated[Tensor, "B 3 H W"]) -> float:

@@ -180,12 +180,14 @@ class Dinov2Config(EncoderConfig):
     """Block whose features are taken, from 1; negative counts from the last."""
     features: Literal["tokens", "keys"] = "tokens"
     """The block's output, or the keys of its attention. A model of the hub gives tokens, which pass its final norm."""
-    stride: int = 14
-    """Pixels of the image per feature: the image is resized until one patch covers that many."""
+    stride: int | None = None
+    """Pixels of the image per feature: the image is resized until one patch covers that many. none = 22 features along its
+    longer side, whatever its size."""
 
     def __post_init__(self) -> None:
         _check_layer(self.layer)
-        at_least("stride", self.stride, 1)
+        if self.stride is not None:
+            at_least("stride", self.stride, 1)
         if self.model is not None and self.features != "tokens":
             raise ConfigError(f"features: {self.features!r} with the model {self.model}; only the one that ships has keys")
 
@@ -334,7 +336,7 @@ class AveragedConfig(EncoderConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ConcatConfig(EncoderConfig):
-    """Two or three encoders side by side, each of unit length times its weight, at the finest one's stride."""
+    """Two or three encoders side by side, each of unit length times its weight."""
 
     first: EncoderConfig = BundledSemanticConfig()
     """An encoder."""
@@ -344,6 +346,8 @@ class ConcatConfig(EncoderConfig):
     """A third one; none = two."""
     weights: tuple[float, ...] = ()
     """Weight of each, in their order: the root mean square length of its centred features; 1 for those left out."""
+    cells: Literal["finest", "first"] = "finest"
+    """Whose cells the features have: coarser encoders are interpolated, finer ones averaged over them, which steadies them."""
 
     def __post_init__(self) -> None:
         for weight in self.weights:
@@ -356,4 +360,9 @@ class ConcatConfig(EncoderConfig):
         if len(self.weights) > len(parts):
             raise ConfigError(f"weights: {len(self.weights)} for {len(parts)} encoders; give one each at most")
         weights = (*self.weights, *(1.0,) * (len(parts) - len(self.weights)))
-        return build_concat([part.build() for part in parts], weights)
+        return build_concat([part.build() for part in parts], weights, cells=self.cells)
+
+
+SEMANTICS = ConcatConfig(first=Dinov2Config(), second=BundledSemanticConfig(), cells="first")
+"""Semantics by default: what things are, by DINOv2, beside what is steady in any light. Together they find the right region of
+more photographs than either (docs/encoders.md)."""

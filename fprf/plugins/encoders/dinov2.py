@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ...errors import WeightsError
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, tensors_hash
-from .frozen import FrozenEncoder, freeze
+from .frozen import CELLS, FrozenEncoder, freeze, patch_grid
 
 PATCH, WIDTH, HEADS = 14, 384, 6
 GRID = 37
@@ -38,18 +38,16 @@ class Block(nn.Module):
         self.fc1, self.fc2 = nn.Linear(WIDTH, 4 * WIDTH), nn.Linear(4 * WIDTH, WIDTH)
         self.scale1, self.scale2 = nn.Parameter(torch.empty(WIDTH)), nn.Parameter(torch.empty(WIDTH))
 
-    def keys(self, x: Annotated[Tensor, "B T 384"]) -> Annotated[Tensor, "B T 384"]:
-        """Keys of all heads side by side."""
-        key = slice(WIDTH, 2 * WIDTH)
-        return F.linear(self.norm1(x), self.qkv.weight[key], self.qkv.bias[key])
-
-    def forward(self, x: Annotated[Tensor, "B T 384"]) -> Annotated[Tensor, "B T 384"]:
+    def forward(self, x: Annotated[Tensor, "B T 384"], keys: bool = False) -> Annotated[Tensor, "B T 384"]:
+        """The tokens after the block, or the keys of all its heads side by side."""
         # [B T 3 heads 64] to three of [B heads T 64].
         query, key, value = self.qkv(self.norm1(x)).unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
-        x = x + self.scale1 * self.proj(attended)
-        result: Tensor = x + self.scale2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
-        return result
+        if keys:
+            x = key.transpose(1, 2).flatten(2)
+        else:
+            x = x + self.scale1 * self.proj(F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2))
+            x = x + self.scale2 * self.fc2(F.gelu(self.fc1(self.norm2(x))))
+        return x
 
 
 class Dinov2(nn.Module):
@@ -69,18 +67,16 @@ class Dinov2(nn.Module):
         positions = F.interpolate(self.pos_embed[None], shape, mode="bicubic", align_corners=False)
         tokens = (patches + positions).flatten(2).transpose(1, 2)
         x = torch.cat([self.cls_token.expand(len(image), 1, -1), tokens], 1)
-        for block in self.blocks[:-1]:
-            x = block(x)
-        last = self.blocks[-1]
-        x = last.keys(x) if keys else last(x)
-        return x[:, 1:].transpose(1, 2).unflatten(2, shape)
+        for index, block in enumerate(self.blocks, start=1):
+            x = block(x, keys and index == len(self.blocks))
+        return x[:, 1:].transpose(1, 2).reshape(len(image), WIDTH, *shape)
 
 
 class Dinov2Encoder(FrozenEncoder):
-    """Tokens or keys of one block, one for each `stride` pixels: the image is resized until a patch covers that many."""
+    """Tokens or keys of one block; the image is resized to the patches of `patch_grid`."""
 
-    def __init__(self, network: Dinov2, *, kind: Literal["tokens", "keys"], stride: int) -> None:
-        settings = f"block{len(network.blocks)}:{kind}:stride{stride}"
+    def __init__(self, network: Dinov2, *, kind: Literal["tokens", "keys"], stride: int | None) -> None:
+        settings = f"block{len(network.blocks)}:{kind}:" + (f"stride{stride}" if stride else f"cells{CELLS}")
         super().__init__(f"dinov2-small:{settings}:{tensors_hash(network.state_dict())}", WIDTH)
         self.network = network
         self._keys, self._stride = kind == "keys", stride
@@ -89,7 +85,7 @@ class Dinov2Encoder(FrozenEncoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features; cells cover the whole image evenly, at least one along each axis."""
-        size = [PATCH * max(1, round(n / self._stride)) for n in image.shape[-2:]]
+        size = [PATCH * n for n in patch_grid(image.shape[-2:], self._stride)]
         if size != list(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bicubic", align_corners=False, antialias=True)
         mean, std = (image.new_tensor(each).view(1, 3, 1, 1) for each in (IMAGENET_MEAN, IMAGENET_STD))
@@ -97,7 +93,7 @@ class Dinov2Encoder(FrozenEncoder):
         return features
 
 
-def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int, path: Path = WEIGHTS) -> Dinov2Encoder:
+def load_dinov2(*, layer: int, kind: Literal["tokens", "keys"], stride: int | None, path: Path = WEIGHTS) -> Dinov2Encoder:
     """The encoder up to block `layer` (negative: from the last of 12). Raises WeightsError where the file has no such block."""
     block = layer if layer > 0 else BLOCKS + 1 + layer
     if not 1 <= block <= HELD:

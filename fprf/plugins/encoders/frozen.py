@@ -78,6 +78,19 @@ def resize_to_multiple(image: Annotated[Tensor, "B 3 H W"], multiple: int) -> Te
     return F.interpolate(image, (height, width), mode="bilinear", align_corners=False)
 
 
+CELLS = 22
+"""Patches along the longer side of an image where no stride is asked for."""
+
+
+def patch_grid(size: Sequence[int], stride: int | None) -> tuple[int, int]:
+    """Rows and columns of patches that cover an image of that height and width: one for `stride` pixels; None = `CELLS` along
+    its longer side.
+    """
+    height, width = size
+    pixels = stride or max(size) / CELLS
+    return max(1, round(height / pixels)), max(1, round(width / pixels))
+
+
 class FrozenEncoder(Encoder):
     """An encoder that knows its identity and channels when it is built."""
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ...errors import WeightsError
 from ..weights import IMAGENET_MEAN, IMAGENET_STD, tensors_hash
-from .frozen import FrozenEncoder, freeze
+from .frozen import FrozenEncoder, freeze, patch_grid
 
 # ViT interpolates its position table on demand, DINOv2 always does, DINOv3 turns its tokens by where they lie.
 CALLS: Mapping[str, Mapping[str, bool]] = {"dino": {"interpolate_pos_encoding": True}, "dinov2": {}, "dinov3": {}}
@@ -28,7 +28,7 @@ TYPES: Mapping[str, tuple[str, ...]] = {
 class VitEncoder(FrozenEncoder):
     """Patch tokens of a vision transformer `model` with patches of `patch` pixels."""
 
-    def __init__(self, family: str, model: nn.Module, *, name: str, patch: int, channels: int, stride: int) -> None:
+    def __init__(self, family: str, model: nn.Module, *, name: str, patch: int, channels: int, stride: int | None) -> None:
         used = {key: value for key, value in model.state_dict().items() if not key.startswith("pooler.")}
         super().__init__(f"{family}:{name}:stride{stride}:{tensors_hash(used)}", channels)
         self._call, self._patch, self._stride = CALLS[family], patch, stride
@@ -38,7 +38,7 @@ class VitEncoder(FrozenEncoder):
     @torch.no_grad()
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features, one per `stride` pixels, cells covering the whole image evenly."""
-        height, width = (max(1, round(n / self._stride)) for n in image.shape[-2:])
+        height, width = patch_grid(image.shape[-2:], self._stride)
         size = (height * self._patch, width * self._patch)
         if size != tuple(image.shape[-2:]):
             image = F.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)
@@ -48,7 +48,7 @@ class VitEncoder(FrozenEncoder):
         return tokens[:, -height * width :].transpose(1, 2).reshape(len(image), self._channels, height, width)
 
 
-def build_vit(family: str, name: str, *, layer: int, stride: int) -> VitEncoder:
+def build_vit(family: str, name: str, *, layer: int, stride: int | None) -> VitEncoder:
     """The encoder from the hub's cache, the hub or a folder. Raises WeightsError where one of its parts is absent."""
     try:
         from transformers import AutoConfig, AutoModel

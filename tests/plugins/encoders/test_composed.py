@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fprf.plugins.encoders.composed import AveragedEncoder, ConcatEncoder
+from fprf.plugins.encoders.composed import UNITS, AveragedEncoder, ConcatEncoder, unit_of
 from fprf.plugins.encoders.config import (
+    SEMANTICS,
     AveragedConfig,
     ConcatConfig,
     RandomConfig,
@@ -61,7 +62,22 @@ def test_parts_are_their_encoders_to_a_factor() -> None:
     torch.testing.assert_close(found, torch.cat([coarse, parts[1](image) * 0.125], dim=1))
 
 
+def test_finer_parts_are_averaged_over_the_cells_of_the_first() -> None:
+    image = torch.rand(2, 3, 48, 64)
+    coarse, fine = RandomConfig(stride=8).build(), RandomConfig(stride=4, seed=1).build()
+    found = ConcatEncoder([coarse, fine], (3.0, 0.5), (2.0, 4.0), cells="first")(image)
+    torch.testing.assert_close(found, torch.cat([coarse(image) * 1.5, F.avg_pool2d(fine(image), 2) * 0.125], dim=1))
+    turned = ConcatEncoder([fine, coarse], (1.0, 1.0), (1.0, 1.0), cells="first")(image)
+    torch.testing.assert_close(turned[:, 16:], F.interpolate(coarse(image), (12, 16), mode="bilinear"))
+
+
 def test_the_finest_of_each_axis_counts() -> None:
     """Cells of 6 and 5 pixels on a strip: neither part decides both axes alone."""
     encoder = ConcatConfig(first=RandomConfig(stride=6), second=RandomConfig(stride=5), third=RandomConfig(stride=30)).build()
     assert encoder(torch.rand(1, 3, 31, 7)).shape[2:] == (7, 2)
+
+
+def test_known_units_are_those_measured() -> None:
+    parts = [part.build() for part in (SEMANTICS.first, SEMANTICS.second)]
+    assert [UNITS[part.identity] for part in parts] == [pytest.approx(unit_of(part, street()), rel=0.01) for part in parts]
+    assert len(UNITS) == len(parts)

@@ -104,7 +104,8 @@ def test_identities_differ_with_settings(tmp_path: Path) -> None:
         AveragedConfig(inner=one, flip=False), AveragedConfig(inner=one, scales=(1.0, 2.0)),
         Dinov2Config(layer=3), Dinov2Config(layer=2), Dinov2Config(layer=3, stride=8), Dinov2Config(layer=3, features="keys"),
         ConcatConfig(first=one, second=two), ConcatConfig(first=two, second=one),
-        ConcatConfig(first=one, second=two, weights=(0.5,)), ConcatConfig(first=one, second=two, third=RandomConfig(seed=2)),
+        ConcatConfig(first=one, second=two, cells="first"), ConcatConfig(first=one, second=two, weights=(0.5,)),
+        ConcatConfig(first=one, second=two, third=RandomConfig(seed=2)),
     ]  # fmt: skip
     identities = [config.build().identity for config in configs]
     assert len(set(identities)) == len(configs)

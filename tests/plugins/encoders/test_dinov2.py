@@ -9,7 +9,9 @@ from torch import Tensor
 from fprf.errors import ConfigError, WeightsError
 from fprf.plugins.encoders.config import Dinov2Config
 from fprf.plugins.encoders.dinov2 import WEIGHTS, dequantised
+from fprf.plugins.typed_json import from_json
 from fprf.plugins.weights import IMAGENET_MEAN, IMAGENET_STD, read_weights, write_weights
+from fprf.splats.config import GaussianSemanticsConfig
 
 
 def picture(height: int, width: int) -> Tensor:
@@ -28,7 +30,7 @@ STORED = {
 
 @pytest.mark.parametrize(("layer", "kind"), STORED)
 def test_features_are_those_stored(layer: int, kind: str) -> None:
-    features = Dinov2Config(layer=layer, features=kind).build()(picture(126, 168))[0]
+    features = Dinov2Config(layer=layer, features=kind, stride=14).build()(picture(126, 168))[0]
     found = torch.stack([features.mean(), features.std(), features[7, 0, 0], features[100, 4, 5], features[383, 8, 11]])
     torch.testing.assert_close(found, torch.tensor(STORED[layer, kind]), rtol=1e-3, atol=1e-3)
 
@@ -48,9 +50,9 @@ def test_features_are_those_of_transformers(tmp_path: Path) -> None:
     with torch.no_grad():
         tokens = model(pixel_values=normal, output_hidden_states=True).hidden_states
     for layer in (1, 9, 11):
-        ours = Dinov2Config(layer=layer).build()(image)
+        ours = Dinov2Config(layer=layer, stride=14).build()(image)
         torch.testing.assert_close(ours.flatten(2).mT, tokens[layer][:, 1:], rtol=1e-4, atol=1e-4)
-    ours = Dinov2Config(layer=11, features="keys").build()(image)
+    ours = Dinov2Config(layer=11, features="keys", stride=14).build()(image)
     torch.testing.assert_close(ours.flatten(2).mT, keys[0][:, 1:], rtol=1e-4, atol=1e-4)
 
 
@@ -85,6 +87,11 @@ def _renamed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return theirs
 
 
+@pytest.mark.parametrize(("size", "cells"), [((96, 128), (16, 22)), ((40, 10), (22, 6)), ((3, 300), (1, 22))])
+def test_without_a_stride_the_longer_side_has_22_cells(size: tuple[int, int], cells: tuple[int, int]) -> None:
+    assert Dinov2Config(layer=1).build()(torch.rand(1, 3, *size)).shape[2:] == cells
+
+
 @pytest.mark.parametrize(("layer", "same"), [(-4, 9), (-2, 11)])
 def test_negative_blocks_count_from_the_twelfth(layer: int, same: int) -> None:
     assert Dinov2Config(layer=layer).build().identity == Dinov2Config(layer=same).build().identity
@@ -99,3 +106,10 @@ def test_blocks_that_do_not_ship_are_refused(layer: int) -> None:
 def test_keys_of_a_hub_model_are_refused() -> None:
     with pytest.raises(ConfigError, match="keys"):
         Dinov2Config(model="facebook/dinov2-base", features="keys")
+
+
+def test_a_run_that_named_the_model_of_the_hub_keeps_it() -> None:
+    """As versions before the one that ships wrote it."""
+    written = {"type": "dinov2", "model": "facebook/dinov2-small", "layer": -1, "stride": 8}
+    kept = from_json({"encoder": written}, GaussianSemanticsConfig).encoder
+    assert kept == Dinov2Config(model="facebook/dinov2-small", layer=-1, stride=8)
