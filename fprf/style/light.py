@@ -274,15 +274,19 @@ def light_maps(
     axes = torch.tensor(_AXES, dtype=torch.float64)
     here, there = ((part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, codes))
     bright = odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
-    cast = [shared(there[:, a], bright) - shared(here[:, a], share) for a in range(len(axes))]
+    cast = []
+    for a in range(len(axes)):
+        lit = shared(there[:, a], bright)
+        # Where the references share nothing, what the scene shares may be its material: a plant is yellowish throughout.
+        cast.append(lit - shared(here[:, a], share) if lit else 0.0)
     balance = (torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
     saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
     towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
     # Two deviations above the mean stay below white, with at least a third of the contrast.
     contrast = gain.minimum(((1 - gain * own) / (2 * deviation).clamp_min(_BLACK)).clamp_min(gain.clamp_max(1) / 3))
     bias = ((gain - contrast)[:, None] * mean) @ towards
-    lit = gain[:, None] * mean @ towards
-    return LightMaps(contrast[:, None, None] * towards, bias, _ungreened(lit, wanted, axes))
+    lit_mean = gain[:, None] * mean @ towards
+    return LightMaps(contrast[:, None, None] * towards, bias, _ungreened(lit_mean, wanted, axes))
 
 
 def agreed(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
