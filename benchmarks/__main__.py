@@ -28,6 +28,7 @@ BENCHMARKS = {
     "kills": "training that is killed a hundred times",
     "large_scene": "a town of 400 images in blocks: quality, seams, memory, time",
     "many_images": "more images than memory",
+    "match_confidence": "what scores of matches say, on painted pairs of photographs",
     "methods": "fields and Gaussians on the same captures for the same seconds",
     "mutants": "how many small mistakes in the mathematics the tests notice",
     "paper": "the paper's tables on any scene",

@@ -24,7 +24,7 @@ _LONGEST = 80
 _SHOWN = 0.1
 """References that a region takes less of are not in the table."""
 
-_HEAD = ("region", "share", "seen best at", "strength", "entropy", "takes")
+_HEAD = ("region", "share", "seen best at", "strength", "sure", "entropy", "takes")
 
 _DESCRIPTION = """Restyle captured views with photographs; no training, the same look from every viewpoint.
 
@@ -50,7 +50,7 @@ class StylizeConfig(StyleConfig, QualityConfig):
     explain: bool = False
     """Render nothing; list the scene's regions with what each takes: a table, explain.json, explain.png."""
     match_only: bool = False
-    """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-entropy.png."""
+    """Render nothing; map what each pixel takes: VIEW-match.png, VIEW-score.png, VIEW-confidence.png, VIEW-entropy.png."""
     matches: bool = True
     """Also write which reference each pixel takes, as VIEW-match.png."""
     pixels: bool = False
@@ -104,7 +104,7 @@ def _make(scene: "Scene", output: Path, styled: "Styled", views: list[int], conf
     from ..style.match_maps import match_map, match_pictures, summarize, write_pixels
 
     shown = not config.match_only
-    maps = ("match", "score", "entropy") if config.match_only else ("match",) if config.matches else ()
+    maps = ("match", "score", "confidence", "entropy") if config.match_only else ("match",) if config.matches else ()
     rendering, matching, summaries = 0.0, 0.0, {}
     restyled = scene.restyled(styled.restyle) if shown else scene
     with Display() as display:
@@ -156,7 +156,8 @@ def _cells(region: "Region") -> tuple[str, ...]:
         return place
     best = [taken for taken in region.taken if taken.share >= _SHOWN][:3] or list(region.taken[:1])
     takes = ", ".join(f"{taken.name} {taken.share:.0%} (score {taken.score:.2f})" for taken in best)
-    return (*place, "kept" if region.strength == 0 else f"{region.strength:.2g}", f"{region.entropy:.1f} bit", takes)
+    sure = f"{region.confidence:.0%}"
+    return (*place, "kept" if region.strength == 0 else f"{region.strength:.2g}", sure, f"{region.entropy:.1f} bit", takes)
 
 
 def _print_table(rows: list[tuple[str, ...]]) -> None:

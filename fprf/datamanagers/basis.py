@@ -28,6 +28,12 @@ class Basis(NamedTuple):
         """Features in the basis, on the device and in the type of `x`."""
         return (x - self.mean.to(x)) @ self.matrix.to(x)
 
+    def beyond(self, x: Annotated[Tensor, "N I"], projected: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 1"]:
+        """Squared length that features lose by projection, above what those of the samples lose on average; at least 0."""
+        inside = projected.square().sum(1, keepdim=True)
+        lost = (x - self.mean.to(x)).square().sum(1, keepdim=True) - inside
+        return (lost - inside * (1 / max(self.energy, 1e-6) - 1)).clamp_min(0)
+
     def lift(self, y: Annotated[Tensor, "... D"]) -> Annotated[Tensor, "... I"]:
         """Back to the encoder's channels: what `project` gives `y` for, as near to the mean as can be."""
         return y @ self.matrix.to(y).T + self.mean.to(y)

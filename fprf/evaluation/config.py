@@ -5,8 +5,11 @@ from pathlib import Path
 from typing import Literal
 
 from ..checks import at_least, between, positive
+from ..errors import ConfigError
 from ..plugins.stylizers.config import RegionToneConfig, StylizerConfig
 from ..style.config import StyleConfig
+
+_KINDS = ("sky", "plants", "ground", "houses")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +96,8 @@ class RestyleConfig(ReportConfig):
     """Style codes per reference, for all methods."""
     blend: float = StyleConfig.blend
     """Share of the overall style in each local one, for all methods, in [0, 1]."""
+    missing: tuple[str, ...] = ("sky", "plants", "ground", "houses")
+    """Kinds of things that a reference is without, one after the other."""
     sheet: Path | None = None
     """Picture of all methods side by side, .png or .jpg; none = none."""
     device: str = "auto"
@@ -107,6 +112,9 @@ class RestyleConfig(ReportConfig):
         between("blend", self.blend, 0.0, 1.0)
         at_least("palettes", len(self.palettes), 1)
         at_least("seeds", len(self.seeds), 3)
+        for kind in self.missing:
+            if kind not in _KINDS:
+                raise ConfigError(f"missing: {kind!r} is no kind of thing of the town; allowed are {', '.join(_KINDS)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -43,12 +43,14 @@ from .town_truth import (
     mean_rows,
     photograph,
     places,
+    psnr_of_kind,
     score,
     set_stage,
     town_settings,
     true_class_maps,
     true_views,
     winners,
+    without,
 )
 
 PLAIN = "no change"
@@ -89,10 +91,15 @@ def lineup(recommended: StylizerConfig) -> dict[str, StylizerConfig]:
     return {**others, "nearest-code": LocalAdainConfig(temperature=_SHARP), name: recommended}
 
 
-def dictionary_of(paths: Sequence[Path], encoders: Encoders, *, clusters: int, blend: float) -> tuple[StyleDictionary, float]:
-    """The style dictionary of photographs on a scene, and the seconds it took."""
+def dictionary_of(
+    paths: Sequence[Path], encoders: Encoders, *, clusters: int, blend: float, masks: Sequence[Path] = ()
+) -> tuple[StyleDictionary, float]:
+    """The style dictionary of photographs on a scene, or of what masks select of them, and the seconds it took."""
     start = time.perf_counter()
-    photographs = [encode_photograph(path, encoders, name=name) for path, name in zip(paths, labels(tuple(paths)), strict=True)]
+    photographs = [
+        encode_photograph(path, encoders, name=name, mask=mask)
+        for path, name, mask in zip(paths, labels(tuple(paths)), masks or (None,) * len(paths), strict=True)
+    ]
     made = build_dictionary(photographs, clusters=clusters, blend=blend, seed=encoders.seed)
     return made, time.perf_counter() - start
 
@@ -124,10 +131,12 @@ def in_scene(
     dictionary: StyleDictionary,
     encoders: Encoders,
     paths: Sequence[Path],
+    bold: float = StyleConfig.bold,
 ) -> Shown:
     """A stylizer of the scene."""
     start = time.perf_counter()
-    look = dress(scene, StyleFile(StyleConfig(references=tuple(paths), stylizer=config)), encoders, dictionary).restyle
+    style = StyleConfig(references=tuple(paths), stylizer=config, bold=bold)
+    look = dress(scene, StyleFile(style), encoders, dictionary).restyle
     spent = time.perf_counter() - start
     pictures, seconds = _each(views, lambda view: view.restyled(look).rgb)
     matched = Want.SEMANTIC in look.stylizer.needs
@@ -202,6 +211,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
     stage = set_stage(scene, opened.known, settings, views=config.views, frames=config.frames, longest=config.longest)
     encoders = scene.encoders()
     results = cases(config, stage, encoders, folder, progress)
+    missing = without_kinds(config, stage, encoders, folder, progress) if config.missing else {}
     sets = dict.fromkeys(case.set for case in results)
     means = {name: mean_rows([case.rows for case in results if case.set == name]) for name in sets}
     best, plain = list(lineup(config.stylizer))[-1], [view.restyled().rgb for view in stage.shown]
@@ -228,6 +238,7 @@ def restyle(config: RestyleConfig, root: Path, folder: Path, progress: Progress)
         "reconstruction": score(plain, true_views(stage, settings.palette), [each.labels for each in stage.truth])[0],
         "means": means,
         "verdict": verdict(means[JUDGED], best),
+        "missing": missing,
         "palettes": {
             light: {case.set: {"rows": case.rows, "delta_e_by_class": case.classes} for case in results if case.light == light}
             for light in config.palettes
@@ -266,6 +277,35 @@ def cases(config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path,
             results.append(_case(config, stage, encoders, (light, name), references, paths, truth))
     progress(total, total, "restyling")
     return results
+
+
+PAINTED, LIT = "paint alone", "light or paint"
+"""The recommended stylizer with `bold` 1, and as it is."""
+
+
+def without_kinds(
+    config: RestyleConfig, stage: Stage, encoders: Encoders, folder: Path, progress: Progress
+) -> dict[str, dict[str, dict[str, Row]]]:
+    """PSNR inside and elsewhere by kind that is masked out of the one reference, by palette and method; and their means."""
+    width, height = (int(side) for side in stage.scene.cameras.size[0])
+    place = places(config.seeds, (width, height))["one"][0]
+    found: dict[str, dict[str, dict[str, Row]]] = {kind: {} for kind in config.missing}
+    for number, light in enumerate(config.palettes):
+        progress(number, len(config.palettes), f"references that lack something, {light}")
+        truth, reference = true_views(stage, light), photograph(place, light)
+        path = folder / f"{reference.name}.png"
+        write_image(path, to_uint8(reference.image))
+        for kind in config.missing:
+            mask = folder / f"{reference.name}-without-{kind}.png"
+            write_image(mask, to_uint8(without(reference, kind).float()[..., None].expand(-1, -1, 3)))
+            dictionary, _ = dictionary_of([path], encoders, clusters=config.clusters, blend=config.blend, masks=[mask])
+            shown = {PLAIN: nothing(stage.shown).pictures}
+            for name, bold in ((PAINTED, 1.0), (LIT, StyleConfig.bold)):
+                made = in_scene(stage.scene, stage.shown, config.stylizer, dictionary, encoders, [path], bold)
+                shown[name] = made.pictures
+            found[kind][light] = {name: psnr_of_kind(views, stage, truth, kind) for name, views in shown.items()}
+    rows = [row for lights in found.values() for row in lights.values()]
+    return {**found, "mean": {"all palettes": mean_rows(rows)}}
 
 
 def verdict(rows: Mapping[str, Row], best: str) -> dict[str, Any]:
@@ -372,6 +412,7 @@ COLUMNS: tuple[Column, ...] = (
     ("style_seconds", "style s", ".2f"),
     ("view_seconds", "view s", ".3f"),
 )
+LACKING: tuple[Column, ...] = (("inside", "PSNR inside, dB", ".2f"), ("elsewhere", "elsewhere, dB", ".2f"))
 _ABOUT = """# Restyling with a true answer
 
 Nobody knows what a photographed scene would look like at night. Of the embedded town we know: a palette changes colours and
@@ -395,6 +436,8 @@ the street and its sky.
 - **2d** is the recommended stylizer on each picture alone, with the picture's own statistics and regions.
 - **true classes** is no method: it knows the classes, and carries the colours of each to those of the same class in the
   references, as a perfect match would.
+- **without sky, plants, ground, houses**: one reference out of which a kind of thing is masked. *Paint alone* paints it with
+  what is least unlike it; *light or paint* gives it the light of the reference (docs/method.md).
 - **best class maps** is none either: it knows the truth, and gives every true class the affine map of colours that comes
   nearest to it. What it misses is light: shadows, lit windows and the lamps' cones lie where the town's geometry puts them,
   another town's picture cannot tell where, and no map of colours makes them.
@@ -426,6 +469,10 @@ def restyle_page(document: Mapping[str, Any], *, picture: str | None = None) -> 
             markdown(rows, COLUMNS, first="method"),
             "",
         ]
+    for kind, lights in document["missing"].items():
+        rows = mean_rows(list(lights.values()))
+        heading = "any of them (mean)" if kind == "mean" else kind
+        parts += [f"## One reference without {heading}, mean over palettes\n", markdown(rows, LACKING, first="method"), ""]
     own = document["reconstruction"]
     parts.append(f"Reconstruction: {own['psnr']:.2f} dB, SSIM {own['ssim']:.3f}, ΔE {own['delta_e']:.1f}.\n")
     if picture:

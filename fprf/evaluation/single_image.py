@@ -17,8 +17,10 @@ from ..interfaces import Decoder, Encoder
 from ..ops.guided import upsample
 from ..plugins.stylizers.config import StylizerConfig
 from ..splats.restyle import region_maps
-from ..style.colours import colour_maps
+from ..style.colours import colour_maps, own_colours
+from ..style.config import StyleConfig
 from ..style.dictionary import StyleDictionary
+from ..style.light import light_of
 from ..style.look import Restyle
 from ..style.scene import SceneStyle, scene_style
 from ..types import Want
@@ -90,14 +92,23 @@ def flat_look(flat: Flat, dictionary: StyleDictionary, config: StylizerConfig, d
     """Restyle the photograph as `fprf stylize` would. Without a decoder its content is its colours, as in `splats.restyle`."""
     device = flat.content.device
     stylizer = config.build(dictionary=dictionary, scene=flat.style).to(device)
+    light = None
+    if config.light:
+
+        def match(part: StyleDictionary) -> Annotated[Tensor, "K T"]:
+            return config.build(dictionary=part, scene=flat.style).region_match(flat.style.keys)
+
+        own = own_colours(stylizer, flat.style, decoder)
+        light = light_of(flat.style, dictionary, match, own, bold=StyleConfig.bold)
+        light = None if light is None else light.to(device)
     if decoder is None:
         maps = region_maps(stylizer, dictionary, flat.style, config)
-        return Restyle(stylizer, features=config.features if maps is None else 0.0, colours=maps)
+        return Restyle(stylizer, features=config.features if maps is None else 0.0, colours=maps, light=light)
     smoothing = config.smoothing(flat.style)
     colours = colour_maps(
         stylizer, dictionary, flat.style, decoder, features=config.features, share=config.colours, smoothing=smoothing
     )
-    return Restyle(stylizer, features=config.features, colours=None if colours is None else colours.to(device))
+    return Restyle(stylizer, features=config.features, colours=None if colours is None else colours.to(device), light=light)
 
 
 @torch.no_grad()

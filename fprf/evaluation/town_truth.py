@@ -48,6 +48,9 @@ _OFF = 0.01
 """By what share focal lengths and centres may differ from those of a town's camera."""
 
 
+Row = dict[str, float | None]
+
+
 class Truth(NamedTuple):
     """Class of what a pixel shows; palettes change none of it."""
 
@@ -214,10 +217,34 @@ def _most(part: str, seed: int, size: tuple[int, int]) -> Place:
 
 KINDS = {SKY: 0, LAWN: 1, FOLIAGE: 1, TRUNK: 1, ROAD: 2, SIDEWALK: 2, FACADE: 3, ROOF: 3, WINDOW: 3, DOOR: 3, LAMP: 4, CAR: 5}
 """Classes that belong together: sky, plants, ground, buildings, lamps, cars."""
+CUT = {"sky": 0, "plants": 1, "ground": 2, "houses": 3}
+"""Kinds that references can be without."""
 _SHOWN = 0.005
 """Share of a reference from which on it shows a class."""
 _REACH = 2
 """Pixels around one that must be of its class for it to lie inside."""
+
+
+def without(reference: Reference, kind: str) -> Annotated[Tensor, "H W"]:
+    """Pixels of a reference that show no such kind of thing, bool: the mask of a reference that lacks it."""
+    return kinds_of(reference.classes) != CUT[kind]
+
+
+def kinds_of(labels: Annotated[Tensor, "H W"]) -> Annotated[Tensor, "H W"]:
+    """Kinds of classes (see KINDS), int64; -1 where a class has none."""
+    kind = torch.full((max(KINDS) + 2,), -1)  # the last one stands for pixels without a class
+    kind[list(KINDS)] = torch.tensor(list(KINDS.values()))
+    return kind[labels]
+
+
+def psnr_of_kind(pictures: Sequence[Annotated[Tensor, "H W 3"]], stage: Stage, truth: Sequence[Tensor], kind: str) -> Row:
+    """PSNR in dB over all pixels of a kind together (`inside`), and over all others (`elsewhere`)."""
+    inside = torch.cat([(kinds_of(each.labels) == CUT[kind]).flatten() for each in stage.truth])
+    apart = torch.cat([(a - b).double().square().mean(-1).flatten() for a, b in zip(pictures, truth, strict=True)])
+    return {
+        name: -10 * math.log10(max(float(apart[where].mean()), 1e-10)) if bool(where.any()) else None
+        for name, where in (("inside", inside), ("elsewhere", ~inside))
+    }
 
 
 class Matched(NamedTuple):
@@ -274,13 +301,11 @@ def match_rates(
     taken, true = torch.cat([x.flatten() for x in found]), torch.cat([x.flatten() for x in truth])
     counts = torch.isin(true, torch.tensor(shown))
     inside = torch.cat([interior(x).flatten() for x in truth])
-    kind = torch.full((max(KINDS) + 2,), -1)  # the last one stands for codes without a class
-    kind[list(KINDS)] = torch.tensor(list(KINDS.values()))
     return Matched(
         _rate(taken == true, counts),
         _rate(taken == true, counts & inside),
         _rate(taken == true, counts & ~inside),
-        _rate(kind[taken] == kind[true], counts),
+        _rate(kinds_of(taken) == kinds_of(true), counts),
     )
 
 
@@ -288,7 +313,6 @@ def _rate(right: Tensor, counts: Tensor) -> float | None:
     return float(right[counts].double().mean()) if bool(counts.any()) else None
 
 
-Row = dict[str, float | None]
 Picture = Annotated[Tensor, "H W 3"]
 Labelled = Sequence[tuple[Picture, Annotated[Tensor, "H W"]]]
 """Pictures with the true class of every pixel."""

@@ -99,6 +99,14 @@ def _change(
 
 def _added(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
     """A and b of one part at full strength."""
+    if part.light is None:
+        return _painted(part, semantic)
+    paint = part.light.paint(semantic)
+    return paint[..., None] * _painted(part, semantic) + part.light.change(semantic, paint)
+
+
+def _painted(part: Restyle, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 4 3"]:
+    """A and b of one part's stylizer and colours."""
     if part.colours is not None:
         maps = part.colours
         belongs: Tensor = maps.membership(semantic)

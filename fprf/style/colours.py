@@ -141,5 +141,14 @@ def decoded_colours(
     return torch.stack(means), torch.stack(covariances)
 
 
+def own_colours(
+    stylizer: Stylizer, scene: SceneStyle, decoder: Decoder | None
+) -> tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]]:
+    """Mean and covariance of each region's own colours, float64; without a decoder they are the content."""
+    if decoder is None:
+        return double(scene.region_mean), double(scene.region_covariance)
+    return decoded_colours(stylizer, scene, decoder, features=0.0)
+
+
 def _device(stylizer: Stylizer, scene: SceneStyle) -> torch.device:
     return next(stylizer.buffers(), scene.mean).device

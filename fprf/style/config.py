@@ -160,6 +160,9 @@ class StyleConfig:
     """0 leaves the scene bit for bit as it is, 1 is the full style."""
     luminance: float = 0.0
     """Share of the scene's own luminance that is kept, in [0, 1]; at 1 the references give their tints alone."""
+    bold: float = 0.5
+    """How far things are painted that the references do not surely show, in [0, 1]: 0 = everything takes light alone, 0.5 = as
+    far as the match is sure, 1 = everything is painted. Counts where `stylizer.light` is true."""
     pin: tuple[str, ...] = ()
     """REGION=REFERENCE: the region takes its style from this reference (from any of them, if pinned to several).
     For Gaussians REGION may be a place; a later place lies over those before it."""
@@ -177,7 +180,7 @@ class StyleConfig:
     """Place between the two styles, in [0, 1]: 0 = this one, 1 = the other."""
 
     def __post_init__(self) -> None:
-        for name in ("blend", "strength", "luminance", "at"):
+        for name in ("blend", "strength", "luminance", "bold", "at"):
             between(name, getattr(self, name), 0.0, 1.0)
         at_least("clusters", self.clusters, 1)
         for weight in self.weights:

@@ -28,6 +28,7 @@ CLUSTERS = 20
 _FORMAT = "fprf-style-1"
 _TENSORS = ("keys", "mean", "covariance", "share", "reference", "weight")
 _COLOURS = ("colour_mean", "colour_covariance")
+_BEYOND = ("beyond",)
 
 
 class Reference(NamedTuple):
@@ -41,6 +42,8 @@ class Reference(NamedTuple):
     """Weight beside the others; above 0."""
     colour: Annotated[Tensor, "N 3"] | None = None
     """The samples' own colours, sRGB in [0, 1]; None where nobody will ask."""
+    beyond: Annotated[Tensor, "N"] | None = None
+    """Squared length of semantics outside of the scene's basis (`Basis.beyond`); None = 0."""
 
 
 class StyleDictionary(NamedTuple):
@@ -64,6 +67,8 @@ class StyleDictionary(NamedTuple):
     colour_mean: Annotated[Tensor, "T 3"] | None = None
     """Mean colour of each code's pixels, blended as `mean` is; None where a reference came without colours."""
     colour_covariance: Annotated[Tensor, "T 3 3"] | None = None
+    beyond: Annotated[Tensor, "T"] | None = None
+    """Mean squared length of each code's semantics outside of the scene's basis; None = 0."""
     allowed: Annotated[Tensor, "K references"] | None = None
     """On one scene: which references each of its regions may take from, bool; None = all. See `style.regional`. Not saved."""
     origin: Annotated[Tensor, "D"] | None = None
@@ -91,7 +96,8 @@ def build_dictionary(
     _check(references)
     ordered = sorted(references, key=lambda r: (_content_hash(r), r.name, r.weight))
     parts = [_codes(r, clusters, blend, seed, min_members) for r in ordered]
-    names = _TENSORS if any(r.colour is None for r in ordered) else _TENSORS + _COLOURS
+    names: tuple[str, ...] = _TENSORS if any(r.colour is None for r in ordered) else _TENSORS + _COLOURS
+    names += () if any(r.beyond is None for r in ordered) else _BEYOND
     tables = {name: torch.cat([part[name] for part in parts]).cpu() for name in names if name != "reference"}
     count = torch.tensor([len(part["keys"]) for part in parts])
     reference = torch.arange(len(parts)).repeat_interleave(count)
@@ -143,7 +149,7 @@ def choose(d: StyleDictionary, references: Annotated[Tensor, "references"]) -> t
     renumbered = references.cumsum(0) - 1
     part = d._replace(
         **{name: getattr(d, name)[codes] for name in ("keys", "mean", "covariance", "share", "weight")},
-        **{name: getattr(d, name)[codes] for name in _COLOURS if getattr(d, name) is not None},
+        **{name: getattr(d, name)[codes] for name in _COLOURS + _BEYOND if getattr(d, name) is not None},
         reference=renumbered[d.reference[codes]],
         names=tuple(name for name, taken in zip(d.names, references.tolist(), strict=True) if taken),
         allowed=None,
@@ -168,7 +174,10 @@ def load_dictionary(path: Path) -> StyleDictionary:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(f"{path}: not readable as safetensors ({error}); build the style again") from error
-    if meta.get("format") != _FORMAT or set(tensors) not in (set(_TENSORS), {*_TENSORS, *_COLOURS}):
+    if meta.get("format") != _FORMAT or set(tensors) - {*_BEYOND} not in (
+        set(_TENSORS),
+        {*_TENSORS, *_COLOURS},
+    ):
         raise CheckpointError(f"{path}: not a style dictionary of format {_FORMAT}; build the style again")
     if meta.get("sha256") != _digest(tensors):
         raise CheckpointError(f"{path}: checksum does not match, the file is damaged; build the style again")
@@ -183,7 +192,7 @@ def load_dictionary(path: Path) -> StyleDictionary:
 
 
 def _stored(d: StyleDictionary) -> tuple[str, ...]:
-    return _TENSORS if d.colour_mean is None else _TENSORS + _COLOURS
+    return tuple(name for name in _TENSORS + _COLOURS + _BEYOND if getattr(d, name) is not None)
 
 
 def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: int) -> dict[str, Tensor]:
@@ -203,6 +212,8 @@ def _codes(r: Reference, clusters: int, blend: float, seed: int, min_members: in
     tables["weight"] = torch.full_like(share, r.weight)
     if r.colour is not None:
         tables["colour_mean"], tables["colour_covariance"] = statistics(r.colour)
+    if r.beyond is not None:
+        tables["beyond"] = member.T @ double(r.beyond) / member.sum(0)
     return {name: table.float() for name, table in tables.items()}
 
 
@@ -251,6 +262,8 @@ def _check_stored(path: Path, d: StyleDictionary) -> None:
     shapes = {"mean": (t, c), "covariance": (t, c, c), "share": (t,), "reference": (t,), "weight": (t,)}
     if d.colour_mean is not None:
         shapes |= {"colour_mean": (t, 3), "colour_covariance": (t, 3, 3)}
+    if d.beyond is not None:
+        shapes["beyond"] = (t,)
     wrong = [name for name, shape in shapes.items() if tuple(getattr(d, name).shape) != shape]
     if t == 0 or c == 0 or wrong:
         raise CheckpointError(f"{path}: {', '.join(wrong) or 'keys'} of the wrong shape; build the style again")

@@ -51,7 +51,10 @@ def read_style(path: Path) -> StyleFile:
         for key in whole:
             if key not in _KEYS:
                 raise ConfigError(f"unknown key {key!r}{nearest(key, list(_KEYS))} (allowed: {', '.join(_KEYS)})")
-        style = from_json(whole["style"], StyleConfig, packages=from_json(whole.get("plugins", {}), dict[str, str]))
+        fields = whole["style"]
+        if "fprf" in whole and "bold" not in fields:  # saved before there was light: all was painted
+            fields = {**fields, "bold": 1.0}
+        style = from_json(fields, StyleConfig, packages=from_json(whole.get("plugins", {}), dict[str, str]))
         hashes = from_json(whole.get("sha256", {}), dict[str, str])
         regions = from_json(whole.get("regions", {}), dict[str, tuple[float, ...]])
         encoder = from_json(whole.get("semantic_encoder", ""), str)

@@ -8,7 +8,7 @@ import hashlib
 import io
 import pickle
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from ..types import Want
 from .colours import ColourMaps
 from .config import Place
 from .controls import blend_strength, keep_luminance, place_weight
+from .light import Light
 from .regional import RegionWeight
 
 Applied: TypeAlias = tuple[Annotated[Tensor, "N C"], float | Annotated[Tensor, "N 1"], float]
@@ -39,6 +40,9 @@ class Restyle:
     """Change of colours behind the decoder at full strength; None = none."""
     luminance: float = 0.0
     """Share of the scene's own luminance that is kept."""
+    light: Light | None = None
+    """What points take, as far as they are not sure of their match, instead of all that the stylizer and `colours` do; None =
+    all are sure."""
     share: float = 1.0
     """Its part of the mix; those of all parts sum to 1."""
     places: tuple[tuple[Place, "Restyle"], ...] = ()
@@ -72,7 +76,7 @@ class Restyle:
                 needs |= part.stylizer.needs
                 if part.colours is not None:
                     needs |= part.colours.needs
-                if part.regions is not None and part.regions.membership.divided:
+                if part.light is not None or (part.regions is not None and part.regions.membership.divided):
                     needs |= Want.SEMANTIC
         return needs
 
@@ -94,18 +98,20 @@ class Restyle:
         self, decoder: Decoder, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None
     ) -> Annotated[Tensor, "N 3"]:
         """Colours of points in this look, in [0, 1]."""
-        shown = [(part, *part._alone(content, semantic)) for part in self.parts if part.share > 0]
-        styled, strength, luminance = _mix([(part.share, applied) for part, applied, _ in shown])
+        shown = [(part, part._alone(content, semantic)) for part in self.parts if part.share > 0]
+        styled, strength, luminance = _mix([(part.share, acting.applied) for part, acting in shown])
         colour: Tensor = decoder.restyled(content, styled, strength)
-        changes = (part._recoloured(colour, semantic, belongs) for part, _, belongs in shown)
+        lit = any(acting.paint is not None for _, acting in shown)
+        own = decoder(content) if luminance > 0 or lit else colour
+        changes = (change for part, acting in shown for change in part._recoloured(colour, own, semantic, acting))
         change = [x for x in changes if x is not None]
         if change:
             colour = (colour + torch.stack(change).sum(0)).clamp(0, 1)
-        return keep_luminance(colour, decoder(content), luminance) if luminance > 0 else colour
+        return keep_luminance(colour, own, luminance) if luminance > 0 else colour
 
     def applied(self, content: Annotated[Tensor, "N C"], semantic: Annotated[Tensor, "N D"] | None) -> Applied:
         """The features with all strengths applied, and what a decoder must know besides."""
-        return _mix([(part.share, part._alone(content, semantic)[0]) for part in self.parts if part.share > 0])
+        return _mix([(part.share, part._alone(content, semantic).applied) for part in self.parts if part.share > 0])
 
     def match(
         self, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"] | None = None
@@ -124,13 +130,34 @@ class Restyle:
             taken.append(part.share * (own if part.regions is None else own * part.regions(semantic)))
         return torch.cat(taken, 1)
 
-    def _alone(self, content: Tensor, semantic: Tensor | None) -> tuple[Applied, Annotated[Tensor, "N K"] | None]:
-        """Points in this part's style, and their regions, if the stylizer has computed them."""
+    def confidence(
+        self, semantic: Annotated[Tensor, "N D"], points: Annotated[Tensor, "N 3"] | None = None
+    ) -> Annotated[Tensor, "N 1"]:
+        """How sure points are of what they take, in [0, 1]; 1 where nobody asks. `points` as of `match`."""
+        total = semantic.new_zeros(len(semantic), 1)
+        for part in self.parts:
+            own = part._sure(semantic)
+            if points is not None:
+                for place, other in part.places:
+                    own = torch.lerp(own, other._sure(semantic), place_weight(place, points)[:, None])
+            total = total + part.share * own
+        return total
+
+    def _sure(self, semantic: Annotated[Tensor, "N D"]) -> Annotated[Tensor, "N 1"]:
+        return semantic.new_ones(len(semantic), 1) if self.light is None else self.light.confidence(semantic).to(semantic)
+
+    def _alone(self, content: Tensor, semantic: Tensor | None) -> "_Acting":
+        """Points in this part's style."""
         if self.strength == 0:
-            return (content, 0.0, self.luminance), None
+            return _Acting((content, 0.0, self.luminance), None, 0.0, None)
         styled, belongs = self.stylizer.shared(content, semantic)
-        strength = self.features * self._strength(content, semantic, belongs)
-        return (blend_strength(content, styled, strength), strength, self.luminance), belongs
+        strength, share = self._strength(content, semantic, belongs), None
+        if self.light is not None:
+            assert semantic is not None, "Want.SEMANTIC was asked for"
+            share = self.light.paint(semantic, belongs)
+            strength = strength * share.to(content)
+        paint = self.features * strength
+        return _Acting((blend_strength(content, styled, paint), paint, self.luminance), belongs, strength, share)
 
     def _strength(
         self, points: Annotated[Tensor, "N X"], semantic: Tensor | None, belongs: Tensor | None
@@ -142,13 +169,28 @@ class Restyle:
         return self.strength * weight
 
     def _recoloured(
-        self, colour: Annotated[Tensor, "N 3"], semantic: Tensor | None, belongs: Tensor | None
-    ) -> Annotated[Tensor, "N 3"] | None:
-        """Change of colours by this part; None = none."""
-        if self.colours is None or self.share == 0 or self.strength == 0:
-            return None
-        change: Tensor = self.colours(colour, semantic, belongs)
-        return self.share * self._strength(colour, semantic, belongs) * change
+        self, colour: Annotated[Tensor, "N 3"], own: Annotated[Tensor, "N 3"], semantic: Tensor | None, acting: "_Acting"
+    ) -> tuple[Annotated[Tensor, "N 3"] | None, Annotated[Tensor, "N 3"] | None]:
+        """Changes of colours by this part, painted and lit; None = none."""
+        painted = lit = None
+        if self.colours is not None and self.share > 0 and self.strength > 0:
+            painted = self.share * acting.strength * self.colours(colour, semantic, acting.belongs)
+        if self.light is not None and acting.paint is not None and self.share > 0 and self.strength > 0:
+            strength = self._strength(colour, semantic, acting.belongs)
+            lit = self.share * strength * self.light(own, semantic, acting.paint, acting.belongs)
+        return painted, lit
+
+
+class _Acting(NamedTuple):
+    """One part at points."""
+
+    applied: Applied
+    belongs: Annotated[Tensor, "N K"] | None
+    """Regions, if the stylizer has computed them."""
+    strength: float | Annotated[Tensor, "N 1"]
+    """Of the change of colours."""
+    paint: Annotated[Tensor, "N 1"] | None
+    """Share of paint; None = all."""
 
 
 class _Pickler(pickle.Pickler):

@@ -38,6 +38,8 @@ class MatchMap(NamedTuple):
     """Cosine of what lies there with the codes that it takes, seen from the scene's mean, in [-1, 1]."""
     region: Annotated[Tensor, "H W K"]
     """Share of each region of the scene."""
+    confidence: Annotated[Tensor, "H W"]
+    """How sure what lies there is of its match, in [0, 1]: what is not takes light alone. 1 where all is painted."""
     opacity: Annotated[Tensor, "H W"]
 
     @property
@@ -68,7 +70,8 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
     def values(semantic: Tensor, points: Tensor | None) -> Tensor:
         taken = look.match(semantic, points)
         near = unit(semantic, centre) @ units.T if belongs.divided else taken.new_zeros(taken.shape)
-        return torch.cat([taken, (taken * near).sum(1, keepdim=True), belongs(semantic)], 1)
+        sure = look.confidence(semantic, points).to(taken)
+        return torch.cat([taken, (taken * near).sum(1, keepdim=True), sure, belongs(semantic)], 1)
 
     pixel = pixel_grid(cameras, view)
     shares, opacity = here.paint(cameras, view, pixel, values, semantic=belongs.divided)
@@ -76,7 +79,8 @@ def match_map(here: Scene, styled: Styled, view: int, cameras: Cameras | None = 
     shares = shares.view(height, width, -1)
     taken = shares[..., :codes]
     score = shares[..., codes] / taken.sum(-1).clamp_min(1e-10)
-    return MatchMap(taken, score.clamp(-1, 1), shares[..., codes + 1 :], opacity.view(height, width))
+    confidence, region = shares[..., codes + 1].clamp(0, 1), shares[..., codes + 2 :]
+    return MatchMap(taken, score.clamp(-1, 1), region, confidence, opacity.view(height, width))
 
 
 def match_picture(matched: MatchMap, codes: Codes) -> Picture:
@@ -85,11 +89,12 @@ def match_picture(matched: MatchMap, codes: Codes) -> Picture:
 
 
 def match_pictures(matched: MatchMap, codes: Codes) -> dict[str, Picture]:
-    """`match` (see `match_picture`), `score` (0 to 1) and `entropy` (0 to log2 T)."""
+    """`match` (see `match_picture`), `score` and `confidence` (0 to 1), and `entropy` (0 to log2 T)."""
     most = math.log2(max(2, len(codes.reference)))
     return {
         "match": match_picture(matched, codes),
         "score": scale_image(matched.score, 0.0, 1.0, matched.opacity * (1 - matched.kept)),
+        "confidence": scale_image(matched.confidence, 0.0, 1.0, matched.opacity * (1 - matched.kept)),
         "entropy": scale_image(matched.entropy, 0.0, most, matched.opacity * (1 - matched.kept)),
     }
 
@@ -105,6 +110,7 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
     return {
         **match_summary(matched.attention, codes.reference, codes.names, weight),
         "score": float((matched.score * weight).sum()) / styled,
+        "confidence": float((matched.confidence * weight).sum()) / styled,
         "kept_share": float((kept * each).sum()) / total,
         "codes": [
             {"reference": codes.names[int(codes.reference[t])], "cluster": int(cluster[t]), "share": float(of_code[t])}
@@ -116,7 +122,9 @@ def summarize(matched: MatchMap, codes: Codes) -> dict[str, Any]:
 
 
 def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
-    """Write an .npz: reference, cluster, region (int16, -1 where nothing is), score, entropy_bits, kept, opacity, names."""
+    """Write an .npz: reference, cluster, region (int16, -1 where nothing is), score, confidence, entropy_bits, kept, opacity,
+    names.
+    """
     code = matched.taken.argmax(-1)
     some, styled = matched.opacity > 0.5, matched.taken.sum(-1) > 0.5
     arrays = {
@@ -124,6 +132,7 @@ def write_pixels(path: Path, matched: MatchMap, codes: Codes) -> None:
         "cluster": torch.where(some & styled, clusters(codes)[code], -1).short(),
         "region": torch.where(some, matched.region.argmax(-1), -1).short(),
         "score": matched.score,
+        "confidence": matched.confidence,
         "entropy_bits": matched.entropy,
         "kept": matched.kept,
         "opacity": matched.opacity,
@@ -178,6 +187,8 @@ class Region(NamedTuple):
     """All references, the most used first."""
     entropy: float = 0.0
     """Bits, over the style codes."""
+    confidence: float = 1.0
+    """How sure it is of its match, in [0, 1]; 1 where all is painted."""
     strength: float = 1.0
     """0 = it stays as it is."""
     restricted: bool = False
@@ -201,7 +212,8 @@ def explain(regions: Regions, styled: Styled | None = None) -> list[Region]:
     if styled is None:
         return rows
     attention = styled.restyle.stylizer.match(regions.scene.keys.to(regions.views.device)).cpu().double()
-    return [_matched(region, styled, attention[region.number]) for region in rows]
+    sure = styled.restyle.confidence(regions.scene.keys.to(regions.views.device)).cpu()
+    return [_matched(row, styled, attention[row.number])._replace(confidence=float(sure[row.number])) for row in rows]
 
 
 def region_row(region: Region) -> dict[str, Any]:
@@ -211,6 +223,7 @@ def region_row(region: Region) -> dict[str, Any]:
         row |= {
             "references": [taken._asdict() for taken in region.taken],
             "entropy_bits": region.entropy,
+            "confidence": region.confidence,
             "strength": region.strength,
             "restricted": region.restricted,
         }
@@ -224,7 +237,11 @@ def region_tile(region: Region, names: tuple[str, ...]) -> Tile:
     if not region.taken:
         return Tile(region.picture, tuple(lines))
     best = region.taken[0]
-    lines.append("kept as it is" if region.strength == 0 else f"{best.name} {best.share:.0%}, score {best.score:.2f}")
+    lines.append(
+        "kept as it is"
+        if region.strength == 0
+        else f"{best.name} {best.share:.0%}, score {best.score:.2f}, sure {region.confidence:.0%}"
+    )
     by_name = {taken.name: taken.share * region.strength for taken in region.taken}
     return Tile(region.picture, tuple(lines), tuple(by_name[name] for name in names))
 

@@ -72,10 +72,21 @@ def encode_photograph(path: Path, encoders: Encoders, *, name: str, weight: floa
     samples, colour = _sampled(_encode(encoders.content, image), image, pixel, encoders.guided), image[pixel[:, 1], pixel[:, 0]]
     if encoders.semantic is None or encoders.basis is None:
         return Reference(name, samples, samples.new_zeros(len(samples), 0), weight, colour)
-    maps = _encode(encoders.semantic, image)
+    semantic, beyond = semantic_samples(image, pixel, encoders.semantic, encoders.basis, encoders.guided)
+    return Reference(name, samples, semantic, weight, colour, beyond)
+
+
+def semantic_samples(
+    image: Annotated[Tensor, "H W 3"], pixel: Annotated[Tensor, "N 2"], encoder: Encoder, basis: "Basis", guided: GuidedConfig
+) -> tuple[Annotated[Tensor, "N D"], Annotated[Tensor, "N"]]:
+    """Filtered semantics at pixels (x, y, int64) in a scene's basis, and what of them lies beyond it (`Basis.beyond`)."""
+    maps = _encode(encoder, image)
+    cells = maps.flatten(1).T
+    low = basis.project(cells)
     # Projecting is linear and so is the filter: fewer channels first.
-    maps = encoders.basis.project(maps.flatten(1).T).T.reshape(-1, *maps.shape[1:])
-    return Reference(name, samples, _sampled(maps, image, pixel, encoders.guided), weight, colour)
+    fewer = torch.cat([low, basis.beyond(cells, low)], 1).T.reshape(-1, *maps.shape[1:])
+    found = _sampled(fewer, image, pixel, guided)
+    return found[:, :-1].contiguous(), found[:, -1].clamp_min(0)
 
 
 def _reduced(photo: Image, longest: int) -> Image:

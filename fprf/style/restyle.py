@@ -12,10 +12,12 @@ from ..errors import ConfigError, UsageError
 from ..interfaces import Scene
 from ..plugins.stylizers.config import StylizerConfig
 from ..rendering.plugin_checks import check_stylizer
+from .colours import own_colours
 from .config import NO_MASK, Place, StyleConfig, find_reference, labels, parse_place, parse_region_value, parse_strength
 from .controls import allowed_references
 from .dictionary import BLEND, CLUSTERS, StyleDictionary, build_dictionary
 from .files import StyleFile, check_photographs, read_style
+from .light import light_of
 from .look import Restyle
 from .matching import scores, unit
 from .references import Encoders, encode_photograph
@@ -88,7 +90,15 @@ def dress(here: Scene, file: StyleFile, encoders: Encoders, dictionary: StyleDic
         stylizer = stylizer.to(device)
         colours = here.colour_maps(stylizer, dictionary, scene, chosen, allowed)
         moved = None if colours is None else colours.to(device)
-        return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance)
+        light = None
+        if chosen.light and style.bold < 1:
+            own = own_colours(stylizer, scene, here.decoder)
+            light = light_of(scene, dictionary, match, own, bold=style.bold, allowed=allowed)
+            light = None if light is None else light.to(device)
+        return Restyle(stylizer, style.strength, weight, chosen.features, moved, style.luminance, light=light)
+
+    def match(part: StyleDictionary) -> Annotated[Tensor, "K T"]:
+        return chosen.build(dictionary=part, scene=scene).region_match(scene.keys)
 
     places = tuple((place.about(here.origin), look(allowed)) for place, allowed in controls.places)
     mine = replace(look(controls.allowed), places=places)

@@ -166,6 +166,7 @@ def concatenate(parts: Sequence[StyleDictionary], names: Sequence[str], weights:
         blend=parts[0].blend,
         colour_mean=together("colour_mean") if coloured else None,
         colour_covariance=together("colour_covariance") if coloured else None,
+        beyond=together("beyond") if all(part.beyond is not None for part in parts) else None,
     )
 
 

@@ -68,7 +68,8 @@ def made_up() -> tuple[MatchMap, Codes]:
     """Two by two pixels: sure of code 0, torn between codes 1 and 2, kept, and empty."""
     taken = torch.tensor([[[1.0, 0, 0], [0, 0.5, 0.5]], [[0, 0, 0], [0, 0, 0]]])
     region = torch.tensor([[[1.0, 0], [0, 1]], [[0.0, 1], [0, 0]]])
-    found = MatchMap(taken, torch.tensor([[0.9, 0.2], [0.0, 0.0]]), region, torch.tensor([[1.0, 1], [1, 0]]))
+    score, sure = torch.tensor([[[0.9, 0.2], [0.0, 0.0]], [[0.8, 0.4], [0.7, 0.0]]])
+    found = MatchMap(taken, score, region, sure, torch.tensor([[1.0, 1], [1, 0]]))
     return found, Codes(torch.tensor([0, 1, 1]), ("a.jpg", "b.jpg"), torch.eye(3))
 
 
@@ -76,7 +77,7 @@ def test_summaries_count_what_is_there() -> None:
     summary = summarize(*made_up())
     assert summary["references"] == [{"name": "a.jpg", "share": 0.5}, {"name": "b.jpg", "share": 0.5}]
     assert summary["kept_share"] == pytest.approx(1 / 3) and summary["score"] == pytest.approx(0.55)
-    assert summary["entropy_bits"] == pytest.approx(0.5)
+    assert summary["entropy_bits"] == pytest.approx(0.5) and summary["confidence"] == pytest.approx(0.6)
     assert summary["codes"][0] == {"reference": "a.jpg", "cluster": 0, "share": pytest.approx(1 / 3)}
     assert {(c["reference"], c["cluster"]) for c in summary["codes"][1:]} == {("b.jpg", 0), ("b.jpg", 1)}
     assert summary["regions"] == [{"region": 0, "share": pytest.approx(1 / 3)}, {"region": 1, "share": pytest.approx(2 / 3)}]
@@ -91,5 +92,6 @@ def test_numbers_of_pixels(tmp_path: Path) -> None:
     assert arrays["reference"].tolist() == [[0, 1], [-1, -1]] and arrays["region"].tolist() == [[0, 1], [1, -1]]
     assert arrays["cluster"][0, 0] == 0 and arrays["cluster"][0, 1] in (0, 1) and arrays["cluster"][1].tolist() == [-1, -1]
     assert arrays["reference"].dtype == np.int16 and arrays["score"].dtype == np.float32
+    assert np.array_equal(arrays["confidence"], found.confidence)
     assert np.allclose(arrays["entropy_bits"], found.entropy) and np.allclose(arrays["kept"], [[0, 0], [1, 0]])
     assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]

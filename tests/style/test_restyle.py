@@ -24,6 +24,7 @@ SECOND: dict[str, object] = {
     "blend": 0.9,
     "strength": 0.5,
     "luminance": 1.0,
+    "bold": 1.0,
     "pin": ("0=1",),
     "forbid": ("0=0",),
     "keep": ("0",),

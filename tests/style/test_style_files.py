@@ -30,6 +30,7 @@ def full(folder: Path) -> StyleFile:
         blend=0.4,
         strength=0.9,
         luminance=0.25,
+        bold=0.75,
         pin=("sky=a.jpg",),
         forbid=("region3=1",),
         keep=("2",),
@@ -51,6 +52,18 @@ def test_every_field_survives(tmp_path: Path) -> None:
     assert json.loads(path.read_text())["made"] == {"seconds": 1.5}
     write_style(path, read)
     assert read_style(path) == read, "what is written is itself such a file"
+
+
+def test_a_style_from_before_there_was_light_paints_everything(tmp_path: Path) -> None:
+    write_style(tmp_path / "style.json", full(tmp_path))
+    whole = json.loads((tmp_path / "style.json").read_text())
+    del whole["style"]["bold"]
+    del whole["style"]["stylizer"]["light"]
+    photo(tmp_path / "old.json", json.dumps(whole))
+    assert read_style(tmp_path / "old.json").style.bold == 1
+    del whole["fprf"]
+    photo(tmp_path / "by_hand.json", json.dumps(whole))
+    assert read_style(tmp_path / "by_hand.json").style.bold == StyleConfig.bold
 
 
 def test_photographs_in_its_folder_move_with_it_and_others_are_absolute(tmp_path: Path) -> None:

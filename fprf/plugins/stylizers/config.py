@@ -33,6 +33,8 @@ class StylizerConfig(PluginConfig):
     """Share of the change of features that counts, in [0, 1]."""
     colours: float = 0.0
     """Share by which the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
+    light: bool = False
+    """What the references show nothing like keeps its material and takes their light; False = it is painted like the rest."""
 
     def __post_init__(self) -> None:
         between("stylizer.features", self.features, 0.0, 1.0)
@@ -164,6 +166,8 @@ class RegionToneConfig(_RegionConfig):
     """Share of the change of features (contrast, texture) that counts, in [0, 1]."""
     colours: float = 1.0
     """Share by which the colours of each region are then carried to the colours of what it matches, in [0, 1]."""
+    light: bool = True
+    """What the references show nothing like keeps its material and takes their light; False = it is painted like the rest."""
     temperature: float = 0.2
     """Softness of the match between regions and style codes, relative to the spread of the scores; above 0."""
     smoothness: float = 16.0

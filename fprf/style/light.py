@@ -1,0 +1,326 @@
+"""Light where a match is not sure: what the references do not show keeps its material and takes their light.
+
+Colours are sRGB in [0, 1], rows: c' = c A + b. A region k with mean m_k takes
+
+    light_k(c)  =  (e_k m_k + q_k (c - m_k)) S,        S = (s I + (1 - s) L) diag(g)
+
+with its exposure e_k and contrast q_k, and the saturation s and white balance g of the references; L takes colours to the grey
+of their luma. A gain of light is a product, in linear light and, but for the black end, in sRGB.
+
+- Exposure: what all regions agree on, and a quarter of what the region's own match says: a night is dark for what it does not
+  show. The sky is a source of light and no thing; it changes more than what it lights, so smooth regions follow their match.
+- White balance: the cast that all codes of the references share (`shared`), less that of the scene. A sunset is warm in sky,
+  road and tree: that is light. A meadow with a blue sky and a red barn shares nothing: that is material.
+
+A point of confidence p takes p paint(c) + (1 - p) light(c) + 4 p (1 - p) u_k. On the way from blue to yellow lies green: u_k
+takes it out of the middle where both are opposite along red and blue.
+
+Confidence is the rate at which matches of that score are right where a right one is as likely as none, on painted pairs of
+photographs (`benchmarks/match_confidence.py`). Scores count in spreads of the cosines between the scene's own regions: encoders
+differ in these as they do in the scores of unlike things.
+"""
+
+from collections.abc import Callable
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..ops.precision import double
+from .controls import luma
+from .dictionary import StyleDictionary, choose, code_odds
+from .matching import score_spread, share_mean, unit
+from .scene import Membership, SceneStyle
+
+UNSURE, SURE = 0.0, 1.3
+"""Scores, in spreads of the scene's own regions, up to which a match counts nothing and from which on it counts wholly."""
+_NEAREST = 0.05
+"""Share of a reference's pixels that a score is the mean of: less may be the rim of something else."""
+_MATCHED = 0.25
+"""Share of a thing's exposure that its own match decides."""
+_SMOOTH, _ROUGH = 0.12, 0.25
+"""Deviations of luma, relative to it, up to which a region is a source of light, and from which on it is a thing."""
+_BLACK = 0.02
+"""Added to colours before ratios are taken: five 8-bit steps, below which no ratio is known."""
+_EXPOSURE = (0.05, 2.5)
+"""Least and largest gain of light."""
+_SATURATION = (0.35, 1.1)
+"""Least and largest gain of saturation: black and white takes colour away, a neon street adds little to a wall."""
+_CAST = 0.36
+"""Largest cast along an axis, in logarithms of sRGB."""
+_BRIGHT = 0.15
+"""Luma below which colours count less for the cast: what is nearly black has none."""
+_LEAST_VOTE = 0.1
+"""Vote of an unsure region on the exposure, beside 1 of a sure one: a scene of nothing but these has an exposure, too."""
+_AXES = ((0.5**0.5, 0.0, -(0.5**0.5)), (-(6**-0.5), (2 / 3) ** 0.5, -(6**-0.5)))
+"""Red against blue, green against magenta; of unit length, at right angles to grey and to each other."""
+
+
+class LightMaps(NamedTuple):
+    """What the light of the references makes of each region, float64."""
+
+    matrix: Annotated[Tensor, "K 3 3"]
+    bias: Annotated[Tensor, "K 3"]
+    between: Annotated[Tensor, "K 3"]
+    """Added to colours half painted, half lit."""
+
+
+class Light(nn.Module):
+    """Confidence of points in their match, and the light that they take as far as they have none."""
+
+    matrix: Annotated[Tensor, "K 3 3"]
+    bias: Annotated[Tensor, "K 3"]
+    between: Annotated[Tensor, "K 3"]
+    keys: Annotated[Tensor, "T D"]
+    beyond: Annotated[Tensor, "T"]
+    middles: Annotated[Tensor, "references D"]
+    share: Annotated[Tensor, "T"]
+    reference: Annotated[Tensor, "T"]
+    forbidden: Annotated[Tensor, "K references"]
+    regions: Annotated[Tensor, "K 1"]
+
+    def __init__(
+        self,
+        scene: SceneStyle,
+        dictionary: StyleDictionary,
+        maps: LightMaps,
+        bold: float,
+        regions: Annotated[Tensor, "K"],
+        allowed: Annotated[Tensor, "K references"],
+    ) -> None:
+        super().__init__()
+        self.membership, self.bold, self._spread = Membership(scene), bold, _spread(scene)
+        self._restricted = not bool(allowed.all())
+        # The identity is taken out, as in ColourMaps.
+        self.register_buffer("matrix", (maps.matrix - torch.eye(3).to(maps.matrix)).float())
+        self.register_buffer("bias", maps.bias.float())
+        self.register_buffer("between", maps.between.float())
+        self.register_buffer("keys", dictionary.keys.float())
+        self.register_buffer("beyond", _beyond(dictionary).float())
+        self.register_buffer("middles", _middles(scene, dictionary).float())
+        self.register_buffer("share", dictionary.share.float())
+        self.register_buffer("reference", dictionary.reference)
+        self.register_buffer("forbidden", (~allowed).float())
+        self.register_buffer("regions", regions.float()[:, None])
+
+    def confidence(
+        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+    ) -> Annotated[Tensor, "N 1"]:
+        """How sure points are of their match, in [0, 1]."""
+        return certainty(self.score(semantic, belongs))
+
+    def score(
+        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+    ) -> Annotated[Tensor, "N 1"]:
+        """Likeness of points to their nearest codes and of their regions to those that they take, half each, in spreads."""
+        belongs, points = self._belongs(semantic, belongs), semantic.to(self.keys)
+        own = points.new_full((len(points),), -1.0)
+        for i, middle in enumerate(self.middles):
+            codes = (self.reference == i).nonzero().squeeze(1)
+            near = cosines(points, self.keys[codes], self.beyond[codes], self.membership.centre, middle)
+            if self._restricted:  # of references that are forbidden to their regions, points know nothing
+                near = near - 2 * (belongs @ self.forbidden[:, i, None])
+            own = torch.maximum(own, nearest_mean(near, self.share[codes]))
+        return (own[:, None] / self._spread + belongs @ self.regions) / 2
+
+    def paint(
+        self, semantic: Annotated[Tensor, "N D"], belongs: Annotated[Tensor, "N K"] | None = None
+    ) -> Annotated[Tensor, "N 1"]:
+        """Share of paint at points, in [0, 1]: the confidence at `bold` 0.5, none at 0, all at 1."""
+        sure = self.confidence(semantic, belongs)
+        return 2 * self.bold * sure if self.bold <= 0.5 else sure + (2 * self.bold - 1) * (1 - sure)
+
+    def change(
+        self,
+        semantic: Annotated[Tensor, "N D"],
+        paint: Annotated[Tensor, "N 1"],
+        belongs: Annotated[Tensor, "N K"] | None = None,
+    ) -> Annotated[Tensor, "N 4 3"]:
+        """What is added to colours beside the paint: A and below it b of each point, c' = c + c A + b."""
+        belongs = self._belongs(semantic, belongs)
+        lit = (belongs @ torch.cat([self.matrix, self.bias[:, None]], 1).flatten(1)).view(-1, 4, 3) * (1 - paint)[..., None]
+        lit[:, 3] += 4 * paint * (1 - paint) * (belongs @ self.between)
+        return lit
+
+    def forward(
+        self,
+        colour: Annotated[Tensor, "N 3"],
+        semantic: Annotated[Tensor, "N D"],
+        paint: Annotated[Tensor, "N 1"],
+        belongs: Annotated[Tensor, "N K"] | None = None,
+    ) -> Annotated[Tensor, "N 3"]:
+        """`change` of the scene's own colours."""
+        maps = self.change(semantic, paint, belongs)
+        own = colour.to(maps)
+        return (torch.einsum("nc,ncd->nd", own, maps[:, :3]) + maps[:, 3]).to(colour)
+
+    def _belongs(self, semantic: Tensor, belongs: Tensor | None) -> Annotated[Tensor, "N K"]:
+        share: Tensor = self.membership(semantic) if belongs is None else belongs
+        return share.to(self.bias)
+
+
+def light_of(
+    scene: SceneStyle,
+    dictionary: StyleDictionary,
+    match: Callable[[StyleDictionary], Annotated[Tensor, "K T"]],
+    colours: tuple[Annotated[Tensor, "K 3"], Annotated[Tensor, "K 3 3"]],
+    *,
+    bold: float,
+    allowed: Annotated[Tensor, "K references"] | None = None,
+) -> Light | None:
+    """The light of references on a scene; None where all is painted (`bold` 1), or nothing tells regions or colours apart.
+
+    `match` gives the share of each code of a dictionary in each region, `colours` are mean and covariance of the regions' own
+    colours. A region that may not take from all references is lit as if there were only those that it may take from.
+    """
+    if bold == 1 or len(scene.share) == 1 or dictionary.colour_mean is None:
+        return None
+    count = len(scene.share)
+    every = torch.ones(count, len(dictionary.names), dtype=torch.bool) if allowed is None else allowed.cpu()
+    mean, covariance = (double(part).cpu() for part in colours)
+    scores = mean.new_zeros(count)
+    maps = LightMaps(mean.new_zeros(count, 3, 3), torch.zeros_like(mean), torch.zeros_like(mean))
+    for row in sorted({tuple(row) for row in every.tolist()}):
+        chosen = torch.tensor(row)
+        part, rows = choose(dictionary, chosen)[0], (every == chosen).all(1)
+        table = double(match(part)).cpu()
+        found = region_scores(scene, part, table)
+        scores[rows] = found[rows]
+        made = light_maps(mean, covariance, double(scene.share), table, part, certainty(found))
+        for whole, own in zip(maps, made, strict=True):
+            whole[rows] = own[rows]
+    return Light(scene, dictionary, maps, bold, scores, every)
+
+
+def cosines(
+    x: Annotated[Tensor, "N D"],
+    keys: Annotated[Tensor, "T D"],
+    beyond: Annotated[Tensor, "T"],
+    centre: Annotated[Tensor, "D"],
+    middle: Annotated[Tensor, "D"],
+) -> Annotated[Tensor, "N T"]:
+    """The lesser of the cosines seen from the scene's mean and from the middle between scene and reference.
+
+    In a room all of a meadow lies in one direction from the mean, and from the middle all of the room does. What codes have
+    `beyond` the basis of the scene (squared length) is at right angles to all that the scene has.
+    """
+
+    def seen(at: Tensor) -> Tensor:
+        length = (keys - at).square().sum(1)
+        shown = (length / (length + beyond).clamp_min(torch.finfo(length.dtype).tiny)).sqrt()
+        return unit(x, at) @ unit(keys, at).T * shown
+
+    return torch.minimum(seen(centre), seen(middle))
+
+
+def nearest_mean(cosine: Annotated[Tensor, "N T"], share: Annotated[Tensor, "T"]) -> Annotated[Tensor, "N"]:
+    """Mean cosine with the nearest twentieth of a reference's pixels."""
+    near, order = cosine.sort(1, descending=True)
+    size = (share / share.sum())[order]
+    taken = (_NEAREST - (size.cumsum(1) - size)).clamp_min(0).minimum(size)
+    return (taken * near).sum(1) / taken.sum(1)
+
+
+def region_scores(scene: SceneStyle, dictionary: StyleDictionary, table: Annotated[Tensor, "K T"]) -> Annotated[Tensor, "K"]:
+    """Mean cosine of each region with the codes that it takes, float64, in spreads of the scene's own regions."""
+    own, keys, centre = double(scene.keys), double(dictionary.keys), double(scene.semantic_mean)
+    beyond = double(_beyond(dictionary))
+    total = own.new_zeros(len(own))
+    for i, middle in enumerate(double(_middles(scene, dictionary))):
+        codes = (dictionary.reference == i).nonzero().squeeze(1)
+        total = total + (table[:, codes] * cosines(own, keys[codes], beyond[codes], centre, middle)).sum(1)
+    return total / _spread(scene)
+
+
+def _beyond(dictionary: StyleDictionary) -> Annotated[Tensor, "T"]:
+    return torch.zeros_like(dictionary.share) if dictionary.beyond is None else dictionary.beyond
+
+
+def _middles(scene: SceneStyle, dictionary: StyleDictionary) -> Annotated[Tensor, "references D"]:
+    """Centre between the scene's mean and that of each reference."""
+    rows = []
+    for i in range(len(dictionary.names)):
+        own = dictionary.reference == i
+        rows.append((scene.semantic_mean + share_mean(dictionary.keys[own], dictionary.share[own])) / 2)
+    return torch.stack(rows)
+
+
+def certainty(score: Annotated[Tensor, "..."]) -> Annotated[Tensor, "..."]:
+    """Confidence in [0, 1] of scores in spreads."""
+    return ((score - UNSURE) / (SURE - UNSURE)).clamp(0, 1)
+
+
+def light_maps(
+    mean: Annotated[Tensor, "K 3"],
+    covariance: Annotated[Tensor, "K 3 3"],
+    share: Annotated[Tensor, "K"],
+    table: Annotated[Tensor, "K T"],
+    dictionary: StyleDictionary,
+    sure: Annotated[Tensor, "K"],
+) -> LightMaps:
+    """The affine map of each region by the references' light, float64; see the top of the file."""
+    assert dictionary.colour_mean is not None
+    codes, odds = double(dictionary.colour_mean), code_odds(dictionary)
+    wanted, own, grey = table @ codes, luma(mean)[:, 0], luma(torch.eye(3, dtype=torch.float64))
+    deviation = torch.einsum("kij,ix,jx->k", covariance, grey, grey).clamp_min(0).sqrt()
+    source = ((_ROUGH - deviation / (own + _BLACK)) / (_ROUGH - _SMOOTH)).clamp(0, 1)
+    vote = share * (1 - source)
+    vote = share if float(vote.sum()) < 1e-3 * float(share.sum()) else vote  # of a scene of nothing but sky, all
+    # Exposure, from the logarithms of luma.
+    change = (luma(wanted)[:, 0] + _BLACK).log() - (own + _BLACK).log()
+    thing = torch.lerp(change.new_tensor(agreed(change, vote * (sure + _LEAST_VOTE))), change, _MATCHED)
+    gain = torch.lerp(thing, change, source).exp().clamp(*_EXPOSURE)
+    # White balance, from the logarithms of colours.
+    axes = torch.tensor(_AXES, dtype=torch.float64)
+    here, there = ((part.clamp_min(0) + _BLACK).log() @ axes.T for part in (mean, codes))
+    bright = odds * (luma(codes)[:, 0] / _BRIGHT).clamp(0.05, 1)
+    cast = []
+    for a in range(len(axes)):
+        lit = shared(there[:, a], bright)
+        # Where the references share nothing, what the scene shares may be its material: a plant is yellowish throughout.
+        cast.append(lit - shared(here[:, a], share) if lit else 0.0)
+    balance = (torch.tensor(cast, dtype=torch.float64).clamp(-_CAST, _CAST) @ axes).exp()
+    saturation = (_saturation(codes, odds) / _saturation(mean, share)).clamp(*_SATURATION)
+    towards = (saturation * torch.eye(3).to(grey) + (1 - saturation) * grey.expand(3, 3)) * balance
+    # Two deviations above the mean stay below white, with at least a third of the contrast.
+    contrast = gain.minimum(((1 - gain * own) / (2 * deviation).clamp_min(_BLACK)).clamp_min(gain.clamp_max(1) / 3))
+    bias = ((gain - contrast)[:, None] * mean) @ towards
+    lit_mean = gain[:, None] * mean @ towards
+    return LightMaps(contrast[:, None, None] * towards, bias, _ungreened(lit_mean, wanted, axes))
+
+
+def agreed(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
+    """The weighted median, as far as more than three fifths (wholly: nine tenths) of the weight have its sign."""
+    median = _quantile(value, weight, 0.5)
+    same = float(weight[value.sign() == (median > 0) - (median < 0)].sum() / weight.sum())
+    return median * min(1.0, max(0.0, (same - 0.6) / 0.3))
+
+
+def shared(value: Annotated[Tensor, "N"], weight: Annotated[Tensor, "N"]) -> float:
+    """What four fifths of the weight have at least, with its sign; 0 where signs differ."""
+    low, high = _quantile(value, weight, 0.2), _quantile(value, weight, 0.8)
+    return low if low > 0 else high if high < 0 else 0.0
+
+
+def _quantile(value: Tensor, weight: Tensor, at: float) -> float:
+    order = value.argsort()
+    edges = weight[order].cumsum(0)
+    return float(value[order][int(torch.searchsorted(edges, at * edges[-1]).clamp_max(len(value) - 1))])
+
+
+def _saturation(colour: Annotated[Tensor, "N 3"], weight: Annotated[Tensor, "N"]) -> Tensor:
+    """Median distance of colours from grey, relative to their luma; never 0."""
+    grey = luma(colour)
+    return torch.tensor(_quantile((colour - grey).abs().amax(1) / (grey[:, 0] + _BLACK), weight, 0.5) + _BLACK)
+
+
+def _ungreened(lit: Tensor, painted: Tensor, axes: Tensor) -> Annotated[Tensor, "K 3"]:
+    """What takes green and magenta out of the middle of two colours, as far as they are opposite along red and blue."""
+    (red, green), (other_red, other_green) = (lit @ axes.T).unbind(1), (painted @ axes.T).unbind(1)
+    opposite = (-red * other_red / red.square().maximum(other_red.square()).clamp_min(1e-12)).clamp(0, 1)
+    return (-opposite * (green + other_green) / 2)[:, None] * axes[1]
+
+
+def _spread(scene: SceneStyle) -> float:
+    units = unit(scene.keys, scene.semantic_mean)
+    return score_spread(units, units)
