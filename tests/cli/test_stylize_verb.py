@@ -91,7 +91,7 @@ def test_explain_lists_regions_and_renders_nothing(run: Path, world: World, caps
     folder, out = run / "styles" / "dusk+snow", capsys.readouterr().out
     assert {p.name for p in folder.iterdir()} == {"explain.json", "explain.png", "dictionary.safetensors", "style.json"}
     listed = json.loads((folder / "explain.json").read_text())
-    assert out.splitlines()[0].split() == ["region", "share", "seen", "best", "at", "strength", "entropy", "takes"]
+    assert out.splitlines()[0].split() == ["region", "share", "seen", "best", "at", "strength", "sure", "entropy", "takes"]
     assert len(listed["regions"]) == 4 and [line.split()[0] for line in out.splitlines()[1:5]] == list("0123")
     assert " kept " in out.splitlines()[2] and "(score " in out.splitlines()[1]
     assert sorted(listed["references"]) == ["dusk.png", "snow.png"]
@@ -101,7 +101,7 @@ def test_explain_lists_regions_and_renders_nothing(run: Path, world: World, caps
 def test_match_maps_alone(run: Path, world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--match-only", "--views", "0003", "0001", "--pixels", "--clusters", "2"]
     made = stylize(run, world, tmp_path / "m", *words)["made"]
-    kinds = ("match.png", "score.png", "entropy.png", "match.npz")
+    kinds = ("match.png", "score.png", "confidence.png", "entropy.png", "match.npz")
     expected = {f"{view}-{kind}" for view in ("0001", "0003") for kind in kinds}
     assert {p.name for p in (tmp_path / "m").iterdir()} == expected | {"dictionary.safetensors", "style.json"}
     assert made.keys() == MADE - {"seconds_per_view"} and made["matches"].keys() == {"0003", "0001"}

@@ -41,7 +41,8 @@ def test_all_slots_of_the_knob_tree_are_found_outer_first() -> None:
     found = {slot.path: slot for slot in slots(fprf())}
     assert set(found) == {
         "datamanager", "datamanager.parser", "sampler", "content.encoder", "content.field", "content.decoder",
-        "semantic.encoder", "semantic.field", "blocks", "executor", "loss.extra",
+        "semantic.encoder", "semantic.encoder.first", "semantic.encoder.second", "semantic.encoder.third", "semantic.field",
+        "blocks", "executor", "loss.extra",
     }  # fmt: skip
     assert list(found).index("datamanager") < list(found).index("datamanager.parser")
     assert found["semantic.encoder"].optional and not found["content.encoder"].optional
