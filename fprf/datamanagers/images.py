@@ -98,7 +98,7 @@ class ImageHeader(NamedTuple):
 
 def read_header(path: Path) -> ImageHeader:
     """The header of an image file. Raises DataError where the file is absent, empty, or of no known format."""
-    with _opened(path) as file:
+    with opened(path) as file:
         return header_of(file, path)
 
 
@@ -273,7 +273,7 @@ def _decode(
 
     Colours of 16 bits become 8 with `rounded`.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         kind, image = open_image(file, path)
         # For TIFF Pillow has a limit of its own, above which it warns.
         most = min(MAX_PIXELS, PIL.Image.MAX_IMAGE_PIXELS or MAX_PIXELS) if kind == "TIFF" else MAX_PIXELS
@@ -381,7 +381,7 @@ def _transform(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform | None]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
+def opened(path: Path) -> Iterator[IO[bytes]]:
     """A file open for reading. Raises DataError where that cannot be."""
     try:
         file = path.open("rb")

@@ -13,7 +13,6 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -117,9 +116,8 @@ class _Bytes:
 
     def take(self, layout: struct.Struct, what: str) -> tuple[float, ...]:
         self.need(layout.size, what)
-        values = layout.unpack_from(self.data, self.at)
         self.at += layout.size
-        return values
+        return layout.unpack_from(self.data, self.at - layout.size)
 
     def count(self, least: int, what: str) -> int:
         """A count of things that take at least `least` bytes each."""
@@ -190,6 +188,11 @@ def _points_bin(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return ids, points
 
 
+def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The place and words of each line that is neither a comment nor empty."""
+    return ((place, line.split()) for place, line in _lines(path) if line.strip())
+
+
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
     """The place and text of each line that is no comment; empty ones too. Blanks at its end may belong to a name."""
     try:
@@ -221,10 +224,7 @@ def _ints(path: Path, place: str, words: list[str]) -> tuple[int, ...]:
 def _cameras_txt(path: Path) -> dict[int, ColmapCamera]:
     known = dict(MODELS)
     cameras: dict[int, ColmapCamera] = {}
-    for place, line in _lines(path):
-        words = line.split()
-        if not words:
-            continue
+    for place, words in _rows(path):
         if len(words) >= 4 and words[1].isidentifier() and words[1] not in known:
             raise DataError(f"{path}: {place}: the camera model {words[1]} is unknown; {_undistort(path.parent)}")
         if len(words) < 4 or words[1] not in known or len(words) != 4 + len(known[words[1]].split()):
@@ -260,10 +260,7 @@ def _images_txt(path: Path) -> list[ColmapImage]:
 def _points_txt(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     ids: list[int] = []
     points: list[tuple[float, ...]] = []
-    for place, line in _lines(path):
-        words = line.split()
-        if not words:
-            continue
+    for place, words in _rows(path):
         if len(words) < 8:
             raise _bad(path, place, "not `ID X Y Z R G B ERROR` and a track")
         ids += _ints(path, place, words[:1])
@@ -274,7 +271,6 @@ def _points_txt(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 _APART = 1e-3
 """Share of the cameras' extent by which the two sets of camera centres may differ."""
 
-_Lens: TypeAlias = tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float, float, float], int]
 Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 """Finite points [P 3], and pairs [O 2] where known."""
 
@@ -414,14 +410,22 @@ class ColmapParser(DataParser):
             if camera is None:
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
             pose = _pose(where, image)
-            focal, centre, distortion, lens = _lens(f"{folder}: camera {image.camera}", camera, _undistort(folder, str(root)))
+            own = f"{folder}: camera {image.camera}"
+            size = pixel_size(own, camera.width, camera.height)
+            # Parameters by name; what is left after those that every lens has are terms that few have.
+            given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
+            focal = given.pop("f", 0.0)
+            k = [given.pop(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+            fx, fy, cx, cy = given.pop("fx", focal), given.pop("fy", focal), given.pop("cx", 0.0), given.pop("cy", 0.0)
+            remedy = _undistort(folder, str(root))
+            distortion, lens = lens_of(own, camera.model, k, list(given.values()), remedy)
             return View(
                 name=inner,
                 path=path,
                 pose=pose,
-                size=(camera.width, camera.height),
-                focal=focal,
-                centre=centre,
+                size=size,
+                focal=(fx, fy),
+                centre=(cx, cy),
                 distortion=distortion,
                 lens=lens,
                 depths=_depths(model.points[rows], pose),
@@ -438,8 +442,8 @@ class ColmapParser(DataParser):
             points, notes = points if extra is None else extra, notes + said
         split = None
         if roles is not None:
-            given = [roles[PurePosixPath(image.name).name] for _, _, image, _ in kept]
-            split = index_tensor([role == "train" for role in given]), index_tensor([role == "test" for role in given])
+            learned = [roles[PurePosixPath(image.name).name] == "train" for _, _, image, _ in kept]
+            split = index_tensor(learned), index_tensor([not each for each in learned])
         return assemble_scene(
             data, views, downscale=downscale, split=split, points=points, seen=seen, reduced=name != "images", notes=notes
         )
@@ -451,18 +455,6 @@ def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
     with np.errstate(over="ignore", invalid="ignore"):
         centre = -back @ np.array(image.translation)
     return rigid_pose(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
-
-
-def _lens(where: str, camera: ColmapCamera, remedy: str) -> _Lens:
-    """Focal lengths, principal point, k1 k2 k3 k4 p1 p2 and lens of a COLMAP camera."""
-    pixel_size(where, camera.width, camera.height)
-    given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
-    fx, fy = (given.pop(key, given.get("f", 0.0)) for key in ("fx", "fy"))
-    given.pop("f", None)
-    centre = given.pop("cx", 0.0), given.pop("cy", 0.0)
-    k = [given.pop(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
-    distortion, lens = lens_of(where, camera.model, k, list(given.values()), remedy)
-    return (fx, fy), centre, distortion, lens
 
 
 def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float] | None:

@@ -253,9 +253,16 @@ def assemble_scene(
     sizes = []
     for view in views:
         header = read_header(view.path)
-        _check_size(view, (header.width, header.height), reduced)
+        size = header.width, header.height
+        # Reducing rounds each side to a whole pixel.
+        same_shape = abs(view.size[0] * size[1] - view.size[1] * size[0]) <= sum(view.size)
+        if not (view.size == size or (reduced and same_shape)):
+            raise DataError(
+                f"{view.path}: {size[0]}x{size[1]} pixels, but its camera has {view.size[0]}x{view.size[1]}; "
+                "restore the image (was it resized, rotated or cropped?) or calibrate again"
+            )
         alpha |= header.alpha
-        sizes.append((header.width, header.height))
+        sizes.append(size)
     delivered = Cameras(
         pose=torch.from_numpy(np.stack([view.pose for view in views])),
         focal=torch.tensor([view.focal for view in views], dtype=torch.float64),
@@ -290,16 +297,6 @@ def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], fold
     if missing:
         raise DataError(f"{data}: {len(missing)} masks are missing, the first is {missing[0]}; copy them there or unname them")
     return tuple(named)
-
-
-def _check_size(view: View, file: tuple[int, int], reduced: bool) -> None:
-    # Reducing rounds each side to a whole pixel.
-    same_shape = abs(view.size[0] * file[1] - view.size[1] * file[0]) <= sum(view.size)
-    if not (view.size == file or (reduced and same_shape)):
-        raise DataError(
-            f"{view.path}: {file[0]}x{file[1]} pixels, but its camera has {view.size[0]}x{view.size[1]}; "
-            "restore the image (was it resized, rotated or cropped?) or calibrate again"
-        )
 
 
 def _check_camera(view: View) -> None:
