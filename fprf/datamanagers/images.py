@@ -240,15 +240,6 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
     An image in a folder that cannot be read is left out, and `report` is given the reason. Raises DataError for a folder
     without a readable image.
     """
-    listed: dict[Path, None] = {}
-    for path in paths:
-        listed |= dict.fromkeys(_readable(path, report) if path.is_dir() else [path])
-    return list(listed)
-
-
-def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
-    """The images of a folder that can be decoded."""
-    images = [folder / name for name in image_names(folder)]
 
     def fault(path: Path) -> str:
         try:
@@ -257,13 +248,17 @@ def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
             return str(error)
         return ""
 
-    with ThreadPoolExecutor() as pool:
-        faults = dict(zip(images, pool.map(fault, images), strict=True))
-    for reason in filter(None, faults.values()):
-        report(f"left out: {reason}")
-    if all(faults.values()):
-        raise DataError(f"{folder}: none of its {len(images)} images can be read; the first one: {faults[images[0]]}")
-    return [path for path in images if not faults[path]]
+    listed: dict[Path, None] = {}
+    for path in paths:
+        images = [path / name for name in image_names(path)] if path.is_dir() else []
+        with ThreadPoolExecutor() as pool:
+            faults = dict(zip(images, pool.map(fault, images), strict=True))
+        for reason in filter(None, faults.values()):
+            report(f"left out: {reason}")
+        if images and all(faults.values()):
+            raise DataError(f"{path}: none of its {len(images)} images can be read; the first one: {faults[images[0]]}")
+        listed |= dict.fromkeys([image for image in images if not faults[image]] if images else [path])
+    return list(listed)
 
 
 def _decode(
@@ -305,7 +300,10 @@ def _decode(
     if pixels.mode not in ("L", "RGB", "CMYK"):
         pixels = pixels.convert("L" if pixels.mode == "1" else "RGB")
     if profile:
-        pixels = _to_srgb(pixels, profile)
+        mode, transform = _transform(profile)
+        if mode == "RGB" and pixels.mode == "L":
+            pixels = pixels.convert("RGB")
+        pixels = pixels if transform is None or pixels.mode != mode else transform.apply(pixels)
     if turn is not None:
         pixels, alpha = pixels.transpose(turn), alpha and alpha.transpose(turn)
     return pixels, alpha
@@ -353,14 +351,6 @@ def _from_16_bits(
     upper = np.asarray(image.convert("RGB"), dtype=np.int16)
     same = eight.shape[:2] == upper.shape[:2] and np.abs(eight[:, :, :3] - upper).max() <= 1
     return PIL.Image.fromarray(eight) if same else image
-
-
-def _to_srgb(pixels: PIL.Image.Image, profile: bytes) -> PIL.Image.Image:
-    """Colours of an ICC profile in sRGB; as they are where the profile is sRGB, broken or not one of such pixels."""
-    mode, transform = _transform(profile)
-    if mode == "RGB" and pixels.mode == "L":
-        pixels = pixels.convert("RGB")
-    return pixels if transform is None or pixels.mode != mode else transform.apply(pixels)
 
 
 @lru_cache(maxsize=16)

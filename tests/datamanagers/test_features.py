@@ -228,10 +228,10 @@ def test_an_interrupted_extraction_goes_on(tmp_path: Path) -> None:
     encoder.fail_after = 2
     with pytest.raises(KeyboardInterrupt):
         build(tmp_path, encoder)
-    assert not list(tmp_path.glob("manifest*")) and len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.iterdir())) == 2
     encoder.calls, encoder.fail_after = 0, 99
     build(tmp_path, encoder)
-    assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.glob("manifest*"))) == 1
+    assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.iterdir())) == len(SIZES)
 
 
 def test_encoders_that_break_their_promise_are_named(tmp_path: Path) -> None:

@@ -205,52 +205,40 @@ class RayCamera(NamedTuple):
 def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> RayCamera:
     """The camera of rays [H W 3] through pixel centres. Raises ValueError where they are not those of any lens."""
     height, width = origin.shape[:2]
-    rows = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
+    lines = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
     columns = np.unique(np.linspace(0, width - 1, min(_LATTICE, width)).round().astype(np.int64))
-    grid = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(columns, lines), -1).reshape(-1, 2)
     ray = direction[grid[:, 1], grid[:, 0]].astype(np.float64)
     long = np.linalg.norm(ray, axis=1, keepdims=True)
     if not (long > 1e-9).all() or len(grid) < 16:
         raise ValueError("rays without a direction, or too few of them")
     ray /= long
     pixel = grid.astype(np.float64) + 0.5
-    turn = _axes(ray, grid)
+    # A pinhole first: the matrix whose products with the rays are the pixels (direct linear transform), and by RQ its parts.
+    middle, side = np.array([width, height]) / 2, max(width, height)
+    unit = np.concatenate([(pixel - middle) / side, np.ones((len(pixel), 1))], 1)
+    none = np.zeros_like(ray)
+    rows = np.block([[ray, none, -unit[:, :1] * ray], [none, ray, -unit[:, 1:2] * ray]])
+    matrix = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
+    _, lens, turn, *_ = cv2.RQDecomp3x3(matrix * np.sign(matrix[2] @ ray.mean(0)))
+    if not (lens.diagonal() > 1e-9).all():
+        raise ValueError("rays that span no image, or a mirrored one")
+    (fx, fy), (cx, cy) = lens.diagonal()[:2] / lens[2, 2] * side, lens[:2, 2] / lens[2, 2] * side + middle
     local = ray @ turn.T
     if not (local[:, 2] > 0.02).all():
         raise ValueError("rays that look backwards: more than a half space in one image")
-    plane = local[:, :2] / local[:, 2:]
-    # Straight lines first: focal lengths and centre of a pinhole.
-    (fx, cx), (fy, cy) = (np.polyfit(plane[:, a], pixel[:, a], 1) for a in range(2))
-    if not (fx > 0 and fy > 0):
-        raise ValueError("rays of a mirrored image")
     best = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
     turned = cv2.Rodrigues(best[:3])[0] @ turn
-    middle = origin.reshape(-1, 3).mean(0, dtype=np.float64)
+    place = origin.reshape(-1, 3).mean(0, dtype=np.float64)
     axes = np.stack([turned[0], -turned[1], -turned[2]], 1)
     fx, fy, cx, cy, k1, k2, p1, p2 = best[3:].tolist()
     return RayCamera(
-        np.concatenate([axes, middle[:, None]], 1),
+        np.concatenate([axes, place[:, None]], 1),
         (fx, fy),
         (cx, cy),
         (k1, k2, 0.0, 0.0, p1, p2),
         float(np.sqrt(((_project(local, best)[0] - pixel) ** 2).sum(1).mean())),
     )
-
-
-def _axes(ray: Array, grid: NDArray[np.int64]) -> Array:
-    """Rows: right, down and forward, as the corners of the lattice say."""
-    x, y = grid[:, 0], grid[:, 1]
-    left, right = ray[x == x.min()].mean(0), ray[x == x.max()].mean(0)
-    above, below = ray[y == y.min()].mean(0), ray[y == y.max()].mean(0)
-    ahead = np.cross(right - left, below - above)
-    if np.linalg.norm(ahead) < 1e-9:
-        raise ValueError("rays that span no image")
-    ahead /= np.linalg.norm(ahead)
-    if ahead @ ray.mean(0) < 0:
-        raise ValueError("rays of a mirrored image")
-    across = (right - left) - ((right - left) @ ahead) * ahead
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(ahead, across), ahead])
 
 
 def _refine(local: Array, pixel: Array, value: Array) -> Array:
@@ -286,11 +274,6 @@ def _project(local: Array, value: Array) -> tuple[Array, Array]:
 _FORMAT = 1
 
 
-def record_files(data: Path) -> list[Path]:
-    """The TFRecord files of a folder and its folders, by name."""
-    return sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
-
-
 def is_record(name: str) -> bool:
     """Return whether a file name is that of a TFRecord file or of one of its shards."""
     return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
@@ -304,10 +287,13 @@ class BlockNerfParser(DataParser):
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the stored size. Raises DataError naming file and record."""
-        files = record_files(data)
+        files = sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
         if not files:
             raise DataError(f"{data}: no *.tfrecord files here or below; name the folder that they lie in")
-        folder = cache_folder() / f"blocknerf-{_key(data, files)}"
+        # By what tells files apart without reading hundreds of gigabytes: place, size and time.
+        facts = [(str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+        key = hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
+        folder = cache_folder() / f"blocknerf-{key}"
         entries = _unpacked(folder)
         if not entries:
             (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -331,12 +317,6 @@ class BlockNerfParser(DataParser):
         split = split_by([entry["held"] for entry in kept])
         scene = assemble_scene(data, views, downscale=downscale, split=split, notes=notes)
         return replace(scene, exposure=torch.tensor([entry["exposure"] for entry in kept], dtype=torch.float64))
-
-
-def _key(data: Path, files: list[Path]) -> str:
-    """By what tells files apart without reading hundreds of gigabytes: place, size and time."""
-    facts = [(str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
-    return hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
 
 
 def _unpacked(folder: Path) -> list[dict[str, Any]]:

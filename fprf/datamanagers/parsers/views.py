@@ -29,12 +29,6 @@ MASKS, SKY_MASKS = "masks", "sky_masks"
 """Names of the folders."""
 
 
-def find_masks(data: Path, images: Sequence[Path], name: str) -> tuple[Path | None, ...]:
-    """The mask of each image, None where there is none; nothing at all where the capture has none of that name."""
-    masks = tuple(_mask(data, image, name) for image in images)
-    return masks if any(mask is not None for mask in masks) else ()
-
-
 def _mask(data: Path, image: Path, name: str) -> Path | None:
     """Beside the image's folder, or beside a folder around that, up to the scene's."""
     for above in image.parents[1:]:
@@ -292,7 +286,8 @@ def assemble_scene(
 def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str) -> tuple[Path | None, ...]:
     """Those that the capture names, or where it names none, those that lie beside the images."""
     if not any(named):
-        return find_masks(data, [view.path for view in views], folder)
+        beside = tuple(_mask(data, view.path, folder) for view in views)
+        return beside if any(beside) else ()
     missing = [path for path in named if path is not None and not os.path.isfile(path)]
     if missing:
         raise DataError(f"{data}: {len(missing)} masks are missing, the first is {missing[0]}; copy them there or unname them")
