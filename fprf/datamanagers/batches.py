@@ -184,7 +184,14 @@ class RayBatches(DataManager):
         self._sizes = scene.cameras.size[scene.train]
         self._ends = self._sizes.prod(1).cumsum(0)
         self._slots = {view: slot for slot, view in enumerate(self._views)}
-        self._pixels = self._load(cache)
+        # All training pixels, view after view; many of them mapped from a file.
+        self._pixels = allocate_pixels(int(self._ends[-1]), cache)
+        filled = 0
+        for first in range(0, len(self._views), DECODE):
+            for image in load_images(scene, self.background, self._views[first : first + DECODE]):
+                rows = torch.from_numpy(image).reshape(-1, 3)
+                self._pixels[filled : filled + len(rows)] = rows
+                filled += len(rows)
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
         self._chosen = None if seen is None and not masks else self._runs(masks, unmasked=True, seen=seen)
         if self._chosen is not None and not len(self._chosen):
@@ -299,14 +306,3 @@ class RayBatches(DataManager):
         at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
         kept = torch.ones(len(at), dtype=torch.bool) if self._chosen is None else self._chosen.holds(at)
         return _Marks(at[kept], sightings.distance[kept].float()) if bool(kept.any()) else None
-
-    def _load(self, cache: Path) -> Annotated[Tensor, "P 3"]:
-        """All training pixels, uint8, view after view; many of them mapped from a file."""
-        pixels = allocate_pixels(int(self._ends[-1]), cache)
-        filled = 0
-        for first in range(0, len(self._views), DECODE):
-            for image in load_images(self._scene, self.background, self._views[first : first + DECODE]):
-                rows = torch.from_numpy(image).reshape(-1, 3)
-                pixels[filled : filled + len(rows)] = rows
-                filled += len(rows)
-        return pixels

@@ -42,16 +42,6 @@ def _mask(data: Path, image: Path, name: str) -> Path | None:
     return None
 
 
-def every_eighth(count: int) -> tuple[Tensor, Tensor]:
-    """Indices (train, test), int64, of `count` views sorted by name: every 8th, from the first on, is test (LLFF).
-
-    A single view is for training, so that there is something to learn from.
-    """
-    index = torch.arange(count)
-    test = (index % 8 == 0) & (count > 1)
-    return index[~test], index[test]
-
-
 def index_tensor(members: Sequence[bool]) -> Tensor:
     """The int64 positions of the members."""
     return torch.tensor([k for k, member in enumerate(members) if member], dtype=torch.int64)
@@ -266,7 +256,9 @@ def assemble_scene(
         lens=torch.tensor([view.lens for view in views], dtype=torch.int64),
     ).resized(torch.tensor(sizes))
     depths = [view.depths for view in views if view.depths is not None]
-    train, test = split or every_eighth(len(views))
+    # Every 8th, from the first on, is for testing (LLFF); but a single view is for training: there must be something to learn.
+    held = [k % 8 == 0 and len(views) > 1 for k in range(len(views))]
+    train, test = split or (index_tensor([not each for each in held]), index_tensor(held))
     return Scene(
         name=name_of(data),
         paths=tuple(view.path for view in views),
