@@ -14,6 +14,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -27,7 +28,7 @@ from ..io.atomic import unwritable
 from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
-from .features import FeatureStore, Progress, extract
+from .features import Progress, extract
 from .images import WHITE, load_image, load_images, load_mask
 from .scene import Scene, find_sightings
 
@@ -199,16 +200,9 @@ class RayBatches(DataManager):
         sky = self._runs(skies, unmasked=False) if skies else None
         marks = self._marked() if config.depth_share > 0 else None
         self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marks)
-        self.content_store: FeatureStore | None = None
-        self.semantic_store: FeatureStore | None = None
-        if content is not None:
-            self.content_store = extract(
-                cache / "content", self._views, self._stored, content, config.guided, progress=progress
-            )
-        if semantic is not None:
-            self.semantic_store = extract(
-                cache / "semantic", self._views, self._stored, semantic, config.guided, dim=dim, progress=progress, basis=basis
-            )
+        features = partial(extract, views=self._views, image=self._stored, config=config.guided, progress=progress)
+        self.content_store = None if content is None else features(cache / "content", encoder=content)
+        self.semantic_store = None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
 
     def batch(self, step: int) -> Batch:
         """The pixels of a step; the first `semantic_share` of them carry semantics."""

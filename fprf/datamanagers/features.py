@@ -187,8 +187,13 @@ class FeatureStore:
         self.channels = len(self._entries[0].scale)
         self.bytes = sum(entry.coefs.numel() * 2 for entry in self._entries)
         """Size of the coefficients."""
-        self.mean, self.std = _spread(self._entries)
-        """Mean over all channels, and root mean square over the channels' standard deviations, over all pixels."""
+        # Mean and variance of each channel over all views, each counted by its pixels.
+        weight = torch.stack([entry.size.prod() for entry in self._entries]).double()[:, None]
+        means, variances = torch.stack([entry.moments for entry in self._entries]).unbind(1)
+        mean = (weight * means).sum(0) / weight.sum()
+        variance = (weight * (variances + (means - mean).square())).sum(0) / weight.sum()
+        self.std = float(variance.mean().sqrt())
+        """Root mean square over the channels' standard deviations, over all pixels."""
         self._magnitude = max(float(entry.centre.abs().max()) for entry in self._entries)
         self._table = _table(self._entries)
         self._packed: tuple[guided.Packed, Tensor] | None = None
@@ -367,13 +372,3 @@ def _table(entries: Sequence[Entry]) -> "ViewTable":
         bits = entry.coefs.view(torch.uint16).numpy().reshape(rows * columns, 4 * run)
         views.append(ViewArrays(bits, rows, columns, height, width, entry.scale.numpy(), entry.centre.numpy()))
     return ViewTable(views)
-
-
-def _spread(entries: Sequence[Entry]) -> tuple[float, float]:
-    """Mean and RMS standard deviation over all views, each counted by its pixels."""
-    weight = torch.stack([entry.size.prod() for entry in entries]).double()
-    weight = (weight / weight.sum())[:, None]
-    means, variances = torch.stack([entry.moments for entry in entries]).unbind(1)
-    mean = (weight * means).sum(0)
-    variance = (weight * (variances + (means - mean).square())).sum(0)
-    return float(mean.mean()), float(variance.mean().sqrt())

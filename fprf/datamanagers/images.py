@@ -148,7 +148,11 @@ def load_image(
     known format or over 1e8 pixels.
     """
     colour, alpha = _decode(path, upright)
-    pixels = _pixels(colour)
+    rgb = colour if colour.mode == "RGB" else colour.convert("RGB")
+    pixels = np.empty((rgb.height, rgb.width, 3), dtype=np.uint8)
+    # In strips: the whole would be copied three times, which takes as long as decoding.
+    for top in range(0, rgb.height, _STRIP):
+        pixels[top : top + _STRIP] = np.asarray(rgb.crop((0, top, rgb.width, min(top + _STRIP, rgb.height))))
     if alpha is not None:
         share = np.asarray(alpha, dtype=np.float32)[:, :, None] / 255
         behind = np.asarray(WHITE if background is None else background, dtype=np.float32) * 255
@@ -328,15 +332,6 @@ def _orientation(image: ImageFile) -> int:
     except Exception:  # whatever is wrong with the block, the pixels are whole
         return 1
     return int(found) if found in _TURNS else 1
-
-
-def _pixels(image: PIL.Image.Image) -> Image:
-    """The pixels [H W 3] of an image. In strips: the whole would be copied three times, which takes as long as decoding."""
-    image = image if image.mode == "RGB" else image.convert("RGB")
-    pixels = np.empty((image.height, image.width, 3), dtype=np.uint8)
-    for top in range(0, image.height, _STRIP):
-        pixels[top : top + _STRIP] = np.asarray(image.crop((0, top, image.width, min(top + _STRIP, image.height))))
-    return pixels
 
 
 def _from_16_bits(

@@ -115,18 +115,16 @@ class Example(NamedTuple):
     def integer(self, name: str) -> int:
         """The one integer of a feature. Raises DataError."""
         value = self.features.get(name)
-        if isinstance(value, list) or value is None or value.dtype != np.int64 or len(value) != 1:
+        if not isinstance(value, np.ndarray) or value.dtype != np.int64 or len(value) != 1:
             raise self._wrong(name, "one integer")
         return int(value[0])
 
     def numbers(self, name: str, count: int) -> NDArray[np.float32]:
         """The floats of a feature, so many of them. Raises DataError, also where one is not finite."""
-        value = self.features.get(name)
-        if isinstance(value, list) or value is None or value.dtype != np.float32 or len(value) != count:
+        data = self.features.get(name)
+        if not isinstance(data, np.ndarray) or data.dtype != np.float32 or len(data) != count or not np.isfinite(data).all():
             raise self._wrong(name, f"{count} finite floats")
-        if not np.isfinite(value).all():
-            raise self._wrong(name, f"{count} finite floats")
-        return value.astype(np.float32)
+        return data.astype(np.float32)
 
     def _wrong(self, name: str, wanted: str) -> DataError:
         value = self.features.get(name)
@@ -186,7 +184,6 @@ def _feature(feature: Any) -> Feature:
 Array = NDArray[np.float64]
 _LATTICE = 24
 """Rays along each side that are looked at."""
-_ROUNDS = 30
 
 
 class RayCamera(NamedTuple):
@@ -227,7 +224,7 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
     local = ray @ turn.T
     if not (local[:, 2] > 0.02).all():
         raise ValueError("rays that look backwards: more than a half space in one image")
-    best = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
+    best, error = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
     turned = cv2.Rodrigues(best[:3])[0] @ turn
     place = origin.reshape(-1, 3).mean(0, dtype=np.float64)
     axes = np.stack([turned[0], -turned[1], -turned[2]], 1)
@@ -237,19 +234,23 @@ def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> R
         (fx, fy),
         (cx, cy),
         (k1, k2, 0.0, 0.0, p1, p2),
-        float(np.sqrt(((_project(local, best)[0] - pixel) ** 2).sum(1).mean())),
+        error,
     )
 
 
-def _refine(local: Array, pixel: Array, value: Array) -> Array:
-    """Levenberg and Marquardt's steps: eleven numbers, a few hundred rays."""
+def _refine(local: Array, pixel: Array, value: Array) -> tuple[Array, float]:
+    """Levenberg and Marquardt's steps: eleven numbers, a few hundred rays. The numbers, and what is left of the distances."""
 
     def miss(value: Array) -> tuple[Array, Array]:
-        pixels, slope = _project(local, value)
-        return np.nan_to_num(pixels - pixel, nan=1e6, posinf=1e6, neginf=-1e6).reshape(-1), slope
+        """Differences [2N] from the pixels, and their slopes [2N 11], by rotation vector, fx fy cx cy, k1 k2 p1 p2."""
+        fx, fy, cx, cy = value[3:7]
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        pixels, slope = cv2.projectPoints(local[:, None], value[:3], np.zeros(3), matrix, value[7:])
+        error = np.nan_to_num(pixels[:, 0] - pixel, nan=1e6, posinf=1e6, neginf=-1e6)
+        return error.reshape(-1), np.delete(slope, (3, 4, 5), axis=1)  # without those of the translation
 
     damping, (error, slope) = 1e-3, miss(value)
-    for _ in range(_ROUNDS):
+    for _ in range(30):
         normal = slope.T @ slope
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(11), -slope.T @ error)
         tried, slope_tried = miss(value + step)
@@ -259,16 +260,7 @@ def _refine(local: Array, pixel: Array, value: Array) -> Array:
         damping *= 0.1 if gained > 0 else 10
         if 0 < gained < 1e-9 or damping > 1e8:
             break
-    return value
-
-
-def _project(local: Array, value: Array) -> tuple[Array, Array]:
-    """Pixels [N 2] of rays in OpenCV's camera axes, and their slopes [2N 11], by rotation vector, fx fy cx cy, k1 k2 p1 p2."""
-    fx, fy, cx, cy = value[3:7]
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    pixels, slope = cv2.projectPoints(local[:, None], value[:3], np.zeros(3), matrix, value[7:])
-    slope = np.delete(slope, (3, 4, 5), axis=1)  # those of the translation
-    return pixels[:, 0].astype(np.float64), slope.astype(np.float64)
+    return value, float(np.sqrt(2 * np.mean(error**2)))
 
 
 _FORMAT = 1

@@ -274,7 +274,8 @@ def recognise(data: Path) -> DataParserConfig:
             between("confidence", confidence, 0.0, 1.0)
         except (Exception, SystemExit) as fault:  # a stranger's
             origin = ", ".join(each.origin for each in entries)
-            print(f"warning: data parser {name!r} ({origin}) is skipped: {_line(fault)}", file=sys.stderr)
+            reason = " ".join(f"{type(fault).__name__}: {fault}".split())
+            print(f"warning: data parser {name!r} ({origin}) is skipped: {reason}", file=sys.stderr)
             continue
         if answer and confidence >= best:
             surest = {name: (config, reason)} if confidence > best else {**surest, name: (config, reason)}
@@ -288,8 +289,10 @@ def recognise(data: Path) -> DataParserConfig:
         raise DataError(f"{data}: no such folder; give a scene folder, or `town` for the embedded scene")
     if not data.is_dir():
         raise DataError(f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field")
+    names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
+    content = f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})" if names else "nothing"
     raise DataError(
-        f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {_content(data)}; "
+        f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {content}; "
         "choose a parser with --datamanager.parser NAME, for Gaussians --parser NAME "
         f"({', '.join(registry.installed(group))}), or make poses with `fprf process`"
     )
@@ -304,12 +307,3 @@ def parse_scene(data: Path, downscale: int, parser: DataParserConfig | None) -> 
 
     chosen = recognise(data) if parser is None else parser
     return in_local_frame(chosen.build().parse(data, downscale))
-
-
-def _content(data: Path) -> str:
-    names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
-    return f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})" if names else "nothing"
-
-
-def _line(fault: BaseException) -> str:
-    return f"{type(fault).__name__}: {' '.join(str(fault).split())}"

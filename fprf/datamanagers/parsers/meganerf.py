@@ -60,12 +60,10 @@ def _unit(data: Path) -> float:
 
 def _load(path: Path) -> dict[str, Any]:
     """Tensors and numbers by name; nothing else is let in."""
+    if path.is_file() and path.stat().st_size > _LARGEST:
+        raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
     try:
-        if path.stat().st_size > _LARGEST:
-            raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except DataError:
-        raise
     except Exception as error:  # the unpickler raises whatever the bytes lead it to
         raise DataError(f"{path}: no tensors of torch.save ({_first_line(error)}); copy the file again") from error
     if not isinstance(content, dict):
@@ -79,8 +77,8 @@ def _first_line(error: Exception) -> str:
 
 def _view(file: Path, images: Path, unit: float) -> View:
     metadata = _load(file)
-    path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
-    path = images / f"{file.stem}.jpg" if path is None else path
+    paths = [images / f"{file.stem}{suffix}" for suffix in sorted(IMAGE_SUFFIXES)]
+    path = next((path for path in paths if path.is_file()), images / f"{file.stem}.jpg")
     try:
         width, height = (None if key not in metadata else float(metadata[key]) for key in "WH")
         size = stated_size(str(file), path, width, height)
