@@ -35,7 +35,7 @@ from ...io.atomic import atomic_path, write_json
 from ...rendering.lens import OPENCV
 from ..images import opened
 from ..scene import Scene
-from .config import BlockNerfConfig
+from .config import BlockNerfConfig, is_record
 from .town import cache_folder
 from .views import View, assemble_scene, read_views, rigid_pose, split_by
 
@@ -264,11 +264,6 @@ def _refine(local: Array, pixel: Array, value: Array) -> tuple[Array, float]:
 
 
 _FORMAT = 1
-
-
-def is_record(name: str) -> bool:
-    """Return whether a file name is that of a TFRecord file or of one of its shards."""
-    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
 
 
 class BlockNerfParser(DataParser):

@@ -6,6 +6,7 @@ with its images, 0.3 for raw recordings. Prepared folders often hold the reconst
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,6 +140,11 @@ class TownConfig(DataParserConfig):
         return TownParser(self)
 
 
+def is_record(name: str) -> bool:
+    """Return whether a file name is that of a TFRecord file or of one of its shards."""
+    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
+
+
 @dataclass(frozen=True, kw_only=True)
 class BlockNerfConfig(DataParserConfig):
     """San Francisco Mission Bay: TFRecord files with exposure and rays of every pixel."""
@@ -155,8 +161,6 @@ class BlockNerfConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By TFRecord files, at most three folders down."""
-        from .blocknerf import is_record
-
         names = (path.name for depth in ("*", "*/*", "*/*/*", "*/*/*/*") for path in data.glob(f"{depth}.tfrecord*"))
         record = next(filter(is_record, names), None)
         return Recognised(0.3, record) if record is not None else None
