@@ -14,6 +14,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -27,7 +28,7 @@ from ..io.atomic import unwritable
 from ..types import Batch
 from .basis import Basis
 from .config import RayBatchesConfig
-from .features import FeatureStore, Progress, extract
+from .features import Progress, extract
 from .images import WHITE, load_image, load_images, load_mask
 from .scene import Scene, find_sightings
 
@@ -184,7 +185,14 @@ class RayBatches(DataManager):
         self._sizes = scene.cameras.size[scene.train]
         self._ends = self._sizes.prod(1).cumsum(0)
         self._slots = {view: slot for slot, view in enumerate(self._views)}
-        self._pixels = self._load(cache)
+        # All training pixels, view after view; many of them mapped from a file.
+        self._pixels = allocate_pixels(int(self._ends[-1]), cache)
+        filled = 0
+        for first in range(0, len(self._views), DECODE):
+            for image in load_images(scene, self.background, self._views[first : first + DECODE]):
+                rows = torch.from_numpy(image).reshape(-1, 3)
+                self._pixels[filled : filled + len(rows)] = rows
+                filled += len(rows)
         masks, skies = (scene.masks, scene.sky_masks) if config.masks else ((), ())
         self._chosen = None if seen is None and not masks else self._runs(masks, unmasked=True, seen=seen)
         if self._chosen is not None and not len(self._chosen):
@@ -192,16 +200,9 @@ class RayBatches(DataManager):
         sky = self._runs(skies, unmasked=False) if skies else None
         marks = self._marked() if config.depth_share > 0 else None
         self._source = _Source(self._pixels, scene.train, self._sizes, self._ends, self._chosen, sky, marks)
-        self.content_store: FeatureStore | None = None
-        self.semantic_store: FeatureStore | None = None
-        if content is not None:
-            self.content_store = extract(
-                cache / "content", self._views, self._stored, content, config.guided, progress=progress
-            )
-        if semantic is not None:
-            self.semantic_store = extract(
-                cache / "semantic", self._views, self._stored, semantic, config.guided, dim=dim, progress=progress, basis=basis
-            )
+        features = partial(extract, views=self._views, image=self._stored, config=config.guided, progress=progress)
+        self.content_store = None if content is None else features(cache / "content", encoder=content)
+        self.semantic_store = None if semantic is None else features(cache / "semantic", encoder=semantic, dim=dim, basis=basis)
 
     def batch(self, step: int) -> Batch:
         """The pixels of a step; the first `semantic_share` of them carry semantics."""
@@ -299,14 +300,3 @@ class RayBatches(DataManager):
         at = self._ends[slot] - width * height + pixel[:, 1] * width + pixel[:, 0]
         kept = torch.ones(len(at), dtype=torch.bool) if self._chosen is None else self._chosen.holds(at)
         return _Marks(at[kept], sightings.distance[kept].float()) if bool(kept.any()) else None
-
-    def _load(self, cache: Path) -> Annotated[Tensor, "P 3"]:
-        """All training pixels, uint8, view after view; many of them mapped from a file."""
-        pixels = allocate_pixels(int(self._ends[-1]), cache)
-        filled = 0
-        for first in range(0, len(self._views), DECODE):
-            for image in load_images(self._scene, self.background, self._views[first : first + DECODE]):
-                rows = torch.from_numpy(image).reshape(-1, 3)
-                pixels[filled : filled + len(rows)] = rows
-                filled += len(rows)
-        return pixels

@@ -67,10 +67,7 @@ def find_kind(scene: Scene) -> Kind:
     if len(cameras) < 3 or mean.norm() < math.cos(FORWARD_ANGLE):
         return "contraction"
     mean = mean / mean.norm()
-    if (axis @ mean).amin() < math.cos(FORWARD_ANGLE):
-        return "contraction"
-    depth = _depths(scene)
-    if depth is None:
+    if (axis @ mean).amin() < math.cos(FORWARD_ANGLE) or (depth := _depths(scene)) is None:
         return "contraction"
     offset = cameras.pose[:, :, 3] - cameras.pose[:, :, 3].mean(0)
     return "ndc" if offset.norm(dim=-1).amax() < FORWARD_SPREAD * depth.median() else "contraction"

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from ..errors import DataError, NumericsError, PluginError
 from ..interfaces import Encoder
-from ..io.atomic import atomic_path, write_json
+from ..io.atomic import atomic_path
 from ..ops import guided
 from .basis import Basis, fit_basis
 from .config import GuidedConfig
@@ -187,8 +187,13 @@ class FeatureStore:
         self.channels = len(self._entries[0].scale)
         self.bytes = sum(entry.coefs.numel() * 2 for entry in self._entries)
         """Size of the coefficients."""
-        self.mean, self.std = _spread(self._entries)
-        """Mean over all channels, and root mean square over the channels' standard deviations, over all pixels."""
+        # Mean and variance of each channel over all views, each counted by its pixels.
+        weight = torch.stack([entry.size.prod() for entry in self._entries]).double()[:, None]
+        means, variances = torch.stack([entry.moments for entry in self._entries]).unbind(1)
+        mean = (weight * means).sum(0) / weight.sum()
+        variance = (weight * (variances + (means - mean).square())).sum(0) / weight.sum()
+        self.std = float(variance.mean().sqrt())
+        """Root mean square over the channels' standard deviations, over all pixels."""
         self._magnitude = max(float(entry.centre.abs().max()) for entry in self._entries)
         self._table = _table(self._entries)
         self._packed: tuple[guided.Packed, Tensor] | None = None
@@ -206,13 +211,8 @@ class FeatureStore:
         for part, end in zip(coefs, ends.tolist(), strict=True):
             packed[end - len(part) : end].copy_(part)
         shapes = torch.tensor([entry.coefs.shape[:2] for entry in self._entries])
-        small = (
-            ends - shapes.prod(1),
-            shapes,
-            torch.stack([entry.size for entry in self._entries]),
-            torch.stack([entry.scale for entry in self._entries]),
-            torch.stack([entry.centre for entry in self._entries]),
-        )
+        columns = zip(*((entry.size, entry.scale, entry.centre) for entry in self._entries), strict=True)
+        small = (ends - shapes.prod(1), shapes, *(torch.stack(column) for column in columns))
         there = copy.copy(self)
         there._packed = guided.Packed(packed, *(part.to(device) for part in small)), self._numbers.to(device)
         return there
@@ -264,7 +264,10 @@ def extract(
     """
     folder.mkdir(parents=True, exist_ok=True)
     remove_stale(folder)
-    prints = {view: _fingerprint(image(view)) for view in views}
+    prints = {}
+    for view in views:
+        pixels = image(view)
+        prints[view] = digest(str(tuple(pixels.shape)), pixels.contiguous().numpy().tobytes())
     remembered: dict[int, Tensor] = {}
     if basis is None and dim is not None:
         basis = _basis(folder, prints, image, encoder, dim, remembered)
@@ -277,44 +280,22 @@ def extract(
         if progress is not None:
             progress(done, len(views), f"features of {encoder.identity}")
         pixels = image(view)
-        radius, stride = _window(config, pixels.shape)
+        radius = round(config.radius * min(pixels.shape[:2]))
+        stride = min(config.stride, max(1, (2 * radius + 1) // CELLS_PER_WINDOW))
         settings = f"radius {radius} eps {config.eps!r} stride {stride} fineness {guided.FINENESS}"
         keys[view] = key = digest(prints[view], encoder.identity, settings, projection, *place)
-        entry = read_entry(folder, key)
+        entry, features = read_entry(folder, key), remembered.pop(view, None)
         if entry is None:
-            features = remembered.get(view)
             features = _encode(encoder, pixels, view) if features is None else features
             made = _make(features, pixels, basis, radius=radius, eps=config.eps, stride=stride)
             write_tensors(folder, key, made._asdict())
             # Read back: what trains is what lies on disk, mapped rather than held in memory.
             entry = read_entry(folder, key) or made
-        remembered.pop(view, None)
         entries[view] = entry
     keep_within(folder, CACHED_BYTES, set(keys.values()))
     if progress is not None:
         progress(len(views), len(views), f"features of {encoder.identity}")
-    store = FeatureStore(entries, basis)
-    # Written last: whoever finds it finds every file it names.
-    manifest = {
-        "encoder": encoder.identity,
-        "channels": store.channels,
-        "mean": store.mean,
-        "std": store.std,
-        "energy": basis.energy if basis is not None else 1.0,
-        "files": {str(view): key for view, key in keys.items()},
-    }
-    write_json(folder / f"manifest-{digest(*keys.values())}.json", manifest)
-    return store
-
-
-def _window(config: GuidedConfig, shape: Sequence[int]) -> tuple[int, int]:
-    """Radius and stride in pixels; the stride is at most a fifth of the window."""
-    radius = round(config.radius * min(shape[:2]))
-    return radius, min(config.stride, max(1, (2 * radius + 1) // CELLS_PER_WINDOW))
-
-
-def _fingerprint(pixels: Annotated[Tensor, "H W 3"]) -> str:
-    return digest(str(tuple(pixels.shape)), pixels.contiguous().numpy().tobytes())
+    return FeatureStore(entries, basis)
 
 
 def _device(encoder: Encoder) -> torch.device:
@@ -391,13 +372,3 @@ def _table(entries: Sequence[Entry]) -> "ViewTable":
         bits = entry.coefs.view(torch.uint16).numpy().reshape(rows * columns, 4 * run)
         views.append(ViewArrays(bits, rows, columns, height, width, entry.scale.numpy(), entry.centre.numpy()))
     return ViewTable(views)
-
-
-def _spread(entries: Sequence[Entry]) -> tuple[float, float]:
-    """Mean and RMS standard deviation over all views, each counted by its pixels."""
-    weight = torch.stack([entry.size.prod() for entry in entries]).double()
-    weight = (weight / weight.sum())[:, None]
-    means, variances = torch.stack([entry.moments for entry in entries]).unbind(1)
-    mean = (weight * means).sum(0)
-    variance = (weight * (variances + (means - mean).square())).sum(0)
-    return float(mean.mean()), float(variance.mean().sqrt())

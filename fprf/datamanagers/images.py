@@ -98,7 +98,7 @@ class ImageHeader(NamedTuple):
 
 def read_header(path: Path) -> ImageHeader:
     """The header of an image file. Raises DataError where the file is absent, empty, or of no known format."""
-    with _opened(path) as file:
+    with opened(path) as file:
         return header_of(file, path)
 
 
@@ -148,7 +148,11 @@ def load_image(
     known format or over 1e8 pixels.
     """
     colour, alpha = _decode(path, upright)
-    pixels = _pixels(colour)
+    rgb = colour if colour.mode == "RGB" else colour.convert("RGB")
+    pixels = np.empty((rgb.height, rgb.width, 3), dtype=np.uint8)
+    # In strips: the whole would be copied three times, which takes as long as decoding.
+    for top in range(0, rgb.height, _STRIP):
+        pixels[top : top + _STRIP] = np.asarray(rgb.crop((0, top, rgb.width, min(top + _STRIP, rgb.height))))
     if alpha is not None:
         share = np.asarray(alpha, dtype=np.float32)[:, :, None] / 255
         behind = np.asarray(WHITE if background is None else background, dtype=np.float32) * 255
@@ -240,15 +244,6 @@ def photographs(paths: Sequence[Path], report: Callable[[str], None]) -> list[Pa
     An image in a folder that cannot be read is left out, and `report` is given the reason. Raises DataError for a folder
     without a readable image.
     """
-    listed: dict[Path, None] = {}
-    for path in paths:
-        listed |= dict.fromkeys(_readable(path, report) if path.is_dir() else [path])
-    return list(listed)
-
-
-def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
-    """The images of a folder that can be decoded."""
-    images = [folder / name for name in image_names(folder)]
 
     def fault(path: Path) -> str:
         try:
@@ -257,13 +252,17 @@ def _readable(folder: Path, report: Callable[[str], None]) -> list[Path]:
             return str(error)
         return ""
 
-    with ThreadPoolExecutor() as pool:
-        faults = dict(zip(images, pool.map(fault, images), strict=True))
-    for reason in filter(None, faults.values()):
-        report(f"left out: {reason}")
-    if all(faults.values()):
-        raise DataError(f"{folder}: none of its {len(images)} images can be read; the first one: {faults[images[0]]}")
-    return [path for path in images if not faults[path]]
+    listed: dict[Path, None] = {}
+    for path in paths:
+        images = [path / name for name in image_names(path)] if path.is_dir() else []
+        with ThreadPoolExecutor() as pool:
+            faults = dict(zip(images, pool.map(fault, images), strict=True))
+        for reason in filter(None, faults.values()):
+            report(f"left out: {reason}")
+        if images and all(faults.values()):
+            raise DataError(f"{path}: none of its {len(images)} images can be read; the first one: {faults[images[0]]}")
+        listed |= dict.fromkeys([image for image in images if not faults[image]] if images else [path])
+    return list(listed)
 
 
 def _decode(
@@ -273,7 +272,7 @@ def _decode(
 
     Colours of 16 bits become 8 with `rounded`.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         kind, image = open_image(file, path)
         # For TIFF Pillow has a limit of its own, above which it warns.
         most = min(MAX_PIXELS, PIL.Image.MAX_IMAGE_PIXELS or MAX_PIXELS) if kind == "TIFF" else MAX_PIXELS
@@ -305,7 +304,10 @@ def _decode(
     if pixels.mode not in ("L", "RGB", "CMYK"):
         pixels = pixels.convert("L" if pixels.mode == "1" else "RGB")
     if profile:
-        pixels = _to_srgb(pixels, profile)
+        mode, transform = _transform(profile)
+        if mode == "RGB" and pixels.mode == "L":
+            pixels = pixels.convert("RGB")
+        pixels = pixels if transform is None or pixels.mode != mode else transform.apply(pixels)
     if turn is not None:
         pixels, alpha = pixels.transpose(turn), alpha and alpha.transpose(turn)
     return pixels, alpha
@@ -332,15 +334,6 @@ def _orientation(image: ImageFile) -> int:
     return int(found) if found in _TURNS else 1
 
 
-def _pixels(image: PIL.Image.Image) -> Image:
-    """The pixels [H W 3] of an image. In strips: the whole would be copied three times, which takes as long as decoding."""
-    image = image if image.mode == "RGB" else image.convert("RGB")
-    pixels = np.empty((image.height, image.width, 3), dtype=np.uint8)
-    for top in range(0, image.height, _STRIP):
-        pixels[top : top + _STRIP] = np.asarray(image.crop((0, top, image.width, min(top + _STRIP, image.height))))
-    return pixels
-
-
 def _from_16_bits(
     path: Path, image: PIL.Image.Image, rounded: Callable[[NDArray[np.float32]], NDArray[np.float32]]
 ) -> PIL.Image.Image:
@@ -353,14 +346,6 @@ def _from_16_bits(
     upper = np.asarray(image.convert("RGB"), dtype=np.int16)
     same = eight.shape[:2] == upper.shape[:2] and np.abs(eight[:, :, :3] - upper).max() <= 1
     return PIL.Image.fromarray(eight) if same else image
-
-
-def _to_srgb(pixels: PIL.Image.Image, profile: bytes) -> PIL.Image.Image:
-    """Colours of an ICC profile in sRGB; as they are where the profile is sRGB, broken or not one of such pixels."""
-    mode, transform = _transform(profile)
-    if mode == "RGB" and pixels.mode == "L":
-        pixels = pixels.convert("RGB")
-    return pixels if transform is None or pixels.mode != mode else transform.apply(pixels)
 
 
 @lru_cache(maxsize=16)
@@ -381,7 +366,7 @@ def _transform(profile: bytes) -> tuple[str, ImageCms.ImageCmsTransform | None]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
+def opened(path: Path) -> Iterator[IO[bytes]]:
     """A file open for reading. Raises DataError where that cannot be."""
     try:
         file = path.open("rb")

@@ -94,9 +94,7 @@ def find_sightings(scene: Scene) -> Sightings | None:
     if scene.points is None or not len(scene.points):
         return None
     if scene.seen is not None:
-        members = torch.zeros(len(scene.cameras), dtype=torch.bool)
-        members[scene.train] = True
-        kept = scene.seen[members[scene.seen[:, 0]]]
+        kept = scene.seen[torch.isin(scene.seen[:, 0], scene.train)]
         kept = kept[kept[:, 0].argsort(stable=True)]
         sightings = _sighted(scene.cameras, kept[:, 0], scene.points[kept[:, 1]])
     else:

@@ -172,7 +172,7 @@ def test_coefficients_on_a_device_answer_as_those_of_the_host(tmp_path: Path) ->
         assert torch.equal(there.at(*where), expected), "what is asked in host memory is answered there"
 
 
-def test_mean_and_spread_are_those_of_the_targets(tmp_path: Path) -> None:
+def test_the_spread_is_that_of_the_targets(tmp_path: Path) -> None:
     encoder = Counting(6)
     store = build(tmp_path, encoder)
     values = []
@@ -181,8 +181,7 @@ def test_mean_and_spread_are_those_of_the_targets(tmp_path: Path) -> None:
         pixel = torch.stack([x, y], -1).flatten(0, 1) + 0.5
         values.append(store.at(torch.full((height * width,), view), pixel, picture(view).flatten(0, 1).float() / 255))
     every = torch.cat(values)
-    # 4 x 2048 drawn pixels: a mean to 1 % of a deviation, a variance to sqrt(2 / 8192); three of those.
-    assert store.mean == pytest.approx(float(every.mean()), abs=0.04 * store.std)
+    # 4 x 2048 drawn pixels: a variance to sqrt(2 / 8192); three of those.
     assert store.std == pytest.approx(float(every.var(0).mean().sqrt()), rel=0.03)
     assert store.scale == store.std
 
@@ -228,10 +227,10 @@ def test_an_interrupted_extraction_goes_on(tmp_path: Path) -> None:
     encoder.fail_after = 2
     with pytest.raises(KeyboardInterrupt):
         build(tmp_path, encoder)
-    assert not list(tmp_path.glob("manifest*")) and len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.iterdir())) == 2
     encoder.calls, encoder.fail_after = 0, 99
     build(tmp_path, encoder)
-    assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.glob("manifest*"))) == 1
+    assert encoder.calls == len(SIZES) - 2 and len(list(tmp_path.iterdir())) == len(SIZES)
 
 
 def test_encoders_that_break_their_promise_are_named(tmp_path: Path) -> None:

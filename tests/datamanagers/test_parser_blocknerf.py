@@ -81,7 +81,7 @@ def test_a_bent_camera_is_found_again(x: float, y: float, z: float, k1: float, p
     k = (0.1 * k1, -0.02 * k1, 0.0, 0.0, 0.002 * p1, 0.001)
     truth = cameras_of(torch.from_numpy(pose)[None], (64, 48), (40.0, 42.0), (31.0, 25.5), k)
     found = fit_camera(*rays_of(truth))
-    assert found.error < 2e-3 and found.drift < 1e-4
+    assert found.error < 2e-3
     np.testing.assert_allclose(found.pose, truth.pose[0].numpy(), atol=3e-4)
     np.testing.assert_allclose(found.focal, (40.0, 42.0), rtol=3e-4)
     np.testing.assert_allclose(found.centre, (31.0, 25.5), atol=2e-2)

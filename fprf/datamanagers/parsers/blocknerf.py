@@ -25,58 +25,75 @@ from typing import Any, NamedTuple, TypeAlias
 import cv2
 import numpy as np
 import torch
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
+from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from ...errors import DataError
 from ...interfaces import DataParser
 from ...io.atomic import atomic_path, write_json
 from ...rendering.lens import OPENCV
+from ..images import opened
 from ..scene import Scene
-from .config import BlockNerfConfig
+from .config import BlockNerfConfig, is_record
 from .town import cache_folder
 from .views import View, assemble_scene, read_views, rigid_pose, split_by
 
-_POLYNOMIAL = 0x82F63B78
-_MASK = 0xA282EAD8
-
 
 @functools.cache
-def _crc_kernel() -> Callable[[NDArray[np.uint8], NDArray[np.uint32]], np.uint32]:
+def _crc_kernel() -> Callable[[NDArray[np.uint8]], np.uint32]:
     """The loop over bytes, compiled at its first use."""
     import numba
 
-    @numba.njit(cache=True, nogil=True)
-    def run(data: NDArray[np.uint8], table: NDArray[np.uint32]) -> np.uint32:
+    table = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = np.where(table & 1, (table >> 1) ^ np.uint32(0x82F63B78), table >> 1).astype(np.uint32)
+
+    @numba.njit(nogil=True)
+    def run(data: NDArray[np.uint8]) -> np.uint32:
         state = np.uint32(0xFFFFFFFF)
         for byte in data:
             state = table[(state ^ byte) & np.uint32(0xFF)] ^ (state >> np.uint32(8))
         return state ^ np.uint32(0xFFFFFFFF)
 
-    kernel: Callable[[NDArray[np.uint8], NDArray[np.uint32]], np.uint32] = run
+    kernel: Callable[[NDArray[np.uint8]], np.uint32] = run
     return kernel
-
-
-@functools.cache
-def _crc_table() -> NDArray[np.uint32]:
-    table = np.arange(256, dtype=np.uint32)
-    for _ in range(8):
-        table = np.where(table & 1, (table >> 1) ^ np.uint32(_POLYNOMIAL), table >> 1).astype(np.uint32)
-    return table
 
 
 def crc32c(data: bytes) -> int:
     """CRC-32C (Castagnoli) of some bytes, in [0, 2**32)."""
-    return int(_crc_kernel()(np.frombuffer(data, np.uint8), _crc_table()))
+    return int(_crc_kernel()(np.frombuffer(data, np.uint8)))
 
 
 def masked(checksum: int) -> int:
     """The checksum as TFRecord files keep it: turned and offset, so that a checksum of checksums stays one."""
-    return ((checksum >> 15 | checksum << 17) + _MASK) & 0xFFFFFFFF
+    return ((checksum >> 15 | checksum << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
 LONGEST = 1 << 30
 """Bytes that one record may claim."""
-_VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
+_SCHEMA = """
+name: "example.proto" package: "fprf" syntax: "proto3"
+message_type { name: "bytes" field { name: "value" number: 1 label: LABEL_REPEATED type: TYPE_BYTES } }
+message_type { name: "floats" field { name: "value" number: 1 label: LABEL_REPEATED type: TYPE_FLOAT } }
+message_type { name: "integers" field { name: "value" number: 1 label: LABEL_REPEATED type: TYPE_INT64 } }
+message_type {
+  name: "Feature" oneof_decl { name: "kind" }
+  field { name: "bytes" number: 1 type: TYPE_MESSAGE type_name: ".fprf.bytes" oneof_index: 0 }
+  field { name: "floats" number: 2 type: TYPE_MESSAGE type_name: ".fprf.floats" oneof_index: 0 }
+  field { name: "integers" number: 3 type: TYPE_MESSAGE type_name: ".fprf.integers" oneof_index: 0 }
+}
+message_type {
+  name: "Entry"
+  field { name: "key" number: 1 type: TYPE_STRING }
+  field { name: "value" number: 2 type: TYPE_MESSAGE type_name: ".fprf.Feature" }
+}
+message_type {
+  name: "Features" field { name: "feature" number: 1 label: LABEL_REPEATED type: TYPE_MESSAGE type_name: ".fprf.Entry" }
+}
+message_type { name: "Example" field { name: "features" number: 1 type: TYPE_MESSAGE type_name: ".fprf.Features" } }
+"""
+"""tf.train.Example and what it consists of; a map is a list of entries in the file."""
 
 Feature: TypeAlias = "list[bytes] | NDArray[np.float32] | NDArray[np.int64]"
 
@@ -98,18 +115,16 @@ class Example(NamedTuple):
     def integer(self, name: str) -> int:
         """The one integer of a feature. Raises DataError."""
         value = self.features.get(name)
-        if isinstance(value, list) or value is None or value.dtype != np.int64 or len(value) != 1:
+        if not isinstance(value, np.ndarray) or value.dtype != np.int64 or len(value) != 1:
             raise self._wrong(name, "one integer")
         return int(value[0])
 
-    def numbers(self, name: str, count: int | None = None) -> NDArray[np.float32]:
+    def numbers(self, name: str, count: int) -> NDArray[np.float32]:
         """The floats of a feature, so many of them. Raises DataError, also where one is not finite."""
-        value = self.features.get(name)
-        if isinstance(value, list) or value is None or value.dtype != np.float32:
-            raise self._wrong(name, "floats")
-        if (count is not None and len(value) != count) or not np.isfinite(value).all():
-            raise self._wrong(name, f"{'some' if count is None else count} finite floats")
-        return value.astype(np.float32)
+        data = self.features.get(name)
+        if not isinstance(data, np.ndarray) or data.dtype != np.float32 or len(data) != count or not np.isfinite(data).all():
+            raise self._wrong(name, f"{count} finite floats")
+        return data.astype(np.float32)
 
     def _wrong(self, name: str, wanted: str) -> DataError:
         value = self.features.get(name)
@@ -119,29 +134,24 @@ class Example(NamedTuple):
 
 def read_records(path: Path) -> Iterator[bytes]:
     """The records of a file, checksums verified. Raises DataError."""
-    try:
-        with path.open("rb") as file:
-            number = 0
-            while head := file.read(12):
-                where = f"{path}: record {number}"
-                if len(head) < 12:
-                    raise DataError(f"{where}: the file ends within its head; download it again")
-                length, check = struct.unpack("<QI", head)
-                if masked(crc32c(head[:8])) != check:
-                    raise DataError(f"{where}: the checksum of its length is wrong; download the file again")
-                if length > LONGEST:
-                    raise DataError(f"{where}: claims {length} bytes, at most {LONGEST} are read; split the file")
-                data, tail = file.read(length), file.read(4)
-                if len(data) < length or len(tail) < 4:
-                    raise DataError(
-                        f"{where}: the file ends {length + 4 - len(data) - len(tail)} bytes early; download it again"
-                    )
-                if masked(crc32c(data)) != struct.unpack("<I", tail)[0]:
-                    raise DataError(f"{where}: its checksum is wrong; download the file again")
-                yield data
-                number += 1
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    with opened(path) as file:
+        number = 0
+        while head := file.read(12):
+            where = f"{path}: record {number}"
+            if len(head) < 12:
+                raise DataError(f"{where}: the file ends within its head; download it again")
+            length, check = struct.unpack("<QI", head)
+            if masked(crc32c(head[:8])) != check:
+                raise DataError(f"{where}: the checksum of its length is wrong; download the file again")
+            if length > LONGEST:
+                raise DataError(f"{where}: claims {length} bytes, at most {LONGEST} are read; split the file")
+            data, tail = file.read(length), file.read(4)
+            if missing := length + 4 - len(data) - len(tail):
+                raise DataError(f"{where}: the file ends {missing} bytes early; download it again")
+            if masked(crc32c(data)) != struct.unpack("<I", tail)[0]:
+                raise DataError(f"{where}: its checksum is wrong; download the file again")
+            yield data
+            number += 1
 
 
 def read_examples(path: Path) -> Iterator[Example]:
@@ -149,105 +159,31 @@ def read_examples(path: Path) -> Iterator[Example]:
     for number, data in enumerate(read_records(path)):
         where = f"{path}: record {number}"
         try:
-            yield Example(where, _example(memoryview(data)))
-        except ValueError as error:
+            message = _message_class().FromString(data)
+        except DecodeError as error:
             raise DataError(f"{where}: no tf.train.Example ({error}); convert the capture again") from error
+        yield Example(where, {entry.key: _feature(entry.value) for entry in message.features.feature})
 
 
-def _example(data: memoryview) -> dict[str, Feature]:
-    record: dict[str, Feature] = {}
-    for features in _children(data, 1):
-        for entry in _children(features, 1):
-            names, values = list(_children(entry, 1)), list(_children(entry, 2))
-            if len(names) != 1:
-                raise ValueError("a feature without a name")
-            name = bytes(names[0]).decode("utf-8")
-            record[name] = _feature(values[-1]) if values else []
-    return record
+@functools.cache
+def _message_class() -> type[Message]:
+    """The class of an Example, in a pool of its own: TensorFlow has the same in the common one."""
+    pool = descriptor_pool.DescriptorPool()
+    pool.AddSerializedFile(text_format.Parse(_SCHEMA, descriptor_pb2.FileDescriptorProto()).SerializeToString())
+    message: type[Message] = message_factory.GetMessageClass(pool.FindMessageTypeByName("fprf.Example"))
+    return message
 
 
-def _feature(data: memoryview) -> Feature:
-    for number, kind, value, _ in _fields(data):
-        if kind != _BYTES:
-            raise ValueError(f"a feature of wire type {kind}")
-        if number == 1:
-            return [bytes(each) for each in _children(value, 1)]
-        if number == 2:
-            return _floats(value)
-        if number == 3:
-            return _integers(value)
-    return []
-
-
-def _floats(data: memoryview) -> NDArray[np.float32]:
-    parts = []
-    for number, kind, value, _ in _fields(data):
-        if number == 1 and kind in (_BYTES, _FOUR):
-            if len(value) % 4:
-                raise ValueError(f"packed floats of {len(value)} bytes")
-            parts.append(np.frombuffer(value, "<f4"))
-    return np.concatenate(parts).astype(np.float32) if parts else np.zeros(0, np.float32)
-
-
-def _integers(data: memoryview) -> NDArray[np.int64]:
-    numbers = []
-    for number, kind, value, whole in _fields(data):
-        if number == 1 and kind == _VARINT:
-            numbers.append(whole)
-        elif number == 1 and kind == _BYTES:
-            at = 0
-            while at < len(value):
-                whole, at = _varint(value, at)
-                numbers.append(whole)
-    return np.array(numbers, dtype=np.uint64).astype(np.int64)
-
-
-def _children(data: memoryview, number: int) -> Iterator[memoryview]:
-    """Length-delimited fields of a number."""
-    for own, kind, value, _ in _fields(data):
-        if own == number and kind == _BYTES:
-            yield value
-
-
-def _fields(data: memoryview) -> Iterator[tuple[int, int, memoryview, int]]:
-    """Number, wire type, bytes and (of a varint) value of each field of a message."""
-    at, none = 0, data[:0]
-    while at < len(data):
-        key, at = _varint(data, at)
-        number, kind = key >> 3, key & 7
-        if kind == _VARINT:
-            whole, at = _varint(data, at)
-            yield number, kind, none, whole
-            continue
-        if kind == _BYTES:
-            size, at = _varint(data, at)
-        elif kind in (_EIGHT, _FOUR):
-            size = 8 if kind == _EIGHT else 4
-        else:
-            raise ValueError(f"wire type {kind} at byte {at}")
-        if size > len(data) - at:
-            raise ValueError(f"a field of {size} bytes where {len(data) - at} are left")
-        yield number, kind, data[at : at + size], 0
-        at += size
-
-
-def _varint(data: memoryview, at: int) -> tuple[int, int]:
-    value = 0
-    for place in range(10):
-        if at >= len(data):
-            raise ValueError("it ends within a number")
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << (7 * place)
-        if byte < 0x80:
-            return value & 0xFFFFFFFFFFFFFFFF, at
-    raise ValueError("a number of more than ten bytes")
+def _feature(feature: Any) -> Feature:
+    kind = feature.WhichOneof("kind")
+    if kind == "floats":
+        return np.array(feature.floats.value, np.float32)
+    return np.array(feature.integers.value, np.int64) if kind == "integers" else list(feature.bytes.value)
 
 
 Array = NDArray[np.float64]
 _LATTICE = 24
 """Rays along each side that are looked at."""
-_ROUNDS = 30
 
 
 class RayCamera(NamedTuple):
@@ -261,108 +197,73 @@ class RayCamera(NamedTuple):
     """k1 k2 0 0 p1 p2."""
     error: float
     """Root mean square distance of the fitted pixels from the true ones."""
-    drift: float
-    """Largest distance of a ray's origin from the pose's."""
 
 
 def fit_camera(origin: NDArray[np.float32], direction: NDArray[np.float32]) -> RayCamera:
     """The camera of rays [H W 3] through pixel centres. Raises ValueError where they are not those of any lens."""
     height, width = origin.shape[:2]
-    rows = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
+    lines = np.unique(np.linspace(0, height - 1, min(_LATTICE, height)).round().astype(np.int64))
     columns = np.unique(np.linspace(0, width - 1, min(_LATTICE, width)).round().astype(np.int64))
-    grid = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(columns, lines), -1).reshape(-1, 2)
     ray = direction[grid[:, 1], grid[:, 0]].astype(np.float64)
     long = np.linalg.norm(ray, axis=1, keepdims=True)
     if not (long > 1e-9).all() or len(grid) < 16:
         raise ValueError("rays without a direction, or too few of them")
     ray /= long
     pixel = grid.astype(np.float64) + 0.5
-    turn = _axes(ray, grid)
+    # A pinhole first: the matrix whose products with the rays are the pixels (direct linear transform), and by RQ its parts.
+    middle, side = np.array([width, height]) / 2, max(width, height)
+    unit = np.concatenate([(pixel - middle) / side, np.ones((len(pixel), 1))], 1)
+    none = np.zeros_like(ray)
+    rows = np.block([[ray, none, -unit[:, :1] * ray], [none, ray, -unit[:, 1:2] * ray]])
+    matrix = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
+    _, lens, turn, *_ = cv2.RQDecomp3x3(matrix * np.sign(matrix[2] @ ray.mean(0)))
+    if not (lens.diagonal() > 1e-9).all():
+        raise ValueError("rays that span no image, or a mirrored one")
+    (fx, fy), (cx, cy) = lens.diagonal()[:2] / lens[2, 2] * side, lens[:2, 2] / lens[2, 2] * side + middle
     local = ray @ turn.T
     if not (local[:, 2] > 0.02).all():
         raise ValueError("rays that look backwards: more than a half space in one image")
-    plane = local[:, :2] / local[:, 2:]
-    # Straight lines first: focal lengths and centre of a pinhole.
-    (fx, cx), (fy, cy) = (np.polyfit(plane[:, a], pixel[:, a], 1) for a in range(2))
-    if not (fx > 0 and fy > 0):
-        raise ValueError("rays of a mirrored image")
-    best = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
+    best, error = _refine(local, pixel, np.array([0.0, 0.0, 0.0, fx, fy, cx, cy, 0.0, 0.0, 0.0, 0.0]))
     turned = cv2.Rodrigues(best[:3])[0] @ turn
-    place = origin.reshape(-1, 3).astype(np.float64)
-    middle = place.mean(0)
+    place = origin.reshape(-1, 3).mean(0, dtype=np.float64)
     axes = np.stack([turned[0], -turned[1], -turned[2]], 1)
     fx, fy, cx, cy, k1, k2, p1, p2 = best[3:].tolist()
     return RayCamera(
-        np.concatenate([axes, middle[:, None]], 1),
+        np.concatenate([axes, place[:, None]], 1),
         (fx, fy),
         (cx, cy),
         (k1, k2, 0.0, 0.0, p1, p2),
-        float(np.sqrt(((_project(local, best)[0] - pixel) ** 2).sum(1).mean())),
-        float(np.linalg.norm(place - middle, axis=1).max()),
+        error,
     )
 
 
-def _axes(ray: Array, grid: NDArray[np.int64]) -> Array:
-    """Rows: right, down and forward, as the corners of the lattice say."""
-    x, y = grid[:, 0], grid[:, 1]
-    left, right = ray[x == x.min()].mean(0), ray[x == x.max()].mean(0)
-    above, below = ray[y == y.min()].mean(0), ray[y == y.max()].mean(0)
-    ahead = np.cross(right - left, below - above)
-    if np.linalg.norm(ahead) < 1e-9:
-        raise ValueError("rays that span no image")
-    ahead /= np.linalg.norm(ahead)
-    if ahead @ ray.mean(0) < 0:
-        raise ValueError("rays of a mirrored image")
-    across = (right - left) - ((right - left) @ ahead) * ahead
-    across /= np.linalg.norm(across)
-    return np.stack([across, np.cross(ahead, across), ahead])
-
-
-def _refine(local: Array, pixel: Array, value: Array) -> Array:
-    """Levenberg and Marquardt's steps: eleven numbers, a few hundred rays."""
+def _refine(local: Array, pixel: Array, value: Array) -> tuple[Array, float]:
+    """Levenberg and Marquardt's steps: eleven numbers, a few hundred rays. The numbers, and what is left of the distances."""
 
     def miss(value: Array) -> tuple[Array, Array]:
-        pixels, slope = _project(local, value)
-        return np.nan_to_num(pixels - pixel, nan=1e6, posinf=1e6, neginf=-1e6).reshape(-1), slope
+        """Differences [2N] from the pixels, and their slopes [2N 11], by rotation vector, fx fy cx cy, k1 k2 p1 p2."""
+        fx, fy, cx, cy = value[3:7]
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        pixels, slope = cv2.projectPoints(local[:, None], value[:3], np.zeros(3), matrix, value[7:])
+        error = np.nan_to_num(pixels[:, 0] - pixel, nan=1e6, posinf=1e6, neginf=-1e6)
+        return error.reshape(-1), np.delete(slope, (3, 4, 5), axis=1)  # without those of the translation
 
-    damping = 1e-3
-    error, slope = miss(value)
-    for _ in range(_ROUNDS):
+    damping, (error, slope) = 1e-3, miss(value)
+    for _ in range(30):
         normal = slope.T @ slope
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(11), -slope.T @ error)
         tried, slope_tried = miss(value + step)
-        if (tried**2).sum() < (error**2).sum():
-            gained = 1 - (tried**2).sum() / max((error**2).sum(), 1e-300)
-            value, error, slope, damping = value + step, tried, slope_tried, damping / 10
-            if gained < 1e-9:
-                break
-        else:
-            damping *= 10
-            if damping > 1e8:
-                break
-    return value
-
-
-def _project(local: Array, value: Array) -> tuple[Array, Array]:
-    """Pixels [N 2] of rays in OpenCV's camera axes, and their slopes [2N 11], by rotation vector, fx fy cx cy, k1 k2 p1 p2."""
-    fx, fy, cx, cy = value[3:7]
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    pixels, slope = cv2.projectPoints(local[:, None], value[:3], np.zeros(3), matrix, value[7:])
-    slope = np.delete(slope, (3, 4, 5), axis=1)  # those of the translation
-    return pixels[:, 0].astype(np.float64), slope.astype(np.float64)
+        gained = 1 - float(tried @ tried) / max(float(error @ error), 1e-300)
+        if gained > 0:
+            value, error, slope = value + step, tried, slope_tried
+        damping *= 0.1 if gained > 0 else 10
+        if 0 < gained < 1e-9 or damping > 1e8:
+            break
+    return value, float(np.sqrt(2 * np.mean(error**2)))
 
 
 _FORMAT = 1
-
-
-def record_files(data: Path) -> list[Path]:
-    """The TFRecord files of a folder and its folders, by name."""
-    return sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
-
-
-def is_record(name: str) -> bool:
-    """Return whether a file name is that of a TFRecord file or of one of its shards."""
-    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
 
 
 class BlockNerfParser(DataParser):
@@ -373,13 +274,20 @@ class BlockNerfParser(DataParser):
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The scene at 1/downscale of the stored size. Raises DataError naming file and record."""
-        files = record_files(data)
+        files = sorted(path for path in data.rglob("*") if is_record(path.name) and path.is_file())
         if not files:
             raise DataError(f"{data}: no *.tfrecord files here or below; name the folder that they lie in")
-        folder = cache_folder() / f"blocknerf-{_key(data, files)}"
+        # By what tells files apart without reading hundreds of gigabytes: place, size and time.
+        facts = [(str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+        key = hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
+        folder = cache_folder() / f"blocknerf-{key}"
         entries = _unpacked(folder)
-        if entries is None:
-            entries = [entry for file in files for entry in _unpack(file, data, folder)]
+        if not entries:
+            (folder / "images").mkdir(parents=True, exist_ok=True)
+            entries = []
+            for file in files:
+                held = re.search("val|test", str(file.relative_to(data)).lower()) is not None
+                entries += [_entry(example, folder, held) for example in read_examples(file)]
             write_json(folder / "views.json", {"format": _FORMAT, "views": entries})
         chosen = [e for e in entries if not self.config.cameras or e["camera"] in self.config.cameras]
         if not chosen:
@@ -398,27 +306,15 @@ class BlockNerfParser(DataParser):
         return replace(scene, exposure=torch.tensor([entry["exposure"] for entry in kept], dtype=torch.float64))
 
 
-def _key(data: Path, files: list[Path]) -> str:
-    """By what tells files apart without reading hundreds of gigabytes: place, size and time."""
-    facts = [(str(f.relative_to(data)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
-    return hashlib.sha256(json.dumps([str(data.resolve()), facts]).encode()).hexdigest()[:12]
-
-
-def _unpacked(folder: Path) -> list[dict[str, Any]] | None:
-    """The views of a complete cache."""
+def _unpacked(folder: Path) -> list[dict[str, Any]]:
+    """The views of a complete cache; none where it is not complete."""
     try:
         document = json.loads((folder / "views.json").read_text())
         entries: list[dict[str, Any]] = document["views"]
         complete = document["format"] == _FORMAT and all((folder / "images" / f"{e['name']}.png").is_file() for e in entries)
     except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return entries if complete else None
-
-
-def _unpack(file: Path, data: Path, folder: Path) -> list[dict[str, Any]]:
-    held = bool(re.search("val|test", str(file.relative_to(data)).lower()))
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    return [_entry(example, folder, held) for example in read_examples(file)]
+        return []
+    return entries if complete else []
 
 
 def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
@@ -426,10 +322,9 @@ def _entry(example: Example, folder: Path, held: bool) -> dict[str, Any]:
     height, width = example.integer("height"), example.integer("width")
     if not (4 <= height <= 10**5 and 4 <= width <= 10**5):
         raise DataError(f"{example.where}: an image of {width}x{height} pixels; download the file again")
-    count = 3 * height * width
-    shape = (height, width, 3)
-    origin = example.numbers("ray_origins", count).reshape(shape)
-    direction = example.numbers("ray_dirs", count).reshape(shape)
+    origin, direction = (
+        example.numbers(name, 3 * height * width).reshape(height, width, 3) for name in ("ray_origins", "ray_dirs")
+    )
     try:
         camera = fit_camera(origin, direction)
     except (ValueError, np.linalg.LinAlgError) as error:

@@ -13,7 +13,6 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -89,10 +88,15 @@ def read_model(folder: Path) -> ColmapModel:
         suffix, cameras_of, images_of, points_of = "bin", _cameras_bin, _images_bin, _points_bin
     else:
         suffix, cameras_of, images_of, points_of = "txt", _cameras_txt, _images_txt, _points_txt
+    cameras: dict[int, ColmapCamera] = {}
+    for place, id_, camera in cameras_of(folder / f"cameras.{suffix}"):
+        if id_ in cameras:
+            raise _bad(folder / f"cameras.{suffix}", place, f"camera {id_} occurs twice")
+        cameras[id_] = camera
     cloud = folder / f"points3D.{suffix}"
-    cameras, images = cameras_of(folder / f"cameras.{suffix}"), images_of(folder / f"images.{suffix}")
-    ids, points = points_of(cloud) if cloud.is_file() else (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-    return ColmapModel(cameras, images, ids, points)
+    images = list(images_of(folder / f"images.{suffix}"))
+    points = np.fromiter(points_of(cloud) if cloud.is_file() else (), np.dtype([("id", "i8"), ("xyz", "f8", 3)]))
+    return ColmapModel(cameras, images, points["id"], points["xyz"])
 
 
 def _bad(path: Path, place: str, finding: str) -> DataError:
@@ -117,9 +121,8 @@ class _Bytes:
 
     def take(self, layout: struct.Struct, what: str) -> tuple[float, ...]:
         self.need(layout.size, what)
-        values = layout.unpack_from(self.data, self.at)
         self.at += layout.size
-        return values
+        return layout.unpack_from(self.data, self.at - layout.size)
 
     def count(self, least: int, what: str) -> int:
         """A count of things that take at least `least` bytes each."""
@@ -139,25 +142,20 @@ _POINT = struct.Struct("<Q3d3Bd")
 _FEATURE = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 
 
-def _cameras_bin(path: Path) -> dict[int, ColmapCamera]:
+def _cameras_bin(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
     file = _Bytes(path)
-    cameras: dict[int, ColmapCamera] = {}
     for _ in range(file.count(_CAMERA.size, "cameras")):
         id_, model, width, height = file.take(_CAMERA, "a camera")
         if not 0 <= model < len(MODELS):
             raise file.error(f"camera model {model} is unknown, 0 to {len(MODELS) - 1} are known; {_undistort(path.parent)}")
-        if id_ in cameras:
-            raise file.error(f"camera {id_} occurs twice")
         name, params = MODELS[int(model)]
         numbers = file.take(struct.Struct(f"<{len(params.split())}d"), "its parameters")
-        cameras[int(id_)] = ColmapCamera(name, int(width), int(height), numbers)
+        yield f"byte {file.at}", int(id_), ColmapCamera(name, int(width), int(height), numbers)
     file.end()
-    return cameras
 
 
-def _images_bin(path: Path) -> list[ColmapImage]:
+def _images_bin(path: Path) -> Iterator[ColmapImage]:
     file = _Bytes(path)
-    images = []
     for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size, "images")):
         _, qw, qx, qy, qz, tx, ty, tz, camera = file.take(_IMAGE, "an image")
         stop = file.data.find(b"\0", file.at)
@@ -171,23 +169,23 @@ def _images_bin(path: Path) -> list[ColmapImage]:
         count = file.count(_FEATURE.itemsize, "features")
         point = np.frombuffer(file.data, dtype=_FEATURE, count=count, offset=file.at)["point"]
         file.at += count * _FEATURE.itemsize
-        images.append(ColmapImage(name, int(camera), (qw, qx, qy, qz), (tx, ty, tz), point[point >= 0].astype(np.int64)))
+        yield ColmapImage(name, int(camera), (qw, qx, qy, qz), (tx, ty, tz), point[point >= 0].astype(np.int64))
     file.end()
-    return images
 
 
-def _points_bin(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _points_bin(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
     file = _Bytes(path)
-    count = file.count(_POINT.size + _COUNT.size, "points")
-    ids, points = np.zeros(count, dtype=np.int64), np.zeros((count, 3))
-    for k in range(count):
+    for _ in range(file.count(_POINT.size + _COUNT.size, "points")):
         id_, *xyz, _, _, _, _ = file.take(_POINT, "a point")
-        ids[k] = min(int(id_), np.iinfo(np.int64).max)
-        points[k] = xyz
         track = file.count(8, "track elements")
         file.at += 8 * track
+        yield min(int(id_), np.iinfo(np.int64).max), tuple(xyz)
     file.end()
-    return ids, points
+
+
+def _rows(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """The place and words of each line that is neither a comment nor empty."""
+    return ((place, line.split()) for place, line in _lines(path) if line.strip())
 
 
 def _lines(path: Path) -> Iterator[tuple[str, str]]:
@@ -218,26 +216,18 @@ def _ints(path: Path, place: str, words: list[str]) -> tuple[int, ...]:
     return values
 
 
-def _cameras_txt(path: Path) -> dict[int, ColmapCamera]:
+def _cameras_txt(path: Path) -> Iterator[tuple[str, int, ColmapCamera]]:
     known = dict(MODELS)
-    cameras: dict[int, ColmapCamera] = {}
-    for place, line in _lines(path):
-        words = line.split()
-        if not words:
-            continue
+    for place, words in _rows(path):
         if len(words) >= 4 and words[1].isidentifier() and words[1] not in known:
             raise DataError(f"{path}: {place}: the camera model {words[1]} is unknown; {_undistort(path.parent)}")
         if len(words) < 4 or words[1] not in known or len(words) != 4 + len(known[words[1]].split()):
             raise _bad(path, place, "not `ID MODEL WIDTH HEIGHT` and as many parameters as the model has")
         id_, width, height = _ints(path, place, [words[0], *words[2:4]])
-        if id_ in cameras:
-            raise _bad(path, place, f"camera {id_} occurs twice")
-        cameras[id_] = ColmapCamera(words[1], width, height, _floats(path, place, words[4:]))
-    return cameras
+        yield place, id_, ColmapCamera(words[1], width, height, _floats(path, place, words[4:]))
 
 
-def _images_txt(path: Path) -> list[ColmapImage]:
-    images = []
+def _images_txt(path: Path) -> Iterator[ColmapImage]:
     lines = _lines(path)
     for place, line in lines:
         # The name is the rest of the line; as bytes only ASCII's blanks part words, of which a name may begin with others.
@@ -253,28 +243,19 @@ def _images_txt(path: Path) -> list[ColmapImage]:
         if len(cells) % 3:
             raise _bad(path, below, f"{len(cells)} numbers are no multiple of the three `X Y POINT3D_ID` of a feature")
         point = np.array(_ints(path, below, cells[2::3]), dtype=np.int64)
-        images.append(ColmapImage(words[9], camera, (qw, qx, qy, qz), (tx, ty, tz), point[point >= 0]))
-    return images
+        yield ColmapImage(words[9], camera, (qw, qx, qy, qz), (tx, ty, tz), point[point >= 0])
 
 
-def _points_txt(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    ids: list[int] = []
-    points: list[tuple[float, ...]] = []
-    for place, line in _lines(path):
-        words = line.split()
-        if not words:
-            continue
+def _points_txt(path: Path) -> Iterator[tuple[int, tuple[float, ...]]]:
+    for place, words in _rows(path):
         if len(words) < 8:
             raise _bad(path, place, "not `ID X Y Z R G B ERROR` and a track")
-        ids += _ints(path, place, words[:1])
-        points.append(_floats(path, place, words[1:4]))
-    return np.array(ids, dtype=np.int64), np.array(points, dtype=np.float64).reshape(-1, 3)
+        yield _ints(path, place, words[:1])[0], _floats(path, place, words[1:4])
 
 
 _APART = 1e-3
 """Share of the cameras' extent by which the two sets of camera centres may differ."""
 
-_Lens: TypeAlias = tuple[tuple[float, float], tuple[float, float], tuple[float, float, float, float, float, float], int]
 Cloud = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 """Finite points [P 3], and pairs [O 2] where known."""
 
@@ -413,15 +394,26 @@ class ColmapParser(DataParser):
             camera = model.cameras.get(image.camera)
             if camera is None:
                 raise DataError(f"{where}: its camera {image.camera} is not in the model; export the model again")
-            pose = _pose(where, image)
-            focal, centre, distortion, lens = _lens(f"{folder}: camera {image.camera}", camera, _undistort(folder, str(root)))
+            back = quaternion_rotation(where, image.quaternion).T
+            # A damaged translation may overflow; `rigid_pose` leaves out what is not finite.
+            with np.errstate(over="ignore", invalid="ignore"):
+                centre = -back @ np.array(image.translation)
+            pose = rigid_pose(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
+            own = f"{folder}: camera {image.camera}"
+            size = pixel_size(own, camera.width, camera.height)
+            # Parameters by name; what is left after those that every lens has are terms that few have.
+            given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
+            focal = given.pop("f", 0.0)
+            k = [given.pop(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+            fx, fy, cx, cy = given.pop("fx", focal), given.pop("fy", focal), given.pop("cx", 0.0), given.pop("cy", 0.0)
+            distortion, lens = lens_of(own, camera.model, k, list(given.values()), _undistort(folder, str(root)))
             return View(
                 name=inner,
                 path=path,
                 pose=pose,
-                size=(camera.width, camera.height),
-                focal=focal,
-                centre=centre,
+                size=size,
+                focal=(fx, fy),
+                centre=(cx, cy),
                 distortion=distortion,
                 lens=lens,
                 depths=_depths(model.points[rows], pose),
@@ -438,31 +430,11 @@ class ColmapParser(DataParser):
             points, notes = points if extra is None else extra, notes + said
         split = None
         if roles is not None:
-            given = [roles[PurePosixPath(image.name).name] for _, _, image, _ in kept]
-            split = index_tensor([role == "train" for role in given]), index_tensor([role == "test" for role in given])
+            learned = [roles[PurePosixPath(image.name).name] == "train" for _, _, image, _ in kept]
+            split = index_tensor(learned), index_tensor([not each for each in learned])
         return assemble_scene(
             data, views, downscale=downscale, split=split, points=points, seen=seen, reduced=name != "images", notes=notes
         )
-
-
-def _pose(where: str, image: ColmapImage) -> NDArray[np.float64]:
-    back = quaternion_rotation(where, image.quaternion).T
-    # A damaged translation may overflow; `rigid_pose` leaves out what is not finite.
-    with np.errstate(over="ignore", invalid="ignore"):
-        centre = -back @ np.array(image.translation)
-    return rigid_pose(where, np.stack([back[:, 0], -back[:, 1], -back[:, 2], centre], 1))
-
-
-def _lens(where: str, camera: ColmapCamera, remedy: str) -> _Lens:
-    """Focal lengths, principal point, k1 k2 k3 k4 p1 p2 and lens of a COLMAP camera."""
-    pixel_size(where, camera.width, camera.height)
-    given = dict(zip(dict(MODELS)[camera.model].split(), camera.params, strict=True))
-    fx, fy = (given.pop(key, given.get("f", 0.0)) for key in ("fx", "fy"))
-    given.pop("f", None)
-    centre = given.pop("cx", 0.0), given.pop("cy", 0.0)
-    k = [given.pop(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
-    distortion, lens = lens_of(where, camera.model, k, list(given.values()), remedy)
-    return (fx, fy), centre, distortion, lens
 
 
 def _depths(points: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[float, float] | None:

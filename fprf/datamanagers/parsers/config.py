@@ -6,6 +6,7 @@ with its images, 0.3 for raw recordings. Prepared folders often hold the reconst
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,6 +140,11 @@ class TownConfig(DataParserConfig):
         return TownParser(self)
 
 
+def is_record(name: str) -> bool:
+    """Return whether a file name is that of a TFRecord file or of one of its shards."""
+    return re.search(r"\.tfrecord(-\d+-of-\d+)?$", name) is not None
+
+
 @dataclass(frozen=True, kw_only=True)
 class BlockNerfConfig(DataParserConfig):
     """San Francisco Mission Bay: TFRecord files with exposure and rays of every pixel."""
@@ -155,8 +161,6 @@ class BlockNerfConfig(DataParserConfig):
 
     def recognises(self, data: Path) -> Recognised | None:
         """By TFRecord files, at most three folders down."""
-        from .blocknerf import is_record
-
         names = (path.name for depth in ("*", "*/*", "*/*/*", "*/*/*/*") for path in data.glob(f"{depth}.tfrecord*"))
         record = next(filter(is_record, names), None)
         return Recognised(0.3, record) if record is not None else None
@@ -274,7 +278,8 @@ def recognise(data: Path) -> DataParserConfig:
             between("confidence", confidence, 0.0, 1.0)
         except (Exception, SystemExit) as fault:  # a stranger's
             origin = ", ".join(each.origin for each in entries)
-            print(f"warning: data parser {name!r} ({origin}) is skipped: {_line(fault)}", file=sys.stderr)
+            reason = " ".join(f"{type(fault).__name__}: {fault}".split())
+            print(f"warning: data parser {name!r} ({origin}) is skipped: {reason}", file=sys.stderr)
             continue
         if answer and confidence >= best:
             surest = {name: (config, reason)} if confidence > best else {**surest, name: (config, reason)}
@@ -288,8 +293,10 @@ def recognise(data: Path) -> DataParserConfig:
         raise DataError(f"{data}: no such folder; give a scene folder, or `town` for the embedded scene")
     if not data.is_dir():
         raise DataError(f"{data}: a file; give the scene folder that it lies in, and name it with the parser's own field")
+    names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
+    content = f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})" if names else "nothing"
     raise DataError(
-        f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {_content(data)}; "
+        f"{data}: no transforms.json, sparse/0/cameras.bin or other file that a parser knows, but {content}; "
         "choose a parser with --datamanager.parser NAME, for Gaussians --parser NAME "
         f"({', '.join(registry.installed(group))}), or make poses with `fprf process`"
     )
@@ -304,12 +311,3 @@ def parse_scene(data: Path, downscale: int, parser: DataParserConfig | None) -> 
 
     chosen = recognise(data) if parser is None else parser
     return in_local_frame(chosen.build().parse(data, downscale))
-
-
-def _content(data: Path) -> str:
-    names = sorted(path.name + "/" * path.is_dir() for path in data.iterdir())
-    return f"{len(names)} entries ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})" if names else "nothing"
-
-
-def _line(fault: BaseException) -> str:
-    return f"{type(fault).__name__}: {' '.join(str(fault).split())}"

@@ -198,10 +198,9 @@ class Record:
     def number(self, key: str) -> float | None:
         """A number, finite or not, or None where it is absent."""
         value = self.get(key)
-        if value is None:
-            return None
-        if (number := _number(value)) is None:
-            raise DataError(f"{self.where}: {key} is {_short(value)}, not a number; correct it")
+        number = _number(value)
+        if value is not None and number is None:
+            raise self._wrong(key, "a number")
         return number
 
     def needed(self, key: str) -> float:
@@ -215,7 +214,7 @@ class Record:
         """A string, or None where it is absent."""
         value = self.get(key)
         if value is not None and not isinstance(value, str):
-            raise DataError(f"{self.where}: {key} is {_short(value)}, not a string; correct it")
+            raise self._wrong(key, "a string")
         return value
 
     def texts(self, key: str) -> list[str] | None:
@@ -223,20 +222,35 @@ class Record:
         value = self.get(key)
         if value is None:
             return None
-        if not isinstance(value, list):
-            raise DataError(f"{self.where}: {key} is {_short(value)}, not a list of strings; correct it")
-        strings = [item for item in value if isinstance(item, str)]
-        if len(strings) != len(value):
-            raise DataError(f"{self.where}: {key} holds something that is not a string; correct it")
+        strings = [item for item in value if isinstance(item, str)] if isinstance(value, list) else []
+        if not isinstance(value, list) or len(strings) != len(value):
+            raise self._wrong(key, "of strings alone" if isinstance(value, list) else "a list of strings")
         return strings
+
+    def numbers(self, key: str, count: int) -> NDArray[np.float64]:
+        """A list of `count` numbers, finite or not."""
+        numbers = _numbers(self.get(key), count)
+        if numbers is None:
+            raise self._wrong(key, f"{count} numbers")
+        return np.array(numbers)
+
+    def table(self, key: str, width: int) -> NDArray[np.float64]:
+        """A list of one or more rows of `width` numbers, finite or not."""
+        value = self.get(key)
+        rows = [_numbers(row, width) for row in value] if isinstance(value, list) else []
+        if not rows or None in rows:
+            raise self._wrong(key, f"rows of {width} numbers")
+        return np.array(rows, dtype=np.float64)
 
     def matrix(self, key: str) -> NDArray[np.float64]:
         """A list of 3 or 4 rows of 4 numbers."""
-        value = self.get(key)
-        rows = table_of(value, 4)
-        if rows is None or len(rows) not in (3, 4):
-            raise DataError(f"{self.where}: {key} is {_short(value)}, not 3 or 4 rows of 4 numbers; correct it")
+        rows = self.table(key, 4)
+        if len(rows) not in (3, 4):
+            raise self._wrong(key, "3 or 4 rows of 4 numbers")
         return rows
+
+    def _wrong(self, key: str, wanted: str) -> DataError:
+        return DataError(f"{self.where}: {key} is {_short(self.get(key))}, not {wanted}; correct it, or export it again")
 
     def records(self, key: str) -> "list[Record]":
         """A list of objects, each falling back to this one."""
@@ -253,17 +267,11 @@ def _number(value: Json) -> float | None:
     return float(value)
 
 
-def numbers_of(value: Json, count: int) -> list[float] | None:
+def _numbers(value: Json, count: int) -> list[float] | None:
     """The numbers, finite or not, of a list of `count`; None for anything else."""
     cells = value if isinstance(value, list) else []
     numbers = [number for number in map(_number, cells) if number is not None]
     return numbers if len(numbers) == len(cells) == count else None
-
-
-def table_of(value: Json, width: int) -> NDArray[np.float64] | None:
-    """The numbers [R width] of a list of one or more such lists; None for anything else."""
-    rows = [numbers_of(row, width) for row in value] if isinstance(value, list) else []
-    return np.array(rows, dtype=np.float64) if rows and None not in rows else None
 
 
 def as_record(where: str | Path, value: Json, common: _Object | None = None) -> Record:

@@ -67,11 +67,7 @@ def _folder(data: Path, wanted: str) -> Path:
         return path_inside(data, "parser.images", wanted)[1]
     if (data / "images").is_dir():
         return data / "images"
-    reduced = {}
-    for path in data.glob("images_*"):
-        factor = re.fullmatch(r"images_([0-9]{1,4})", path.name)
-        if factor and path.is_dir():
-            reduced[int(factor[1])] = path
-    if not reduced:
+    folders = [path for path in data.glob("images_*") if re.fullmatch(r"images_[0-9]{1,4}", path.name) and path.is_dir()]
+    if not folders:
         raise DataError(f"{data}: poses_bounds.npy, but no folder images or images_N; put the images there")
-    return reduced[min(reduced)]
+    return min(folders, key=lambda path: int(path.name.removeprefix("images_")))

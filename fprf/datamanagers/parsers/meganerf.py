@@ -7,7 +7,6 @@ are OpenGL's, in world axes down, right, back; `coordinates.pt` tells how many m
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from ...errors import DataError
@@ -61,12 +60,10 @@ def _unit(data: Path) -> float:
 
 def _load(path: Path) -> dict[str, Any]:
     """Tensors and numbers by name; nothing else is let in."""
+    if path.is_file() and path.stat().st_size > _LARGEST:
+        raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
     try:
-        if path.stat().st_size > _LARGEST:
-            raise DataError(f"{path}: larger than {_LARGEST} bytes, so no metadata of one image; copy it again")
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except DataError:
-        raise
     except Exception as error:  # the unpickler raises whatever the bytes lead it to
         raise DataError(f"{path}: no tensors of torch.save ({_first_line(error)}); copy the file again") from error
     if not isinstance(content, dict):
@@ -80,17 +77,15 @@ def _first_line(error: Exception) -> str:
 
 def _view(file: Path, images: Path, unit: float) -> View:
     metadata = _load(file)
-    path = next((p for s in sorted(IMAGE_SUFFIXES) for p in (images / f"{file.stem}{s}",) if p.is_file()), None)
-    path = images / f"{file.stem}.jpg" if path is None else path
+    paths = [images / f"{file.stem}{suffix}" for suffix in sorted(IMAGE_SUFFIXES)]
+    path = next((path for path in paths if path.is_file()), images / f"{file.stem}.jpg")
     try:
         width, height = (None if key not in metadata else float(metadata[key]) for key in "WH")
         size = stated_size(str(file), path, width, height)
-        pose = np.array(torch.as_tensor(metadata["c2w"]).double().numpy())
+        matrix = torch.as_tensor(metadata["c2w"]).double().numpy()
         fx, fy, cx, cy = (float(v) for v in torch.as_tensor(metadata["intrinsics"]).reshape(-1).tolist())
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         told = f"{file}: c2w [3 4] and intrinsics [4] are needed ({_first_line(error)}); copy the file again"
         raise DataError(told) from error
-    if pose.shape not in ((3, 4), (4, 4)):
-        raise DataError(f"{file}: c2w is {pose.shape}, not 3x4 or 4x4; copy the file again")
-    pose[:3, 3] *= unit
-    return View(name=file.stem, path=path, pose=rigid_pose(str(file), pose), size=size, focal=(fx, fy), centre=(cx, cy))
+    pose = rigid_pose(str(file), matrix) * [1, 1, 1, unit]
+    return View(name=file.stem, path=path, pose=pose, size=size, focal=(fx, fy), centre=(cx, cy))

@@ -19,7 +19,7 @@ from ...errors import DataError
 from ...interfaces import DataParser
 from ..scene import Scene
 from .config import OdmConfig
-from .files import NamedFiles, Record, as_record, numbers_of, path_inside, read_json
+from .files import NamedFiles, Record, as_record, path_inside, read_json
 from .views import View, assemble_scene, image_size, lens_of, read_views, rigid_pose
 
 _RECONSTRUCTION, _SHOTS = "opensfm/reconstruction.json", "odm_report/shots.geojson"
@@ -78,9 +78,9 @@ def _reconstruction(file: Path) -> tuple[list[_Shot], NDArray[np.float64]]:
         key = record.text("camera") or ""
         if key not in cameras:
             raise DataError(f"{record.where}: its camera {key!r} is none of cameras; run ODM again")
-        turn, offset = _turn(record), _vector(record, "translation")
+        turn, offset = _turn(record), record.numbers("translation", 3)
         shots.append(_Shot(name, cameras[key], turn, -turn.T @ offset))
-    points = [_vector(point, "coordinates") for point in _objects(largest, "points").values()]
+    points = [point.numbers("coordinates", 3) for point in _objects(largest, "points").values()]
     cloud = np.array(points).reshape(-1, 3)
     return shots, cloud[np.isfinite(cloud).all(1)]
 
@@ -99,8 +99,7 @@ def _shots(data: Path, file: Path) -> list[_Shot]:
             key = next(iter(cameras))
         if key is None or key not in cameras:
             raise DataError(f"{record.where}: which of {len(cameras)} cameras took it is not said; keep {_RECONSTRUCTION}")
-        place = _vector(record, "translation")
-        shots.append(_Shot(name, cameras[key], _turn(record), place))
+        shots.append(_Shot(name, cameras[key], _turn(record), record.numbers("translation", 3)))
     return shots
 
 
@@ -126,27 +125,17 @@ def _view(where: str, name: str, path: Path, shot: _Shot) -> View:
         size=(width, height),
         focal=(fx * longest, (fx if fy is None else fy) * longest),
         # OpenSfM counts pixels from the middle of the first one, we from its corner: the half cancels.
-        centre=(
-            width / 2 + (camera.number("c_x") or 0.0) * longest,
-            height / 2 + (camera.number("c_y") or 0.0) * longest,
-        ),
+        centre=(width / 2 + (camera.number("c_x") or 0) * longest, height / 2 + (camera.number("c_y") or 0) * longest),
         distortion=distortion,
         lens=lens,
     )
 
 
 def _turn(record: Record) -> NDArray[np.float64]:
-    vector = _vector(record, "rotation")
+    vector = record.numbers("rotation", 3)
     if np.abs(vector).max() > _TURN:
         raise DataError(f"{record.where}: rotation is {vector.tolist()}, not an axis times an angle; run ODM again")
     return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
-
-
-def _vector(record: Record, key: str) -> NDArray[np.float64]:
-    numbers = numbers_of(record.get(key), 3)
-    if numbers is None:
-        raise DataError(f"{record.where}: {key} is not three numbers; run ODM again")
-    return np.array(numbers)
 
 
 def _objects(record: Record, key: str) -> Mapping[str, Record]:

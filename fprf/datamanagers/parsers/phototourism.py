@@ -24,23 +24,17 @@ class PhotoTourismParser(DataParser):
 
     def parse(self, data: Path, downscale: int) -> Scene:
         """The listed photographs. Raises DataError where the table names none of the model's."""
-        table = self._table(data)
+        tables = [data / self.config.list] if self.config.list else sorted(data.glob("*.tsv"))
+        if len(tables) != 1:
+            raise DataError(f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list")
+        table = tables[0]
+        if not table.is_file():
+            raise DataError(f"{table}: no such table; name one of the folder's with parser.list")
         inner = data / "dense" if not model_folders(data) and (data / "dense").is_dir() else data
         scene = ColmapParser(ColmapConfig()).parse(inner, downscale, read_list(table))
         if not len(scene.train):
             raise DataError(f"{table}: none of its training photographs is in the model of {inner}; is it another scene's?")
         return replace(scene, name=name_of(data))
-
-    def _table(self, data: Path) -> Path:
-        if self.config.list:
-            path = data / self.config.list
-            if not path.is_file():
-                raise DataError(f"{path}: no such table; name one of the folder's with parser.list")
-            return path
-        tables = sorted(data.glob("*.tsv"))
-        if len(tables) != 1:
-            raise DataError(f"{data}: {len(tables)} tables *.tsv; exactly one is needed, or its name in parser.list")
-        return tables[0]
 
 
 def read_list(path: Path) -> dict[str, str]:

@@ -5,8 +5,8 @@ Images are numbered. `poses` has a row for each: a quaternion x y z w and the po
 Both are in pixels of the images, which are `w` by `h`, or as they are where the file says nothing.
 """
 
+import re
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,10 @@ from ...interfaces import DataParser
 from ..images import image_names
 from ..scene import Scene
 from .config import Record3DConfig
-from .files import Record, as_record, numbers_of, read_json, table_of
+from .files import Record, as_record, read_json
 from .views import View, assemble_scene, quaternion_rotation, read_views, rigid_pose, stated_size
 
-_Rows: TypeAlias = NDArray[np.float64]
+_NUMBER = re.compile("[0-9]{1,9}")
 _PAIRS = (("metadata.json", "rgb"), ("metadata", "rgbd"), ("metadata", "rgb"), ("metadata.json", "rgbd"))
 
 
@@ -42,8 +42,8 @@ class Record3DParser(DataParser):
             raise DataError(f"{data}: no metadata.json with rgb/; export from Record3D as EXR and JPG, or unpack its .r3d")
         file, folder = files
         record = as_record(file, read_json(file))
-        poses = _table(record, "poses", 7)
-        numbered = sorted((int(Path(name).stem), name) for name in image_names(folder) if _numbered(name))
+        poses = record.table("poses", 7)
+        numbered = sorted((int(Path(name).stem), name) for name in image_names(folder) if _NUMBER.fullmatch(Path(name).stem))
         posed = [each for each in numbered if each[0] < len(poses)]
         if not posed:
             last = numbered[-1][1] if numbered else "nothing numbered"
@@ -73,26 +73,10 @@ class Record3DParser(DataParser):
         return assemble_scene(data, views, downscale=downscale, notes=notes)
 
 
-def _numbered(name: str) -> bool:
-    stem = Path(name).stem
-    return stem.isascii() and stem.isdigit() and len(stem) <= 9
-
-
-def _lenses(record: Record, count: int) -> _Rows:
+def _lenses(record: Record, count: int) -> NDArray[np.float64]:
     """fx fy cx cy of each image."""
     if record.get("perFrameIntrinsicCoeffs") is not None:
-        rows = _table(record, "perFrameIntrinsicCoeffs", 4)
+        rows = record.table("perFrameIntrinsicCoeffs", 4)
         if len(rows) >= count:
             return rows
-    numbers = numbers_of(record.get("K"), 9)
-    if numbers is None:
-        raise DataError(f"{record.where}: K is no list of 9 numbers; export the recording again")
-    fx, _, _, _, fy, _, cx, cy, _ = numbers
-    return np.tile([fx, fy, cx, cy], (count, 1))
-
-
-def _table(record: Record, key: str, width: int) -> _Rows:
-    rows = table_of(record.get(key), width)
-    if rows is None:
-        raise DataError(f"{record.where}: {key} is no list of {width} numbers each; export the recording again")
-    return rows
+    return np.tile(record.numbers("K", 9)[[0, 4, 6, 7]], (count, 1))

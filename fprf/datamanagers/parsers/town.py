@@ -20,26 +20,20 @@ class TownParser(DataParser):
         """The scene. A town folder is read as it is; the literal `town` and paths that don't exist mean the town of the
         config's settings, from the cache. Raises DataError where a folder holds something else.
         """
-        from ...town.write import is_town
+        from ...town.write import TownSettings, is_town, write_town
         from .transforms import TransformsParser
 
+        parser, c = TransformsParser(TransformsConfig()), self.config
         if is_town(data):
-            return TransformsParser(TransformsConfig()).parse(data, downscale)
+            return parser.parse(data, downscale)
         if data.exists() and data != Path("town"):
             raise DataError(f"{data}: no town.json, so this is not a town; give `town`, or choose another parser")
-        scene = TransformsParser(TransformsConfig()).parse(self._rendered(), downscale)
-        return replace(scene, name="town")
-
-    def _rendered(self) -> Path:
-        from ...town.write import TownSettings, write_town
-
-        c = self.config
         settings = TownSettings(
             seed=c.seed, palette=c.palette, views=c.views, width=c.width, height=c.height, extra=float(c.extra)
         )
         folder = cache_folder() / f"town-{settings.key}"
         write_town(folder, **{k: v for k, v in asdict(settings).items() if k != "edition"})
-        return folder
+        return replace(parser.parse(folder, downscale), name="town")
 
 
 def cache_folder() -> Path:

@@ -52,7 +52,11 @@ class TransformsParser(DataParser):
         tops = [as_record(file, read_json(file)) for file, _ in files]
         entries, inside = [], NamedFiles(data)
         for top, (_, role) in zip(tops, files, strict=True):
-            entries += [_entry(inside, record, role) for record in top.records("frames")]
+            for record in top.records("frames"):
+                text = record.text("file_path")
+                if text is None:
+                    raise DataError(f"{record.where}: file_path is missing; each frame names its image")
+                entries.append(_Entry(record, *inside.find(record.where, text, IMAGE_SUFFIXES), role))
         entries.sort(key=lambda entry: entry.name)
         # A frame that is written twice over says nothing new; where the two differ `read_views` refuses them.
         same = [k > 0 and entries[k - 1].record.own == entry.record.own for k, entry in enumerate(entries)]
@@ -103,13 +107,6 @@ def _cloud(
         sparse = cloud_of_model(model, [view.name for view in views], [view.pose for view in views], applied)
         return (points, None, notes) if sparse is None else (*sparse, [])
     return points, seen, notes
-
-
-def _entry(inside: NamedFiles, record: Record, role: str) -> _Entry:
-    text = record.text("file_path")
-    if text is None:
-        raise DataError(f"{record.where}: file_path is missing; each frame names its image")
-    return _Entry(record, *inside.find(record.where, text, IMAGE_SUFFIXES), role)
 
 
 def _view(entry: _Entry, inside: NamedFiles) -> View:

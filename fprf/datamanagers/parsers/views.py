@@ -29,12 +29,6 @@ MASKS, SKY_MASKS = "masks", "sky_masks"
 """Names of the folders."""
 
 
-def find_masks(data: Path, images: Sequence[Path], name: str) -> tuple[Path | None, ...]:
-    """The mask of each image, None where there is none; nothing at all where the capture has none of that name."""
-    masks = tuple(_mask(data, image, name) for image in images)
-    return masks if any(mask is not None for mask in masks) else ()
-
-
 def _mask(data: Path, image: Path, name: str) -> Path | None:
     """Beside the image's folder, or beside a folder around that, up to the scene's."""
     for above in image.parents[1:]:
@@ -46,16 +40,6 @@ def _mask(data: Path, image: Path, name: str) -> Path | None:
         if above == data or not above.is_relative_to(data):
             return None
     return None
-
-
-def every_eighth(count: int) -> tuple[Tensor, Tensor]:
-    """Indices (train, test), int64, of `count` views sorted by name: every 8th, from the first on, is test (LLFF).
-
-    A single view is for training, so that there is something to learn from.
-    """
-    index = torch.arange(count)
-    test = (index % 8 == 0) & (count > 1)
-    return index[~test], index[test]
 
 
 def index_tensor(members: Sequence[bool]) -> Tensor:
@@ -253,9 +237,16 @@ def assemble_scene(
     sizes = []
     for view in views:
         header = read_header(view.path)
-        _check_size(view, (header.width, header.height), reduced)
+        size = header.width, header.height
+        # Reducing rounds each side to a whole pixel.
+        same_shape = abs(view.size[0] * size[1] - view.size[1] * size[0]) <= sum(view.size)
+        if not (view.size == size or (reduced and same_shape)):
+            raise DataError(
+                f"{view.path}: {size[0]}x{size[1]} pixels, but its camera has {view.size[0]}x{view.size[1]}; "
+                "restore the image (was it resized, rotated or cropped?) or calibrate again"
+            )
         alpha |= header.alpha
-        sizes.append((header.width, header.height))
+        sizes.append(size)
     delivered = Cameras(
         pose=torch.from_numpy(np.stack([view.pose for view in views])),
         focal=torch.tensor([view.focal for view in views], dtype=torch.float64),
@@ -265,7 +256,9 @@ def assemble_scene(
         lens=torch.tensor([view.lens for view in views], dtype=torch.int64),
     ).resized(torch.tensor(sizes))
     depths = [view.depths for view in views if view.depths is not None]
-    train, test = split or every_eighth(len(views))
+    # Every 8th, from the first on, is for testing (LLFF); but a single view is for training: there must be something to learn.
+    held = [k % 8 == 0 and len(views) > 1 for k in range(len(views))]
+    train, test = split or (index_tensor([not each for each in held]), index_tensor(held))
     return Scene(
         name=name_of(data),
         paths=tuple(view.path for view in views),
@@ -285,21 +278,12 @@ def assemble_scene(
 def _masks(data: Path, views: Sequence[View], named: Sequence[Path | None], folder: str) -> tuple[Path | None, ...]:
     """Those that the capture names, or where it names none, those that lie beside the images."""
     if not any(named):
-        return find_masks(data, [view.path for view in views], folder)
+        beside = tuple(_mask(data, view.path, folder) for view in views)
+        return beside if any(beside) else ()
     missing = [path for path in named if path is not None and not os.path.isfile(path)]
     if missing:
         raise DataError(f"{data}: {len(missing)} masks are missing, the first is {missing[0]}; copy them there or unname them")
     return tuple(named)
-
-
-def _check_size(view: View, file: tuple[int, int], reduced: bool) -> None:
-    # Reducing rounds each side to a whole pixel.
-    same_shape = abs(view.size[0] * file[1] - view.size[1] * file[0]) <= sum(view.size)
-    if not (view.size == file or (reduced and same_shape)):
-        raise DataError(
-            f"{view.path}: {file[0]}x{file[1]} pixels, but its camera has {view.size[0]}x{view.size[1]}; "
-            "restore the image (was it resized, rotated or cropped?) or calibrate again"
-        )
 
 
 def _check_camera(view: View) -> None:
