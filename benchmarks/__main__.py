@@ -24,6 +24,7 @@ BENCHMARKS = {
     "gallery": "the pictures and figures of docs/gallery",
     "gaussians": "the rasteriser of 3D Gaussians: time and error",
     "hosts": "a cluster of two hosts that loses one",
+    "images": "time and error of decoding photographs",
     "kernels": "what each compiled kernel brings end to end",
     "kills": "training that is killed a hundred times",
     "large_scene": "a town of 400 images in blocks: quality, seams, memory, time",
