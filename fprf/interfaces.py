@@ -52,9 +52,7 @@ class Encoder(nn.Module, ABC):
     def forward(self, image: Annotated[Tensor, "B 3 H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features of sRGB images in [0, 1], aligned to the whole image: cell (i, j) covers its h-th and w-th part."""
 
-    def cutout(
-        self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]
-    ) -> Annotated[Tensor, "B C h w"]:
+    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features of what images show that are transparent in places; colours are premultiplied by the opacity in [0, 1].
 
         This mean over a white and a black backdrop serves any encoder: neither alone decides what a single thing is. Override

@@ -334,7 +334,7 @@ def find_semantics(
         camera = camera_of(small, 0, near)
         index = seen_by(gaussians, camera)
         shape = (gaussians.means[index], gaussians.quaternions[index], gaussians.log_scales[index], gaussians.logits[index])
-        lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased).features
+        lifted = lift(*shape, camera, torch.cat([fine * trust, trust], 2), antialiased=antialiased)
         sums.index_add_(0, index, lifted[:, :dim])
         weights.index_add_(0, index, lifted[:, dim])
         # Colours are those of single pixels of the whole picture: averages would have less contrast.

@@ -68,9 +68,7 @@ class ConcatEncoder(FrozenEncoder):
         return self._side_by_side([part(image) for part in self._encoders])
 
     @torch.no_grad()
-    def cutout(
-        self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]
-    ) -> Annotated[Tensor, "B C h w"]:
+    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
         """Each part leaves the backdrop out as it can."""
         return self._side_by_side([part.cutout(image, opacity) for part in self._encoders])
 

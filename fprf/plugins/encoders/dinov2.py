@@ -25,7 +25,7 @@ HELD, BLOCKS = 11, 12
 """Blocks in the file and of the network."""
 EPS = 1e-6
 """Of layer norms, as in training."""
-COVER = 0.1
+COVER = 0.02
 """Mean opacity of a patch from which on it is encoded."""
 GREY = 0.5
 """Backdrop of patches that show something in part: the mean colour of what is shown hides its outline, and matches worse."""
@@ -104,9 +104,7 @@ class Dinov2Encoder(FrozenEncoder):
         return self._features(image)
 
     @torch.no_grad()
-    def cutout(
-        self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]
-    ) -> Annotated[Tensor, "B C h w"]:
+    def cutout(self, image: Annotated[Tensor, "B 3 H W"], opacity: Annotated[Tensor, "B H W"]) -> Annotated[Tensor, "B C h w"]:
         """Features of the patches that show something, encoded without the others: cheaper, and no backdrop has a say."""
         cover = F.adaptive_avg_pool2d(opacity[:, None], patch_grid(image.shape[-2:], self._stride))[:, 0]
         filled = image + (1 - opacity[:, None]) * GREY
@@ -114,7 +112,7 @@ class Dinov2Encoder(FrozenEncoder):
         return torch.cat(
             [
                 self._features(each, shown if bool(shown.any() & ~shown.all()) else None)
-                for each, shown in zip(filled.split(1), cover > COVER, strict=True)
+                for each, shown in zip(torch.split(filled, 1), cover > COVER, strict=True)
             ]
         )
 
